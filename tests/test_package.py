@@ -44,12 +44,21 @@ PACKAGES = {
     "checker": {"_arguments"},
     "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names"},
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
+    "repair": {"detection", "_arguments"},
     "usd": {"_arguments", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_version"},
     "bench": {"detection", "kernels", "usd", "checker", "response", "_arguments", "_private_names"},
     "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
     "__main__": {"cli"},
-    "__init__": {"_version", "checker", "detection", "replay", "response", "usd"},  # most for type checkers alone
+    "__init__": {
+        "_version",
+        "checker",
+        "detection",
+        "repair",
+        "replay",
+        "response",
+        "usd",
+    },  # most for type checkers alone
 }
 """Whom a package of ours, or a module beside them, may import; the names that it exports import what they need."""
 
@@ -69,7 +78,7 @@ LIBRARIES = {
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
     "trimesh": {"bench", "response", "usd"},
-    "warp": {"kernels", "detection", "response", "bench", "cli", "_private_names"},
+    "warp": {"kernels", "detection", "response", "repair", "bench", "cli", "_private_names"},
 }
 """Who may import a library: packages, or single files."""
 

@@ -39,6 +39,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
         query_vertex_vertex,
     )
     from .detection.query_points import query_points
+    from .repair.repair import repair
+    from .repair.results import RepairResult, UnresolvedContour
     from .replay.intervals import replay
     from .replay.results import IntervalResult, IntervalSummary
     from .replay.scene_contacts import SceneContacts
@@ -67,6 +69,7 @@ _MODULES = {
     "IntervalResult": "replay.results",
     "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",
+    "RepairResult": "repair.results",
     "Scene": "usd.scene",
     "SceneContacts": "replay.scene_contacts",
     "SceneIntersections": "replay.scene_intersections",
@@ -74,11 +77,13 @@ _MODULES = {
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.report",
+    "UnresolvedContour": "repair.results",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
     "query_vertex_edge": "detection.query",
     "query_vertex_face": "detection.query",
     "query_vertex_vertex": "detection.query",
+    "repair": "repair.repair",
     "replay": "replay.intervals",
 }
 
@@ -96,6 +101,7 @@ __all__ = [
     "IntervalResult",
     "IntervalSummary",
     "QueryResult",
+    "RepairResult",
     "Scene",
     "SceneContacts",
     "SceneIntersections",
@@ -103,19 +109,23 @@ __all__ = [
     "Selection",
     "SolverCCD",
     "SolverReport",
+    "UnresolvedContour",
     "checker",
     "query_edge_edge",
     "query_points",
     "query_vertex_edge",
     "query_vertex_face",
     "query_vertex_vertex",
+    "repair",
     "replay",
 ]
 
 
-# The function of this name is public, not the package. The import system binds a package only at its first import: now.
-importlib.import_module(".replay", __name__)
-del globals()["replay"]
+# The functions of these names are public, not the packages. The import system binds a package only at its first import:
+# now.
+for _name in ("repair", "replay"):
+    importlib.import_module(f".{_name}", __name__)
+    del globals()[_name]
 
 
 def __getattr__(name):

@@ -282,6 +282,22 @@ def calls() -> dict[str, Call]:
             "x1": bad_arrays(X) | {"rows": np.zeros((5, 3)), "single": X.astype(np.float32)},
         },
     )
+    vertices = without(bad_arrays(np.array([1]), index=True), "None")
+    found["repair"] = Call(
+        bsc.repair,
+        {"mesh": FACES, "x": X, "device": "cpu"},
+        {
+            "mesh": {},
+            "x": COORDINATES,
+            "fixed": vertices,
+            "order": without(bad_arrays(np.zeros(6, int), index=True), "None", "negative")
+            | {"negative": np.full(6, -2), "shared": [[0, 1], [1, 2]], "out of range": [[0], [9]]},
+            "x_previous": without(COORDINATES, "None") | {"single": X.astype(np.float32)},
+            "min_distance": without(DISTANCES, "None"),
+            "max_strain": {**NUMBERS, "zero": 0.0, "negative": -1.0},
+            "device": DEVICES,
+        },
+    )
     found |= calls_of_scenes() | calls_of_solvers()
     return found
 
@@ -435,10 +451,12 @@ RESULTS = {
     "IntervalResult",
     "IntervalSummary",
     "QueryResult",
+    "RepairResult",
     "SceneContacts",
     "SceneIntersections",
     "SceneProximities",
     "SolverReport",
+    "UnresolvedContour",
 }
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 

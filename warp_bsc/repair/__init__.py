@@ -1,1 +1,1 @@
-"""Makes positions, and the shots of a scene, free of intersections and collisions, and certifies it."""
+"""Moves positions that cross to the nearest positions that do not, and certifies them."""

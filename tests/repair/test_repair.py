@@ -1,0 +1,119 @@
+"""Repairs of meshes that cross themselves: free in the end, near, and never worse."""
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import warp_bsc as bsc
+from warp_bsc.bench.repair_scenes import KINDS, KNOWN, damaged
+
+
+def crossings(faces, x):
+    mesh = bsc.CollisionMesh(faces, len(x), device="cpu")
+    return len(bsc.CollisionDetector(mesh).find_intersections(x))
+
+
+def repair(scene, x, **options):
+    """Repairs, and checks what holds for every result."""
+    result = bsc.repair(scene.faces, x, fixed=scene.fixed, device="cpu", **options)
+    assert result.x.dtype == x.dtype
+    assert result.crossings == crossings(scene.faces, result.x) <= result.crossings_before == crossings(scene.faces, x)
+    assert result.crossings == sum(len(contour.elements) for contour in result.unresolved)
+    still = result.moved == 0.0
+    assert result.x[still].tobytes() == x[still].tobytes()
+    assert still[scene.fixed].all()
+    if result.certified:
+        assert not ipctk_finds(scene.faces, result.x)
+    return result
+
+
+def ipctk_finds(faces, x):
+    """Whether ipctk finds an intersection; False where it is not installed."""
+    try:
+        import ipctk  # noqa: PLC0415
+    except ImportError:
+        return False
+    faces = np.asarray(faces, np.int32)
+    mesh = ipctk.CollisionMesh(np.asarray(x, float), ipctk.edges(faces), faces)
+    return ipctk.has_intersections(mesh, np.asarray(x, float))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", ["sheets", "folded"])
+def test_known_tangles_come_free_with_little_strain(name, dtype):
+    scene = KNOWN[name]()
+    result = repair(scene, scene.x.astype(dtype))
+    assert result.certified
+    assert result.max_strain <= 0.1
+
+
+def test_a_contour_from_border_to_border_is_named():
+    scene = KNOWN["corner"]()
+    result = repair(scene, scene.x)
+    assert not result.certified
+    assert [contour.kind for contour in result.unresolved] == ["border"]
+    assert "order" in result.unresolved[0].reason
+
+
+@pytest.mark.parametrize("hint", ["order", "groups", "x_previous"])
+def test_order_or_history_solves_it(hint):
+    scene = KNOWN["corner"]()
+    groups = [np.flatnonzero(scene.layer == 0), scene.layer == 1]
+    option = {"order": scene.layer} if hint == "order" else {"order": groups}
+    result = repair(scene, scene.x, **({"x_previous": scene.free} if hint == "x_previous" else option))
+    assert result.certified
+    assert result.max_strain <= 0.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=2, deadline=None)
+@given(seed=st.integers(0, 19), single=st.booleans())
+def test_random_damage_is_never_worse(kind, seed, single):
+    scene = damaged(kind, seed)
+    repair(scene, scene.x.astype(np.float32 if single else np.float64))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_moves_where_nothing_crosses(kind):
+    scene = damaged(kind, 0)
+    result = repair(scene, scene.free, min_distance=1e-3)
+    assert result.certified
+    assert not result.moved.any()
+
+
+def test_what_is_fixed_and_crosses_is_named():
+    scene = KNOWN["folded"]()
+    result = bsc.repair(scene.faces, scene.x, fixed=np.ones(len(scene.x), bool), device="cpu")
+    assert result.crossings == result.crossings_before > 0
+    assert {contour.reason for contour in result.unresolved} == {"both of its sides are fixed"}
+
+
+def test_seams_stay_closed():
+    scene = KNOWN["folded"]()
+    doubled = np.vstack([scene.x, scene.x])
+    half = len(scene.faces) // 2
+    result = bsc.repair(np.vstack([scene.faces[:half], scene.faces[half:] + len(scene.x)]), doubled, device="cpu")
+    used = np.intersect1d(scene.faces[:half], scene.faces[half:])
+    border = used[(result.x[used] == result.x[used + len(scene.x)]).all(axis=1)]
+    assert len(border) == len(used)
+
+
+def test_warp_arrays_come_back_as_warp_arrays():
+    scene = KNOWN["folded"]()
+    result = bsc.repair(scene.faces, wp.array(scene.x, dtype=wp.vec3, device="cpu"), device="cpu")
+    assert result.certified
+    assert result.x.dtype == wp.vec3
+
+
+def test_a_minimum_distance_is_kept():
+    scene = KNOWN["folded"]()
+    result = repair(scene, scene.x, min_distance=1e-3)
+    assert not result.crossings
+
+
+def test_a_previous_configuration_must_be_free():
+    scene = KNOWN["folded"]()
+    with pytest.raises(ValueError, match="x_previous"):
+        repair(scene, scene.x, x_previous=scene.x)

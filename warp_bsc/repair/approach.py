@@ -1,0 +1,51 @@
+"""Takes a surface back towards its input along a certified path, as near as contact and strain allow."""
+
+import numpy as np
+
+from .elastic import Springs
+from .motion import move_freely
+from .surface import Surface
+
+__all__ = ["approach"]
+
+_ROUNDS = 8
+_SWEEPS = 40
+_SETTLED = 2.0**-10
+"""Move, in edges, below which the approach ends."""
+_SOUGHT = 0.5
+"""Strain that springs leave, as a share of the limit."""
+
+
+def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float) -> np.ndarray:
+    """Returns positions near the input that can be reached from a start without a collision.
+
+    What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
+    below the limit. Of the positions passed, the result has the least strain above the limit, then the least moves.
+
+    Args:
+        surface: The surface.
+        x: The start, in units of the surface, shape [n, 3]. What crosses there may cross in the end, nothing else.
+        springs: Springs of the vertices that may move.
+        max_strain: Largest strain.
+    """
+    best, best_score = x, _score(surface, x, max_strain)
+    held = np.zeros(len(x), dtype=bool)
+    for _ in range(_ROUNDS):
+        goal = np.where(held[:, None], x, surface.home)
+        if held.any():
+            goal = springs.relax(goal, _SWEEPS, _SOUGHT * max_strain)
+        moved, stopped = move_freely(surface, x, surface.rounded(goal))
+        held |= stopped
+        change = np.abs(moved - x).max(initial=0.0)
+        x = moved
+        score = _score(surface, x, max_strain)
+        if score < best_score:
+            best, best_score = x, score
+        if change < _SETTLED * surface.edge:
+            break
+    return best
+
+
+def _score(surface: Surface, x: np.ndarray, max_strain: float) -> tuple[float, float]:
+    """Returns the strain above the limit and the sum of squared moves."""
+    return max(surface.strain(x) - max_strain, 0.0), float((surface.moves(x) ** 2).sum())

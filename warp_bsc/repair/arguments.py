@@ -1,0 +1,78 @@
+"""Checks the arguments of a repair and converts them: vertices that stay, and the layer of each vertex."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .._arguments import as_numpy, given
+
+__all__ = ["checked_layers", "checked_mask", "host"]
+
+
+def host(array: Any) -> Any:
+    """Returns a Warp array as NumPy, and anything else as it is."""
+    return array.numpy() if isinstance(array, wp.array) else array
+
+
+def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
+    """Returns which vertices are given, bool, shape [count].
+
+    Args:
+        vertices: A mask, bool, shape [count], or indices, integers, shape [n].
+        name: Name of the argument in errors.
+        count: Number of vertices.
+
+    Raises:
+        TypeError: If they are no array of numbers.
+        ValueError: If they have another shape or type, or an index is out of range.
+    """
+    values = as_numpy(host(vertices), name, "an array of indices or a mask")
+    if values.dtype == bool:
+        if values.shape != (count,):
+            raise ValueError(f"{name} as a mask must have shape ({count},), not {values.shape}")
+        return values.copy()
+    mask = np.zeros(count, dtype=bool)
+    if values.shape == (0,):
+        return mask
+    if values.ndim != 1 or not np.issubdtype(values.dtype, np.integer):
+        raise ValueError(f"{name} must be a mask or integers of shape (n,), not {values.dtype} {values.shape}")
+    bad = (values < 0) | (values >= count)
+    if bad.any():
+        raise ValueError(f"{name}[{np.argmax(bad)}] is {values[np.argmax(bad)]}, but the mesh has {count} vertices")
+    mask[values] = True
+    return mask
+
+
+def checked_layers(order: Any, count: int) -> np.ndarray:
+    """Returns the layer of each vertex from inside to outside, -1 for none, int, shape [count].
+
+    Args:
+        order: A layer for each vertex, integers of at least -1, as an array; or a sequence of groups of vertices.
+        count: Number of vertices.
+
+    Raises:
+        TypeError: If it is neither.
+        ValueError: If layers or groups have another shape or are out of range, or groups share a vertex.
+    """
+    if isinstance(order, np.ndarray | wp.array):
+        values = as_numpy(host(order), "order")
+        if values.shape != (count,) or not np.issubdtype(values.dtype, np.integer):
+            raise ValueError(
+                f"order as an array must be {count} integers, one a vertex, not {values.dtype} {values.shape}"
+            )
+        if values.min(initial=0) < -1 or values.max(initial=0) >= 2**31:
+            raise ValueError(f"order must be in [-1, 2^31), not {values.min(initial=0)} to {values.max(initial=0)}")
+        return values.astype(np.int64)
+    if isinstance(order, str) or not isinstance(order, Sequence):
+        raise TypeError(f"order must be an array of layers or a sequence of groups of vertices, not {given(order)}")
+    layer = np.full(count, -1)
+    for number, group in enumerate(order):
+        mask = checked_mask(group, f"order[{number}]", count)
+        shared = mask & (layer >= 0)
+        if shared.any():
+            vertex = np.argmax(shared)
+            raise ValueError(f"order[{number}] has vertex {vertex}, which order[{layer[vertex]}] has as well")
+        layer[mask] = number
+    return layer

@@ -1,0 +1,103 @@
+"""Springs that keep the shape of the input, in the part of a surface that may move."""
+
+import numpy as np
+import warp as wp
+
+from ..detection.launch import launch
+from .kernels import relax_springs, spread_moves
+from .surface import Surface
+
+__all__ = ["Springs", "near"]
+
+_BENDING = 0.3
+"""Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges."""
+
+
+def near(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
+    """Returns which vertices are within some edges of given ones and not fixed, bool, shape [n]."""
+    reached = np.zeros(len(surface.home), dtype=bool)
+    reached[vertices] = True
+    for _ in range(rings):
+        reached[surface.mesh.edges[reached[surface.mesh.edges].any(axis=1)]] = True
+    return reached & ~surface.fixed
+
+
+class Springs:
+    """Springs along edges and across them, between the two vertices opposite an edge, at rest in the input.
+
+    Attributes:
+        movable: Vertices that they move, bool, shape [n].
+    """
+
+    def __init__(self, surface: Surface, movable: np.ndarray):
+        """Finds the springs.
+
+        Args:
+            surface: The surface.
+            movable: Vertices that they may move, bool, shape [n].
+        """
+        self._surface, self.movable = surface, movable
+        vertices = np.flatnonzero(movable)
+        edges = np.flatnonzero(movable[surface.mesh.edges].any(axis=1))
+        across = _vertices_across(surface, movable)
+        ends = np.concatenate([surface.mesh.edges[edges], across])
+        stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
+        lengths = np.linalg.norm(surface.home[ends[:, 1]] - surface.home[ends[:, 0]], axis=1)
+        both = np.concatenate([ends, ends[:, ::-1]])
+        order = np.argsort(both[:, 0], kind="stable")
+        order = order[movable[both[order, 0]]]
+        array = surface.array
+        self._springs = [
+            array(vertices, int),
+            array(np.append(np.searchsorted(both[order, 0], vertices), len(order)), int),
+            array(both[order, 1], int),
+        ]
+        self._rest = [array(np.tile(values, 2)[order], wp.float64) for values in (lengths, stiffness)]
+
+    def spread(self, moves: np.ndarray, given: np.ndarray, sweeps: int) -> np.ndarray:
+        """Returns moves of all vertices, which join those of given vertices smoothly; Jacobi sweeps.
+
+        Args:
+            moves: Moves, 0 where not given, in units, shape [n, 3].
+            given: Vertices whose moves stay, bool, shape [n].
+            sweeps: Number of sweeps, about as many edges as moves spread over.
+        """
+        is_given = self._surface.array(given, bool)
+        return self._sweep(spread_moves, [*self._springs, is_given], moves, sweeps)
+
+    def relax(self, x: np.ndarray, sweeps: int, slack: float = 0.0) -> np.ndarray:
+        """Returns positions with strains that are smaller, or at most ``slack`` if there are enough sweeps.
+
+        Args:
+            x: Positions, in units, shape [n, 3].
+            sweeps: Number of Jacobi sweeps.
+            slack: Strain that needs no change.
+        """
+        return self._sweep(relax_springs, [*self._springs, *self._rest, wp.float64(slack)], x, sweeps)
+
+    def _sweep(self, kernel: wp.Kernel, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
+        """Returns values after some launches of a kernel that writes those of all movable vertices."""
+        before, after = self._surface.array(values), self._surface.array(values)
+        for _ in range(sweeps):
+            launch(
+                kernel, len(self._springs[0]), inputs=[*inputs, before], outputs=[after], device=self._surface.device
+            )
+            before, after = after, before
+        return before.numpy()
+
+
+def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:
+    """Returns the pairs of vertices opposite an edge in two of its faces, near movable vertices, int, shape [m, 2]."""
+    mesh = surface.mesh
+    (faces,) = np.nonzero(movable[mesh.faces].any(axis=1)) if len(mesh.faces) else (np.zeros(0, int),)
+    # neighbours of these faces are needed as well
+    is_edge = np.zeros(len(mesh.edges) + 1, dtype=bool)
+    is_edge[mesh.face_edges[faces]] = True
+    is_edge[-1] = False  # that of sides without an edge
+    (sides,) = np.nonzero(is_edge[mesh.face_edges.ravel()])
+    of_sides = mesh.face_edges.ravel()[sides]
+    order = np.argsort(of_sides, kind="stable")
+    opposite = mesh.faces[sides // 3, (sides + 2) % 3][order]
+    (first,) = np.nonzero(of_sides[order][1:] == of_sides[order][:-1])
+    across = np.stack([opposite[first], opposite[first + 1]], axis=1)
+    return across[(across[:, 0] != across[:, 1]) & movable[across].any(axis=1)]

@@ -1,0 +1,145 @@
+"""The kernels of the repair: gradients of contours, and springs that keep the shape of the input."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+_ZERO = wp.constant(wp.float64(0.0))
+_HALF = wp.constant(wp.float64(0.5))
+_ONE = wp.constant(wp.float64(1.0))
+_TWO = wp.constant(wp.float64(2.0))
+_TINY = wp.constant(wp.float64(1.0e-300))
+_FLATTEST = wp.constant(wp.float64(0.05))
+"""Sine of the smallest angle between an edge and a face with which a gradient is computed."""
+
+
+@wp.func
+def _direction(v: wp.vec3d) -> wp.vec3d:
+    """Returns a vector of length 1, or 0 for 0."""
+    return v / wp.max(wp.length(v), _TINY)
+
+
+@wp.kernel
+def contour_gradients(
+    # mesh
+    x: wp.array[wp.vec3d],
+    edges: wp.array2d[int],
+    faces: wp.array2d[int],
+    # in
+    pairs: wp.array[wp.vec2i],
+    starts: wp.array[int],
+    opposite: wp.array[int],
+    # out
+    along: wp.array[wp.float64],
+    coordinates: wp.array[wp.vec3d],
+    gradient: wp.array[wp.vec3d],
+):
+    """Finds where an edge passes through a face, and the direction in which it leaves soonest.
+
+    The vertices across the edge in its faces are ``opposite[starts[i]:starts[i + 1]]``. For an edge with direction E
+    through a face with normal N, and the direction R of the contour into a face of the edge, the gradient of the length
+    of the contour is the sum of R - 2 (E.R)/(E.N) N over its faces (Volino and Magnenat-Thalmann 2006). It is scaled
+    down to length 1 where it is longer.
+    """
+    i = wp.tid()
+    edge = pairs[i][0]
+    face = pairs[i][1]
+    p = x[edges[edge, 0]]
+    q = x[edges[edge, 1]]
+    a = x[faces[face, 0]]
+    u = x[faces[face, 1]] - a
+    v = x[faces[face, 2]] - a
+    n = wp.cross(u, v)
+    normal = _direction(n)
+    e = _direction(q - p)
+    from_p = wp.dot(p - a, normal)
+    s = wp.clamp(from_p / wp.where(from_p == wp.dot(q - a, normal), _ONE, from_p - wp.dot(q - a, normal)), _ZERO, _ONE)
+    w = p + s * (q - p) - a
+    nn = wp.max(wp.dot(n, n), _TINY)
+    beta = wp.clamp(wp.dot(wp.cross(w, v), n) / nn, _ZERO, _ONE)
+    gamma = wp.clamp(wp.dot(wp.cross(u, w), n) / nn, _ZERO, _ONE - beta)
+    along[i] = s
+    coordinates[i] = wp.vec3d(_ONE - beta - gamma, beta, gamma)
+    steep = wp.dot(e, normal)
+    steep = wp.where(steep < _ZERO, wp.min(steep, -_FLATTEST), wp.max(steep, _FLATTEST))
+    total = wp.vec3d()
+    for k in range(starts[i], starts[i + 1]):
+        inward = x[opposite[k]] - p
+        inward -= wp.dot(inward, e) * e
+        r = _direction(wp.cross(normal, wp.cross(e, inward)))
+        if wp.dot(r, inward) < _ZERO:
+            r = -r
+        total += r - _TWO * wp.dot(e, r) / steep * normal
+    gradient[i] = total / wp.max(wp.length(total), _ONE)
+
+
+@wp.kernel
+def relax_springs(
+    # springs
+    vertices: wp.array[int],
+    starts: wp.array[int],
+    ends: wp.array[int],
+    lengths: wp.array[wp.float64],
+    weights: wp.array[wp.float64],
+    # in
+    slack: wp.float64,
+    x: wp.array[wp.vec3d],
+    # out
+    relaxed: wp.array[wp.vec3d],
+):
+    """Moves each vertex towards the lengths of its springs: one Jacobi sweep.
+
+    The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``. Lengths within ``slack``, a share,
+    of their rest length are left.
+    """
+    i = wp.tid()
+    vertex = vertices[i]
+    p = x[vertex]
+    total = wp.vec3d()
+    weight = _ZERO
+    for k in range(starts[i], starts[i + 1]):
+        along = x[ends[k]] - p
+        length = wp.length(along)
+        wanted = wp.clamp(length, lengths[k] * (_ONE - slack), lengths[k] * (_ONE + slack))
+        total += weights[k] * (length - wanted) * _direction(along)
+        weight += weights[k]
+    relaxed[vertex] = p + _HALF * total / wp.max(weight, _TINY)
+
+
+@wp.kernel
+def spread_moves(
+    # springs
+    vertices: wp.array[int],
+    starts: wp.array[int],
+    ends: wp.array[int],
+    # in
+    given: wp.array[bool],
+    moves: wp.array[wp.vec3d],
+    # out
+    smoothed: wp.array[wp.vec3d],
+):
+    """Moves each vertex as its neighbours move, in the mean, and given vertices as before: one Jacobi sweep."""
+    i = wp.tid()
+    vertex = vertices[i]
+    total = wp.vec3d()
+    for k in range(starts[i], starts[i + 1]):
+        total += moves[ends[k]]
+    mean = total / wp.float64(wp.max(starts[i + 1] - starts[i], 1))
+    smoothed[vertex] = wp.where(given[vertex], moves[vertex], mean)
+
+
+@wp.kernel
+def find_closest(
+    # mesh
+    surface: wp.uint64,
+    # in
+    points: wp.array[wp.vec3],
+    # out
+    closest: wp.array[wp.vec3],
+    normals: wp.array[wp.vec3],
+):
+    """Finds the point of a surface that is closest to each point, and the normal of its face."""
+    i = wp.tid()
+    query = wp.mesh_query_point_no_sign(surface, points[i], wp.inf)
+    closest[i] = wp.mesh_eval_position(surface, query.face, query.u, query.v)
+    normals[i] = wp.mesh_eval_face_normal(surface, query.face)

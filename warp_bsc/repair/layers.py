@@ -1,0 +1,87 @@
+"""Puts layers of a surface on the sides that their order asks for, where they have changed places."""
+
+import numpy as np
+import warp as wp
+
+from ..detection.launch import launch
+from .contours import connected_components
+from .elastic import Springs, near
+from .kernels import find_closest
+from .surface import Surface
+
+__all__ = ["separate_layers"]
+
+_GAP = 0.5
+"""Distance from the layers inside at which a vertex is put, in edges."""
+_ALONG_NORMAL = 0.5
+"""Least cosine between the way to the closest point of a layer and its normal; less is beyond the border."""
+_RINGS = 12
+_SWEEPS = 12
+
+
+def separate_layers(surface: Surface, layer: np.ndarray) -> np.ndarray:
+    """Returns positions in which layers that cross are on their sides, nearly: contours may be left.
+
+    Parts of a layer that are behind the layers inside, bounded by contours, move in front of these: to the side to
+    which their faces point. Where the layer is fixed, the layers inside move back instead.
+
+    Args:
+        surface: The surface.
+        layer: Layer of each vertex from inside to outside, -1 for none, int, shape [n].
+    """
+    x = surface.home
+    for outer in np.unique(layer[layer > layer[layer >= 0].min(initial=0)]):
+        inside, outside = (layer >= 0) & (layer < outer), layer == outer
+        if (outside & ~surface.fixed).any():
+            x = _put_on_side(surface, x, outside, inside, 1.0)
+        else:
+            x = _put_on_side(surface, x, inside, outside, -1.0)
+    return surface.rounded(x)
+
+
+def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: np.ndarray, side: float) -> np.ndarray:
+    """Returns positions in which moving vertices are on one side of the faces of an obstacle.
+
+    Args:
+        surface: The surface.
+        x: Positions, in units, shape [n, 3].
+        moving: Vertices of the layer that moves, bool, shape [n].
+        obstacle: Vertices of the layers that it leaves, bool, shape [n].
+        side: 1 for the side to which the faces point, -1 for the other.
+    """
+    mesh = surface.mesh
+    crossings = surface.crossings(surface.rounded(x))
+    ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
+    cuts = moving[ends].all(axis=1) & obstacle[corners].all(axis=1)
+    if not cuts.any():
+        return x
+    (vertices,) = np.nonzero(moving & ~surface.fixed)
+    (faces,) = np.nonzero(obstacle[mesh.faces].all(axis=1))
+    closest, normals = _closest(surface, x, faces, x[vertices])
+    way = closest - x[vertices]
+    behind = np.zeros(len(x), dtype=bool)
+    behind[vertices] = side * np.einsum("ij,ij->i", way, normals) > _ALONG_NORMAL * np.linalg.norm(way, axis=1)
+    # of these, the parts that contours bound
+    part = connected_components(len(x), mesh.edges[behind[mesh.edges].all(axis=1)])
+    a, b, c = (x[corners[cuts, i]] for i in range(3))
+    heights = np.einsum("ikj,ij->ik", x[ends[cuts]] - a[:, None], np.cross(b - a, c - a))
+    wrong = behind & np.isin(part, part[ends[cuts][side * heights < 0.0]])
+    moves = np.zeros_like(x)
+    moves[vertices] = way + side * _GAP * surface.edge * normals
+    moves[~wrong] = 0.0
+    springs = Springs(surface, near(surface, np.flatnonzero(wrong), _RINGS) & moving)
+    return x + springs.spread(moves, wrong, _SWEEPS)
+
+
+def _closest(surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the points of some faces that are closest to given ones, and the normals there, both [n, 3]."""
+    target = wp.Mesh(surface.array(x, wp.vec3), surface.array(surface.mesh.faces[faces].ravel(), int))
+    closest, normals = (wp.empty(len(points), dtype=wp.vec3, device=surface.device) for _ in range(2))
+    launch(
+        find_closest,
+        len(points),
+        inputs=[target.id, surface.array(points, wp.vec3)],
+        outputs=[closest, normals],
+        device=surface.device,
+    )
+    return closest.numpy().astype(np.float64), normals.numpy().astype(np.float64)

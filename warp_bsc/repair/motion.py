@@ -1,0 +1,165 @@
+"""Certified motions of a surface: as far towards a goal as contacts allow, and apart to a minimum distance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..detection.collisions import Collisions
+from .surface import Surface
+
+__all__ = ["move_freely", "near_contacts", "push_apart"]
+
+_PROJECTIONS = 6
+"""Detections after which contacts no longer slide, but stop."""
+_DETECTIONS = 40
+"""Detections after which nothing moves."""
+_GAP = 2.0**-7
+"""Gap that contacts leave, in edges."""
+_MORE_DISTANCE = 1.0 + 2.0**-7
+"""Distance at which contacts with a minimum distance are put, as a multiple of it."""
+_KEPT_TIME = 0.8
+"""Share of the time to a contact after which a vertex stops."""
+_LEAST_TIME = 0.05
+"""Shares of the way that are less count as 0, so that the search for a motion ends."""
+_SWEEPS = 4
+_LEAST_MOBILITY = 0.05
+"""Sum of squared weights below which a contact counts as one that hardly moves."""
+_PUSHES = 20
+_KEY = np.array([2**31, 1])
+"""Makes one number of the numbers of two elements."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Contacts:
+    """Contacts of a motion, vertex-face and edge-edge ones alike.
+
+    Attributes:
+        keys: A number for each pair of elements, int64, shape [n].
+        vertices: Vertices of both elements, int, shape [n, 4].
+        weights: Coordinates of the contact in the elements, those of the second one negative, shape [n, 4].
+        normals: Normals, from the second element to the first, shape [n, 3].
+        toi: Times of impact, shape [n].
+        gap: Distance that the elements are to have along the normal, in units, shape [n].
+    """
+
+    keys: np.ndarray
+    vertices: np.ndarray
+    weights: np.ndarray
+    normals: np.ndarray
+    toi: np.ndarray
+    gap: np.ndarray
+
+    def rows(self, which: np.ndarray) -> "_Contacts":
+        """Returns some of the contacts."""
+        return _Contacts(*(values[which] for values in vars(self).values()))
+
+    @staticmethod
+    def joined(contacts: list["_Contacts"]) -> "_Contacts":
+        """Returns the contacts of a list."""
+        return _Contacts(
+            *(np.concatenate(values) for values in zip(*(vars(c).values() for c in contacts), strict=True))
+        )
+
+
+def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns positions on the way to a goal that are reached without a collision, and which vertices contacts stopped.
+
+    At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact.
+    Pairs that keep the minimum distance at the start keep it.
+
+    Args:
+        surface: The surface.
+        start: Positions, in units, shape [n, 3].
+        goal: Likewise, as rounded to the type of the input.
+    """
+    stopped = np.zeros(len(start), dtype=bool)
+    known: list[_Contacts] = []
+    near = near_contacts(surface, start).keys if surface.min_distance else np.zeros(0, dtype=np.int64)
+    for detection in range(_DETECTIONS):
+        contacts = _contacts(surface, start, goal, near)
+        if not len(contacts.toi):
+            return goal, stopped
+        stopped[contacts.vertices] = True
+        if detection < _PROJECTIONS:
+            known.append(contacts)
+            goal = _projected(surface, goal, _Contacts.joined(known))
+        else:
+            kept = np.ones(len(start))
+            np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
+            kept[kept < _LEAST_TIME] = 0.0
+            goal = start + kept[:, None] * (goal - start)
+        goal = surface.rounded(goal)
+    return start, stopped
+
+
+def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Returns positions at which pairs are the minimum distance apart, as far as they get there without a collision."""
+    count = None
+    for _ in range(_PUSHES):
+        near = near_contacts(surface, x)
+        if not len(near.keys) or (count is not None and len(near.keys) >= count):
+            break
+        count = len(near.keys)
+        x, _ = move_freely(surface, x, surface.rounded(_projected(surface, x, near)))
+    return x
+
+
+def near_contacts(surface: Surface, x: np.ndarray) -> _Contacts:
+    """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
+    positions = surface.positions(x)
+    found = surface.distance_detector.detect(positions, positions)
+    return _as_contacts(surface, found, surface.min_distance * _MORE_DISTANCE)
+
+
+def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> _Contacts:
+    """Returns the contacts of a motion between positions in units; pairs at rest stay as they are.
+
+    Args:
+        surface: The surface.
+        start: Positions at the start.
+        goal: Positions at the end.
+        near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
+    """
+    x0, x1 = surface.positions(start), surface.positions(goal)
+    contacts = _as_contacts(surface, surface.detector.detect(x0, x1), _GAP * surface.edge)
+    if surface.min_distance:
+        found = surface.distance_detector.detect(x0, x1)
+        too_near = _as_contacts(surface, found, surface.min_distance * _MORE_DISTANCE)
+        too_near = too_near.rows(~np.isin(too_near.keys, near))
+        contacts = _Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
+    moves = (start != goal).any(axis=1)
+    return contacts.rows(moves[contacts.vertices].any(axis=1))
+
+
+def _as_contacts(surface: Surface, found: Collisions, gap: float) -> _Contacts:
+    """Returns collisions with faces and edges in one form."""
+    mesh = surface.mesh
+    beta = found.vertex_face_coordinates
+    s, r = found.edge_edge_coordinates[:, 0, None], found.edge_edge_coordinates[:, 1, None]
+    vertex_face, edge_edge = found.vertex_face.astype(np.int64), found.edge_edge.astype(np.int64)
+    toi = np.concatenate([found.vertex_face_toi, found.edge_edge_toi])
+    return _Contacts(
+        np.concatenate([vertex_face @ _KEY, -1 - edge_edge @ _KEY]),
+        np.concatenate(
+            [np.column_stack([vertex_face[:, 0], mesh.faces[vertex_face[:, 1]]]), mesh.edges[edge_edge].reshape(-1, 4)]
+        ),
+        np.concatenate([np.hstack([np.ones((len(beta), 1)), -beta]), np.hstack([1.0 - s, s, r - 1.0, -r])]),
+        np.concatenate([found.vertex_face_normal, found.edge_edge_normal]),
+        toi,
+        np.full(len(toi), gap),
+    )
+
+
+def _projected(surface: Surface, x: np.ndarray, contacts: _Contacts) -> np.ndarray:
+    """Returns positions at which contacts have their gaps along their normals: Jacobi sweeps, averaged by vertex."""
+    vertices, weights, normals = contacts.vertices, contacts.weights, contacts.normals
+    movable = np.where(surface.fixed[vertices], 0.0, weights)
+    inverse = 1.0 / np.maximum((movable**2).sum(axis=1), _LEAST_MOBILITY)
+    for _ in range(_SWEEPS):
+        short = contacts.gap - np.einsum("ik,ikj,ij->i", weights, x[vertices], normals)
+        push = np.where(short > 0.0, short * inverse, 0.0)
+        moves = (movable * push[:, None])[:, :, None] * normals[:, None, :]
+        total = np.stack([np.bincount(vertices.ravel(), moves[:, :, i].ravel(), len(x)) for i in range(3)], axis=1)
+        count = np.bincount(vertices.ravel(), np.repeat(push > 0.0, 4), len(x))
+        x = x + total / np.maximum(count, 1.0)[:, None]
+    return x

@@ -1,0 +1,50 @@
+"""What a repair returns: positions, what it moved, and the contours that it could not free."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .contours import ContourKind
+
+__all__ = ["RepairResult", "UnresolvedContour"]
+
+
+@dataclass(frozen=True, eq=False)
+class UnresolvedContour:
+    """A contour along which the returned positions still cross.
+
+    Attributes:
+        elements: (edge, face) along the contour, edges as in ``CollisionMesh.edges``, sorted, int32, shape [n, 2].
+        kind: "closed"; "border" if it ends at borders of the surface alone; "open" if it ends at a vertex that both
+            sides share, or where elements touch.
+        reason: Why it was not freed.
+    """
+
+    elements: np.ndarray
+    kind: ContourKind
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class RepairResult:
+    """The result of :func:`warp_bsc.repair`. Numbers of crossings count doubled vertices of borders as one.
+
+    Attributes:
+        x: Positions, as given: float32 or float64, NumPy or Warp. What has not moved has the bits of the input.
+        certified: Whether no edge meets a face at these positions, decided exactly in their type, and each pair with a
+            moved vertex keeps the minimum distance, or the distance of the input if that was less.
+        crossings_before: Number of edges that meet a face in the input, each counted once a face.
+        crossings: Number of those in ``x``, never more.
+        moved: Distance of each vertex from its input, in the unit of the positions, float64, shape [vertex_count].
+        max_strain: Largest change of the length of an edge, as a share of its length in the input.
+        unresolved: The contours that are left.
+    """
+
+    x: np.ndarray | wp.array
+    certified: bool
+    crossings_before: int
+    crossings: int
+    moved: np.ndarray
+    max_strain: float
+    unresolved: tuple[UnresolvedContour, ...]

@@ -1,0 +1,114 @@
+"""The surface that is repaired: its mesh without doubled vertices, its input, and its exact checks."""
+
+import functools
+
+import numpy as np
+import warp as wp
+
+from ..detection.detector import CollisionDetector
+from ..detection.mesh import CollisionMesh
+
+__all__ = ["Surface", "weld_borders"]
+
+
+def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Returns for each vertex the first one that it is welded to, int, shape [n].
+
+    The two sides of a seam are borders whose vertices have the same positions. Vertices inside a surface are not
+    welded: there, two surfaces touch.
+
+    Args:
+        mesh: The mesh.
+        positions: Positions of the vertices in one configuration or several, finite, shape [n, 3 k].
+        label: Only vertices of the same labels are welded, int, shape [n, m].
+    """
+    weld = np.arange(len(positions))
+    border = np.bincount(mesh.face_edges.ravel() + 1, minlength=len(mesh.edges) + 1)[1:] == 1
+    vertices = np.unique(mesh.edges[border])
+    if len(vertices):
+        keys = np.column_stack([positions[vertices], label[vertices]])
+        _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        weld[vertices] = vertices[firsts[numbers.reshape(-1)]]
+    return weld
+
+
+class Surface:
+    """A mesh without doubled vertices, the input, and what must stay. Positions are in units of its size.
+
+    Attributes:
+        mesh: The mesh, in which no face uses a doubled vertex.
+        home: Input positions, in units, float64, shape [n, 3].
+        fixed: Vertices that stay, and those that no face uses, bool, shape [n].
+        unit: The unit, a power of 2, in the unit of the input.
+        lengths: Length of each edge of the input, in units, float64.
+        edge: Median length of the edges.
+        min_distance: Distance that elements keep, in units, 0 for none.
+    """
+
+    def __init__(self, mesh: CollisionMesh, x: np.ndarray, fixed: np.ndarray, min_distance: float = 0.0):
+        """Prepares detection.
+
+        Args:
+            mesh: The mesh.
+            x: Input positions, finite, float32 or float64, shape [n, 3].
+            fixed: Vertices that stay, bool, shape [n].
+            min_distance: Distance that elements keep, in the unit of the input.
+        """
+        self.mesh, self._dtype = mesh, x.dtype
+        is_used = np.zeros(len(x), dtype=bool)
+        is_used[mesh.vertices] = True
+        used = x[mesh.vertices].astype(np.float64)
+        size = float(np.max(used.max(axis=0) - used.min(axis=0))) if len(used) else 0.0
+        self.unit = 2.0 ** np.floor(np.log2(size)) if size > 0.0 else 1.0
+        self._input, self._is_used = x, is_used[:, None]
+        self.home = self.in_units(x)
+        self.min_distance = min_distance / self.unit
+        self.fixed = fixed | ~is_used
+        self.lengths = self.edge_lengths(self.home)
+        self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
+        self.detector = CollisionDetector(mesh)
+        self._finder = self.detector.intersection_finder()
+
+    @functools.cached_property
+    def distance_detector(self) -> CollisionDetector:
+        """A detector of pairs that come within the minimum distance."""
+        return CollisionDetector(self.mesh, min_distance=self.min_distance * self.unit)
+
+    def in_units(self, x: np.ndarray) -> np.ndarray:
+        """Returns positions in units, float64; 0 for vertices that are not used."""
+        return np.where(self._is_used, x, 0.0).astype(np.float64) / self.unit
+
+    def edge_lengths(self, x: np.ndarray) -> np.ndarray:
+        """Returns the length of each edge at positions in units."""
+        return np.linalg.norm(x[self.mesh.edges[:, 1]] - x[self.mesh.edges[:, 0]], axis=1)
+
+    def strain(self, x: np.ndarray) -> float:
+        """Returns the largest change of the length of an edge, as a share of its length in the input."""
+        change = np.abs(self.edge_lengths(x) - self.lengths)
+        return float((change / np.where(self.lengths > 0.0, self.lengths, np.inf)).max(initial=0.0))
+
+    def moves(self, x: np.ndarray) -> np.ndarray:
+        """Returns how far each vertex is from its input, in units."""
+        return np.linalg.norm(x - self.home, axis=1)
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """Returns positions in units as those of the input: of its type, with its bits where nothing has moved."""
+        with np.errstate(over="ignore"):
+            return np.where(x == self.home, self._input, (x * self.unit).astype(self._dtype))
+
+    def rounded(self, x: np.ndarray) -> np.ndarray:
+        """Returns positions in units as they will be returned, rounded to the type of the input."""
+        return np.where(x == self.home, self.home, self.positions(x).astype(np.float64) / self.unit)
+
+    def crossings(self, x: np.ndarray) -> np.ndarray:
+        """Returns the edges that meet faces at positions in units, exactly, as returned: (edge, face), shape [n, 2]."""
+        return self._finder.find(self.positions(x)).pairs
+
+    @property
+    def device(self) -> wp.Device:
+        """The Warp device."""
+        return self.mesh.device
+
+    def array(self, values: np.ndarray, dtype: type = wp.vec3d) -> wp.array:
+        """Returns an array on the device."""
+        return wp.array(values, dtype=dtype, device=self.device)

@@ -1,0 +1,149 @@
+"""Untangles a surface: shortens the contours along which it crosses itself, until none is left.
+
+References:
+    David Baraff, Andrew Witkin, and Michael Kass. "Untangling Cloth." ACM Transactions on Graphics 22, 3 (2003).
+    https://doi.org/10.1145/882262.882357.
+    Pascal Volino and Nadia Magnenat-Thalmann. "Resolving Surface Collisions through Intersection Contour
+    Minimization." ACM Transactions on Graphics 25, 3 (2006). https://doi.org/10.1145/1141911.1142007.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from ..detection.launch import launch
+from .contours import faces_of_edges, trace_contours
+from .elastic import Springs, near
+from .kernels import contour_gradients
+from .surface import Surface
+
+__all__ = ["Untangled", "untangle"]
+
+_STEP = 0.25
+"""Distance by which an edge and a face move apart in an iteration, in edges."""
+_RINGS = 10
+"""Edges around contours within which vertices may move, and how many more when these grow."""
+_MORE_RINGS = 4
+_SPREAD_SWEEPS = 6
+_RELAX_SWEEPS = 10
+_PATIENCE = 40
+"""Iterations without fewer crossings after which the search ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Untangled:
+    """The best positions of a search.
+
+    Attributes:
+        x: Positions, in units of the surface, float64, shape [n, 3].
+        crossings: What still crosses there, (edge, face), int32, shape [m, 2].
+        movable: Vertices that the search could move, bool, shape [n].
+    """
+
+    x: np.ndarray
+    crossings: np.ndarray
+    movable: np.ndarray
+
+
+def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangled:
+    """Returns positions with the fewest crossings that are found from a start.
+
+    In turn, each edge leaves its face along its own gradient of the contour's length, and all edges of a contour along
+    their mean. The moves spread over the surface, and springs restore its lengths and angles.
+
+    Args:
+        surface: The surface.
+        x: The start, in units of the surface, shape [n, 3].
+        crossings: What crosses there, (edge, face), shape [m, 2].
+    """
+    movable = near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
+    springs = Springs(surface, movable)
+    best, since, iteration = Untangled(x, crossings, movable), 0, 0
+    while not _are_fixed(surface, crossings).all() and since < _PATIENCE:
+        needed = near(surface, _vertices_of(surface, crossings), _RINGS)
+        if (needed & ~movable).any():
+            movable = movable | near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
+            springs = Springs(surface, movable)
+        moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
+        x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
+        x = surface.rounded(x)
+        crossings = surface.crossings(x)
+        iteration, since = iteration + 1, since + 1
+        if len(crossings) < len(best.crossings):
+            best, since = Untangled(x, crossings, movable), 0
+    return best
+
+
+def _are_fixed(surface: Surface, crossings: np.ndarray) -> np.ndarray:
+    """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
+    return surface.fixed[_vertices_of(surface, crossings).reshape(-1, 5)].all(axis=1)
+
+
+def _vertices_of(surface: Surface, crossings: np.ndarray) -> np.ndarray:
+    """Returns the vertices of edges and faces that cross, with repetitions, int, shape [5 m]."""
+    return np.hstack([surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]]).ravel()
+
+
+def _contour_moves(
+    surface: Surface, x: np.ndarray, crossings: np.ndarray, *, whole: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the moves of vertices that shorten contours, and which vertices they are for.
+
+    Args:
+        surface: The surface.
+        x: Positions, in units, shape [n, 3].
+        crossings: (edge, face), shape [m, 2].
+        whole: Whether all edges of a contour move alike.
+    """
+    mesh = surface.mesh
+    ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
+    along, coordinates, direction = _gradients(surface, x, crossings)
+    if whole:
+        contours = trace_contours(mesh, crossings)
+        sign = np.where(contours.sign < 0, -1.0, 1.0)[:, None]
+        mean = _sums(contours.number, sign * direction, len(contours.kinds))
+        direction = sign * (mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-30)[:, None])[contours.number]
+    # small elements take small steps, or their strain would be large
+    sides = np.linalg.norm(x[corners] - x[np.roll(corners, 1, axis=1)], axis=2).mean(axis=1)
+    size = 0.5 * (np.linalg.norm(x[ends[:, 1]] - x[ends[:, 0]], axis=1) + sides)
+    step = _STEP * np.minimum(size, surface.edge)[:, None] * direction
+    vertices = np.concatenate([ends, corners], axis=1)
+    weights = np.concatenate([1.0 - along[:, None], along[:, None], coordinates], axis=1) * ~surface.fixed[vertices]
+    # edge and face share the step, unless one of them is fixed
+    shares = np.where(weights[:, :2].any(axis=1) & weights[:, 2:].any(axis=1), 0.5, 1.0)[:, None]
+    moves = (np.array([1.0, 1.0, -1.0, -1.0, -1.0]) * weights * shares)[:, :, None] * step[:, None, :]
+    total = _sums(vertices.ravel(), moves.reshape(-1, 3), len(x))
+    weight = np.bincount(vertices.ravel(), weights.ravel(), len(x))
+    given = np.zeros(len(x), dtype=bool)
+    given[vertices] = True
+    return total / np.maximum(weight, 0.5)[:, None], given & ~surface.fixed
+
+
+def _gradients(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the results of :func:`.kernels.contour_gradients` for positions in units."""
+    mesh, n = surface.mesh, len(crossings)
+    rows, faces = faces_of_edges(mesh, crossings[:, 0])
+    opposite = mesh.faces[faces].sum(axis=1) - mesh.edges[crossings[rows, 0]].sum(axis=1)
+    along = wp.empty(n, dtype=wp.float64, device=surface.device)
+    coordinates, gradient = (wp.empty(n, dtype=wp.vec3d, device=surface.device) for _ in range(2))
+    launch(
+        contour_gradients,
+        n,
+        inputs=[
+            surface.array(x),
+            mesh.device_edges,
+            mesh.device_faces,
+            surface.array(crossings, wp.vec2i),
+            surface.array(np.searchsorted(rows, np.arange(n + 1)), int),
+            surface.array(opposite, int),
+        ],
+        outputs=[along, coordinates, gradient],
+        device=surface.device,
+    )
+    return along.numpy(), coordinates.numpy(), gradient.numpy()
+
+
+def _sums(rows: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """Returns the sums of the vectors of each row, in the order of the vectors, shape [count, 3]."""
+    return np.stack([np.bincount(rows, values[:, axis], count) for axis in range(3)], axis=1)
