@@ -10,12 +10,14 @@ from newton.solvers import SolverBase
 from ..response.solver_ccd import SolverCCD
 from .follow_kernels import normalize, smooth
 
-__all__ = ["FollowedFrame", "Follower"]
+__all__ = ["SMALLEST", "FollowedFrame", "Follower"]
 
-SWEEPS = 100, 50, 25
+_SWEEPS = 100, 50, 25
 """Sweeps that spread the displacements of the first, second and third response of a step over the mesh."""
-WIDE_SEPARATION = 0.05
+_WIDE_SEPARATION = 0.05
 """Distance that these responses move contacts apart, as a share of the median edge length, so that few are left."""
+SMALLEST = 2e-3
+"""Displacement, as a share of that length, that is none: a response does not reach all of a mesh."""
 _TOLERANCE = 0.02
 """Displacement by a response, as a share of that length, that is not spread: the neighbourhood need not follow."""
 _LARGEST_STEP = 1.0
@@ -46,7 +48,8 @@ class Follower:
     neighbourhood of a contact then moves with it, and keeps the shape that it has in the given positions.
 
     Attributes:
-        length: Median edge length of the movable part at the start.
+        edges: Vertices of the edges of the movable part, the smaller first, shape [n, 2].
+        length: Median length of these at the start.
     """
 
     def __init__(
@@ -82,7 +85,7 @@ class Follower:
         model = builder.finalize(device=device)
         self._device = model.device
         self._playback = _Playback(model)
-        wide = max(WIDE_SEPARATION * self.length, separation or 0.0)
+        wide = max(_WIDE_SEPARATION * self.length, separation or 0.0)
         options = {"friction": 0.0, "restitution": 0.0, "substeps": None}
         self._wide = SolverCCD(self._playback, separation=wide, **options)
         self._last = SolverCCD(self._playback, separation=separation, **options)
@@ -106,7 +109,7 @@ class Follower:
                 bit for bit.
             displacement: Displacements to begin with, float64, shape [vertex_count, 3].
         """
-        for sweeps in SWEEPS:
+        for sweeps in _SWEEPS:
             target = _displaced(given, displacement)
             x, certified = self._respond(self._wide, start, target)
             residual = np.where(x == target, 0.0, x.astype(np.float64) - target)
@@ -137,7 +140,8 @@ class Follower:
             wp.launch(smooth, count, [self._first, self._neighbours, values], [smoothed], device=self._device)
             values, smoothed = smoothed, values
         wp.launch(normalize, count, [values, sweeps, self._movable], [self._spread], device=self._device)
-        return self._spread.numpy().astype(np.float64)
+        spread = self._spread.numpy().astype(np.float64)
+        return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < SMALLEST * self.length, 0.0, spread)
 
 
 class _Playback(SolverBase):

@@ -12,7 +12,7 @@ from ..usd.points_layer import MovedFrame
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .follow import Follower
+from .follow import SMALLEST, Follower
 from .repair import repair
 
 __all__ = ["BLEND", "Finding", "RepairedStretch", "find_collisions", "kept_meshes", "repair_shot"]
@@ -25,8 +25,6 @@ _MARGIN = BLEND + _SMOOTHINGS
 """Intervals by which a displacement precedes and outlasts what needs it."""
 _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
-_ZERO = 2e-3
-"""Displacement, as a share of the median edge length, below which a fading one is none."""
 
 
 @dataclass(frozen=True)
@@ -232,7 +230,8 @@ class _Shot:
         needed = np.concatenate([needed, np.zeros((stop - first + 1 - len(frames), *needed.shape[1:]), np.float32)])
         frames = self._follow(first, stop - first, last - first, [start], blend(needed))
         stop = first + len(frames) - 1
-        if self._differs(frames[-1]):
+        is_free = all(finding.is_free for finding in self._findings[max(first, stop - 2 * _MARGIN) : stop])
+        if is_free and self._differs(frames[-1]):
             time = self._scene.times[stop]
             left.append(f"the meshes have not returned to the shot at time {time:g}, where it ends or jumps")
         stretch = self._describe(first, frames, left)
@@ -317,7 +316,7 @@ class _Shot:
             else:
                 displacement = _FADING * frames[-1].displacement
                 size = np.linalg.norm(displacement, axis=1, keepdims=True)
-                displacement = np.where(size < _ZERO * self._follower.length, 0.0, displacement)
+                displacement = np.where(size < SMALLEST * self._follower.length, 0.0, displacement)
             found = self._follower.follow(frames[-1].x, given, displacement)
             added = found.displacement if not len(displacements) else found.x - given
             frames.append(_Frame(given, found.x, added.astype(np.float32), found.certified))
