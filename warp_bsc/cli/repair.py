@@ -164,7 +164,8 @@ class _Repair:
         with INTERRUPTS.held():
             try:
                 with INTERRUPTS.raised():
-                    for done in self._repair():
+                    for number in self._repair():
+                        done = number
                         INTERRUPTS.check()
                     done = len(self.scene)
             except KeyboardInterrupt as stopped:

@@ -1,5 +1,6 @@
 """Positions of a mesh at one time from those at the time before: near given ones, and reached without a collision."""
 
+import warnings
 from dataclasses import dataclass
 
 import newton
@@ -66,7 +67,7 @@ class Follower:
         Args:
             faces: Vertices of the faces, integers, shape [face_count, 3].
             x: Positions at the start, float, shape [vertex_count, 3].
-            is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles, which
+            is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
                 move as given.
             separation: Distance that contacts are moved apart at the end; default: that of :class:`SolverCCD`.
             device: Warp device.
@@ -128,7 +129,9 @@ class Follower:
         self._start.particle_q.assign(start)
         self._playback.target = target
         stage.reset(self._start)
-        stage.step(self._start, self._end, None, None, 1.0)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
+            stage.step(self._start, self._end, None, None, 1.0)
         return self._end.particle_q.numpy().copy(), stage.report.certified
 
     def _spread_out(self, displacement, sweeps) -> np.ndarray:

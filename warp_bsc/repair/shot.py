@@ -170,8 +170,8 @@ def repair_shot(
 def _repair_shot(shot, max_move, progress) -> Iterator[RepairedStretch]:
     """Yields the stretches of :func:`repair_shot`, whose arguments have been checked."""
     done = 0
-    for first, stop in shot.stretches():
-        first = max(first, done)
+    for begin, stop in shot.stretches():
+        first = max(begin, done)
         if first >= stop:
             continue
         stretch, done = shot.repair(first, stop, max_move)
