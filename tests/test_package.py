@@ -44,11 +44,11 @@ PACKAGES = {
     "checker": {"_arguments"},
     "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names"},
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
-    "repair": {"detection", "_arguments"},
-    "usd": {"_arguments", "_one_thread"},
+    "repair": {"detection", "response", "usd", "replay", "_arguments"},
+    "usd": {"_arguments", "_atomic_file", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_version"},
     "bench": {"detection", "kernels", "usd", "checker", "response", "_arguments", "_private_names"},
-    "cli": {"replay", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
+    "cli": {"replay", "repair", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
     "__main__": {"cli"},
     "__init__": {
         "_version",
@@ -65,6 +65,7 @@ PACKAGES = {
 LIBRARIES = {
     "newton": {
         "response",
+        "warp_bsc/repair/follow.py",  # plays positions back as a solver
         "warp_bsc/_private_names/of_newton.py",
         "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
         "warp_bsc/bench/newton_process.py",  # runs them

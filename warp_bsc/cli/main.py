@@ -5,7 +5,7 @@ import sys
 from typing import NoReturn
 
 from .._version import __version__
-from . import bench_detector, bench_newton, bench_paper, bench_queries, bench_response, query, replay
+from . import bench_detector, bench_newton, bench_paper, bench_queries, bench_response, query, repair, replay
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_command
@@ -15,6 +15,7 @@ __all__ = ["main", "run"]
 _EPILOG = f"""\
 examples:
   warp-bsc replay cloth.usd
+  warp-bsc repair cloth.usd --output fixed.usdc
   warp-bsc query 227vf.csv 227ee.csv
   warp-bsc bench detector
   warp-bsc replay --help
@@ -79,6 +80,7 @@ def _build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"warp-bsc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     replay.add_to(commands)
+    repair.add_to(commands)
     query.add_to(commands)
     bench = add_command(
         commands,

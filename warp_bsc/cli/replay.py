@@ -11,8 +11,6 @@ from collections.abc import Generator
 from dataclasses import asdict
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from .._atomic_file import STDOUT, naming, unfinished_path
 from ..replay.baseline import Baseline
 from ..replay.earlier import EarlierReplay, find_earlier
@@ -32,14 +30,12 @@ from .error_boundary import describe
 from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .options import Commands, add_command
+from .progress import RunProgress
 from .replay_options import DESCRIPTION, EPILOG, add_replay_options
-from .replay_tables import print_new, print_replay, print_work
+from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
 __all__ = ["add_to", "open_scene", "run_replay"]
-
-_LOG_SECONDS = 10.0
-"""Time between two lines on the progress, where there is no terminal."""
 
 
 def add_to(commands: Commands) -> None:
@@ -127,7 +123,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         importlib.import_module("warp_bsc.usd.find_meshes")
     INTERRUPTS.check()
     try:
-        with _Progress("Comparing vertices") as progress:
+        with RunProgress("Comparing vertices") as progress:
             scene = Scene(
                 arguments.scene,
                 selection=selection,
@@ -223,6 +219,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
                 console = Console()
                 print_replay(console, summary)
                 print_work(console, works, writing)
+                print_repair(console, summary)
                 if baseline:
                     print_new(console, baseline.new_in(summary))
                 for output in finished:
@@ -311,48 +308,11 @@ def _open_outputs(
     return outputs
 
 
-class _Progress:
-    """Shows the progress of a run: a bar on a terminal, else a line on standard error every ten seconds."""
-
-    def __init__(self, activity: str):
-        self._activity = activity
-        self._bar = Progress(
-            TextColumn(activity),
-            BarColumn(bar_width=None),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            transient=True,
-        )
-        self._bar.disable = not self._bar.console.is_terminal
-        self._task = self._bar.add_task("", total=None, note="")
-        self._started = self._last_line = time.monotonic()
-
-    def __enter__(self) -> "_Progress":
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def show(self, done: int, total: int, note: str = "") -> None:
-        """Shows how much of the total is done, and a note."""
-        now = time.monotonic()
-        if done:
-            note += f"{', ' * bool(note)}{done / max(now - self._started, 1e-9):.1f}/s"
-        self._bar.update(self._task, completed=done, total=total, note=note)
-        if self._bar.disable and done and now - self._last_line > _LOG_SECONDS:
-            self._last_line = now
-            left = (now - self._started) / done * (total - done)
-            say(self._bar.console, f"{self._activity}: {done} of {total}, {note}, about {left:,.0f} s left")
-
-
 def _track(
     scene: Scene, arguments: argparse.Namespace, earlier: EarlierReplay | None
 ) -> Generator[IntervalResult, None, None]:
     """Yields the intervals of an earlier replay, then the others as they are found; shows progress and time left."""
-    with _Progress("Replaying") as progress:
+    with RunProgress("Replaying") as progress:
         progress.show(0, len(scene))
         for result in replay(
             scene,

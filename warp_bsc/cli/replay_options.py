@@ -11,7 +11,7 @@ from ..usd.selection import PURPOSES
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_detection_options, add_fail_on, distance, positive
 
-__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options"]
+__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options", "add_scene_selection"]
 
 DESCRIPTION = """\
 Find the collisions of the meshes of a USD scene, with themselves and with each
@@ -57,20 +57,7 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("scene", metavar="SCENE", nargs="?", help="a .usd, .usda, .usdc or .usdz file")
 
     which = command.add_argument_group("selection")
-    patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
-    which.add_argument(
-        "--prims",
-        **patterns,
-        help="check only meshes at or below these prims or instances, named as in the report; * matches any text",
-    )
-    which.add_argument("--exclude", **patterns, help="do not check meshes at or below these prims")
-    which.add_argument(
-        "--self",
-        dest="self_collisions",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="check each mesh with itself (default: yes, unless only its transform moves it)",
-    )
+    add_scene_selection(which)
     which.add_argument(
         "--intersections",
         action=argparse.BooleanOptionalAction,
@@ -88,17 +75,6 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         "intersection instead",
     )
     which.add_argument(
-        "--between", nargs=2, metavar=("A", "B"), help="check only pairs of a mesh of pattern A and one of pattern B"
-    )
-    which.add_argument(
-        "--ignore",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("A", "B"),
-        help="only count the collisions of a mesh of pattern A and one of pattern B; may be repeated",
-    )
-    which.add_argument(
         "--ignore-from",
         metavar="FILE",
         help="read pairs for --ignore from a file: two patterns a line, in quotation marks if they contain blanks; # "
@@ -111,38 +87,12 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         "meshes that are inside others then, ignore only that they are inside",
     )
     which.add_argument(
-        "--purpose",
-        nargs="+",
-        action="extend",
-        choices=PURPOSES,
-        metavar="PURPOSE",
-        help="purposes of the meshes to check: default, render, proxy, guide (default: default render)",
-    )
-    which.add_argument(
-        "--frames",
-        type=_frames,
-        metavar="START:END:STEP",
-        help="time codes to check, each of the three optional; without STEP, all samples from START to END",
-    )
-    which.add_argument(
         "--subdivide",
         type=positive,
         default=1,
         metavar="N",
         help="divide the time from each sample to the next into N intervals, for motion that is not linear, such as "
         "rotations (default: 1)",
-    )
-    which.add_argument(
-        "--strict",
-        action="store_true",
-        help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
-    )
-    which.add_argument(
-        "--allow-missing",
-        **patterns,
-        help="do not count these files, or the files and prims that these prims refer to, as left out if they are "
-        "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
-        "may always be missing",
     )
     which.add_argument(
         "--validate",
@@ -198,6 +148,61 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         "files, check all",
     )
     add_detection_options(command, method="exact")
+
+
+def add_scene_selection(which: argparse._ArgumentGroup) -> None:
+    """Adds the options that select meshes, pairs of them and the time of a scene, and how it is read."""
+    patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
+    which.add_argument(
+        "--prims",
+        **patterns,
+        help="check only meshes at or below these prims or instances, named as in the report; * matches any text",
+    )
+    which.add_argument("--exclude", **patterns, help="do not check meshes at or below these prims")
+    which.add_argument(
+        "--self",
+        dest="self_collisions",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="check each mesh with itself (default: yes, unless only its transform moves it)",
+    )
+    which.add_argument(
+        "--between", nargs=2, metavar=("A", "B"), help="check only pairs of a mesh of pattern A and one of pattern B"
+    )
+    which.add_argument(
+        "--ignore",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("A", "B"),
+        help="only count the collisions of a mesh of pattern A and one of pattern B; may be repeated",
+    )
+    which.add_argument(
+        "--purpose",
+        nargs="+",
+        action="extend",
+        choices=PURPOSES,
+        metavar="PURPOSE",
+        help="purposes of the meshes to check: default, render, proxy, guide (default: default render)",
+    )
+    which.add_argument(
+        "--frames",
+        type=_frames,
+        metavar="START:END:STEP",
+        help="time codes to check, each of the three optional; without STEP, all samples from START to END",
+    )
+    which.add_argument(
+        "--strict",
+        action="store_true",
+        help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
+    )
+    which.add_argument(
+        "--allow-missing",
+        **patterns,
+        help="do not count these files, or the files and prims that these prims refer to, as left out if they are "
+        "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
+        "may always be missing",
+    )
 
 
 def _output(text: str) -> str:

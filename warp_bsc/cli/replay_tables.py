@@ -1,6 +1,8 @@
 """Shows the results of a replay on the terminal."""
 
+import shlex
 from collections import defaultdict
+from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
@@ -12,7 +14,7 @@ from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, Validatio
 from .option_names import with_option
 from .tables import LONGEST, count, make_table, say
 
-__all__ = ["print_new", "print_replay", "print_work"]
+__all__ = ["print_new", "print_repair", "print_replay", "print_work"]
 
 _RANGES = 4
 """Most ranges of time in a line."""
@@ -75,6 +77,14 @@ def print_replay(console: Console, summary: Summary) -> None:
         )
     if summary.validation:
         _print_validation(console, summary.validation, scene.has_strands)
+
+
+def print_repair(console: Console, summary: Summary) -> None:
+    """Prints how to repair what a replay found; nothing if it found nothing that moves."""
+    scene = summary.scene
+    if summary.hits and not scene.is_still:
+        path = Path(scene.path)
+        say(console, f"To repair: warp-bsc repair {shlex.join([scene.path])} --output {path.stem}_repaired.usdc")
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:

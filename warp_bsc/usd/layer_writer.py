@@ -13,7 +13,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = ["SHAPES", "LayerContent", "LayerPrim", "PrimKind", "write_binary_layer", "write_text_layer"]
+__all__ = [
+    "SHAPES",
+    "LayerContent",
+    "LayerPrim",
+    "PrimKind",
+    "as_os_error",
+    "write_binary_layer",
+    "write_text_layer",
+]
 
 PrimKind = Literal["Mesh", "PointInstancer", "BasisCurves"]
 """The types of prims in a layer."""
@@ -98,7 +106,7 @@ def write_binary_layer(content: LayerContent, path: Path) -> None:
     except BaseException as error:
         path.unlink(missing_ok=True)
         if isinstance(error, Tf.ErrorException):
-            raise _as_os_error(error) from error
+            raise as_os_error(error) from error
         raise
 
 
@@ -216,7 +224,7 @@ def _to_text(rows) -> str:
     return ", ".join([row] * len(rows)).format(*rows.reshape(-1).tolist())
 
 
-def _as_os_error(error) -> Exception:
+def as_os_error(error) -> Exception:
     """Returns the system's error, such as a full disk, in an error of OpenUSD; the error itself without one."""
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         if os.strerror(number) in str(error):

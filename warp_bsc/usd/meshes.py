@@ -222,6 +222,52 @@ class UsdMesh:
         """Removes the mesh from a time on; minus infinity removes it at all times."""
         self.states = {time: state for time, state in self.states.items() if time < since} | {since: None}
 
+    @property
+    def why_not_written(self) -> str | None:
+        """Why a layer over the scene cannot give the mesh points of its own, in words; None if it can."""
+        if self._instance:
+            return "a point instancer places it"
+        if self._prim.IsInstanceProxy():
+            return "it is in an instance, which shares its points with others"
+        if self.is_shape or self.is_strands:
+            return f"a {self.type_name} has no faces of its own"
+        return None
+
+    @property
+    def prim(self) -> Usd.Prim:
+        """The prim."""
+        return self._prim
+
+    @property
+    def is_skinned(self) -> bool:
+        """Whether a skeleton or blend shapes deform it."""
+        return self._skin is not None
+
+    def read_own_points(self, time: float, *, before: bool = False) -> np.ndarray:
+        """Returns the points in the space of the prim itself, also if a skeleton deforms them, shape [point_count, 3].
+
+        Those that nothing deforms have the bits of the file. Arguments and errors are those of :meth:`read_points`.
+        """
+        points = self.read_points(time, before=before)
+        if self._frame is self._prim:
+            return points
+        transform = self._transform(time, before=before)
+        return self.to_own_space(points @ transform[:3, :3] + transform[3, :3], time, before=before)
+
+    def to_own_space(self, positions: np.ndarray, time: float, *, before: bool = False) -> np.ndarray:
+        """Returns positions in world space, shape [n, 3], as points of the prim, float32.
+
+        Args:
+            positions: The positions.
+            time: Time code.
+            before: Whether the moment just before that time is meant.
+        """
+        if self.is_placed:
+            return positions.astype(np.float32)
+        code = self._time_code(time, before)
+        inverse = np.linalg.inv(np.array(UsdGeom.Imageable(self._prim).ComputeLocalToWorldTransform(code)))
+        return (positions @ inverse[:3, :3] + inverse[3, :3]).astype(np.float32)
+
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
         """Returns the stored points, or those that a skeleton and blend shapes deform, shape [point_count, 3].
 

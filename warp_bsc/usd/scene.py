@@ -52,6 +52,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from numbers import Integral
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -72,6 +73,9 @@ from .scene_options import Revealed, SceneOptions
 from .scene_times import find_times
 from .segment import Segment
 from .selection import Selection
+
+if TYPE_CHECKING:
+    from .meshes import UsdMesh  # which imports pxr
 
 __all__ = ["Scene"]
 
@@ -336,6 +340,10 @@ class Scene:
                 self._welds[span] = self._segment.welds
                 self._welded = max(self._welded, self._segment.welded)
         return self._segment
+
+    def prim_of(self, name: str) -> "UsdMesh":
+        """Returns the prim, or the instance of one, that is read as the mesh of a name."""
+        return next(mesh for mesh in self._usd_meshes if mesh.name == name)
 
     @one_at_a_time
     def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:

@@ -200,6 +200,10 @@ class Segment:
         rows, sides = self._find_sides(ends)
         return rows, np.searchsorted(self._vertex_ends, self._ends_of_sides(sides)[:, 0], side="right")
 
+    def vertices_of(self, number: int) -> np.ndarray:
+        """Returns the vertices of a mesh, in the order of :attr:`SceneMesh.points`, shape [n]."""
+        return np.searchsorted(self._kept, self._welded_to[self.meshes[number].vertices])
+
     def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
         faces = np.asarray(faces)

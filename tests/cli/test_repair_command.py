@@ -1,0 +1,103 @@
+"""The command ``warp-bsc repair``: errors by name, and valid partial files."""
+
+import contextlib
+import os
+import signal
+
+import pytest
+from pxr import Usd
+from stages import add_mesh, new_stage, save
+
+from warp_bsc.cli.main import main
+
+SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
+
+
+def crossing_twice(folder):
+    """A quad that dips through a plate at two times that are far apart."""
+    stage = new_stage(folder / "shot.usda")
+    add_mesh(stage, "/World/Plate", [(9 * x - 4, 9 * y - 4, z) for x, y, z in SQUARE], [4], [0, 1, 2, 3])
+    heights = {time: -0.1 if time in (9, 40) else 0.3 for time in range(50)}
+    points = {time: [(x, y, height) for x, y, _ in SQUARE] for time, height in heights.items()}
+    add_mesh(stage, "/World/Quad", points, [4], [0, 1, 2, 3])
+    return save(stage)
+
+
+def repair(path, output, *options):
+    return main(["repair", str(path), "--output", str(output), "--device", "cpu", *options])
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["--keep", "/None"], "--keep: no mesh matches /None"),
+        (["--max-move", "0"], "--max-move"),
+        (["--separation", "x"], "--separation"),
+        (["--prims", "/None"], "--prims"),
+    ],
+)
+def test_errors_name_the_option(tmp_path, capsys, options, error):
+    path = crossing_twice(tmp_path)
+    assert repair(path, tmp_path / "fixed.usdc", *options) == 2
+    assert error in capsys.readouterr().err
+    assert not (tmp_path / "fixed.usdc").exists()
+
+
+@pytest.mark.parametrize("output", ["shot.usda", "fixed.txt", "none/fixed.usdc"])
+def test_bad_outputs(tmp_path, capsys, output):
+    path = crossing_twice(tmp_path)
+    assert repair(path, tmp_path / output) == 2
+    assert str(tmp_path / output) in capsys.readouterr().err
+
+
+def test_interrupted_repair_leaves_a_partial_layer(tmp_path, monkeypatch):
+    path = crossing_twice(tmp_path)
+    shot = __import__("warp_bsc.cli.repair", fromlist=["repair_shot"])
+    whole = shot.repair_shot
+
+    def interrupted(*arguments, **options):
+        stretches = whole(*arguments, **options)
+        yield next(stretches)
+        os.kill(os.getpid(), signal.SIGINT)
+        yield from stretches
+
+    monkeypatch.setattr(shot, "repair_shot", interrupted)
+    assert repair(path, tmp_path / "fixed.usdc") == 130
+    stage = Usd.Stage.Open(str(tmp_path / "fixed.usdc"))
+    facts = stage.GetRootLayer().customLayerData["repair"]
+    assert facts["complete"] is False and facts["stretches"] == 1 and facts["stopped"] == "interrupted"
+    assert 10 < stage.GetEndTimeCode() < 40
+    assert stage.GetPrimAtPath("/World/Quad").GetAttribute("points").GetTimeSamples()[-1] == stage.GetEndTimeCode()
+    assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+@contextlib.contextmanager
+def largest_file(size):
+    """Lets no file become larger: as on a full disk, writing more is an error."""
+    resource = pytest.importorskip("resource")  # of POSIX
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_full_disk(tmp_path, capsys):
+    path = crossing_twice(tmp_path)
+    assert repair(path, tmp_path / "fixed.usda") == 0  # compiles kernels, whose files are large
+    size = (tmp_path / "fixed.usda").stat().st_size
+    (tmp_path / "fixed.usda").unlink()
+    with largest_file(size * 3 // 4):
+        assert repair(path, tmp_path / "fixed.usda") == 2
+    stage = Usd.Stage.Open(str(tmp_path / "fixed.usda"))
+    assert stage.GetRootLayer().customLayerData["repair"]["complete"] is False
+    assert 10 < stage.GetEndTimeCode() < 49
+    assert "not all of it is written" in capsys.readouterr().err
+    assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+def test_replay_says_how_to_repair(tmp_path, capsys):
+    path = crossing_twice(tmp_path)
+    assert main(["replay", path, "--device", "cpu"]) == 0
+    assert f"To repair: warp-bsc repair {path} --output shot_repaired.usdc" in capsys.readouterr().out

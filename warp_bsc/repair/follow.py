@@ -1,0 +1,168 @@
+"""Positions of a mesh at one time from those at the time before: near given ones, and reached without a collision."""
+
+import warnings
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from ..response.solver_ccd import SolverCCD
+from .follow_kernels import normalize, smooth
+
+__all__ = ["SMALLEST", "FollowedFrame", "Follower"]
+
+_SWEEPS = 100, 50, 25
+"""Sweeps that spread the displacements of the first, second and third response of a step over the mesh."""
+_WIDE_SEPARATION = 0.05
+"""Distance that these responses move contacts apart, as a share of the median edge length, so that few are left."""
+SMALLEST = 2e-3
+"""Displacement, as a share of that length, that is none: a response does not reach all of a mesh."""
+_TOLERANCE = 0.02
+"""Displacement by a response, as a share of that length, that is not spread: the neighbourhood need not follow."""
+_LARGEST_STEP = 1.0
+"""Largest displacement of a vertex that is spread, as a share of that length."""
+
+
+@dataclass(frozen=True)
+class FollowedFrame:
+    """The positions at the end of a step.
+
+    Attributes:
+        x: Positions, float32, shape [vertex_count, 3].
+        displacement: The displacements that were added to the given positions before the last response, float64, shape
+            [vertex_count, 3].
+        certified: Whether the straight motion to these positions is free of collisions.
+    """
+
+    x: np.ndarray
+    displacement: np.ndarray
+    certified: bool
+
+
+class Follower:
+    """Moves a mesh from positions that are free to others near given ones, behind :class:`SolverCCD`.
+
+    The stage moves the vertices of contacts only, which would strain the edges around them. So its displacements are
+    spread over the mesh and added to the given positions, and the stage responds again: first widely, then less. The
+    neighbourhood of a contact then moves with it, and keeps the shape that it has in the given positions.
+
+    Attributes:
+        edges: Vertices of the edges of the movable part, the smaller first, shape [n, 2].
+        length: Median length of these at the start.
+    """
+
+    def __init__(
+        self,
+        faces: np.ndarray,
+        x: np.ndarray,
+        is_movable: np.ndarray,
+        *,
+        separation: float | None = None,
+        device: wp.DeviceLike = None,
+    ):
+        """Makes the stages.
+
+        Args:
+            faces: Vertices of the faces, integers, shape [face_count, 3].
+            x: Positions at the start, float, shape [vertex_count, 3].
+            is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
+                move as given.
+            separation: Distance that contacts are moved apart at the end; default: that of :class:`SolverCCD`.
+            device: Warp device.
+        """
+        self._is_movable = is_movable
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        edges = np.unique(np.sort(edges[is_movable[edges].all(axis=1)], axis=1), axis=0).astype(np.int64)
+        lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
+        self.length = float(np.median(lengths)) if len(lengths) else 1.0
+        self.edges = edges
+        builder = newton.ModelBuilder()
+        positions = np.asarray(x, np.float32)
+        masses = is_movable.astype(float).tolist()
+        builder.add_particles(positions.tolist(), np.zeros_like(positions).tolist(), masses)
+        builder.add_triangles(*np.asarray(faces, np.int64).T.tolist())
+        model = builder.finalize(device=device)
+        self._device = model.device
+        self._playback = _Playback(model)
+        wide = max(_WIDE_SEPARATION * self.length, separation or 0.0)
+        options = {"friction": 0.0, "restitution": 0.0, "substeps": None}
+        self._wide = SolverCCD(self._playback, separation=wide, **options)
+        self._last = SolverCCD(self._playback, separation=separation, **options)
+        self._start, self._end = model.state(), model.state()
+        both = np.concatenate([edges, edges[:, ::-1]])
+        order = np.argsort(both[:, 0], kind="stable")
+        first = np.concatenate([[0], np.cumsum(np.bincount(both[:, 0], minlength=len(x)))])
+        self._first = wp.array(first, dtype=int, device=self._device)
+        self._neighbours = wp.array(both[order, 1], dtype=int, device=self._device)
+        self._movable = wp.array(is_movable, dtype=wp.bool, device=self._device)
+        self._values = wp.empty(len(x), dtype=wp.vec4, device=self._device)
+        self._smoothed = wp.empty_like(self._values)
+        self._spread = wp.empty(len(x), dtype=wp.vec3, device=self._device)
+
+    def follow(self, start: np.ndarray, given: np.ndarray, displacement: np.ndarray) -> FollowedFrame:
+        """Returns positions near given ones that a straight motion reaches without a collision.
+
+        Args:
+            start: Positions at the start of the motion, float32, shape [vertex_count, 3].
+            given: Positions to follow, float32, shape [vertex_count, 3]. Vertices that no response displaces get these
+                bit for bit.
+            displacement: Displacements to begin with, float64, shape [vertex_count, 3].
+        """
+        for sweeps in _SWEEPS:
+            target = _displaced(given, displacement)
+            x, certified = self._respond(self._wide, start, target)
+            residual = np.where(x == target, 0.0, x.astype(np.float64) - target)
+            size = np.linalg.norm(residual, axis=1, keepdims=True)
+            if certified and size.max(initial=0.0) < _TOLERANCE * self.length:
+                return FollowedFrame(x, displacement, certified)
+            largest = _LARGEST_STEP * self.length
+            residual *= np.minimum(1.0, largest / np.maximum(size, largest))
+            displacement = displacement + self._spread_out(residual, sweeps)
+        x, certified = self._respond(self._last, start, _displaced(given, displacement))
+        return FollowedFrame(x, displacement, certified)
+
+    def _respond(self, stage, start, target) -> tuple[np.ndarray, bool]:
+        """Returns the positions that a stage makes of a motion, and whether it certifies the motion to them."""
+        assert self._start.particle_q is not None and self._end.particle_q is not None
+        self._start.particle_q.assign(start)
+        self._playback.target = target
+        stage.reset(self._start)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
+            stage.step(self._start, self._end, None, None, 1.0)
+        return self._end.particle_q.numpy().copy(), stage.report.certified
+
+    def _spread_out(self, displacement, sweeps) -> np.ndarray:
+        """Returns the displacements of some vertices, and of those around them."""
+        weights = (displacement != 0.0).any(axis=1, keepdims=True)
+        self._values.assign(np.concatenate([displacement, weights], axis=1).astype(np.float32))
+        values, smoothed, count = self._values, self._smoothed, len(weights)
+        for _ in range(sweeps):
+            wp.launch(smooth, count, [self._first, self._neighbours, values], [smoothed], device=self._device)
+            values, smoothed = smoothed, values
+        wp.launch(normalize, count, [values, sweeps, self._movable], [self._spread], device=self._device)
+        spread = self._spread.numpy().astype(np.float64)
+        return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < SMALLEST * self.length, 0.0, spread)
+
+
+class _Playback(SolverBase):
+    """A solver that moves particles to given positions.
+
+    Attributes:
+        target: The positions, float32, shape [particle_count, 3].
+    """
+
+    target: np.ndarray
+
+    def step(self, state_in, state_out, control, contacts, dt):
+        """Writes the target, and the velocity that reaches it."""
+        state_out.particle_q.assign(self.target)
+        state_out.particle_qd.assign((self.target - state_in.particle_q.numpy()) / np.float32(dt))
+
+
+def _displaced(given, displacement) -> np.ndarray:
+    """Returns displaced positions in single precision; those without a displacement keep every bit."""
+    is_displaced = displacement.any(axis=1, keepdims=True)
+    return np.where(is_displaced, (given + displacement).astype(np.float32), given)

@@ -1,0 +1,282 @@
+"""Writes a layer over a scene that gives meshes other points, with the normals, extents and velocities of these."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import os
+import secrets
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._atomic_file import OutputFile
+from .layer import just_before, layer_metadata
+from .layer_writer import as_os_error
+from .scene import Scene
+from .segment import Segment
+
+if TYPE_CHECKING:
+    from .meshes import UsdMesh  # which imports pxr
+
+__all__ = ["MovedFrame", "PointsLayer"]
+
+_SAVED = 1 << 25  # bytes of samples that the layer holds in memory before it saves them
+
+
+@dataclass(frozen=True)
+class MovedFrame:
+    """The vertices that are moved at one time.
+
+    Attributes:
+        time: Time code.
+        before: Whether the moment just before that time is meant, at which a mesh then jumps or a segment ends.
+        segment: The meshes.
+        vertices: The moved vertices, shape [n].
+        x: Their positions in world space, float64, shape [n, 3].
+    """
+
+    time: float
+    before: bool
+    segment: Segment = field(repr=False)
+    vertices: np.ndarray = field(repr=False)
+    x: np.ndarray = field(repr=False)
+
+
+class PointsLayer:
+    """A layer whose sublayer is the scene, so that opening it shows the scene with the moved points.
+
+    A moved mesh has a sample of its points at each time of the scene and of its own. Points that are not moved have the
+    bits of the scene. Meshes that are not moved at any time have no opinion in the layer. A skeleton or blend shapes no
+    longer deform a moved mesh: its points are those that they would give it. Authored normals turn with the surface,
+    authored extents are computed again where points move, authored velocities get the velocity of the displacement, and
+    authored accelerations are blocked.
+
+    Attributes:
+        file: The file.
+        end: Last time code of a partial layer; None writes all times.
+    """
+
+    def __init__(self, path: str | os.PathLike, *, scene: Scene):
+        """Opens the file.
+
+        Args:
+            path: The file, with a name that ends in ``.usda``, ``.usdc`` or ``.usd``.
+            scene: The scene.
+
+        Raises:
+            OSError: If the file cannot be written.
+            ValueError: If its name has another suffix.
+        """
+        suffix = Path(path).suffix
+        if suffix not in (".usda", ".usdc", ".usd"):
+            raise ValueError(f"{path}: the name of a layer of USD must end in .usda, .usdc or .usd")
+        self._format = "usda" if suffix == ".usda" else "usdc"
+        self._scene = scene
+        self._moved: dict[str, dict[tuple[float, bool], tuple[np.ndarray, np.ndarray]]] = {}  # by name of the mesh
+        self._metadata = layer_metadata(scene)
+        self.end: float | None = None
+        self.file = OutputFile(path)
+
+    def add(self, frame: MovedFrame) -> None:
+        """Adds the moved vertices of one time."""
+        rows = np.full(frame.segment.vertex_count, -1)
+        rows[frame.vertices] = np.arange(len(frame.vertices))
+        for number, mesh in enumerate(frame.segment.meshes):
+            own = rows[frame.segment.vertices_of(number)]
+            if (own >= 0).any():
+                prim = self._scene.prim_of(mesh.name)
+                x = prim.to_own_space(frame.x[own[own >= 0]], frame.time, before=frame.before)
+                at = self._moved.setdefault(mesh.name, {})
+                at[frame.time, frame.before] = mesh.points[own >= 0], x
+
+    def finish(self, facts: dict[str, Any]) -> None:
+        """Writes the layer and moves it to its path.
+
+        Args:
+            facts: What was done, for programs.
+
+        Raises:
+            OSError: If the file cannot be written.
+            ValueError: If the scene cannot be read again.
+        """
+        from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
+
+        path = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
+        try:
+            layer = Sdf.Layer.New(Sdf.FileFormat.FindById(self._format), str(path))
+            self._describe(layer, facts)
+            waiting = 0
+            for name in self._moved:
+                for size in self._write_mesh(layer, name):
+                    waiting += size
+                    if waiting > _SAVED and self._format == "usdc":
+                        layer.Save()
+                        waiting = 0
+            layer.Save()
+        except BaseException as error:
+            path.unlink(missing_ok=True)
+            if isinstance(error, Tf.ErrorException):
+                raise as_os_error(error) from error
+            raise
+        self.file.adopt(path)
+        self.file.commit()
+
+    def shrink(self) -> bool:
+        """Drops the last eighth of the times, and returns whether the layer becomes shorter."""
+        times = [time for time in self._scene.times if self.end is None or time <= self.end]
+        if len(times) < 2 or not self._moved:
+            return False
+        self.end = times[-1 - max(1, len(times) // 8)]
+        return True
+
+    def discard(self) -> None:
+        """Removes the temporary file."""
+        self.file.discard()
+
+    def _describe(self, layer, facts) -> None:
+        """Sets the metadata of the layer."""
+        metadata = dict(self._metadata)
+        if self.end is not None:
+            metadata["endTimeCode"] = min(self.end, float(metadata["endTimeCode"]))
+        for name, value in metadata.items():
+            layer.pseudoRoot.SetInfo(name, value)
+        layer.customLayerData = {"repair": facts | {"complete": self.end is None}}
+        layer.documentation = "Points moved by warp-bsc repair, so that meshes do not collide."
+        if self.end is not None:
+            layer.documentation += f" Partial: it ends at time {self.end:g}."
+        source = os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())
+        source = Path(source).as_posix()
+        layer.subLayerPaths.append(source if source.startswith("../") else f"./{source}")
+
+    def _write_mesh(self, layer, name) -> Iterator[int]:
+        """Writes the samples of one mesh, and yields their sizes [bytes]."""
+        from pxr import Sdf, Vt  # noqa: PLC0415 (slow)
+
+        mesh = self._scene.prim_of(name)
+        spec = Sdf.CreatePrimInLayer(layer, mesh.path)
+        surface = _Surface(mesh)
+        if mesh.is_skinned:
+            skeleton = Sdf.RelationshipSpec(spec, "skel:skeleton", False)
+            skeleton.targetPathList.ClearEditsAndMakeExplicit()
+        if mesh.prim.GetAttribute("accelerations").HasAuthoredValue():
+            blocked = Sdf.AttributeSpec(spec, "accelerations", Sdf.ValueTypeNames.Vector3fArray)
+            blocked.default = Sdf.ValueBlock()
+        frames = [(*key, *self._points(mesh, *key)) for key in self._times(mesh)]
+        for index, (time, before, old, new) in enumerate(frames):
+            code = just_before(time) if before else time
+            following = frames[index + 1] if index + 1 < len(frames) else None
+            if following is not None and following[0] > time and len(following[2]) == len(old):
+                seconds = (following[0] - time) / self._scene.time_codes_per_second
+                added = ((following[3] - following[2]) - (new - old)) / seconds
+            else:
+                added = np.zeros_like(new)
+            for attribute, kind, value in surface.samples(old, new, added, time):
+                if not spec.attributes.get(attribute):
+                    Sdf.AttributeSpec(spec, attribute, Sdf.ValueTypeNames.Find(kind))
+                array = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, np.float32))
+                layer.SetTimeSample(f"{mesh.path}.{attribute}", code, array)
+                yield value.nbytes
+
+    def _times(self, mesh: "UsdMesh") -> list[tuple[float, bool]]:
+        """Returns the times at which a mesh gets points, and whether the moment just before each is meant."""
+        keys = []
+        for time in sorted(mesh.times | set(self._scene.times)):
+            if self.end is not None and time > self.end:
+                break
+            jumps = mesh.may_jump or (time, True) in self._moved[mesh.name]
+            before = max((since for since in mesh.states if since < time), default=None)
+            if jumps and keys and before is not None and mesh.states[before] is not None:
+                keys.append((time, True))
+            if mesh.state_at(time) is not None:
+                keys.append((time, False))
+        return keys
+
+    def _points(self, mesh, time, before) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the points of a mesh in the scene and in the layer, shapes [point_count, 3]."""
+        old = mesh.read_own_points(time, before=before)
+        moved = self._moved[mesh.name].get((time, before))
+        if moved is None:
+            return old, old
+        new = old.copy()
+        new[moved[0]] = moved[1]
+        return old, new
+
+
+class _Surface:
+    """What is authored on a mesh beside its points, for other points."""
+
+    def __init__(self, mesh: "UsdMesh"):
+        from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+        self._schema = UsdGeom.Mesh(mesh.prim)
+        primvar = UsdGeom.PrimvarsAPI(mesh.prim).GetPrimvar("normals")
+        has_primvar = primvar and primvar.HasAuthoredValue() and not primvar.IsIndexed()
+        self._normals = primvar.GetAttr() if has_primvar else self._schema.GetNormalsAttr()
+        self._interpolation = primvar.GetInterpolation() if has_primvar else self._schema.GetNormalsInterpolation()
+        self._velocities = self._schema.GetVelocitiesAttr()
+        self._extent = self._schema.GetExtentAttr()
+
+    def samples(self, old, new, added, time) -> Iterator[tuple[str, str, np.ndarray]]:
+        """Yields names, types and values of the attributes at a time.
+
+        Args:
+            old: Points in the scene, shape [point_count, 3].
+            new: Points in the layer.
+            added: Velocities of the displacement in a unit a second.
+            time: Time code.
+        """
+        yield "points", "point3f[]", new
+        if self._extent.HasAuthoredValue():
+            same = new is old and self._extent.Get(time) is not None
+            box = np.array(self._extent.Get(time)) if same else np.stack([new.min(axis=0), new.max(axis=0)])
+            yield "extent", "float3[]", box
+        if self._velocities.HasAuthoredValue():
+            velocities = np.array(self._velocities.Get(time))
+            if len(velocities) == len(new):
+                yield "velocities", "vector3f[]", velocities + added
+        if self._normals.HasAuthoredValue():
+            normals = np.array(self._normals.Get(time))
+            turned = normals if new is old else self._turn(normals, old, new, time)
+            yield self._normals.GetName(), "normal3f[]", turned
+
+    def _turn(self, normals, old, new, time) -> np.ndarray:
+        """Returns authored normals turned with the surface; those of a constant or of another number stay."""
+        counts = np.array(self._schema.GetFaceVertexCountsAttr().Get(time))
+        corners = np.array(self._schema.GetFaceVertexIndicesAttr().Get(time))
+        (a_faces, a_points), (b_faces, b_points) = (_normals_of(x, counts, corners) for x in (old, new))
+        by_interpolation = {
+            "vertex": (a_points, b_points),
+            "varying": (a_points, b_points),
+            "uniform": (a_faces, b_faces),
+            "faceVarying": (a_points[corners], b_points[corners]),
+        }
+        a, b = by_interpolation.get(str(self._interpolation), (normals, normals))
+        if len(a) != len(normals):
+            return normals
+        changed = (a != b).any(axis=1)
+        across, along = np.cross(a, b), (a * b).sum(axis=1, keepdims=True)
+        once = np.cross(across, normals)
+        turned = normals * 1.0 + once + np.cross(across, once) / np.maximum(1.0 + along, 1e-6)
+        return np.where(changed[:, None], turned, normals)
+
+
+def _normals_of(x, counts, corners) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the unit normals of polygons and of points."""
+    x = x.astype(np.float64)
+    faces = np.repeat(np.arange(len(counts)), counts)
+    last = np.cumsum(counts) - 1
+    following = np.arange(len(corners)) + 1
+    following[last] = last - counts + 1
+    crossed = np.cross(x[corners], x[corners[following]])
+    of_faces = np.stack([np.bincount(faces, crossed[:, axis], len(counts)) for axis in range(3)], axis=1)
+    spread = of_faces[faces]
+    of_points = np.stack([np.bincount(corners, spread[:, axis], len(x)) for axis in range(3)], axis=1)
+    return _unit(of_faces), _unit(of_points)
+
+
+def _unit(vectors) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
