@@ -13,11 +13,11 @@ from .follow_kernels import normalize, smooth
 
 __all__ = ["SMALLEST", "FollowedFrame", "Follower"]
 
-_SWEEPS = 100, 50, 25
+_SWEEPS = 64, 32, 16
 """Sweeps that spread the displacements of the first, second and third response of a step over the mesh."""
-_WIDE_SEPARATION = 0.05
+_WIDE_SEPARATION = 0.02
 """Distance that these responses move contacts apart, as a share of the median edge length, so that few are left."""
-SMALLEST = 2e-3
+SMALLEST = 1e-4
 """Displacement, as a share of that length, that is none: a response does not reach all of a mesh."""
 _TOLERANCE = 0.02
 """Displacement by a response, as a share of that length, that is not spread: the neighbourhood need not follow."""
