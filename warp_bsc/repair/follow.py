@@ -11,13 +11,13 @@ from newton.solvers import SolverBase
 from ..response.solver_ccd import SolverCCD
 from .follow_kernels import normalize, smooth
 
-__all__ = ["SMALLEST", "FollowedFrame", "Follower"]
+__all__ = ["FollowedFrame", "Follower"]
 
 _SWEEPS = 64, 32, 16
 """Sweeps that spread the displacements of the first, second and third response of a step over the mesh."""
 _WIDE_SEPARATION = 0.02
 """Distance that these responses move contacts apart, as a share of the median edge length, so that few are left."""
-SMALLEST = 1e-4
+_SMALLEST = 1e-4
 """Displacement, as a share of that length, that is none: a response does not reach all of a mesh."""
 _TOLERANCE = 0.02
 """Displacement by a response, as a share of that length, that is not spread: the neighbourhood need not follow."""
@@ -144,7 +144,7 @@ class Follower:
             values, smoothed = smoothed, values
         wp.launch(normalize, count, [values, sweeps, self._movable], [self._spread], device=self._device)
         spread = self._spread.numpy().astype(np.float64)
-        return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < SMALLEST * self.length, 0.0, spread)
+        return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < _SMALLEST * self.length, 0.0, spread)
 
 
 class _Playback(SolverBase):

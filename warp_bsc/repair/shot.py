@@ -12,7 +12,7 @@ from ..usd.points_layer import MovedFrame
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .follow import SMALLEST, Follower
+from .follow import Follower
 from .repair import repair
 
 __all__ = ["BLEND", "Finding", "RepairedStretch", "find_collisions", "kept_meshes", "repair_shot"]
@@ -25,6 +25,8 @@ _MARGIN = BLEND + _SMOOTHINGS
 """Intervals by which a displacement precedes and outlasts what needs it."""
 _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
+_FADED = 0.05
+"""Displacement, as a share of the median edge length, below which the next frame begins with none."""
 
 
 @dataclass(frozen=True)
@@ -316,7 +318,7 @@ class _Shot:
             else:
                 displacement = _FADING * frames[-1].displacement
                 size = np.linalg.norm(displacement, axis=1, keepdims=True)
-                displacement = np.where(size < SMALLEST * self._follower.length, 0.0, displacement)
+                displacement = np.where(size < _FADED * self._follower.length, 0.0, displacement)
             found = self._follower.follow(frames[-1].x, given, displacement)
             added = found.displacement if not len(displacements) else found.x - given
             frames.append(_Frame(given, found.x, added.astype(np.float32), found.certified))
