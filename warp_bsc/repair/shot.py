@@ -25,7 +25,7 @@ _MARGIN = BLEND + _SMOOTHINGS
 """Intervals by which a displacement precedes and outlasts what needs it."""
 _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
-_FADED = 0.05
+_FADED = 0.002
 """Displacement, as a share of the median edge length, below which the next frame begins with none."""
 
 
