@@ -137,6 +137,14 @@ def test_moved_mesh_with_a_transform(tmp_path):
     assert np.array_equal(points_of(output, 2), old)
 
 
+def test_last_frame_is_repaired(tmp_path):
+    output = repaired(dipping_sheet(tmp_path, last=HIT + 1))
+    found = find(output)
+    assert not found["hits"] and not any(at["crossings"] for at in found["intersections"])
+    assert not np.array_equal(points_of(output, HIT), sheet(0.1 + 0.001 * HIT, -0.12))
+    assert points_of(output, HIT)[:, 2].min() > 0
+
+
 def test_blend():
     displacements = np.zeros((21, 3, 3), np.float32)
     displacements[10, 1] = (0.0, 0.0, 1.0)

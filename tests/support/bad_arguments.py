@@ -471,6 +471,7 @@ INTERNAL = {
     "FrameRange.bounds",
     "FrameRange.times",
     "Scene.note",
+    "Scene.prim_of",
     "Scene.segment",
     "Scene.take_notes",
     "Selection.check_patterns",
@@ -571,6 +572,8 @@ NUMBERS_OF: dict[Any, list[str]] = {positive: NUMERIC, natural: [text for text i
 VALUES: dict[str, list[str]] = {
     "--clearance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--min-distance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
+    "--max-move": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
+    "--separation": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--fail-on": ["", "x", "collisions,x"],
     "--frames": ["", "x", "1", "3:1", "1:1", "1:2:0", "1:2:-1", "nan:2", "1:inf", "1:2:3:4"],
     "--validate": [*NUMERIC, "ALL"],
@@ -615,6 +618,8 @@ def option_rows() -> list[Row]:
 TEXTS = {
     "--prims",
     "--exclude",
+    "--keep",
+    "--output",
     "--figure",
     "--between",
     "--ignore",

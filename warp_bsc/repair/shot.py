@@ -339,9 +339,10 @@ class _Shot:
             (vertices,) = np.nonzero((frame.x != frame.given).any(axis=1))
             if not len(vertices):
                 continue
-            before = number > 0 and first + number == self._span(max(first, last - 1))[1]
+            index = first + number
+            before = number > 0 and index < len(self._findings) and not self._findings[index].is_joined
             x = frame.x[vertices].astype(np.float64) + self._origin
-            moved.append(MovedFrame(times[first + number], before, segment, vertices, x))
+            moved.append(MovedFrame(times[index], before, segment, vertices, x))
             sizes.append(len(vertices))
             moves.append(np.linalg.norm(frame.x[vertices] - frame.given[vertices], axis=1))
             lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
