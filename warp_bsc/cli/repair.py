@@ -38,6 +38,8 @@ Where the scene is free, it keeps every bit; a few frames before a collision the
 points leave their places, and return to them after it.
 Meshes that only transforms move, shapes, curves, points and instances keep
 their places, and so do meshes of --keep: the others are kept apart from them.
+Curves and points are not seen. --ignore and --between choose what is looked
+for; where something is found, all pairs are kept apart.
 Skeletons and blend shapes no longer deform a mesh that is moved; it has points
 of its own. The layer is then replayed, and what is left is named.
 If Ctrl-C, SIGTERM, SIGHUP, an error or a full disk stops the run, the layer
