@@ -18,7 +18,7 @@ def near(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
     reached = np.zeros(len(surface.home), dtype=bool)
     reached[vertices] = True
     for _ in range(rings):
-        reached[surface.mesh.edges[reached[surface.mesh.edges].any(axis=1)]] = True
+        reached[surface.edges[reached[surface.edges].any(axis=1)]] = True
     return reached & ~surface.fixed
 
 
@@ -38,9 +38,9 @@ class Springs:
         """
         self._surface, self.movable = surface, movable
         vertices = np.flatnonzero(movable)
-        edges = np.flatnonzero(movable[surface.mesh.edges].any(axis=1))
+        edges = np.flatnonzero(movable[surface.edges].any(axis=1))
         across = _vertices_across(surface, movable)
-        ends = np.concatenate([surface.mesh.edges[edges], across])
+        ends = np.concatenate([surface.edges[edges], across])
         stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
         lengths = np.linalg.norm(surface.home[ends[:, 1]] - surface.home[ends[:, 0]], axis=1)
         both = np.concatenate([ends, ends[:, ::-1]])
