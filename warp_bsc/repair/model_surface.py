@@ -5,9 +5,9 @@ import numpy as np
 import warp as wp
 
 from .._arguments import check_finite
-from ..detection.mesh import CollisionMesh
 from ..detection.body_parts import connect_cells
 from ..detection.launch import launch
+from ..detection.mesh import CollisionMesh
 from ..response.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, elements_of
 from .kernels import place_planes
@@ -77,8 +77,10 @@ class ModelSurface:
 
     def crossings(self, x: np.ndarray) -> np.ndarray:
         """Returns the edges that meet faces at positions in units, (edge, face); planes have no faces."""
+        mesh, count = self.surface.mesh, self._of_model.vertex_count
         pairs = self.surface.crossings(x)
-        return pairs[pairs[:, 1] < len(self._of_model.faces)]
+        of_planes = (mesh.edges[pairs[:, 0]] >= count).any(axis=1) | (mesh.faces[pairs[:, 1]] >= count).any(axis=1)
+        return pairs[~of_planes]
 
     def inside(self, x: np.ndarray) -> Inside:
         """Returns the particles inside shapes, soft bodies and solids of planes at positions in units."""
@@ -145,7 +147,7 @@ def _with_planes(
         corners = [middle + across, middle + along, middle - across, middle - along]
         of_plane = mesh.planes.world[number]
         for w in np.unique(world) if of_plane < 0 else [of_plane]:
-            positions.append(np.float32(corners))
+            positions.append(np.array(corners, dtype=np.float32))
             faces.append(count + np.array([[0, 1, 2], [0, 2, 3]]))
             shapes.append(np.full(4, mesh.planes.shape[number]))
             worlds.append(np.full(4, w))

@@ -110,7 +110,7 @@ def repair(
     result = np.where(has_moved[:, None], positions, given)
     return RepairResult(
         x=_as_given(result, x),
-        certified=not len(crossings) and np.isin(near, near_before).all(),
+        certified=not len(crossings) and bool(np.isin(near, near_before).all()),
         crossings_before=len(before),
         crossings=len(crossings),
         near_before=len(near_before),

@@ -53,7 +53,9 @@ def leave_solid(surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np
     return moves
 
 
-def spread_exits(surface: Surface, x: np.ndarray, moves: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def spread_exits(
+    surface: Surface, x: np.ndarray, moves: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions after moves of some vertices that others join, and which vertices may have moved.
 
     Args:

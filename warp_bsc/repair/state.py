@@ -64,16 +64,14 @@ def repair_state(
     placed = ModelSurface(model, state, np.full(count, -1) if layer is None else layer, distance)
     surface, weld = placed.surface, placed.weld
     before = _Faults(placed, surface.home)
-    after = before
-    if before:
-        after = min(before, *_candidates(placed, before, layer, strain))
+    after = _repaired(placed, before, layer, strain) if before else before
     x = placed.positions(after.x)
     if after is not before:
         assert state.particle_q is not None
         state.particle_q.assign(x[:count])
     return StateRepairResult(
         x=x[:count],
-        certified=not len(after.crossings) and not len(after.inside) and np.isin(after.near, before.near).all(),
+        certified=not len(after.crossings) and not len(after.inside) and bool(np.isin(after.near, before.near).all()),
         crossings_before=len(before.crossings),
         crossings=len(after.crossings),
         near_before=len(before.near),
@@ -90,12 +88,12 @@ def repair_state(
 
 
 class _Faults:
-    """What is wrong with positions, less if nothing crosses more and less is wrong.
+    """What is wrong with positions.
 
     Attributes:
         x: Positions, in units of the surface, shape [n, 3].
         crossings: (edge, face) of the surface, shape [m, 2].
-        inside: Particles inside shapes.
+        inside: Particles inside solids.
         near: Pairs that are nearer than the minimum distance.
         inverted: Number of inverted tetrahedra.
     """
@@ -111,17 +109,19 @@ class _Faults:
         """Whether there is anything to repair; inverted tetrahedra alone stay."""
         return bool(len(self.crossings) or len(self.inside) or len(self.near))
 
-    def __lt__(self, other: "_Faults") -> bool:
-        """Whether these positions are better."""
-        crossings, before = len(self.crossings), len(other.crossings)
-        counts, counts_before = ((len(f.inside) + len(f.crossings), len(f.near)) for f in (self, other))
-        return crossings <= before and self.inverted <= other.inverted and counts < counts_before
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Crossings and particles inside solids; pairs that are too near."""
+        return len(self.crossings) + len(self.inside), len(self.near)
+
+    def are_no_more(self, before: "_Faults") -> bool:
+        """Whether nothing is worse than before."""
+        are_fewer = len(self.crossings) <= len(before.crossings) and self.inverted <= before.inverted
+        return are_fewer and self.counts <= before.counts
 
 
-def _candidates(
-    placed: ModelSurface, before: _Faults, layer: np.ndarray | None, max_strain: float
-) -> tuple[_Faults, _Faults]:
-    """Returns the positions that are found, and those with the parts restored that got no better."""
+def _repaired(placed: ModelSurface, before: _Faults, layer: np.ndarray | None, max_strain: float) -> _Faults:
+    """Returns the best positions that are found, the input if these are not better."""
     surface = placed.surface
     start = surface.home if layer is None else separate_layers(surface, placed.layer)
     start, movable = placed.leave_solids(start)
@@ -129,5 +129,9 @@ def _candidates(
     if len(placed.tetrahedra):
         x = restore_inverted(surface, follow_surface(surface, x, placed.tetrahedra), placed.tetrahedra)
     found = _Faults(placed, x)
-    inside = tuple(placed.weld[faults.inside.particles] for faults in (before, found))
-    return found, _Faults(placed, restore_parts(surface, x, (before.crossings, found.crossings), inside))
+    if found:
+        inside = placed.weld[before.inside.particles], placed.weld[found.inside.particles]
+        restored = _Faults(placed, restore_parts(surface, x, (before.crossings, found.crossings), inside))
+        if restored.are_no_more(before):
+            found = restored
+    return found if found.are_no_more(before) and found.counts < before.counts else before

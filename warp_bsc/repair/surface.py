@@ -139,7 +139,7 @@ class Surface:
     def are_fixed(self, crossings: np.ndarray) -> np.ndarray:
         """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
         ends, corners = self.mesh.edges[crossings[:, 0]], self.mesh.faces[crossings[:, 1]]
-        return self.fixed[ends].all(axis=1) & self.fixed[corners].all(axis=1)
+        return np.asarray(self.fixed[ends].all(axis=1) & self.fixed[corners].all(axis=1))
 
     @property
     def device(self) -> wp.Device:

@@ -64,7 +64,9 @@ def restore_inverted(surface: Surface, x: np.ndarray, tetrahedra: np.ndarray) ->
         x: Positions, in units, shape [n, 3].
         tetrahedra: Vertices of the tetrahedra, int, shape [m, 4].
     """
-    inverted = are_inverted(surface.positions(x), tetrahedra) & ~are_inverted(surface.positions(surface.home), tetrahedra)
+    inverted = are_inverted(surface.positions(x), tetrahedra) & ~are_inverted(
+        surface.positions(surface.home), tetrahedra
+    )
     if not inverted.any():
         return x
     moved = (x != surface.home).any(axis=1)

@@ -121,9 +121,9 @@ def _contour_moves(
 
 
 def _ways_to_ends(surface: Surface, x: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Returns the directions in which edges without faces leave a face: back from the end of their strand, shape [m, 3].
+    """Returns the directions in which edges without faces leave a face: away from the end of their strand.
 
-    0 if no end is near.
+    A direction is 0 if no end is near. Shape [m, 3].
     """
     mesh = surface.mesh
     strands = mesh.edges[mesh.free_edges]

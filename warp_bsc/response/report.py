@@ -143,8 +143,8 @@ class SolverReport:
             advice += f" (substeps='auto' takes none: {self.substeps_omitted})"
         elif not self.totals.substepped_steps:
             advice += ", or pass substeps='auto'"
-        limit = float(MAX_STRAIN)
-        return f"contacts strained an edge by more than {limit:.0%} in a step, as its solver does not see them: {advice}"
+        cause = "as its solver does not see them"
+        return f"contacts strained an edge by more than {float(MAX_STRAIN):.0%} in a step, {cause}: {advice}"
 
     @property
     def certified(self) -> bool:
