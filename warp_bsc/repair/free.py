@@ -6,7 +6,7 @@ from .approach import approach
 from .contours import connected_components
 from .elastic import Springs, near
 from .motion import push_apart
-from .surface import Surface
+from .surface import Surface, differ
 from .untangle import untangle
 
 __all__ = ["free", "restore_parts"]
@@ -26,7 +26,7 @@ def free(surface: Surface, start: np.ndarray, max_strain: float, *, movable: np.
     """
     untangled = untangle(surface, start, surface.crossings(start))
     x = push_apart(surface, untangled.x) if surface.min_distance else untangled.x
-    (pushed,) = np.nonzero((x != untangled.x).any(axis=1))
+    (pushed,) = np.nonzero(differ(x, untangled.x))
     may_move = untangled.movable | near(surface, pushed, _RINGS)
     return approach(surface, x, Springs(surface, may_move if movable is None else may_move | movable), max_strain)
 
@@ -48,7 +48,7 @@ def restore_parts(
         inside: Vertices inside solids in the input and at ``x``, int; default: none.
     """
     mesh = surface.mesh
-    moved = (x != surface.home).any(axis=1)
+    moved = differ(x, surface.home)
     links, counts = [surface.edges[moved[surface.edges].all(axis=1)]], []
     for pairs in crossings:
         ends, corners = mesh.edges[pairs[:, 0]], mesh.faces[pairs[:, 1]]

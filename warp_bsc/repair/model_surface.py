@@ -12,7 +12,7 @@ from ..response.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, elements_of
 from .kernels import place_planes
 from .solids import leave_solid, spread_exits
-from .surface import Surface, weld_borders, welded
+from .surface import Surface, differ, weld_borders, welded
 
 __all__ = ["ModelSurface"]
 
@@ -72,7 +72,7 @@ class ModelSurface:
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Returns the positions of all vertices [m] at positions in units; what has not moved has its bits, float32."""
-        moved = (x != self.surface.home).any(axis=1)[self.weld]
+        moved = differ(x, self.surface.home)[self.weld]
         return np.where(moved[:, None], self.surface.positions(x)[self.weld], self._x)
 
     def crossings(self, x: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..detection.collisions import Collisions
-from .surface import Surface
+from .surface import Surface, differ
 
 __all__ = ["move_freely", "near_pairs", "push_apart"]
 
@@ -135,7 +135,7 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         too_near = _as_contacts(surface, found, surface.min_distance * _MORE_DISTANCE)
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = _Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
-    moves = (start != goal).any(axis=1)
+    moves = differ(start, goal)
     return contacts.rows(moves[contacts.vertices].any(axis=1))
 
 

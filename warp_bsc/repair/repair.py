@@ -15,7 +15,7 @@ from .free import free, restore_parts
 from .layers import separate_layers
 from .motion import near_pairs
 from .results import RepairResult
-from .surface import Surface, weld_borders, welded
+from .surface import Surface, differ, weld_borders, welded
 from .unresolved import unresolved_contours
 
 __all__ = ["repair"]
@@ -106,7 +106,7 @@ def repair(
     if (len(crossings), len(near)) >= (len(before), len(near_before)):
         final, crossings, near = surface.home, before, near_before
     positions = surface.positions(final)[weld]
-    has_moved = (final != surface.home).any(axis=1)[weld]
+    has_moved = differ(final, surface.home)[weld]
     result = np.where(has_moved[:, None], positions, given)
     return RepairResult(
         x=_as_given(result, x),

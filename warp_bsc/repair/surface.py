@@ -8,7 +8,7 @@ import warp as wp
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["Surface", "weld_borders", "welded"]
+__all__ = ["Surface", "differ", "weld_borders", "welded"]
 
 
 def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -47,12 +47,18 @@ def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
     )
 
 
+def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns which rows of two arrays of vectors differ, bool, shape [n]."""
+    return (a[:, 0] != b[:, 0]) | (a[:, 1] != b[:, 1]) | (a[:, 2] != b[:, 2])  # faster than any(axis=1)
+
+
 class Surface:
     """A mesh without doubled vertices, the input, and what must stay. Positions are in units of its size.
 
     Attributes:
         mesh: The mesh, in which no face uses a doubled vertex.
         edges: Vertices of the edges of the mesh, then of the other edges of tetrahedra, int, shape [m, 2].
+        ends: The first and the second vertices of the edges, shape [2, m].
         home: Input positions, in units, float64, shape [n, 3].
         fixed: Vertices that stay, and those that no element uses, bool, shape [n].
         unit: The unit, a power of 2, in the unit of the input.
@@ -88,6 +94,7 @@ class Surface:
         if tetrahedra is not None and len(tetrahedra):
             is_used[tetrahedra] = True
             self.edges = _with_edges_of(tetrahedra, mesh.edges, len(x))
+        self.ends = np.ascontiguousarray(self.edges.T)
         used = x[is_used].astype(np.float64)
         size = float(np.max(used.max(axis=0) - used.min(axis=0))) if len(used) else 0.0
         self.unit = 2.0 ** np.floor(np.log2(size)) if size > 0.0 else 1.0
@@ -95,7 +102,7 @@ class Surface:
         self.home = self.in_units(x)
         self.min_distance = min_distance / self.unit
         self.fixed = fixed | ~is_used
-        self.lengths = self.edge_lengths(self.home)
+        self.lengths = self._lengths_of(self.home, slice(None))
         self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
         self.detector = CollisionDetector(mesh)
         self._finder = self.detector.intersection_finder()
@@ -109,14 +116,16 @@ class Surface:
         """Returns positions in units, float64; 0 for vertices that are not used."""
         return np.where(self._is_used, x, 0.0).astype(np.float64) / self.unit
 
-    def edge_lengths(self, x: np.ndarray) -> np.ndarray:
-        """Returns the length of each edge at positions in units."""
-        return np.linalg.norm(x[self.edges[:, 1]] - x[self.edges[:, 0]], axis=1)
-
     def strain(self, x: np.ndarray) -> float:
         """Returns the largest change of the length of an edge, as a share of its length in the input."""
-        change = np.abs(self.edge_lengths(x) - self.lengths)
-        return float((change / np.where(self.lengths > 0.0, self.lengths, np.inf)).max(initial=0.0))
+        moved = differ(x, self.home)
+        (rows,) = np.nonzero(moved[self.ends[0]] | moved[self.ends[1]])
+        change = np.abs(self._lengths_of(x, rows) - self.lengths[rows])
+        return float((change / np.where(self.lengths[rows] > 0.0, self.lengths[rows], np.inf)).max(initial=0.0))
+
+    def _lengths_of(self, x: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
+        """Returns the lengths of some edges at positions in units."""
+        return np.linalg.norm(x[self.ends[1][rows]] - x[self.ends[0][rows]], axis=1)
 
     def moves(self, x: np.ndarray) -> np.ndarray:
         """Returns how far each vertex is from its input, in units."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from .contours import connected_components
 from .elastic import Springs
-from .surface import Surface
+from .surface import Surface, differ
 
 __all__ = ["are_inverted", "follow_surface", "restore_inverted"]
 
@@ -69,7 +69,7 @@ def restore_inverted(surface: Surface, x: np.ndarray, tetrahedra: np.ndarray) ->
     )
     if not inverted.any():
         return x
-    moved = (x != surface.home).any(axis=1)
+    moved = differ(x, surface.home)
     part = connected_components(len(x), surface.edges[moved[surface.edges].all(axis=1)])
     restored = np.isin(part, part[tetrahedra[inverted]]) & moved
     return np.where(restored[:, None], surface.home, x)

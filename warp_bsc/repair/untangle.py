@@ -14,7 +14,7 @@ import warp as wp
 
 from ..detection.launch import launch
 from .contours import faces_of_edges, trace_contours
-from .elastic import Springs, near
+from .elastic import Springs, within
 from .kernels import contour_gradients
 from .surface import Surface
 
@@ -59,13 +59,14 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
         x: The start, in units of the surface, shape [n, 3].
         crossings: What crosses there, (edge, face), shape [m, 2].
     """
-    movable = near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
-    springs = Springs(surface, movable)
+    movable = np.zeros(len(x), dtype=bool)
+    inner, springs = movable, Springs(surface, movable)
     best, since, iteration = Untangled(x, crossings, movable), 0, 0
     while not surface.are_fixed(crossings).all() and since < _PATIENCE:
-        needed = near(surface, _vertices_of(surface, crossings), _RINGS)
-        if (needed & ~movable).any():
-            movable = movable | near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
+        vertices = _vertices_of(surface, crossings)
+        if not inner[vertices].all():
+            inner = inner | within(surface, vertices, _MORE_RINGS)
+            movable = movable | (within(surface, vertices, _RINGS + _MORE_RINGS) & ~surface.fixed)
             springs = Springs(surface, movable)
         moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
         x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
