@@ -66,6 +66,7 @@ def test_tables(capsys, monkeypatch, tmp_path, measured):
         *((kind, number) for kind in ("folds", "soft bodies") for number in "12"),
     ]
     assert max(map(len, lines)) <= 100
+    assert sum(line.rstrip().endswith("[s]") for line in lines) == 2
     named = ("sheets", "folded", "corner", "body", "folds", "soft", "50", "500")
     rows = [line.split() for line in lines if line.startswith(named) and ":" not in line]
     usual = ["0.46", "0.12", "5.1", "0.25"]

@@ -27,8 +27,8 @@ _MESH_HEADERS = (
 _KIND_HEADERS = (
     "Meshes",
     "Freed",
-    "or by\norder",
-    "or by\nx_prev.",
+    "with\norder=",
+    "with\nx_pre-\nvious=",
     "Crossings",
     "Move,\nmedian",
     "at\nmost",
