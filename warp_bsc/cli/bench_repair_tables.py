@@ -24,17 +24,13 @@ _MESH_HEADERS = (
     "Strain\n[%]",
     "Time\n[s]",
 )
-_KIND_HEADERS = (
-    "Meshes",
-    "Freed",
-    "with\norder=",
-    "with\nx_pre-\nvious=",
-    "Crossings",
-    "Move,\nmedian",
+_FREED_HEADERS = ("Meshes", "Freed", "with\norder=", "with\nx_previous=", "Crossings")
+_COST_HEADERS = (
+    "Largest move,\nmedian",
     "at\nmost",
     "Strain,\nmedian\n[%]",
     "at\nmost\n[%]",
-    f"> {100 * STRAIN:.0f}%",
+    f"more\nthan\n{100 * STRAIN:.0f}%",
     "Time,\nmedian\n[s]",
 )
 
@@ -56,9 +52,9 @@ def print_repair_runs(console: Console, runs: Sequence[RepairRun], *, device: wp
         _print_meshes(console, named)
     if random:
         console.print()
-        _print_kinds(console, random)
+        _print_freed(console, random)
         console.print()
-        _print_ranges(console, random)
+        _print_costs(console, random)
     console.print()
     for line in [*_describe_failures(runs), *_describe_checks(runs)]:
         say(console, line)
@@ -96,17 +92,30 @@ def _print_meshes(console: Console, runs: Sequence[RepairRun]) -> None:
     console.print(table)
 
 
-def _print_kinds(console: Console, runs: Sequence[RepairRun]) -> None:
-    """Prints a row for each kind of random damage."""
-    table = make_table("Damage", *_KIND_HEADERS)
-    for kind in dict.fromkeys(run.kind for run in runs):
-        found = summarize([run for run in runs if run.kind == kind])
+def _print_freed(console: Console, runs: Sequence[RepairRun]) -> None:
+    """Prints how much of the random damage is freed, by kind and by number of crossings."""
+    table = make_table("Damage", *_FREED_HEADERS)
+    groups = _by_kind(runs)
+    for least, largest in CROSSING_RANGES:
+        title = f"{least} or more" if largest is None else f"{least} to {largest}"
+        within = [run for run in runs if run.crossings >= least and (largest is None or run.crossings <= largest)]
+        groups[f"{title} crossings"] = within
+    for title, group in groups.items():
+        if group:
+            found = summarize(group)
+            freed = (found.meshes, found.freed, *(found.freed_by_hint[hint] for hint in HINTS))
+            crossings = f"{found.crossings[0]:,} to {found.crossings[1]:,}"
+            table.add_row(title, *(f"{number:,}" for number in freed), crossings)
+    console.print(table)
+
+
+def _print_costs(console: Console, runs: Sequence[RepairRun]) -> None:
+    """Prints moves, strains and times of repairs of random damage, by kind."""
+    table = make_table("Damage", *_COST_HEADERS)
+    for kind, group in _by_kind(runs).items():
+        found = summarize(group)
         table.add_row(
             kind,
-            f"{found.meshes:,}",
-            f"{found.freed:,}",
-            *(f"{found.freed_by_hint[hint]:,}" for hint in HINTS),
-            f"{found.crossings[0]:,} to {found.crossings[1]:,}",
             *(f"{move:.2f}" for move in found.move),
             *(f"{100 * strain:.1f}" for strain in found.strain),
             f"{found.strained:,}",
@@ -115,17 +124,9 @@ def _print_kinds(console: Console, runs: Sequence[RepairRun]) -> None:
     console.print(table)
 
 
-def _print_ranges(console: Console, runs: Sequence[RepairRun]) -> None:
-    """Prints how much of the random damage is freed, by number of crossings."""
-    table = make_table("Crossings", *_KIND_HEADERS[:4])
-    for least, largest in CROSSING_RANGES:
-        group = [run for run in runs if run.crossings >= least and (largest is None or run.crossings <= largest)]
-        if group:
-            found = summarize(group)
-            title = f"{least} or more" if largest is None else f"{max(least, 1)} to {largest}"
-            freed = (found.meshes, found.freed, *(found.freed_by_hint[hint] for hint in HINTS))
-            table.add_row(title, *(f"{number:,}" for number in freed))
-    console.print(table)
+def _by_kind(runs: Sequence[RepairRun]) -> dict[str, list[RepairRun]]:
+    """Returns the runs of each kind."""
+    return {kind: [run for run in runs if run.kind == kind] for kind in dict.fromkeys(run.kind for run in runs)}
 
 
 def _describe_failures(runs: Sequence[RepairRun]) -> list[str]:
