@@ -1,4 +1,4 @@
-"""Asks libuipc's sanity check whether it accepts meshes before and after their repair; it needs no GPU for that.
+"""Prints whether libuipc's sanity check accepts meshes before and after their repair; the check needs no GPU.
 
     pip install pyuipc
     python tests/support/libuipc.py body.obj
@@ -34,7 +34,7 @@ def complaints(faces, x, radius, folder):
 
 
 def main():
-    """Reads the command line, and prints what libuipc says to each mesh."""
+    """Reads the command line, and prints for each mesh that it is accepted, or the checks that fail."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("meshes", metavar="MESH", nargs="*", help="Mesh files.")
     parser.add_argument("--radius", type=float, default=0.0, help="Half the thickness of the shells.")
