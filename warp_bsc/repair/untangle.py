@@ -27,6 +27,9 @@ _RINGS = 10
 _MORE_RINGS = 4
 _SPREAD_SWEEPS = 6
 _RELAX_SWEEPS = 10
+_STUCK = 10
+"""Iterations without fewer crossings after which every other one smooths the surface around them."""
+_SMOOTHING_SWEEPS = 3
 _LONGEST_END = 8
 """Edges of a strand, such as a rope, that may be drawn through a face."""
 _PATIENCE = 40
@@ -52,7 +55,8 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     """Returns positions with the fewest crossings that are found from a start.
 
     In turn, each edge leaves its face along its own gradient of the contour's length, and all edges of a contour along
-    their mean. The moves spread over the surface, and springs restore its lengths and angles.
+    their mean. The moves spread over the surface, and springs restore its lengths and angles. What remains are mostly
+    folds that are smaller than a few elements, whose contours have no side to go to: these are smoothed away.
 
     Args:
         surface: The surface.
@@ -68,8 +72,11 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
             inner = inner | within(surface, vertices, _MORE_RINGS)
             movable = movable | (within(surface, vertices, _RINGS + _MORE_RINGS) & ~surface.fixed)
             springs = Springs(surface, movable)
-        moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
-        x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
+        if since >= _STUCK and since % 2 == 0:
+            x = springs.spread(x, ~within(surface, vertices, 1), _SMOOTHING_SWEEPS)
+        else:
+            moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
+            x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
         x = surface.rounded(x)
         crossings = surface.crossings(x)
         iteration, since = iteration + 1, since + 1
