@@ -8,10 +8,14 @@ from .surface import Surface
 
 __all__ = ["approach"]
 
-_ROUNDS = 8
+_ROUNDS = 24
 _SWEEPS = 40
 _SETTLED = 2.0**-10
 """Move, in edges, below which the approach ends."""
+_PROGRESS = 0.98
+"""Share of the strain above the limit, or of the moves once there is none, to which a round must come down."""
+_PATIENCE = 4
+"""Rounds that do not, after which the approach ends; one if strains are below the limit."""
 _SOUGHT = 0.5
 """Strain that springs leave, as a share of the limit."""
 
@@ -29,7 +33,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         max_strain: Largest strain.
     """
     best, best_score = x, _score(surface, x, max_strain)
-    held = np.zeros(len(x), dtype=bool)
+    held, stalled = np.zeros(len(x), dtype=bool), 0
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         if held.any():
@@ -39,9 +43,10 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         change = np.abs(moved - x).max(initial=0.0)
         x = moved
         score = _score(surface, x, max_strain)
+        stalled = 0 if _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
-        if change < _SETTLED * surface.edge:
+        if change < _SETTLED * surface.edge or stalled >= (_PATIENCE if best_score[0] else 1):
             break
     return best
 
@@ -49,3 +54,10 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
 def _score(surface: Surface, x: np.ndarray, max_strain: float) -> tuple[float, float]:
     """Returns the strain above the limit and the sum of squared moves."""
     return max(surface.strain(x) - max_strain, 0.0), float((surface.moves(x) ** 2).sum())
+
+
+def _is_better(before: tuple[float, float], after: tuple[float, float]) -> bool:
+    """Returns whether a score is much better than another one."""
+    if before[0] or after[0]:
+        return after[0] < _PROGRESS * before[0]
+    return after[1] < _PROGRESS * before[1]
