@@ -33,7 +33,7 @@ class FollowedFrame:
         x: Positions, float32, shape [vertex_count, 3].
         displacement: The displacements that were added to the given positions before the last response, float64, shape
             [vertex_count, 3].
-        certified: Whether the straight motion to these positions is free of collisions.
+        certified: Whether the straight motion to these positions is free of collisions, and keeps the distance.
     """
 
     x: np.ndarray
@@ -59,7 +59,7 @@ class Follower:
         x: np.ndarray,
         is_movable: np.ndarray,
         *,
-        separation: float | None = None,
+        min_distance: float = 0.0,
         device: wp.DeviceLike = None,
     ):
         """Makes the stages.
@@ -69,7 +69,7 @@ class Follower:
             x: Positions at the start, float, shape [vertex_count, 3].
             is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
                 move as given.
-            separation: Distance that contacts are moved apart at the end; default: that of :class:`SolverCCD`.
+            min_distance: Distance that pairs keep, see :class:`SolverCCD`.
             device: Warp device.
         """
         self._is_movable = is_movable
@@ -86,10 +86,9 @@ class Follower:
         model = builder.finalize(device=device)
         self._device = model.device
         self._playback = _Playback(model)
-        wide = max(_WIDE_SEPARATION * self.length, separation or 0.0)
-        options = {"friction": 0.0, "restitution": 0.0, "substeps": None}
-        self._wide = SolverCCD(self._playback, separation=wide, **options)
-        self._last = SolverCCD(self._playback, separation=separation, **options)
+        options = {"friction": 0.0, "restitution": 0.0, "substeps": None, "min_distance": min_distance}
+        self._wide = SolverCCD(self._playback, separation=_WIDE_SEPARATION * self.length, **options)
+        self._last = SolverCCD(self._playback, **options)
         self._start, self._end = model.state(), model.state()
         both = np.concatenate([edges, edges[:, ::-1]])
         order = np.argsort(both[:, 0], kind="stable")
