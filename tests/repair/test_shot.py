@@ -9,7 +9,9 @@ from stages import add_mesh, find, new_stage, save
 
 from warp_bsc import Scene, replay
 from warp_bsc.cli.main import main
-from warp_bsc.repair.shot import BLEND, blend, find_collisions, repair_shot
+from warp_bsc.repair.blend import BLEND, blend
+from warp_bsc.repair.findings import find_collisions
+from warp_bsc.repair.shot import repair_shot
 
 SIZE, FRAMES, HIT = 8, 34, 16
 
@@ -160,7 +162,7 @@ def test_blend():
     [
         ({"keep": ("/None",)}, "keep: no mesh matches /None"),
         ({"max_move": -1.0}, "max_move"),
-        ({"separation": 0.0}, "separation"),
+        ({"min_distance": -1.0}, "min_distance"),
     ],
 )
 def test_errors_name_the_argument(dipped, options, error):
@@ -171,6 +173,7 @@ def test_errors_name_the_argument(dipped, options, error):
 
 def test_findings_know_where_a_mesh_jumps(tmp_path):
     stage = dipping_sheet(tmp_path, last=4)
-    findings = list(find_collisions(replay(Scene(save(stage)), device="cpu")))
+    scene = Scene(save(stage))
+    findings = list(find_collisions(scene, replay(scene, device="cpu")))
     assert [finding.is_joined for finding in findings] == [False, True, True]
     assert all(finding.is_free for finding in findings)

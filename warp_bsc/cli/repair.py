@@ -6,7 +6,8 @@ import importlib
 import json
 import os
 
-from .._atomic_file import STDOUT
+from .._atomic_file import STDOUT, unfinished_path
+from ..repair.report import RepairPage
 from ..repair.shot import kept_meshes
 from ..replay.hit_files import replay_facts
 from ..usd.frames import FrameRange
@@ -44,6 +45,8 @@ _EPILOG = f"""\
 examples:
   warp-bsc repair shot.usd --output fixed.usdc
   warp-bsc repair shot.usd --output fixed.usdc --keep '/World/Body*'
+  warp-bsc repair shot.usd --output fixed.usdc --report moves.html --resume
+  warp-bsc repair shot.usd --output fixed.usdc --min-distance 0.002
   warp-bsc repair shot.usd --output fixed.usdc --frames 101:150 --max-move 0.02
   warp-bsc repair shot.usd --output fixed.usdc --fail-on left --json > done.json
 
@@ -90,6 +93,11 @@ def add_to(commands: Commands) -> None:
     out = command.add_argument_group("output")
     out.add_argument("--output", required=True, metavar="FILE", help="the layer, .usda, .usdc or .usd")
     out.add_argument(
+        "--report",
+        metavar="FILE",
+        help="a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html",
+    )
+    out.add_argument(
         "--resume",
         action="store_true",
         help="continue an earlier run with the same options and files that was stopped or killed: take what it found "
@@ -103,8 +111,14 @@ def add_to(commands: Commands) -> None:
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.output == STDOUT:
         raise ValueError("--output must be a file, not standard output")
-    if os.path.realpath(arguments.output) == os.path.realpath(arguments.scene):
-        raise ValueError(f"{arguments.output}: the scene is read from this file; write to another one")
+    if arguments.report == STDOUT:
+        raise ValueError("--report must be a file, not standard output")
+    written = [file for file in (arguments.output, arguments.report) if file]
+    written.append(str(unfinished_path(arguments.output)))
+    paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path}: named twice, as two files of a repair")
     device = find_device(arguments.device)
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         importlib.import_module("warp_bsc.usd.find_meshes")
@@ -118,25 +132,34 @@ def _run(arguments: argparse.Namespace) -> int:
         ignore=tuple(map(tuple, arguments.ignore)),
     )
     scene = _open(arguments.scene, arguments, selection, arguments.frames)
-    if arguments.output in scene.files:
-        raise ValueError(f"{arguments.output}: the scene is read from this file; write to another one")
+    for file in written:
+        if file in scene.files:
+            raise ValueError(f"{file}: the scene is read from this file; write to another one")
     kept = kept_meshes(scene, arguments.keep)
     with loading_kernels(device):
         load_detector("exact", scene.dtype, device, intersections=True, strands=scene.has_strands)
     options = describe_selection(scene, arguments)
     options |= {name: getattr(arguments, name) for name in ("keep", "max_move", "min_distance")}
     facts = replay_facts(scene, method="exact", device=str(device), clearance=None, options=options)
-    with contextlib.closing(RepairRun(scene, arguments, str(device), facts)) as run:
+    with contextlib.ExitStack() as stack:
+        page = None
+        if arguments.report:
+            page = RepairPage(arguments.report)
+            stack.callback(page.discard)
+        run = stack.enter_context(contextlib.closing(RepairRun(scene, arguments, str(device), facts)))
         run.run()
+        after = run.journal.findings if run.is_whole else None
+        if run.is_whole and run.is_written:
+            fixed = _open(arguments.output, arguments, selection, arguments.frames)
+            after = find(fixed, "Checking", arguments.min_distance, str(device))
+        if page and run.journal.findings is not None:
+            run.report(page, kept, after)
         if run.interrupt:
             raise run.interrupt
         if run.problems:
             raise ValueError("; ".join(run.problems))
-        left = run.found
-        if run.is_written:
-            written = _open(arguments.output, arguments, selection, arguments.frames)
-            findings = find(written, "Checking", arguments.min_distance, str(device))
-            left = count_found(findings, arguments.min_distance)
+    assert after is not None
+    left = count_found(after, arguments.min_distance)
     if arguments.json:
         print(json.dumps(run.facts(kept, left), indent=1))
     else:

@@ -2,14 +2,16 @@
 
 import argparse
 import errno
+import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from typing import Any
 
 from .._atomic_file import naming, unfinished_path
 from ..repair.findings import Finding, find_collisions
 from ..repair.journal import Journal
+from ..repair.report import RepairPage
 from ..repair.shot import repair_shot
 from ..repair.stretch import RepairedStretch
 from ..replay.intervals import replay
@@ -37,6 +39,7 @@ class RepairRun:
         seconds: Times to find and to repair [s].
         interrupt: The signal that ended it.
         problems: Messages of errors.
+        notes: Messages on what else did not work.
         output: Path of the layer.
         is_written: Whether there is a layer: there is none if nothing is moved.
     """
@@ -61,10 +64,11 @@ class RepairRun:
         self.initially_near = 0
         self.stretches: list[RepairedStretch] = []
         self.frames: list[list[tuple[float, int]]] = []
-        self.earlier = self.journal.count
+        self.earlier = 0
         self.seconds = {"finding": 0.0, "repairing": 0.0}
         self.interrupt: KeyboardInterrupt | None = None
         self.problems: list[str] = []
+        self.notes: list[str] = []
         self.output, self.is_written = arguments.output, False
 
     @property
@@ -104,8 +108,7 @@ class RepairRun:
         started = time.perf_counter()
         if journal.findings is None:
             findings = find(scene, "Finding", arguments.min_distance, self._device)
-            with naming(journal.path):
-                journal.begin(findings)
+            self._keep(lambda: journal.begin(findings))
         assert journal.findings is not None
         self.found = count_found(journal.findings, arguments.min_distance)
         self.initially_near = sum(finding.initially_near for finding in journal.findings)
@@ -115,6 +118,7 @@ class RepairRun:
             self._add(stretch)
             done = scene.times.index(stretch.end)
             yield done
+        self.earlier = len(self.stretches)
         started = time.perf_counter()
         with RunProgress("Repairing") as progress:
             progress.show(done, len(scene))
@@ -129,11 +133,20 @@ class RepairRun:
                 progress=lambda number: progress.show(number, len(scene)),
             ):
                 scene.files.check()
-                with naming(journal.path):
-                    journal.add(stretch)
+                if journal.is_open:
+                    self._keep(functools.partial(journal.add, stretch))
                 self._add(stretch)
                 self.seconds["repairing"] = time.perf_counter() - started
                 yield scene.times.index(stretch.end)
+
+    def _keep(self, write: Callable[[], None]) -> None:
+        """Writes to the journal; without space for it, the run goes on without one."""
+        try:
+            with naming(self.journal.path):
+                write()
+        except OSError as error:
+            self.journal.close(remove=True)
+            self.notes.append(f"a later run cannot resume this one: {describe(error)}")
 
     def _add(self, stretch: RepairedStretch) -> None:
         """Adds a stretch to the layer and to the numbers."""
@@ -165,12 +178,39 @@ class RepairRun:
                 self.problems.append(f"not all of it is written: {shortage}")
             return
 
+    def report(self, page: RepairPage, kept: dict[str, str], after: list[Finding] | None) -> None:
+        """Writes the page of what is done; ``after`` is what a replay finds in the layer, None if it was not replayed.
+
+        Without space on the disk there is no page, and a problem says so.
+        """
+        assert self.journal.findings is not None
+        stopped = str(self.interrupt or "") or "; ".join(self.problems)
+        try:
+            if self.stretches and not self.journal.is_open:
+                raise OSError(f"it needs {self.journal.path}, which could not be written")
+            with naming(page.file.name):
+                page.write(
+                    self.scene,
+                    stretches=lambda: self.journal.stretches(self.scene),
+                    before=self.journal.findings,
+                    after=after,
+                    kept=kept,
+                    min_distance=self._arguments.min_distance,
+                    stopped=stopped,
+                )
+        except Exception as error:
+            self.problems.append(f"{page.file.name}: not written: {describe(error)}")
+
     def facts(self, kept: dict[str, str], left: dict[str, int]) -> dict[str, Any]:
         """Returns what was done, for programs."""
         stretches = []
         for stretch, frames in zip(self.stretches, self.frames, strict=True):
-            of_frames = [{"time": time, "moved": moved} for time, moved in frames]
-            stretches.append(asdict(stretch) | {"frames": of_frames})
+            values = asdict(stretch)
+            of_frames = [
+                {"time": time, "moved": moved, "largest_move": move}
+                for (time, moved), move in zip(frames, values.pop("largest_moves"), strict=True)
+            ]
+            stretches.append(values | {"frames": of_frames})
         return {
             "scene": self.scene.path,
             "output": str(self._arguments.output) if self.is_written else None,

@@ -17,6 +17,8 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
     )
     for warning in scene.warnings:
         say(console, f"note: {with_option(warning)}")
+    for note in run.notes:
+        say(console, f"note: {note}")
     for name, reason in list(kept.items())[:LONGEST]:
         say(console, f"note: {name} is not moved: {reason}")
     if len(kept) > LONGEST:

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -28,7 +28,6 @@ class Journal:
 
     Attributes:
         findings: What was found in each interval; None if that is not known yet.
-        count: Number of stretches.
     """
 
     def __init__(self, path: str | os.PathLike, facts: dict[str, Any], *, resume: bool):
@@ -52,9 +51,9 @@ class Journal:
             self._open()
 
     @property
-    def count(self) -> int:
-        """Number of stretches."""
-        return len(self._places)
+    def is_open(self) -> bool:
+        """Whether there is a file: :meth:`begin` or a resumed run has opened it, and it is not closed."""
+        return self._file is not None and not self._file.closed
 
     def begin(self, findings: list[Finding]) -> None:
         """Writes the file with the findings and no stretch.
@@ -63,14 +62,14 @@ class Journal:
             OSError: If that fails.
         """
         self.findings = findings
-        self._file = open(self.path, "w+b")  # noqa: SIM115 (closed by close)
+        self._file = open(self.path, "w+b", buffering=0)  # noqa: SIM115 (closed by close)
         self._write([_line({"format": _FORMAT, "facts": self._facts}), _line([asdict(found) for found in findings])])
 
     def add(self, stretch: RepairedStretch) -> None:
         """Appends a stretch.
 
         Raises:
-            OSError: If that fails; the file then has the stretches before it.
+            OSError: If that fails. The file can then only be closed.
         """
         assert self._file
         frames = [(frame.time, frame.before, len(frame.vertices)) for frame in stretch.frames]
@@ -79,27 +78,29 @@ class Journal:
             parts += [np.asarray(frame.vertices, np.int64).tobytes(), np.asarray(frame.x, np.float64).tobytes()]
         self._file.seek(0, os.SEEK_END)
         place = self._file.tell()
-        try:
-            self._write(parts)
-        except OSError:
-            self._file.truncate(place)
-            raise
+        self._write(parts)
         self._places.append(place)
 
     def stretches(self, scene: Scene) -> Iterator[RepairedStretch]:
         """Yields the stretches, in order."""
-        assert self._file
-        for place in self._places:
-            self._file.seek(place)
-            fields = json.loads(self._file.readline())
-            segment = scene.segment(scene.times.index(fields["start"]))
-            frames = []
-            for time, before, count in fields.pop("frames"):
-                vertices = np.frombuffer(self._file.read(8 * count), np.int64)
-                x = np.frombuffer(self._file.read(24 * count), np.float64).reshape(-1, 3)
-                frames.append(MovedFrame(time, before, segment, vertices, x))
-            values = {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
-            yield RepairedStretch(frames=tuple(frames), **values)
+        if not self._places:
+            return
+        with open(self.path, "rb") as file:
+            for place in self._places:
+                file.seek(place)
+                yield self._read(file, scene)
+
+    def _read(self, file: BinaryIO, scene: Scene) -> RepairedStretch:
+        """Returns the stretch that begins where a file is."""
+        fields = json.loads(file.readline())
+        segment = scene.segment(scene.times.index(fields["start"]))
+        frames = []
+        for time, before, count in fields.pop("frames"):
+            vertices = np.frombuffer(file.read(8 * count), np.int64)
+            x = np.frombuffer(file.read(24 * count), np.float64).reshape(-1, 3)
+            frames.append(MovedFrame(time, before, segment, vertices, x))
+        values: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
+        return RepairedStretch(frames=tuple(frames), **values)
 
     def close(self, *, remove: bool) -> None:
         """Closes the file, and removes it if there is nothing to resume."""
@@ -110,42 +111,41 @@ class Journal:
 
     def _open(self) -> None:
         """Reads the facts and the findings of an earlier run, and where its stretches are."""
-        self._file = open(self.path, "r+b")  # noqa: SIM115 (closed by close)
-        try:
-            head = json.loads(self._file.readline())
-            if head["format"] != _FORMAT:
-                raise ValueError
-            facts, findings = head["facts"], json.loads(self._file.readline())
-        except (ValueError, KeyError, TypeError):
-            self._file.close()
-            raise ValueError(f"{self.path}: not a resumable repair of this version") from None
-        for fact in self._facts:
-            if facts.get(fact) != self._facts[fact]:
-                self._file.close()
-                difference = describe_difference(fact, facts, self._facts)
-                raise ValueError(f"{self.path}: written with other options or files; cannot resume: {difference}")
-        self.findings = [_as_finding(fields) for fields in findings]
-        size = self._file.seek(0, os.SEEK_END)
-        self._file.seek(0)
-        self._file.readline()
-        self._file.readline()
-        while (place := self._file.tell()) < size:
-            line = self._file.readline()
-            end = size + 1
-            if line.endswith(b"\n"):
-                end = self._file.tell() + sum(32 * count for *_, count in json.loads(line)["frames"])
-            if end > size:  # cut by the end of the process
-                self._file.truncate(place)
-                return
-            self._places.append(place)
-            self._file.seek(end)
+        with open(self.path, "rb") as file:
+            try:
+                head = json.loads(file.readline())
+                if head["format"] != _FORMAT:
+                    raise ValueError
+                facts, findings = head["facts"], json.loads(file.readline())
+            except (ValueError, KeyError, TypeError):
+                raise ValueError(f"{self.path}: not a resumable repair of this version") from None
+            for fact in self._facts:
+                if facts.get(fact) != self._facts[fact]:
+                    difference = describe_difference(fact, facts, self._facts)
+                    raise ValueError(f"{self.path}: written with other options or files; cannot resume: {difference}")
+            self.findings = [_as_finding(fields) for fields in findings]
+            end = file.tell()
+            size = file.seek(0, os.SEEK_END)
+            while end < size:
+                file.seek(end)
+                line = file.readline()
+                if not line.endswith(b"\n"):
+                    break
+                place = end
+                end = file.tell() + sum(32 * count for *_, count in json.loads(line)["frames"])
+                if end > size:
+                    end = place
+                    break
+                self._places.append(place)
+        self._file = open(self.path, "r+b", buffering=0)  # noqa: SIM115 (closed by close)
+        self._file.truncate(end)  # the rest was cut by the end of the process
 
     def _write(self, parts: list[bytes]) -> None:
         """Appends bytes, and waits until they are on the disk."""
         assert self._file
-        for part in parts:
-            self._file.write(part)
-        self._file.flush()
+        rest = memoryview(b"".join(parts))
+        while rest:
+            rest = rest[self._file.write(rest) :]
         os.fsync(self._file.fileno())
 
 

@@ -24,6 +24,9 @@ _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
 _FADED = 0.002
 """Displacement, as a share of the median edge length, below which the next frame begins with none."""
+_SOUGHT, _ACCEPTED = 0.02, 0.05
+"""Displacement of vertices alone, as a share of that length, that is left to them while displacements are sought, and
+afterwards."""
 _MORE_DISTANCE = 1.0 + 2.0**-8
 """Distance that is kept, as a multiple of the minimum distance: the points of a layer are rounded."""
 
@@ -261,7 +264,8 @@ class _Shot:
             if self._findings[index].is_free and not frame.differs and not displacement.any():
                 frame = ShotFrame.of_shot(given)
             else:
-                found = self._follower.follow(frame.x, given, displacement)
+                tolerance = _SOUGHT if displacements is None else _ACCEPTED
+                found = self._follower.follow(frame.x, given, displacement, tolerance=tolerance)
                 added = found.displacement if displacements is None else found.x - given
                 frame = ShotFrame(given, found.x, added.astype(np.float32), found.certified)
             yield frame

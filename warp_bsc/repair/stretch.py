@@ -17,8 +17,9 @@ class RepairedStretch:
         start: Time code of its first frame.
         end: Time code of its last frame.
         frames: The frames with moved vertices.
+        largest_moves: Largest distance of a vertex from the shot in each of these, in its unit of length.
         moved: Number of moved vertices, the most of all frames.
-        largest_move: Largest distance of a vertex from the shot, in its unit of length.
+        largest_move: The largest of all these.
         mean_move: Mean of the distances of moved vertices.
         edge_length: Median edge length of the meshes that may move, at the start.
         edge_ratio: Smallest and largest length of an edge, as shares of its length in the shot at the same time.
@@ -31,6 +32,7 @@ class RepairedStretch:
     start: float
     end: float
     frames: tuple[MovedFrame, ...] = field(repr=False)
+    largest_moves: tuple[float, ...] = field(repr=False)
     moved: int
     largest_move: float
     mean_move: float
@@ -91,7 +93,8 @@ class StretchRecorder:
         self._frames: list[MovedFrame] = []
         self._times: list[float] = []
         self._uncertified: list[float] = []
-        self._moved, self._largest, self._sum, self._count = 0, 0.0, 0.0, 0
+        self._largest: list[float] = []
+        self._moved, self._sum, self._count = 0, 0.0, 0
         self._ratio = 1.0, 1.0
         self._last: list[tuple[np.ndarray, np.ndarray]] = []  # displacements and positions of the last two frames
         self._acceleration = 0.0, 0.0
@@ -113,7 +116,7 @@ class StretchRecorder:
         self._frames.append(moved)
         moves = np.linalg.norm(added[moved.vertices], axis=1)
         self._moved = max(self._moved, len(moves))
-        self._largest = max(self._largest, float(moves.max()))
+        self._largest.append(float(moves.max()))
         self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
         edges = self._mesh.edges
         lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
@@ -126,8 +129,9 @@ class StretchRecorder:
             start=self._times[0],
             end=self._times[-1],
             frames=tuple(self._frames),
+            largest_moves=tuple(self._largest),
             moved=self._moved,
-            largest_move=self._largest,
+            largest_move=max(self._largest, default=0.0),
             mean_move=self._sum / max(1, self._count),
             edge_length=self._mesh.length,
             edge_ratio=self._ratio,
