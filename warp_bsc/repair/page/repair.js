@@ -6,7 +6,7 @@ const KEPT_COLOR = [0.62, 0.64, 0.67];
 const SMALL_MOVE = [0.98, 0.8, 0.25], LARGE_MOVE = [0.8, 0.09, 0.11];
 const meshColor = (mesh) => (data.meshes[mesh].kept ? KEPT_COLOR : BASE_COLORS[mesh % BASE_COLORS.length]);
 
-// `amount` is a move as a share of the largest one.
+// `amount` is the root of a move as a share of the largest one, so that small moves are seen.
 const MOVED_SHADER = `#version 300 es
 in vec3 start; in vec3 end; in vec3 color; in float amount;
 uniform mat4 view; uniform mat4 projection; uniform float time; uniform float painted; uniform vec3 small; uniform vec3 large;
@@ -39,7 +39,7 @@ function fillTimeline() {
   const most = (some) => some.reduce((largest, item) => Math.max(largest, item[2]), 0);
   const percent = (some) => Math.round((100 * most(some)) / data.edge_length);
   const marked = addBars(byId("moves"), bars(data.moves, width, (some) => [percent(some)], (some) => `largest move ${edges(most(some))}`), ["bar"], width, "time code", 160, 64);
-  const kinds = [["collisions", "first"], ["intersections at the start", "second"], ["too near", "third"]].slice(0, data.has_distance ? 3 : 2);
+  const kinds = [["collisions", "first"], ["intersections", "second"], ["pairs too near", "third"]].slice(0, data.has_distance ? 3 : 2);
   kinds.forEach(([name, color]) => addKey(byId("timeline-legend"), { class: color }, name));
   for (const [name, title] of [["before", "Before"], ["after", "After"]]) {
     const list = data[name];
@@ -49,7 +49,7 @@ function fillTimeline() {
       continue;
     }
     const sum = (some, column) => some.reduce((total, item) => total + item[column], 0);
-    const total = kinds.map(([what], column) => `${count(sum(list, 2 + column))} ${what.split(" ")[0] === "too" ? "pairs too near" : what.split(" ")[0]}`).join(", ");
+    const total = kinds.map(([what], column) => `${count(sum(list, 2 + column))} ${what}`).join(", ");
     byId(`${name}-title`).textContent = `${title}: ${total}`;
     const isFree = !kinds.some((_, column) => sum(list, 2 + column));
     byId(name).hidden = isFree;
@@ -66,7 +66,7 @@ function fillTimeline() {
 
 // --- The frame in 3D ---
 
-// Returns the arrays of a frame: positions before and after, and moves as shares of the largest one.
+// Returns the arrays of a frame: positions before and after, and the roots of moves as shares of the largest one.
 async function loadFrame({ view }) {
   const block = await unpack(`frame-${view}`);
   const topology = await unpack(`faces-${block.faces}`);
@@ -76,7 +76,7 @@ async function loadFrame({ view }) {
   block.moved.forEach((vertex, row) => {
     const added = block.displacement.subarray(3 * row, 3 * row + 3);
     for (let axis = 0; axis < 3; axis += 1) end[3 * vertex + axis] += added[axis];
-    amount[vertex] = Math.min(1, Math.hypot(...added) / data.largest);
+    amount[vertex] = Math.sqrt(Math.min(1, Math.hypot(...added) / data.largest));
     moved.set(end.subarray(3 * vertex, 3 * vertex + 3), 3 * row);
   });
   return { start, end, amount, moved, faces: topology.faces, meshes: topology.mesh_of_vertex, of: block.of };
@@ -146,9 +146,9 @@ function makeViewer(markTime) {
   }
 
   const legend = byId("viewer-legend");
-  [0.05, 0.25, 0.5, 0.75, 1].forEach((share) => {
+  [0.25, 0.5, 0.75, 1].forEach((share) => {
     const color = SMALL_MOVE.map((value, axis) => value + share * (LARGE_MOVE[axis] - value));
-    addKey(legend, { fill: css(color) }, edges(share * data.largest));
+    addKey(legend, { fill: css(color) }, edges(share ** 2 * data.largest));
   });
   data.meshes.slice(0, 6).forEach((mesh, index) => addKey(legend, { fill: css(meshColor(index)) }, mesh.name + (mesh.kept ? ", kept" : "")));
   if (data.meshes.length > 6) add(legend, "span", {}, `and ${count(data.meshes.length - 6)} more`);
