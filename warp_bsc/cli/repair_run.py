@@ -6,6 +6,7 @@ import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 from .._atomic_file import naming, unfinished_path
@@ -42,6 +43,7 @@ class RepairRun:
         notes: Messages on what else did not work.
         output: Path of the layer.
         is_written: Whether there is a layer: there is none if nothing is moved.
+        page: Path of the report, once it is written.
     """
 
     def __init__(self, scene: Scene, arguments: argparse.Namespace, device: str, facts: dict[str, Any]):
@@ -70,6 +72,7 @@ class RepairRun:
         self.problems: list[str] = []
         self.notes: list[str] = []
         self.output, self.is_written = arguments.output, False
+        self.page: Path | None = None
 
     @property
     def is_whole(self) -> bool:
@@ -112,6 +115,11 @@ class RepairRun:
         assert journal.findings is not None
         self.found = count_found(journal.findings, arguments.min_distance)
         self.initially_near = sum(finding.initially_near for finding in journal.findings)
+        if self.initially_near:
+            self.notes.append(
+                f"pairs that are nearer than {arguments.min_distance:g} from the start: {self.initially_near:,}, which "
+                "are not counted; where the scene is repaired, they come no nearer"
+            )
         self.seconds["finding"] = time.perf_counter() - started
         done = 0
         for stretch in journal.stretches(scene):
@@ -198,6 +206,7 @@ class RepairRun:
                     min_distance=self._arguments.min_distance,
                     stopped=stopped,
                 )
+            self.page = page.file.path
         except Exception as error:
             self.problems.append(f"{page.file.name}: not written: {describe(error)}")
 

@@ -24,7 +24,7 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
     if len(kept) > LONGEST:
         say(console, f"note: {len(kept) - LONGEST} more are not moved")
     if run.earlier:
-        say(console, f"note: {count(run.earlier, 'stretch', 'stretches')} were repaired by an earlier run")
+        say(console, f"note: stretches that an earlier run has repaired: {run.earlier:,}")
     if run.stretches:
         _print_stretches(console, run)
     for stretch in run.stretches[:LONGEST]:
@@ -35,12 +35,6 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
             say(console, f"Not certified: {count(len(stretch.uncertified), 'frame')}, the first at {times}.")
     for what, number in run.found.items():
         say(console, f"{what.capitalize()}: {number:,} before, {left[what]:,} left.")
-    if run.initially_near:
-        say(
-            console,
-            f"note: {count(run.initially_near, 'more pair')} of those are so from the start: where the scene is "
-            "repaired they come no nearer",
-        )
     seconds = run.seconds
     say(
         console,
@@ -50,7 +44,9 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
     if run.is_written:
         say(console, f"Wrote {run.output}.")
     else:
-        say(console, "Nothing was moved: no file was written.")
+        say(console, "Nothing was moved: no layer was written.")
+    if run.page:
+        say(console, f"Wrote {run.page}.")
 
 
 def _print_stretches(console: Console, run: RepairRun) -> None:

@@ -18,7 +18,7 @@ __all__ = ["FollowedFrame", "Follower"]
 
 _SWEEPS = 64, 32, 16
 """Sweeps that spread the displacements by the first contacts of a step over the mesh, by the second ones, and so on."""
-_DETECTIONS = 6
+_DETECTIONS = 4
 """Detections after which contacts are not moved apart anew before their displacements are spread."""
 _PROJECTIONS = 20
 """Sweeps over the contacts after each detection."""
