@@ -24,6 +24,8 @@ def test_page_has_the_moved_frames(page_path):
     assert HIT in times and len(data["moves"]) == FRAMES
     assert page.blocks == {"faces-0", *(f"frame-{number}" for number in range(len(times)))}
     assert sum(row[2] for row in data["before"]) > 0 and not any(row[2] + row[3] for row in data["after"])
+    hits = sum(row[2] for row in data["before"])
+    assert data["tiles"][0] == ["0", f"collisions, of {hits} before"]
     frame = times.index(HIT)
     block, faces = page.block(f"frame-{frame}"), page.block("faces-0")
     shot = np.array(block["low"]) + block["step"] * block["before"].reshape(-1, 3)

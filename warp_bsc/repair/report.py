@@ -20,7 +20,9 @@ from .stretch import RepairedStretch
 
 __all__ = ["RepairPage"]
 
-_ALL_FACES = 6_000_000  # in the views of all frames together; divided by their number, the limit of a frame ...
+_ALL_FACES = (
+    3_000_000  # about 25 MB, in the views of all frames together; divided by their number, the limit of a frame ...
+)
 _FEWEST_FACES, _MOST_FACES = 2_000, 150_000  # ... within these bounds
 _MOST_VIEWS = 1_500  # frames with a view
 _STEPS = 1 << 16  # positions in the shot are rounded to this part of the size of what is shown
@@ -131,11 +133,11 @@ class _Summary:
             moves[frame["time"]] = max(moves[frame["time"]], frame["move"])
         uncertified = sum(len(stretch.uncertified) for stretch in stretches)
         tiles = [
-            (_change(before, after, lambda found: found.hits), "collisions"),
-            (_change(before, after, lambda found: found.crossings[0], last=True), "intersections at rest"),
+            _left(before, after, "collisions", lambda found: found.hits),
+            _left(before, after, "intersections", lambda found: found.crossings[0], last=True),
         ]
         if min_distance:
-            tiles.append((_change(before, after, lambda found: found.near), f"pairs nearer than {min_distance:g}"))
+            tiles.append(_left(before, after, f"pairs nearer than {min_distance:g}", lambda found: found.near))
         ratios = [stretch.edge_ratio for stretch in stretches]
         tiles += [
             (f"{len(moves.keys() & {frame['time'] for frame in self.frames}):,} of {len(moves):,}", "frames moved"),
@@ -279,15 +281,20 @@ def _rows(scene: Scene, findings: list[Finding]) -> list[tuple[float, float, int
     return rows
 
 
-def _change(
-    before: list[Finding], after: list[Finding] | None, number: Callable[[Finding], int], *, last: bool = False
-) -> str:
-    """Returns in words how a number of findings has changed; ``last`` adds the crossings at the end."""
+def _left(
+    before: list[Finding],
+    after: list[Finding] | None,
+    what: str,
+    number: Callable[[Finding], int],
+    *,
+    last: bool = False,
+) -> tuple[str, str]:
+    """Returns how many findings are left and were there before, in words; ``last`` adds the crossings at the end."""
     sums = [
         None if findings is None else sum(map(number, findings)) + last * findings[-1].crossings[1]
         for findings in (before, after)
     ]
-    return f"{sums[0]:,} → {'?' if sums[1] is None else format(sums[1], ',')}"
+    return "?" if sums[1] is None else f"{sums[1]:,}", f"{what}, of {sums[0]:,} before"
 
 
 def _title(scene: Scene) -> str:
