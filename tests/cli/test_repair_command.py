@@ -7,6 +7,7 @@ import signal
 
 import pytest
 from pxr import Usd
+from replay_files import Page
 from stages import add_mesh, new_stage, save
 
 from warp_bsc.cli.main import main
@@ -72,7 +73,10 @@ def interrupt():
 def test_interrupted_repair_leaves_a_partial_layer(tmp_path, monkeypatch):
     path = crossing_twice(tmp_path)
     stop_after_one_stretch(monkeypatch, interrupt)
-    assert repair(path, tmp_path / "fixed.usdc") == 130
+    assert repair(path, tmp_path / "fixed.usdc", "--report", str(tmp_path / "page.html")) == 130
+    page = Page((tmp_path / "page.html").read_text())
+    assert page.data["partial"] == "Partial: interrupted. The layer has not been replayed."
+    assert page.data["after"] is None and page.data["tiles"][0][0] == "?"
     stage = Usd.Stage.Open(str(tmp_path / "fixed.usdc"))
     facts = stage.GetRootLayer().customLayerData["repair"]
     assert facts["complete"] is False and facts["stretches"] == 1 and facts["stopped"] == "interrupted"
