@@ -40,7 +40,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     )
     from .detection.query_points import query_points
     from .repair.repair import repair
-    from .repair.results import RepairResult, UnresolvedContour
+    from .repair.results import RepairResult, StateRepairResult, UnresolvedContour
+    from .repair.state import repair_state
     from .replay.intervals import replay
     from .replay.results import IntervalResult, IntervalSummary
     from .replay.scene_contacts import SceneContacts
@@ -77,6 +78,7 @@ _MODULES = {
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.report",
+    "StateRepairResult": "repair.results",
     "UnresolvedContour": "repair.results",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
@@ -84,6 +86,7 @@ _MODULES = {
     "query_vertex_face": "detection.query",
     "query_vertex_vertex": "detection.query",
     "repair": "repair.repair",
+    "repair_state": "repair.state",
     "replay": "replay.intervals",
 }
 
@@ -109,6 +112,7 @@ __all__ = [
     "Selection",
     "SolverCCD",
     "SolverReport",
+    "StateRepairResult",
     "UnresolvedContour",
     "checker",
     "query_edge_edge",
@@ -117,6 +121,7 @@ __all__ = [
     "query_vertex_face",
     "query_vertex_vertex",
     "repair",
+    "repair_state",
     "replay",
 ]
 

@@ -66,6 +66,7 @@ def test_tables(capsys, monkeypatch, measured):
     lines = run(capsys, "cloth_twist", "cloth_hanging --width 9").out.splitlines()
     notes = [line for line in lines if line.startswith("cloth_hanging --width 9,")]  # wrapped only on a terminal
     assert max(len(line) for line in lines if line not in notes) <= 80
+    assert any("[ms]" in line for line in lines)  # not taken for markup
     rows = [line.split() for line in lines if line.startswith("cloth_") and line not in notes]
     assert rows == [
         ["cloth_twist", "plain", "11.5", "1,701.8", "2,000.0", "0", "1,234", "ok"],

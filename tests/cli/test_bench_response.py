@@ -65,6 +65,7 @@ def test_tables(capsys, monkeypatch, measured):
     options = ["--configurations", "plain,stage,reference", "--perturb", "1e-6"]
     lines = run(capsys, "sphere", "pile", *options).out.splitlines()
     assert max(map(len, lines)) <= 100
+    assert any("[ms]" in line for line in lines)  # not taken for markup
     rows = [line.split() for line in lines if line.startswith(("plain ", "stage ", "reference "))]
     assert rows == [
         ["plain", "12.35", "1,234.50", "40.0", "0.0028", "1,040", "11.50", "508.25"],

@@ -283,7 +283,7 @@ def test_query_fails_on_collision(capsys, tmp_path):
         ("", [0, 1, 2, 3, 4]),
         ("replay", [0, 1, 2, 3, 4]),
         ("query", [0, 1, 2]),
-        *((f"bench {name}".strip(), [0, 2]) for name in ("", "paper", "detector", "queries", "newton")),
+        *((f"bench {name}".strip(), [0, 2]) for name in ("", "paper", "detector", "queries", "newton", "repair")),
     ],
 )
 def test_help_lists_the_exit_statuses(capsys, command, statuses):
@@ -353,7 +353,13 @@ def test_device_that_is_not_there(capsys, falling_scene):
 
 @pytest.mark.parametrize(
     "command",
-    [[], ["replay"], ["query"], ["bench"], *(["bench", name] for name in ("paper", "detector", "queries", "newton"))],
+    [
+        [],
+        ["replay"],
+        ["query"],
+        ["bench"],
+        *(["bench", name] for name in ("paper", "detector", "queries", "newton", "repair")),
+    ],
 )
 def test_help_has_examples(capsys, command):
     with pytest.raises(SystemExit) as end:

@@ -427,6 +427,17 @@ def calls_of_solvers() -> dict[str, Call]:
             },
             raises=bsc.CapturedSteps.__init__,
         ),
+        "repair_state": Call(
+            bsc.repair_state,
+            {"model": inner.model, "state": start},
+            {
+                "model": OBJECTS,
+                "state": {**OBJECTS, "model": inner.model},
+                "order": without(bad_arrays(np.zeros(count, int), index=True), "None", "negative"),
+                "min_distance": without(DISTANCES, "None"),
+                "max_strain": {**NUMBERS, "zero": 0.0, "negative": -1.0},
+            },
+        ),
     }
     states = {"state_in": start, "state_out": end, "control": None, "contacts": None, "dt": 0.01}
     for name, cls in (
@@ -456,6 +467,7 @@ RESULTS = {
     "SceneIntersections",
     "SceneProximities",
     "SolverReport",
+    "StateRepairResult",
     "UnresolvedContour",
 }
 """Classes of results, which users read and do not make; their methods take slices of rows."""

@@ -1,4 +1,4 @@
-"""Measures the IPC Toolkit: its results of single queries, and its candidates and collision-free step size.
+"""Measures the IPC Toolkit: its results of single queries and meshes, and its candidates and collision-free step size.
 
 Its queries are called one by one from Python, where a call can take longer than the query. The time of a call is
 measured on a query of features so far apart that it ends at once, and subtracted. The subtracted time contains that of
@@ -24,6 +24,7 @@ __all__ = [
     "IpcToolkitBenchmark",
     "benchmark_ipc_toolkit",
     "decide_queries",
+    "has_intersections",
     "is_installed",
     "time_queries",
     "version",
@@ -94,6 +95,19 @@ def is_installed() -> bool:
 def version() -> str | None:
     """Returns the version of the IPC Toolkit, None if it is not installed."""
     return importlib.metadata.version("ipctk") if is_installed() else None
+
+
+def has_intersections(faces: np.ndarray, x: np.ndarray) -> bool:
+    """Returns whether the IPC Toolkit finds an edge that meets a face.
+
+    Args:
+        faces: Vertex indices, int, shape [face_count, 3].
+        x: Positions, shape [vertex_count, 3].
+    """
+    import ipctk  # noqa: PLC0415 (optional)
+
+    positions, corners = np.asfortranarray(x, dtype=np.float64), np.asfortranarray(faces, dtype=np.int32)
+    return ipctk.has_intersections(ipctk.CollisionMesh(positions, ipctk.edges(corners), corners), positions)
 
 
 def decide_queries(method: str, kind: PairKind, points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Meshes pushed into themselves, for measurements of repair: known ones, and random damage of five kinds."""
+"""Meshes that cross themselves, for measurements of repair: known ones, files, and random damage of five kinds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,25 +7,27 @@ import numpy as np
 
 from ..detection.intersections import IntersectionFinder
 from ..detection.mesh import CollisionMesh
+from .mesh_files import read_mesh
 
-__all__ = ["KINDS", "KNOWN", "TangledMesh", "damaged"]
+__all__ = ["KINDS", "KNOWN", "TangledMesh", "damaged", "load_tangled"]
 
 
 @dataclass(frozen=True, eq=False)
 class TangledMesh:
-    """A mesh whose positions cross.
+    """A mesh whose positions cross, or may cross.
 
     Attributes:
         faces: Vertex indices, int, shape [face_count, 3].
         x: Positions that cross, float64, shape [vertex_count, 3].
-        free: Positions before the damage, which do not cross, float64, shape [vertex_count, 3].
+        free: Positions that do not cross, such as those before the damage, float64, shape [vertex_count, 3]; None if
+            there are none.
         fixed: Vertices that must stay, bool, shape [vertex_count].
         layer: Layer of each vertex from inside to outside, -1 for none, int, shape [vertex_count].
     """
 
     faces: np.ndarray
     x: np.ndarray
-    free: np.ndarray
+    free: np.ndarray | None
     fixed: np.ndarray
     layer: np.ndarray
 
@@ -252,5 +254,30 @@ def _folded() -> TangledMesh:
     return TangledMesh(faces, x, free, np.zeros(len(x), bool), np.full(len(x), -1))
 
 
-KNOWN = {"sheets": _sheets, "corner": _corner, "folded": _folded}
-"""Known meshes: two sheets through each other in islands, one through another from border to border, a sunk fold."""
+KNOWN = {"sheets": _sheets, "folded": _folded, "corner": _corner}
+"""Known meshes: two sheets through each other in islands, a sunk fold, one sheet through another from border to border.
+"""
+
+
+def load_tangled(path: str) -> TangledMesh:
+    """Returns the mesh of a file. Vertices at the same position are one, and faces that thereby lose an edge are gone.
+
+    Args:
+        path: A file of any format that trimesh reads.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not a readable triangle mesh, or has no triangles or positions that are not finite.
+    """
+    mesh = read_mesh(path)
+    if not np.isfinite(mesh.vertices).all():
+        raise ValueError(f"{path}: it has positions that are not finite")
+    _, firsts, numbers = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
+    faces = firsts[numbers.reshape(-1)][mesh.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    if not len(faces):
+        raise ValueError(f"{path}: it has no triangles with three different corners")
+    used, faces = np.unique(faces, return_inverse=True)
+    x, faces = np.array(mesh.vertices[used]), faces.reshape(-1, 3)
+    return TangledMesh(faces, x, None, np.zeros(len(x), bool), np.full(len(x), -1))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..usd.scene import Scene
+from .mesh_files import read_mesh
 
 __all__ = [
     "GENERATORS",
@@ -130,7 +131,7 @@ def _load_pair(name: str) -> BenchmarkScene:
     paths = name.split(",")
     if len(paths) != 2:
         raise ValueError(f"{name}: expected two files joined by a comma, got {len(paths)}")
-    first, second = (_read_mesh(path) for path in paths)
+    first, second = (read_mesh(path) for path in paths)
     if len(first.vertices) != len(second.vertices):
         raise ValueError(f"{name}: the first has {len(first.vertices)} vertices, the second {len(second.vertices)}")
     if not np.array_equal(first.faces, second.faces):
@@ -141,21 +142,6 @@ def _load_pair(name: str) -> BenchmarkScene:
     if all(np.array_equal(x, single) for x, single in zip((x0, x1), singles, strict=True)):
         x0, x1 = singles
     return BenchmarkScene(name, np.array(first.faces, dtype=np.int32), x0, x1)
-
-
-def _read_mesh(path):
-    import trimesh  # noqa: PLC0415 (slow)
-
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-        faces = mesh.faces
-    except Exception as error:  # its readers raise errors of any kind
-        raise ValueError(f"{path}: not a readable triangle mesh: {error}") from error
-    if not len(faces):
-        raise ValueError(f"{path}: it has no triangles")
-    return mesh
 
 
 def generate_cloth(triangles: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

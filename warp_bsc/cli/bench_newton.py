@@ -1,19 +1,18 @@
 """The command ``warp-bsc bench newton``: measures Newton's own examples, plain and with the collision stage."""
 
 import argparse
-import json
+from collections.abc import Generator
 
 import warp as wp
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .._atomic_file import STDOUT, OutputFile
 from ..bench.newton_examples import MODES, ExampleRun, NewtonExample, find_examples, measure_example
 from .bench_newton_tables import example_runs_to_dict, print_example_runs, print_examples
+from .bench_runs import RunsProgress, add_json_file, report_runs
 from .device import find_device
 from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS
 from .options import Commands, add_command, add_device, positive
-from .tables import Console, say
+from .tables import Console
 
 __all__ = ["add_to"]
 
@@ -74,13 +73,7 @@ def add_to(commands: Commands) -> None:
         "--download", action="store_true", help="let examples download assets; without it, their rows name the assets"
     )
     command.add_argument("--list", action="store_true", help="list the examples and what they need, and run none")
-    command.add_argument(
-        "--json",
-        metavar="FILE",
-        nargs="?",
-        const=STDOUT,
-        help="write all results as JSON to a file; without FILE, print them instead of tables",
-    )
+    add_json_file(command)
     add_device(command)
 
 
@@ -104,59 +97,38 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.list:
         print_examples(Console(), examples)
         return 0
-    file = OutputFile(arguments.json) if arguments.json not in (None, STDOUT) else None
-    try:
-        runs: list[ExampleRun] = []
-        interrupt = None
-        try:
-            _measure(runs, examples, arguments, device)
-        except KeyboardInterrupt as signal:
-            interrupt = signal
-        with INTERRUPTS.held():
-            settings = {"device": device, "partial": interrupt is not None}
-            found = example_runs_to_dict(runs, **settings)
-            if arguments.json == STDOUT:
-                print(json.dumps(found))
-            else:
-                print_example_runs(Console(), runs, **settings)
-            if file:
-                file.write(json.dumps(found))
-                file.commit()
-        if interrupt:
-            raise interrupt
-    finally:
-        if file:
-            file.discard()
+    report_runs(
+        _measure(examples, arguments, device),
+        to_dict=example_runs_to_dict,
+        show=print_example_runs,
+        json_path=arguments.json,
+        device=device,
+    )
     return 0
 
 
 def _measure(
-    runs: list[ExampleRun], examples: list[NewtonExample], arguments: argparse.Namespace, device: wp.Device
-) -> None:
-    """Adds a run for each example and mode to a list, with a progress bar on standard error."""
-    console = Console(stderr=True)
-    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        total = len(examples) * len(arguments.modes)
-        task = progress.add_task("Measuring", total=total)
-        for example in examples:
-            for mode in arguments.modes:
-                title, done = f"{example.name}, {mode}", len(runs)
-                progress.update(task, completed=done, description=f"{title}: starts")
+    examples: list[NewtonExample], arguments: argparse.Namespace, device: wp.Device
+) -> Generator[ExampleRun, None, None]:
+    """Yields a run for each example and mode, and shows the progress."""
+    pairs = [(example, mode) for example in examples for mode in arguments.modes]
+    with RunsProgress(len(pairs)) as progress:
+        for done, (example, mode) in enumerate(pairs):
+            title = f"{example.name}, {mode}"
+            progress.show(done, f"{title}: starts")
 
-                def show(frame: int, frames: int, title: str = title, done: int = done) -> None:
-                    description = f"{title}: frame {frame} of {frames}"
-                    progress.update(task, completed=done + frame / frames, description=description)
+            def show(frame: int, frames: int, title: str = title, done: int = done) -> None:
+                progress.show(done + frame / frames, f"{title}: frame {frame} of {frames}")
 
-                run = measure_example(
-                    example,
-                    mode,
-                    device=str(device),
-                    frames=arguments.frames,
-                    check_every=arguments.check_every,
-                    download=arguments.download,
-                    progress=show,
-                )
-                runs.append(run)
-                if run.problem and console.is_terminal:
-                    say(progress.console, f"{title}: {run.problem}")
+            run = measure_example(
+                example,
+                mode,
+                device=str(device),
+                frames=arguments.frames,
+                check_every=arguments.check_every,
+                download=arguments.download,
+                progress=show,
+            )
+            if run.problem:
+                progress.note(f"{title}: {run.problem}")
+            yield run

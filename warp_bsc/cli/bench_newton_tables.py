@@ -44,7 +44,7 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
     table = make_table("Example", caption=caption)
     _add_text_column(table, "Mode", no_wrap=True)
     for header in ("Median\n[ms]", "95%\n[ms]", "Worst\n[ms]", "Cross-\nings at\nstart", "At\nmost"):
-        table.add_column(header, justify="right", no_wrap=True)
+        table.add_column(Text(header), justify="right", no_wrap=True)
     _add_text_column(table, "Its tests", no_wrap=True)
     notes = []
     for run in runs:

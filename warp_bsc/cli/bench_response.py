@@ -2,13 +2,11 @@
 
 import argparse
 import difflib
-import json
 import math
+from collections.abc import Generator
 
 import warp as wp
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .._atomic_file import STDOUT, OutputFile
 from ..bench.response import (
     CONFIGURATIONS,
     REFERENCE,
@@ -20,11 +18,11 @@ from ..bench.response import (
     measure_response,
 )
 from .bench_response_tables import print_response_runs, response_runs_to_dict
+from .bench_runs import RunsProgress, add_json_file, report_runs
 from .device import find_device
 from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS
 from .options import Commands, add_command, add_device, distance, positive
-from .tables import Console, say
 
 __all__ = ["add_to"]
 
@@ -101,13 +99,7 @@ def add_to(commands: Commands) -> None:
         help="run stage a second time with all particles moved sideways by D [m], and report how much its stretch "
         "differs",
     )
-    command.add_argument(
-        "--json",
-        metavar="FILE",
-        nargs="?",
-        const=STDOUT,
-        help="write all results as JSON to a file; without FILE, print them instead of tables",
-    )
+    add_json_file(command)
     add_device(command)
 
 
@@ -157,65 +149,41 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.perturb is not None and "stage" not in configurations:
         raise ValueError("--perturb runs the configuration stage a second time, and --configurations omits it")
     device = find_device(arguments.device)
-    file = OutputFile(arguments.json) if arguments.json not in (None, STDOUT) else None
-    try:
-        runs: list[ResponseRun] = []
-        interrupt = None
-        try:
-            _measure(runs, scenes, configurations, arguments, device)
-        except KeyboardInterrupt as signal:
-            interrupt = signal
-        with INTERRUPTS.held():
-            settings = {"device": device, "partial": interrupt is not None}
-            found = response_runs_to_dict(runs, **settings)
-            if arguments.json == STDOUT:
-                print(json.dumps(found))
-            else:
-                print_response_runs(Console(), runs, **settings)
-            if file:
-                file.write(json.dumps(found))
-                file.commit()
-        if interrupt:
-            raise interrupt
-    finally:
-        if file:
-            file.discard()
+    report_runs(
+        _measure(scenes, configurations, arguments, device),
+        to_dict=response_runs_to_dict,
+        show=print_response_runs,
+        json_path=arguments.json,
+        device=device,
+    )
     return 0
 
 
 def _measure(
-    runs: list[ResponseRun],
-    scenes: tuple[str, ...],
-    configurations: tuple[str, ...],
-    arguments: argparse.Namespace,
-    device: wp.Device,
-) -> None:
-    """Adds a run for each scene and configuration to a list, with a progress bar on standard error."""
-    console = Console(stderr=True)
-    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("Measuring", total=len(scenes) * len(configurations))
-        for scene in scenes:
-            for configuration in configurations:
-                title, done = f"{scene}, {configuration}", len(runs)
-                progress.update(task, completed=done, description=f"{title}: starts")
+    scenes: tuple[str, ...], configurations: tuple[str, ...], arguments: argparse.Namespace, device: wp.Device
+) -> Generator[ResponseRun, None, None]:
+    """Yields a run for each scene and configuration, and shows the progress."""
+    pairs = [(scene, configuration) for scene in scenes for configuration in configurations]
+    with RunsProgress(len(pairs)) as progress:
+        for done, (scene, configuration) in enumerate(pairs):
+            title = f"{scene}, {configuration}"
+            progress.show(done, f"{title}: starts")
 
-                def show(step: int, steps: int, title: str = title, done: int = done) -> None:
-                    INTERRUPTS.check()
-                    description = f"{title}: step {step:,} of {steps:,}"
-                    progress.update(task, completed=done + step / steps, description=description)
+            def show(step: int, steps: int, title: str = title, done: int = done) -> None:
+                INTERRUPTS.check()
+                progress.show(done + step / steps, f"{title}: step {step:,} of {steps:,}")
 
-                with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
-                    run = measure_response(
-                        scene,
-                        configuration,
-                        solver=arguments.solver,
-                        device=device,
-                        seconds=arguments.seconds,
-                        reference_rate=arguments.reference_rate,
-                        perturb=arguments.perturb,
-                        progress=show,
-                    )
-                runs.append(run)
-                if run.problem and console.is_terminal:
-                    say(progress.console, f"{title}: {run.problem}")
+            with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
+                run = measure_response(
+                    scene,
+                    configuration,
+                    solver=arguments.solver,
+                    device=device,
+                    seconds=arguments.seconds,
+                    reference_rate=arguments.reference_rate,
+                    perturb=arguments.perturb,
+                    progress=show,
+                )
+            if run.problem:
+                progress.note(f"{title}: {run.problem}")
+            yield run

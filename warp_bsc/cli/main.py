@@ -5,7 +5,17 @@ import sys
 from typing import NoReturn
 
 from .._version import __version__
-from . import bench_detector, bench_newton, bench_paper, bench_queries, bench_response, query, repair, replay
+from . import (
+    bench_detector,
+    bench_newton,
+    bench_paper,
+    bench_queries,
+    bench_repair,
+    bench_response,
+    query,
+    repair,
+    replay,
+)
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_command
@@ -23,8 +33,8 @@ examples:
 {explain_statuses(*ExitStatus)}"""
 
 _BENCH = """\
-Measure how long detection takes. Without the name of a benchmark, warp-bsc
-bench runs the paper's five benchmarks, as warp-bsc bench paper does."""
+Measure detection, SolverCCD and repair. Without the name of a benchmark,
+warp-bsc bench runs the paper's five benchmarks, as warp-bsc bench paper does."""
 
 _BENCH_EPILOG = f"""\
 examples:
@@ -35,6 +45,7 @@ examples:
   warp-bsc bench queries
   warp-bsc bench newton
   warp-bsc bench response
+  warp-bsc bench repair
   warp-bsc bench detector --help
 
 {explain_statuses()}"""
@@ -45,6 +56,7 @@ _BENCHMARKS = {
     "queries": bench_queries,
     "newton": bench_newton,
     "response": bench_response,
+    "repair": bench_repair,
 }
 
 
@@ -86,7 +98,7 @@ def _build_parser() -> argparse.ArgumentParser:
         commands,
         "bench",
         None,
-        summary="measure how long detection takes",
+        summary="measure detection, SolverCCD and repair",
         description=_BENCH,
         epilog=_BENCH_EPILOG,
     )

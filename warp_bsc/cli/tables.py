@@ -3,6 +3,7 @@
 import rich.console
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 __all__ = ["LONGEST", "Console", "count", "make_table", "say"]
 
@@ -24,11 +25,14 @@ def say(console: rich.console.Console, line: str) -> None:
 
 
 def make_table(first: str, *others: str, caption: str | None = None) -> Table:
-    """Returns a table whose first column is text, which may wrap; the other columns are numbers, which may not."""
+    """Returns a table whose first column is text, which may wrap; the other columns are numbers, which may not.
+
+    Headers are shown as they are: markup would take "[s]" for a style.
+    """
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False, caption=caption, caption_justify="left")
-    table.add_column(first, overflow="fold")
+    table.add_column(Text(first), overflow="fold")
     for header in others:
-        table.add_column(header, justify="right", no_wrap=True)
+        table.add_column(Text(header), justify="right", no_wrap=True)
     return table
 
 

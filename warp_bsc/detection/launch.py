@@ -78,6 +78,29 @@ def launch(kernel: wp.Kernel, dim: int, *, device: wp.DeviceLike, **options: Any
             wp.launch(kernel, dim, device=device, **options)
 
 
+def launch_in_turn(kernel: wp.Kernel, dim: int, times: int, *, inputs: list, values: list[wp.array]) -> wp.array:
+    """Launches a kernel several times, each time from the results of the time before, and returns the last ones.
+
+    Args:
+        kernel: The kernel, whose last input is an array and whose only output is one like it.
+        dim: Number of threads; with 0, nothing is launched.
+        times: Number of launches.
+        inputs: The inputs before that array.
+        values: Two arrays, of which the first is the input of the first launch; both are overwritten.
+    """
+    device = values[0].device
+    if not dim or not times:
+        return values[0]
+    with _loading(kernel, device, 0):
+        commands = [
+            wp.launch(kernel, dim, [*inputs, before], [after], device=device, record_tape=False, record_cmd=True)
+            for before, after in (values, values[::-1])
+        ]
+        for number in range(times):
+            commands[number % 2].launch()
+    return values[times % 2]
+
+
 @contextlib.contextmanager
 def cores(count: int) -> Iterator[None]:
     """Limits launches on the CPU to ``count`` threads in the context; if 1, to the thread that launches."""

@@ -147,6 +147,14 @@ class CollisionMesh:
         return owned
 
     @functools.cached_property
+    def edge_faces(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the faces of each edge begin, int, shape [edge_count + 1], and these faces, int, shape [n]."""
+        sides = self.face_edges.ravel()
+        order = np.argsort(sides, kind="stable")[np.count_nonzero(sides < 0) :]
+        first = np.concatenate([[0], np.cumsum(np.bincount(sides[order], minlength=len(self.edges)))])
+        return first, order // 3
+
+    @functools.cached_property
     def face_order(self) -> np.ndarray:
         """Cell at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
         return order_faces(self.cells, None if self.world is None else self.world[self.cells[:, 0]])

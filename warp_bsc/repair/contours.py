@@ -69,17 +69,10 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
 
 def faces_of_edges(mesh: CollisionMesh, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the faces of edges: the row of the edge, and the face, each of shape [m], in the order of the rows."""
-    wanted = np.zeros(len(mesh.edges) + 1, dtype=bool)  # the last one is that of sides without an edge, -1
-    wanted[edges] = True
-    (sides,) = np.nonzero(wanted[mesh.face_edges.ravel()])
-    of_sides = mesh.face_edges.ravel()[sides]
-    order = np.argsort(of_sides, kind="stable")
-    sides, of_sides = sides[order], of_sides[order]
-    first, last = np.searchsorted(of_sides, edges), np.searchsorted(of_sides, edges, side="right")
-    counts = last - first
+    first, faces = mesh.edge_faces
+    counts = first[edges + 1] - first[edges]
     rows = np.repeat(np.arange(len(edges)), counts)
-    places = np.arange(len(rows)) + np.repeat(first - (np.cumsum(counts) - counts), counts)
-    return rows, sides[places] // 3
+    return rows, faces[np.arange(len(rows)) + np.repeat(first[edges] - (np.cumsum(counts) - counts), counts)]
 
 
 def connected_components(count: int, edges: np.ndarray) -> np.ndarray:

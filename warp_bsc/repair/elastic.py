@@ -3,11 +3,11 @@
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch
+from ..detection.launch import launch_in_turn
 from .kernels import relax_springs, spread_moves
 from .surface import Surface
 
-__all__ = ["Springs", "near"]
+__all__ = ["Springs", "near", "within"]
 
 _BENDING = 0.3
 """Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges."""
@@ -15,11 +15,19 @@ _BENDING = 0.3
 
 def near(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
     """Returns which vertices are within some edges of given ones and not fixed, bool, shape [n]."""
+    return within(surface, vertices, rings) & ~surface.fixed
+
+
+def within(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
+    """Returns which vertices are within some edges of given ones, bool, shape [n]."""
     reached = np.zeros(len(surface.home), dtype=bool)
     reached[vertices] = True
+    first, second = surface.ends
     for _ in range(rings):
-        reached[surface.mesh.edges[reached[surface.mesh.edges].any(axis=1)]] = True
-    return reached & ~surface.fixed
+        from_first, from_second = reached[first], reached[second]
+        reached[second[from_first]] = True
+        reached[first[from_second]] = True
+    return reached
 
 
 class Springs:
@@ -38,9 +46,10 @@ class Springs:
         """
         self._surface, self.movable = surface, movable
         vertices = np.flatnonzero(movable)
-        edges = np.flatnonzero(movable[surface.mesh.edges].any(axis=1))
+        first, second = surface.ends
+        edges = np.flatnonzero(movable[first] | movable[second])
         across = _vertices_across(surface, movable)
-        ends = np.concatenate([surface.mesh.edges[edges], across])
+        ends = np.concatenate([surface.edges[edges], across])
         stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
         lengths = np.linalg.norm(surface.home[ends[:, 1]] - surface.home[ends[:, 0]], axis=1)
         both = np.concatenate([ends, ends[:, ::-1]])
@@ -77,13 +86,8 @@ class Springs:
 
     def _sweep(self, kernel: wp.Kernel, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns values after some launches of a kernel that writes those of all movable vertices."""
-        before, after = self._surface.array(values), self._surface.array(values)
-        for _ in range(sweeps):
-            launch(
-                kernel, len(self._springs[0]), inputs=[*inputs, before], outputs=[after], device=self._surface.device
-            )
-            before, after = after, before
-        return before.numpy()
+        arrays = [self._surface.array(values), self._surface.array(values)]
+        return launch_in_turn(kernel, len(self._springs[0]), sweeps, inputs=inputs, values=arrays).numpy()
 
 
 def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:

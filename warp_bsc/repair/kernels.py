@@ -2,6 +2,9 @@
 
 import warp as wp
 
+from ..response.state.mesh import Placement
+from ..response.state.planes import transformed_plane
+
 wp.set_module_options({"enable_backward": False})
 
 _ZERO = wp.constant(wp.float64(0.0))
@@ -143,3 +146,26 @@ def find_closest(
     query = wp.mesh_query_point_no_sign(surface, points[i], wp.inf)
     closest[i] = wp.mesh_eval_position(surface, query.face, query.u, query.v)
     normals[i] = wp.mesh_eval_face_normal(surface, query.face)
+
+
+@wp.kernel
+def find_exits(
+    # mesh
+    surface: wp.uint64,
+    # in
+    points: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    # out
+    distances: wp.array2d[float],
+):
+    """Finds how far each point is from a surface along each direction, infinite if it does not meet it."""
+    i, j = wp.tid()
+    query = wp.mesh_query_ray(surface, points[i], directions[j], wp.inf)
+    distances[i, j] = wp.where(query.result, query.t, wp.inf)
+
+
+@wp.kernel
+def place_planes(place: Placement, planes: wp.array[wp.vec4d]):
+    """Writes the infinite planes of a model where its bodies are."""
+    i = wp.tid()
+    planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)

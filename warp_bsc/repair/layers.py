@@ -1,12 +1,10 @@
 """Puts layers of a surface on the sides that their order asks for, where they have changed places."""
 
 import numpy as np
-import warp as wp
 
-from ..detection.launch import launch
+from .closest import closest_points
 from .contours import connected_components
 from .elastic import Springs, near
-from .kernels import find_closest
 from .surface import Surface
 
 __all__ = ["separate_layers"]
@@ -57,7 +55,7 @@ def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: 
         return x
     (vertices,) = np.nonzero(moving & ~surface.fixed)
     (faces,) = np.nonzero(obstacle[mesh.faces].all(axis=1))
-    closest, normals = _closest(surface, x, faces, x[vertices])
+    closest, normals = closest_points(surface, x, faces, x[vertices])
     way = closest - x[vertices]
     behind = np.zeros(len(x), dtype=bool)
     behind[vertices] = side * np.einsum("ij,ij->i", way, normals) > _ALONG_NORMAL * np.linalg.norm(way, axis=1)
@@ -71,17 +69,3 @@ def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: 
     moves[~wrong] = 0.0
     springs = Springs(surface, near(surface, np.flatnonzero(wrong), _RINGS) & moving)
     return x + springs.spread(moves, wrong, _SWEEPS)
-
-
-def _closest(surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the points of some faces that are closest to given ones, and the normals there, both [n, 3]."""
-    target = wp.Mesh(surface.array(x, wp.vec3), surface.array(surface.mesh.faces[faces].ravel(), int))
-    closest, normals = (wp.empty(len(points), dtype=wp.vec3, device=surface.device) for _ in range(2))
-    launch(
-        find_closest,
-        len(points),
-        inputs=[target.id, surface.array(points, wp.vec3)],
-        outputs=[closest, normals],
-        device=surface.device,
-    )
-    return closest.numpy().astype(np.float64), normals.numpy().astype(np.float64)

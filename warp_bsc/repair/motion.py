@@ -6,9 +6,9 @@ import numpy as np
 
 from ..detection.collisions import Collisions
 from ..detection.mesh import CollisionMesh
-from .surface import Surface
+from .surface import Surface, differ
 
-__all__ = ["Contacts", "as_contacts", "move_freely", "near_contacts", "projected", "push_apart"]
+__all__ = ["Contacts", "as_contacts", "move_freely", "near_pairs", "projected", "push_apart"]
 
 _PROJECTIONS = 6
 """Detections after which contacts no longer slide, but stop."""
@@ -25,7 +25,8 @@ _LEAST_TIME = 0.05
 _SWEEPS = 4
 _LEAST_MOBILITY = 0.05
 """Sum of squared weights below which a contact counts as one that hardly moves."""
-_PUSHES = 20
+_PATIENCE = 4
+"""Pushes without fewer near pairs after which the search ends."""
 _KEY = np.array([2**31, 1])
 """Makes one number of the numbers of two elements."""
 
@@ -73,7 +74,7 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
     """
     stopped = np.zeros(len(start), dtype=bool)
     known: list[Contacts] = []
-    near = near_contacts(surface, start).keys if surface.min_distance else np.zeros(0, dtype=np.int64)
+    near = near_pairs(surface, start)
     for detection in range(_DETECTIONS):
         contacts = _contacts(surface, start, goal, near)
         if not len(contacts.toi):
@@ -92,18 +93,25 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
 
 
 def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
-    """Returns positions at which pairs are the minimum distance apart, as far as they get there without a collision."""
-    count = None
-    for _ in range(_PUSHES):
-        near = near_contacts(surface, x)
-        if not len(near.keys) or (count is not None and len(near.keys) >= count):
+    """Returns positions with the fewest pairs nearer than the minimum distance that are reached without a collision."""
+    best, fewest, since = x, None, 0
+    while since < _PATIENCE:
+        near = _near_contacts(surface, x)
+        since += 1
+        if fewest is None or len(near.keys) < fewest:
+            best, fewest, since = x, len(near.keys), 0
+        if not len(near.keys):
             break
-        count = len(near.keys)
         x, _ = move_freely(surface, x, surface.rounded(projected(surface.fixed, x, near)))
-    return x
+    return best
 
 
-def near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
+def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
+    """Returns a number for each pair that is at most the minimum distance apart at positions in units, int64."""
+    return _near_contacts(surface, x).keys if surface.min_distance else np.zeros(0, dtype=np.int64)
+
+
+def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
     positions = surface.positions(x)
     found = surface.distance_detector.detect(positions, positions)
@@ -126,8 +134,8 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         too_near = as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
-    moves = (start != goal).any(axis=1)
-    return contacts.rows(moves[contacts.vertices].any(axis=1))
+    moves = differ(start, goal)
+    return contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1)))
 
 
 def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float) -> Contacts:

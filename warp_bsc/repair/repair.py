@@ -10,19 +10,15 @@ from ..detection.mesh import CollisionMesh
 from ..detection.start import checked_device
 from .approach import approach
 from .arguments import checked_layers, checked_mask, host
-from .contours import connected_components, trace_contours
 from .elastic import Springs
+from .free import free, restore_parts
 from .layers import separate_layers
-from .motion import near_contacts, push_apart
-from .results import RepairResult, UnresolvedContour
-from .surface import Surface, weld_borders
-from .untangle import are_fixed, untangle
+from .motion import near_pairs
+from .results import RepairResult
+from .surface import Surface, differ, weld_borders, welded
+from .unresolved import unresolved_contours
 
 __all__ = ["repair"]
-
-_FIXED = "both of its sides are fixed"
-_BORDER = "it runs from border to border, so that both sides may be the right one: order or x_previous would tell"
-_NOT_FOUND = "no positions without it were found"
 
 
 def repair(
@@ -62,8 +58,8 @@ def repair(
             [vertex_count], -1 for those that have none. The faces of a layer must point to the layers outside it.
         x_previous: A configuration that does not cross, such as the frame before, of the shape and type of ``x``. It
             tells which side is which: the result is reached from it without a collision.
-        min_distance: Distance that elements keep, in the unit of the positions: 0 or at least 2^-1021. Pairs that were
-            nearer in the input need not.
+        min_distance: Distance that elements keep, in the unit of the positions: 0 or at least 2^-1021. What is nearer
+            is moved apart as far as that is possible; ``RepairResult.near`` tells.
         max_strain: Largest change of the length of an edge that is sought, as a share of its length in ``x``, more than
             0. The result may exceed it where nothing else is free; ``RepairResult.max_strain`` tells.
         device: Warp device for given faces; default: Warp's default. A mesh has its own.
@@ -95,29 +91,33 @@ def repair(
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
     weld = weld_borders(mesh, np.hstack([given, previous]), _labels(mesh, layer))
-    welded_mesh = _welded(mesh, weld)
+    welded_mesh = welded(mesh, weld)
     is_fixed = np.bincount(weld, fixed_mask, len(given)) > 0
     surface = Surface(welded_mesh, given, is_fixed, distance)
     before = surface.crossings(surface.home)
     history = None if x_previous is None else surface.in_units(previous)
     if history is not None and (count := len(surface.crossings(history))):
         raise ValueError(f"x_previous must not cross, but {count} edges meet faces in it")
+    near_before = near_pairs(surface, surface.home)
     final = surface.home
-    if len(before):
+    if len(before) or len(near_before):
         final = _repaired(surface, before, history, layer if order is not None else None, strain)
-    crossings = surface.crossings(final)
+    crossings, near = surface.crossings(final), near_pairs(surface, final)
+    if (len(crossings), len(near)) >= (len(before), len(near_before)):
+        final, crossings, near = surface.home, before, near_before
     positions = surface.positions(final)[weld]
-    has_moved = (final != surface.home).any(axis=1)[weld]
+    has_moved = differ(final, surface.home)[weld]
     result = np.where(has_moved[:, None], positions, given)
-    keeps = not surface.min_distance or _keeps_distance(surface, final)
     return RepairResult(
         x=_as_given(result, x),
-        certified=not len(crossings) and keeps,
+        certified=not len(crossings) and bool(np.isin(near, near_before).all()),
         crossings_before=len(before),
         crossings=len(crossings),
+        near_before=len(near_before),
+        near=len(near),
         moved=surface.moves(final)[weld] * surface.unit,
         max_strain=surface.strain(final),
-        unresolved=_unresolved(surface, mesh, weld, crossings),
+        unresolved=unresolved_contours(surface, mesh, weld, crossings),
     )
 
 
@@ -138,91 +138,22 @@ def _labels(mesh: CollisionMesh, layer: np.ndarray) -> np.ndarray:
     return np.column_stack([layer, np.zeros_like(layer) if mesh.world is None else mesh.world])
 
 
-def _welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
-    """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers."""
-    if mesh.radius is None and not mesh.only_free and (weld == np.arange(len(weld))).all():
-        return mesh
-    edges = weld[mesh.edges[mesh.free_edges]]
-    return CollisionMesh(
-        weld[mesh.faces],
-        mesh.vertex_count,
-        edges=edges[edges[:, 0] != edges[:, 1]],
-        world=mesh.world,
-        device=mesh.device,
-    )
-
-
 def _repaired(
     surface: Surface, before: np.ndarray, history: np.ndarray | None, layer: np.ndarray | None, max_strain: float
 ) -> np.ndarray:
-    """Returns the best positions for an input that crosses, in units of the surface."""
+    """Returns the best positions that are found for an input, in units of the surface; they may be worse."""
     if history is not None:
         reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
         # fixed vertices that contact keeps from their places cannot stay elsewhere
         if (reached == surface.home)[surface.fixed].all():
             return reached
-    if layer is None:
-        start, crossings = surface.home, before
-    else:
-        start = separate_layers(surface, layer)
-        crossings = surface.crossings(start)
-    untangled = untangle(surface, start, crossings)
-    x = untangled.x
-    springs = Springs(surface, untangled.movable if layer is None else ~surface.fixed)
-    if surface.min_distance:
-        x = push_apart(surface, x)
-    x = approach(surface, x, springs, max_strain)
+    start = surface.home if layer is None else separate_layers(surface, layer)
+    x = free(surface, start, max_strain, movable=None if layer is None else ~surface.fixed)
     left = surface.crossings(x)
-    if len(left):
-        x = _restored(surface, x, before, left)
-        left = surface.crossings(x)
-    return x if len(left) < len(before) else surface.home
-
-
-def _restored(surface: Surface, x: np.ndarray, before: np.ndarray, left: np.ndarray) -> np.ndarray:
-    """Returns positions in which parts that still have most of their crossings are as in the input.
-
-    A part is connected by vertices that have moved and by crossings.
-    """
-    mesh = surface.mesh
-    moved = (x != surface.home).any(axis=1)
-    links = [mesh.edges[moved[mesh.edges].all(axis=1)]]
-    for crossings in (before, left):
-        ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
-        links += [np.stack([ends[:, i], other], axis=1) for i in (0, 1) for other in corners.T]
-    part = connected_components(len(x), np.concatenate(links))
-    counts = [np.bincount(part[mesh.edges[crossings[:, 0], 0]], minlength=len(x)) for crossings in (before, left)]
-    restored = np.where((2 * counts[1] > counts[0])[part][:, None], surface.home, x)
+    restored = restore_parts(surface, x, (before, left)) if len(left) else x
     return restored if len(surface.crossings(restored)) <= len(before) else x
 
 
 def _as_given(result: np.ndarray, x: np.ndarray | wp.array) -> np.ndarray | wp.array:
     """Returns positions as a Warp array where the input was one, of its type and on its device."""
     return wp.array(result, dtype=x.dtype, device=x.device) if isinstance(x, wp.array) else result
-
-
-def _unresolved(
-    surface: Surface, mesh: CollisionMesh, weld: np.ndarray, crossings: np.ndarray
-) -> tuple[UnresolvedContour, ...]:
-    """Returns the contours of crossings, with the edges of the given mesh."""
-    if not len(crossings):
-        return ()
-    contours = trace_contours(surface.mesh, crossings)
-    fixed = are_fixed(surface, crossings)
-    # an edge of the given mesh for each one of the welded mesh
-    n = len(weld)
-    keys = np.sort(weld[mesh.edges], axis=1).astype(np.int64) @ np.array([n, 1])
-    unique, first = np.unique(keys, return_index=True)
-    welded_keys = surface.mesh.edges[crossings[:, 0]].astype(np.int64) @ np.array([n, 1])
-    elements = np.column_stack([first[np.searchsorted(unique, welded_keys)], crossings[:, 1]]).astype(np.int32)
-    found = []
-    for number, kind in enumerate(contours.kinds):
-        rows = contours.number == number
-        reason = _FIXED if fixed[rows].all() else _BORDER if kind == "border" else _NOT_FOUND
-        found.append(UnresolvedContour(elements[rows][np.lexsort(elements[rows].T[::-1])], kind, reason))
-    return tuple(found)
-
-
-def _keeps_distance(surface: Surface, x: np.ndarray) -> bool:
-    """Returns whether no pair is nearer than the minimum distance that was not so in the input."""
-    return not len(np.setdiff1d(near_contacts(surface, x).keys, near_contacts(surface, surface.home).keys))

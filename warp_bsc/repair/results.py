@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from ..detection.mesh import CollisionMesh
+from ..response.inside import Inside
 from .contours import ContourKind
 
-__all__ = ["RepairResult", "UnresolvedContour"]
+__all__ = ["RepairResult", "StateRepairResult", "UnresolvedContour"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,9 @@ class RepairResult:
             moved vertex keeps the minimum distance, or the distance of the input if that was less.
         crossings_before: Number of edges that meet a face in the input, each counted once a face.
         crossings: Number of those in ``x``, never more.
+        near_before: Number of pairs of elements that are at most the minimum distance apart in the input, 0 without
+            one. Neighbours do not count, see :class:`warp_bsc.CollisionDetector`.
+        near: Number of those in ``x``.
         moved: Distance of each vertex from its input, in the unit of the positions, float64, shape [vertex_count].
         max_strain: Largest change of the length of an edge, as a share of its length in the input.
         unresolved: The contours that are left.
@@ -45,6 +50,31 @@ class RepairResult:
     certified: bool
     crossings_before: int
     crossings: int
+    near_before: int
+    near: int
     moved: np.ndarray
     max_strain: float
     unresolved: tuple[UnresolvedContour, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class StateRepairResult(RepairResult):
+    """The result of :func:`warp_bsc.repair_state`. Rows of arrays are particles.
+
+    Pairs of which no vertex can move do not count: two shapes, or what is kinematic.
+
+    Attributes:
+        inside_before: Number of particles inside rigid shapes, soft bodies and the solids of infinite planes in the
+            input; one that is inside several counts for each.
+        inside: Those in ``x``, see :class:`warp_bsc.response.inside.Inside`.
+        inverted_before: Number of tetrahedra whose volume is not positive in the input.
+        inverted: Number of those in ``x``. A tetrahedron that has a positive volume keeps one.
+        mesh: The mesh of ``UnresolvedContour.elements``: the particles, then the vertices of shapes, then four for each
+            infinite plane and world.
+    """
+
+    inside_before: int
+    inside: Inside
+    inverted_before: int
+    inverted: int
+    mesh: CollisionMesh

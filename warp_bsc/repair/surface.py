@@ -8,7 +8,7 @@ import warp as wp
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["Surface", "weld_borders"]
+__all__ = ["Surface", "differ", "weld_borders", "welded"]
 
 
 def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) -> np.ndarray:
@@ -32,20 +32,51 @@ def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) 
     return weld
 
 
+def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
+    """Returns the mesh whose faces and edges use no vertex that is welded to another one, with the same numbers."""
+    if mesh.radius is None and not mesh.only_free and (weld == np.arange(len(weld))).all():
+        return mesh
+    edges = weld[mesh.edges[mesh.free_edges]]
+    return CollisionMesh(
+        weld[mesh.faces],
+        mesh.vertex_count,
+        edges=edges[edges[:, 0] != edges[:, 1]],
+        points=weld[mesh.points],
+        world=mesh.world,
+        device=mesh.device,
+    )
+
+
+def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns which rows of two arrays of vectors differ, bool, shape [n]."""
+    return (a[:, 0] != b[:, 0]) | (a[:, 1] != b[:, 1]) | (a[:, 2] != b[:, 2])  # faster than any(axis=1)
+
+
 class Surface:
     """A mesh without doubled vertices, the input, and what must stay. Positions are in units of its size.
 
     Attributes:
         mesh: The mesh, in which no face uses a doubled vertex.
+        edges: Vertices of the edges of the mesh, then of the other edges of tetrahedra, int, shape [m, 2].
+        ends: The first and the second vertices of the edges, shape [2, m].
         home: Input positions, in units, float64, shape [n, 3].
-        fixed: Vertices that stay, and those that no face uses, bool, shape [n].
+        fixed: Vertices that stay, and those that no element uses, bool, shape [n].
         unit: The unit, a power of 2, in the unit of the input.
-        lengths: Length of each edge of the input, in units, float64.
+        lengths: Length of each of the edges in the input, in units, float64, shape [m].
         edge: Median length of the edges.
         min_distance: Distance that elements keep, in units, 0 for none.
     """
 
-    def __init__(self, mesh: CollisionMesh, x: np.ndarray, fixed: np.ndarray, min_distance: float = 0.0):
+    def __init__(
+        self,
+        mesh: CollisionMesh,
+        x: np.ndarray,
+        fixed: np.ndarray,
+        min_distance: float = 0.0,
+        *,
+        tetrahedra: np.ndarray | None = None,
+        counts_fixed: bool = True,
+    ):
         """Prepares detection.
 
         Args:
@@ -53,18 +84,25 @@ class Surface:
             x: Input positions, finite, float32 or float64, shape [n, 3].
             fixed: Vertices that stay, bool, shape [n].
             min_distance: Distance that elements keep, in the unit of the input.
+            tetrahedra: Vertices of tetrahedra, whose inner vertices follow, int, shape [m, 4]; default: none.
+            counts_fixed: Whether an edge and a face count as crossing if all of their vertices stay.
         """
-        self.mesh, self._dtype = mesh, x.dtype
+        self.mesh, self._dtype, self._counts_fixed = mesh, x.dtype, counts_fixed
+        self.edges = mesh.edges
         is_used = np.zeros(len(x), dtype=bool)
         is_used[mesh.vertices] = True
-        used = x[mesh.vertices].astype(np.float64)
+        if tetrahedra is not None and len(tetrahedra):
+            is_used[tetrahedra] = True
+            self.edges = _with_edges_of(tetrahedra, mesh.edges, len(x))
+        self.ends = np.ascontiguousarray(self.edges.T)
+        used = x[is_used].astype(np.float64)
         size = float(np.max(used.max(axis=0) - used.min(axis=0))) if len(used) else 0.0
         self.unit = 2.0 ** np.floor(np.log2(size)) if size > 0.0 else 1.0
         self._input, self._is_used = x, is_used[:, None]
         self.home = self.in_units(x)
         self.min_distance = min_distance / self.unit
         self.fixed = fixed | ~is_used
-        self.lengths = self.edge_lengths(self.home)
+        self.lengths = self._lengths_of(self.home, slice(None))
         self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
         self.detector = CollisionDetector(mesh)
         self._finder = self.detector.intersection_finder()
@@ -78,14 +116,16 @@ class Surface:
         """Returns positions in units, float64; 0 for vertices that are not used."""
         return np.where(self._is_used, x, 0.0).astype(np.float64) / self.unit
 
-    def edge_lengths(self, x: np.ndarray) -> np.ndarray:
-        """Returns the length of each edge at positions in units."""
-        return np.linalg.norm(x[self.mesh.edges[:, 1]] - x[self.mesh.edges[:, 0]], axis=1)
-
     def strain(self, x: np.ndarray) -> float:
         """Returns the largest change of the length of an edge, as a share of its length in the input."""
-        change = np.abs(self.edge_lengths(x) - self.lengths)
-        return float((change / np.where(self.lengths > 0.0, self.lengths, np.inf)).max(initial=0.0))
+        moved = differ(x, self.home)
+        (rows,) = np.nonzero(moved[self.ends[0]] | moved[self.ends[1]])
+        change = np.abs(self._lengths_of(x, rows) - self.lengths[rows])
+        return float((change / np.where(self.lengths[rows] > 0.0, self.lengths[rows], np.inf)).max(initial=0.0))
+
+    def _lengths_of(self, x: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
+        """Returns the lengths of some edges at positions in units."""
+        return np.linalg.norm(x[self.ends[1][rows]] - x[self.ends[0][rows]], axis=1)
 
     def moves(self, x: np.ndarray) -> np.ndarray:
         """Returns how far each vertex is from its input, in units."""
@@ -102,7 +142,13 @@ class Surface:
 
     def crossings(self, x: np.ndarray) -> np.ndarray:
         """Returns the edges that meet faces at positions in units, exactly, as returned: (edge, face), shape [n, 2]."""
-        return self._finder.find(self.positions(x)).pairs
+        pairs = self._finder.find(self.positions(x)).pairs
+        return pairs if self._counts_fixed else pairs[~self.are_fixed(pairs)]
+
+    def are_fixed(self, crossings: np.ndarray) -> np.ndarray:
+        """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
+        ends, corners = self.mesh.edges[crossings[:, 0]], self.mesh.faces[crossings[:, 1]]
+        return np.asarray(self.fixed[ends].all(axis=1) & self.fixed[corners].all(axis=1))
 
     @property
     def device(self) -> wp.Device:
@@ -112,3 +158,11 @@ class Surface:
     def array(self, values: np.ndarray, dtype: type = wp.vec3d) -> wp.array:
         """Returns an array on the device."""
         return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _with_edges_of(tetrahedra: np.ndarray, edges: np.ndarray, count: int) -> np.ndarray:
+    """Returns edges, then those of tetrahedra that are not among them, each with the smaller vertex first."""
+    sides = np.sort(tetrahedra[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2), axis=1)
+    sides = np.unique(sides, axis=0)
+    key = np.array([count, 1])
+    return np.concatenate([edges, sides[~np.isin(sides @ key, edges.astype(np.int64) @ key)]])

@@ -14,11 +14,11 @@ import warp as wp
 
 from ..detection.launch import launch
 from .contours import faces_of_edges, trace_contours
-from .elastic import Springs, near
+from .elastic import Springs, within
 from .kernels import contour_gradients
 from .surface import Surface
 
-__all__ = ["Untangled", "are_fixed", "untangle"]
+__all__ = ["Untangled", "untangle"]
 
 _STEP = 0.25
 """Distance by which an edge and a face move apart in an iteration, in edges."""
@@ -27,6 +27,11 @@ _RINGS = 10
 _MORE_RINGS = 4
 _SPREAD_SWEEPS = 6
 _RELAX_SWEEPS = 10
+_STUCK = 10
+"""Iterations without fewer crossings after which every other one smooths the surface around them."""
+_SMOOTHING_SWEEPS = 3
+_LONGEST_END = 8
+"""Edges of a strand, such as a rope, that may be drawn through a face."""
 _PATIENCE = 40
 """Iterations without fewer crossings after which the search ends."""
 
@@ -50,34 +55,34 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     """Returns positions with the fewest crossings that are found from a start.
 
     In turn, each edge leaves its face along its own gradient of the contour's length, and all edges of a contour along
-    their mean. The moves spread over the surface, and springs restore its lengths and angles.
+    their mean. The moves spread over the surface, and springs restore its lengths and angles. What remains are mostly
+    folds that are smaller than a few elements, whose contours have no side to go to: these are smoothed away.
 
     Args:
         surface: The surface.
         x: The start, in units of the surface, shape [n, 3].
         crossings: What crosses there, (edge, face), shape [m, 2].
     """
-    movable = near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
-    springs = Springs(surface, movable)
+    movable = np.zeros(len(x), dtype=bool)
+    inner, springs = movable, Springs(surface, movable)
     best, since, iteration = Untangled(x, crossings, movable), 0, 0
-    while not are_fixed(surface, crossings).all() and since < _PATIENCE:
-        needed = near(surface, _vertices_of(surface, crossings), _RINGS)
-        if (needed & ~movable).any():
-            movable = movable | near(surface, _vertices_of(surface, crossings), _RINGS + _MORE_RINGS)
+    while not surface.are_fixed(crossings).all() and since < _PATIENCE:
+        vertices = _vertices_of(surface, crossings)
+        if not inner[vertices].all():
+            inner = inner | within(surface, vertices, _MORE_RINGS)
+            movable = movable | (within(surface, vertices, _RINGS + _MORE_RINGS) & ~surface.fixed)
             springs = Springs(surface, movable)
-        moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
-        x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
+        if since >= _STUCK and since % 2 == 0:
+            x = springs.spread(x, ~within(surface, vertices, 1), _SMOOTHING_SWEEPS)
+        else:
+            moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
+            x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
         x = surface.rounded(x)
         crossings = surface.crossings(x)
         iteration, since = iteration + 1, since + 1
         if len(crossings) < len(best.crossings):
             best, since = Untangled(x, crossings, movable), 0
     return best
-
-
-def are_fixed(surface: Surface, crossings: np.ndarray) -> np.ndarray:
-    """Returns whether all vertices of edges and faces that cross are fixed, bool, shape [m]."""
-    return np.all(surface.fixed[_vertices_of(surface, crossings).reshape(-1, 5)], axis=1)
 
 
 def _vertices_of(surface: Surface, crossings: np.ndarray) -> np.ndarray:
@@ -99,6 +104,9 @@ def _contour_moves(
     mesh = surface.mesh
     ends, corners = mesh.edges[crossings[:, 0]], mesh.faces[crossings[:, 1]]
     along, coordinates, direction = _gradients(surface, x, crossings)
+    strands = np.isin(crossings[:, 0], mesh.free_edges)
+    if strands.any():
+        direction[strands] = _ways_to_ends(surface, x, ends[strands])
     if whole:
         contours = trace_contours(mesh, crossings)
         sign = np.where(contours.sign < 0, -1.0, 1.0)[:, None]
@@ -118,6 +126,23 @@ def _contour_moves(
     given = np.zeros(len(x), dtype=bool)
     given[vertices] = True
     return total / np.maximum(weight, 0.5)[:, None], given & ~surface.fixed
+
+
+def _ways_to_ends(surface: Surface, x: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Returns the directions in which edges without faces leave a face: away from the end of their strand.
+
+    A direction is 0 if no end is near. Shape [m, 3].
+    """
+    mesh = surface.mesh
+    strands = mesh.edges[mesh.free_edges]
+    rings = np.where(np.bincount(strands.ravel(), minlength=len(x)) == 1, 0, _LONGEST_END)
+    rings[mesh.faces] = _LONGEST_END
+    for _ in range(_LONGEST_END):
+        nearer = rings[strands].min(axis=1) + 1
+        np.minimum.at(rings, strands, np.repeat(nearer[:, None], 2, axis=1))
+    first, second = rings[ends].T
+    way = (x[ends[:, 1]] - x[ends[:, 0]]) * np.sign(second - first)[:, None]
+    return way / np.maximum(np.linalg.norm(way, axis=1), 1e-30)[:, None]
 
 
 def _gradients(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,6 +14,11 @@ from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
 from .tuning import MAX_STRAIN
 
+_CROSSINGS_WARNING = (
+    "edges pass through faces at the start of a step, and their contacts are left to the solver: "
+    "warp_bsc.repair_state(model, state) moves them apart before the first step"
+)
+
 
 @wp.struct
 class StepTotals:
@@ -29,6 +34,7 @@ class StepTotals:
     remaining: wp.array[wp.int64]
     excluded: wp.array[wp.int64]
     strained_steps: wp.array[wp.int64]
+    crossing_steps: wp.array[wp.int64]
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
 
@@ -49,6 +55,7 @@ class Totals:
         remaining: Sum of :attr:`SolverReport.remaining`: contacts that were passed, in steps not certified.
         excluded: Sum of :attr:`SolverReport.excluded`; a pair counts in each step in which it has a contact.
         strained_steps: Steps in which :attr:`SolverReport.strain` was more than 0.2.
+        crossing_steps: Steps at whose start :attr:`SolverReport.crossings` was more than 0.
     """
 
     steps: int
@@ -61,6 +68,7 @@ class Totals:
     remaining: int
     excluded: int
     strained_steps: int
+    crossing_steps: int
 
 
 @dataclass(frozen=True)
@@ -104,30 +112,39 @@ class SolverReport:
         self.last_strain = wp.zeros(1, dtype=float, device=work.device)
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
         self.device_totals = views_of(StepTotals, self.total_values)
-        self._strained = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)  # steps, on the host
-        self._has_warned = False
+        self._host_totals = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)
+        self._said: set[str] = set()  # the warnings that have been given
         self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
 
-    def copy_strained(self) -> None:
-        """Copies the number of strained steps to the host, without waiting for the device, also in a CUDA graph."""
-        wp.copy(self._strained, self.device_totals.strained_steps)
+    def copy_totals(self) -> None:
+        """Copies the totals to the host, without waiting for the device, also in a CUDA graph."""
+        wp.copy(self._host_totals, self.total_values)
 
-    def warn_if_strained(self) -> None:
-        """Warns once after a step whose :attr:`strain` is more than 0.2, as the host knows it; waits only to warn."""
-        if self._has_warned or not self._strained.numpy()[0]:
-            return
-        self._has_warned = True
+    def warn(self) -> None:
+        """Warns once of a step whose :attr:`strain` is more than 0.2, and once of a start that crosses itself.
+
+        Known is what the host knows already; the device is only waited for to warn.
+        """
+        known = dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True))
+        if known["strained_steps"]:
+            self._warn_once("strain", self._strain_warning)
+        if known["crossing_steps"] and self._responds:
+            self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
+
+    def _warn_once(self, subject, message):
+        if subject not in self._said:
+            self._said.add(subject)
+            warnings.warn(message(), stacklevel=6)
+
+    def _strain_warning(self):
         advice = "take shorter steps"
         if self.substeps_omitted is not None:
             advice += f" (substeps='auto' takes none: {self.substeps_omitted})"
         elif not self.totals.substepped_steps:
             advice += ", or pass substeps='auto'"
-        limit = float(MAX_STRAIN)
-        warnings.warn(
-            f"contacts strained an edge by more than {limit:.0%} in a step, as its solver does not see them: {advice}",
-            stacklevel=5,
-        )
+        cause = "as its solver does not see them"
+        return f"contacts strained an edge by more than {float(MAX_STRAIN):.0%} in a step, {cause}: {advice}"
 
     @property
     def certified(self) -> bool:
@@ -139,7 +156,7 @@ class SolverReport:
         step with a start position that is not finite is not certified; without a response, neither is one with such an
         end. :attr:`uncertified_vertices` lists the particles concerned.
         """
-        self.warn_if_strained()
+        self.warn()
         return bool(_read(self._work.results[Result.CERTIFIED]))
 
     @property
@@ -340,7 +357,7 @@ class SolverReport:
         if self.speed_limit_lifted:
             line += ", without VBD's speed limit"
         if self.crossings:
-            line += f", {self.crossings} crossings at the start"
+            line += f", {self.crossings} crossings at the start (warp_bsc.repair_state removes them)"
         if totals.remaining or totals.excluded:
             line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
         if totals.not_finite_steps:

@@ -89,7 +89,7 @@ class CollisionStage(CouplingHooks):
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
         if not self.mesh.device.is_capturing:
-            self.report.warn_if_strained()
+            self.report.warn()
 
     def _check_tape(self, tape, state_in, state_out):
         """Raises an error if the step cannot be recorded on a tape."""
@@ -109,7 +109,7 @@ class CollisionStage(CouplingHooks):
     def _count_step(self):
         work, report = self._work, self.report
         work.launch(count_step, 1, [work.status, report.last_substeps, report.last_strain], [report.device_totals])
-        report.copy_strained()
+        report.copy_totals()
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""

@@ -1,0 +1,217 @@
+"""Measures repairs: what they free, how far they move and strain it, their time, and whether others agree."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+
+from ..detection.mesh import CollisionMesh
+from ..repair.repair import repair
+from ..repair.results import RepairResult
+from . import ipc_toolkit
+from .repair_scenes import TangledMesh
+
+__all__ = [
+    "CROSSING_RANGES",
+    "FILE",
+    "HINTS",
+    "KNOWN_MESH",
+    "STRAIN",
+    "DamageSummary",
+    "Hint",
+    "RepairAttempt",
+    "RepairRun",
+    "measure_repair",
+    "summarize",
+]
+
+Hint = Literal["none", "order", "x_previous"]
+"""What a repair is told: nothing; which layer is inside which; positions that do not cross."""
+
+HINTS: tuple[Hint, ...] = ("order", "x_previous")
+"""The hints with which a mesh is repaired again that was not freed without one."""
+
+KNOWN_MESH, FILE = "known", "file"
+"""Kinds of meshes beside those of random damage."""
+
+STRAIN = 0.1
+"""Strain that :func:`warp_bsc.repair` seeks by default, above which meshes are counted."""
+
+CROSSING_RANGES = ((0, 49), (50, 149), (150, 499), (500, None))
+"""Least and largest numbers of crossings of the groups in which random damage is counted."""
+
+
+@dataclass(frozen=True)
+class RepairAttempt:
+    """A repair of a mesh.
+
+    Attributes:
+        hint: What it was told.
+        crossings: Edges that meet faces afterwards, each counted once a face.
+        certified: Whether the repair certifies that there are none.
+        largest_move: Largest distance of a vertex from the input, in median edge lengths of the input.
+        mean_move: Mean distance of the vertices that moved, in the same unit; 0 if none did.
+        strain: Largest change of the length of an edge, as a share of its length in the input.
+        seconds: Time of a second call with the same arguments, which makes its mesh from faces and has the positions
+            on the host [s].
+        reasons: Why crossings are left, each reason once.
+        toolkit_crosses: Whether the IPC Toolkit finds intersections afterwards; None if it is not installed.
+    """
+
+    hint: Hint
+    crossings: int
+    certified: bool
+    largest_move: float
+    mean_move: float
+    strain: float
+    seconds: float
+    reasons: tuple[str, ...]
+    toolkit_crosses: bool | None
+
+    @property
+    def toolkit_agrees(self) -> bool | None:
+        """Whether the IPC Toolkit finds intersections where this repair counts crossings; None if not installed."""
+        return None if self.toolkit_crosses is None else self.toolkit_crosses == (self.crossings > 0)
+
+
+@dataclass(frozen=True)
+class RepairRun:
+    """The repairs of a mesh.
+
+    Attributes:
+        kind: :data:`KNOWN_MESH`, :data:`FILE`, or the kind of random damage.
+        name: The name of a known mesh, the path of a file, or the number of random damage.
+        vertices: Number of vertices.
+        faces: Number of faces.
+        crossings: Edges that meet faces in the input, each counted once a face.
+        attempts: A repair without a hint; if it did not free the mesh, one with each hint that there is for it.
+        keeps_free: Whether the repair of positions that do not cross returned every bit: of those before the damage,
+            or of a file the repaired ones. None if there are none.
+    """
+
+    kind: str
+    name: str
+    vertices: int
+    faces: int
+    crossings: int
+    attempts: tuple[RepairAttempt, ...]
+    keeps_free: bool | None
+
+    def is_freed(self, *hints: Hint) -> bool:
+        """Returns whether the mesh is free without a hint, or with one of the given ones."""
+        return any(attempt.certified for attempt in self.attempts if attempt.hint in ("none", *hints))
+
+
+@dataclass(frozen=True)
+class DamageSummary:
+    """Repairs of several meshes. Moves, strains and times are those of repairs without a hint.
+
+    Attributes:
+        meshes: Number of meshes.
+        freed: Number of them that were freed without a hint.
+        freed_by_hint: Number that were freed without a hint or with this one.
+        crossings: Smallest and largest number of crossings of an input.
+        move: Median and maximum of the largest moves, in median edge lengths.
+        strain: Median and maximum of the strains.
+        strained: Number of meshes whose strain is more than :data:`STRAIN`.
+        seconds: Median time [s].
+    """
+
+    meshes: int
+    freed: int
+    freed_by_hint: dict[Hint, int]
+    crossings: tuple[int, int]
+    move: tuple[float, float]
+    strain: tuple[float, float]
+    strained: int
+    seconds: float
+
+
+def measure_repair(kind: str, name: str, mesh: TangledMesh, *, device: wp.DeviceLike = None) -> RepairRun:
+    """Repairs a mesh, first without a hint, and measures the result.
+
+    Args:
+        kind: Kind of the mesh, as of :class:`RepairRun`.
+        name: Name of the mesh.
+        mesh: The mesh.
+        device: The Warp device; default: the current one.
+    """
+    edges = CollisionMesh(mesh.faces, len(mesh.x), device="cpu").edges
+    edge = float(np.median(np.linalg.norm(mesh.x[edges[:, 0]] - mesh.x[edges[:, 1]], axis=1)))
+    first, result = _attempt("none", {}, mesh, edge, device)
+    attempts = [first]
+    if not first.certified:
+        attempts += [_attempt(hint, options, mesh, edge, device)[0] for hint, options in _hints(mesh).items()]
+    free = mesh.free if mesh.free is not None else result.x if first.certified else None
+    keeps_free = None
+    if free is not None:
+        again = repair(mesh.faces, free, fixed=mesh.fixed, device=device)
+        keeps_free = again.certified and np.asarray(again.x).tobytes() == np.asarray(free).tobytes()
+    return RepairRun(
+        kind=kind,
+        name=name,
+        vertices=len(mesh.x),
+        faces=len(mesh.faces),
+        crossings=result.crossings_before,
+        attempts=tuple(attempts),
+        keeps_free=keeps_free,
+    )
+
+
+def summarize(runs: Sequence[RepairRun]) -> DamageSummary:
+    """Returns what repairs of several meshes, at least one, have in common."""
+    firsts = [run.attempts[0] for run in runs]
+    crossings = [run.crossings for run in runs]
+    moves, strains = ([getattr(first, name) for first in firsts] for name in ("largest_move", "strain"))
+    return DamageSummary(
+        meshes=len(runs),
+        freed=sum(run.is_freed() for run in runs),
+        freed_by_hint={hint: sum(run.is_freed(hint) for run in runs) for hint in HINTS},
+        crossings=(min(crossings), max(crossings)),
+        move=(float(np.median(moves)), max(moves)),
+        strain=(float(np.median(strains)), max(strains)),
+        strained=sum(strain > STRAIN for strain in strains),
+        seconds=float(np.median([first.seconds for first in firsts])),
+    )
+
+
+def _hints(mesh: TangledMesh) -> dict[Hint, dict[str, Any]]:
+    """Returns the arguments of a repair for each hint that there is for a mesh."""
+    hints: dict[Hint, dict[str, Any]] = {}
+    if (mesh.layer >= 0).any():
+        hints["order"] = {"order": mesh.layer}
+    if mesh.free is not None:
+        hints["x_previous"] = {"x_previous": mesh.free}
+    return hints
+
+
+def _attempt(
+    hint: Hint, options: dict[str, Any], mesh: TangledMesh, edge: float, device: wp.DeviceLike
+) -> tuple[RepairAttempt, RepairResult]:
+    """Repairs a mesh twice; returns the measurement and the result of the second repair."""
+
+    def run() -> RepairResult:
+        return repair(mesh.faces, mesh.x, fixed=mesh.fixed, device=device, **options)
+
+    run()  # loads kernels
+    started = time.perf_counter()
+    result = run()
+    seconds = time.perf_counter() - started
+    moves = result.moved[result.moved > 0.0] / edge
+    attempt = RepairAttempt(
+        hint=hint,
+        crossings=result.crossings,
+        certified=result.certified,
+        largest_move=float(moves.max(initial=0.0)),
+        mean_move=float(moves.mean()) if len(moves) else 0.0,
+        strain=result.max_strain,
+        seconds=seconds,
+        reasons=tuple(dict.fromkeys(contour.reason for contour in result.unresolved)),
+        toolkit_crosses=(
+            ipc_toolkit.has_intersections(mesh.faces, np.asarray(result.x)) if ipc_toolkit.is_installed() else None
+        ),
+    )
+    return attempt, result

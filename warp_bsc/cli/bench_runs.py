@@ -1,0 +1,104 @@
+"""What benchmarks of many runs share: --json FILE, results that an interrupt keeps, and the progress of the runs."""
+
+import argparse
+import contextlib
+import json
+from collections.abc import Callable, Generator
+from typing import Any, TypeVar
+
+import warp as wp
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from .._atomic_file import STDOUT, OutputFile
+from .interrupts import INTERRUPTS
+from .tables import Console, say
+
+__all__ = ["RunsProgress", "add_json_file", "report_runs"]
+
+_Run = TypeVar("_Run")
+
+
+def add_json_file(command: argparse.ArgumentParser) -> None:
+    """Adds --json, whose file may be omitted."""
+    command.add_argument(
+        "--json",
+        metavar="FILE",
+        nargs="?",
+        const=STDOUT,
+        help="write all results as JSON to a file; without FILE, print them instead of tables",
+    )
+
+
+def report_runs(
+    measured: Generator[_Run, None, None],
+    *,
+    to_dict: Callable[..., dict[str, Any]],
+    show: Callable[..., None],
+    json_path: str | None,
+    device: wp.Device,
+) -> None:
+    """Measures all runs, prints them, and writes those that were complete if an interrupt ends it.
+
+    Args:
+        measured: Measures a run when its next element is taken.
+        to_dict: Returns runs as plain data, given a list of them, the device, and whether some are missing (partial).
+        show: Prints runs to a console, given the console and the same.
+        json_path: The value of --json.
+        device: The Warp device.
+
+    Raises:
+        OSError: If the file cannot be written.
+        KeyboardInterrupt: If an interrupt ended the measurement, after its results are written.
+    """
+    file = OutputFile(json_path) if json_path not in (None, STDOUT) else None
+    try:
+        runs: list[_Run] = []
+        interrupt = None
+        try:
+            with contextlib.closing(measured):  # takes its bar away
+                for run in measured:
+                    runs.append(run)
+        except KeyboardInterrupt as signal:
+            interrupt = signal
+        with INTERRUPTS.held():
+            settings = {"device": device, "partial": interrupt is not None}
+            found = to_dict(runs, **settings)
+            if json_path == STDOUT:
+                print(json.dumps(found))
+            else:
+                show(Console(), runs, **settings)
+            if file:
+                file.write(json.dumps(found))
+                file.commit()
+        if interrupt:
+            raise interrupt
+    finally:
+        if file:
+            file.discard()
+
+
+class RunsProgress:
+    """A bar on standard error with the run that is measured, if this is a terminal."""
+
+    def __init__(self, total: int):
+        """Makes the bar for a number of runs."""
+        console = Console(stderr=True)
+        columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._task = self._bar.add_task("Measuring", total=total)
+
+    def __enter__(self) -> "RunsProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def show(self, done: float, description: str) -> None:
+        """Shows how many runs are done, with the share of the one that is measured, and what it does."""
+        self._bar.update(self._task, completed=done, description=description)
+
+    def note(self, line: str) -> None:
+        """Prints a line above the bar, if there is one."""
+        if not self._bar.disable:
+            say(self._bar.console, line)

@@ -1,0 +1,57 @@
+"""Finds the points of a part of a surface that are closest to given ones, and where straight ways out meet it."""
+
+import numpy as np
+import warp as wp
+
+from ..detection.launch import launch
+from .kernels import find_closest, find_exits
+from .surface import Surface
+
+__all__ = ["closest_points", "exit_distances"]
+
+
+def closest_points(
+    surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the points of some faces that are closest to given ones, and the normals there, both [n, 3].
+
+    Args:
+        surface: The surface.
+        x: Its positions, in units, shape [m, 3].
+        faces: Numbers of the faces, int.
+        points: Points, in units, shape [n, 3].
+    """
+    target = _part(surface, x, faces)
+    closest, normals = (wp.empty(len(points), dtype=wp.vec3, device=surface.device) for _ in range(2))
+    launch(
+        find_closest,
+        len(points),
+        inputs=[target.id, surface.array(points, wp.vec3)],
+        outputs=[closest, normals],
+        device=surface.device,
+    )
+    return closest.numpy().astype(np.float64), normals.numpy().astype(np.float64)
+
+
+def exit_distances(
+    surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray, directions: np.ndarray
+) -> np.ndarray:
+    """Returns how far points are from some faces along directions, infinite where they meet none, shape [n, k].
+
+    Args:
+        surface: The surface.
+        x: Its positions, in units, shape [m, 3].
+        faces: Numbers of the faces, int.
+        points: Points, in units, shape [n, 3].
+        directions: Directions of length 1, shape [k, 3].
+    """
+    target = _part(surface, x, faces)
+    distances = wp.empty((len(points), len(directions)), dtype=float, device=surface.device)
+    inputs = [target.id, surface.array(points, wp.vec3), surface.array(directions, wp.vec3)]
+    launch(find_exits, distances.shape, inputs=inputs, outputs=[distances], device=surface.device)
+    return distances.numpy().astype(np.float64)
+
+
+def _part(surface: Surface, x: np.ndarray, faces: np.ndarray) -> wp.Mesh:
+    """Returns some faces as a mesh that Warp can search."""
+    return wp.Mesh(surface.array(x, wp.vec3), surface.array(surface.mesh.faces[faces].ravel(), int))

@@ -1,0 +1,68 @@
+"""Puts vertices that are inside a solid outside of it, part by part, on the shortest way that keeps a part whole."""
+
+import numpy as np
+
+from .closest import closest_points, exit_distances
+from .contours import connected_components
+from .elastic import Springs, near
+from .surface import Surface
+
+__all__ = ["leave_solid", "spread_exits"]
+
+_GAP = 0.25
+"""Distance from the solid at which a vertex is put, in edges."""
+_SAMPLES = 16
+"""Vertices of a part whose own ways out are tried as the direction of all."""
+_LONGEST = 1.5
+"""Longest way in a common direction, as a multiple of the longest way to the closest points, with which all vertices
+of a part take it. What wraps around a solid, such as a sleeve, leaves it on all sides instead."""
+_RINGS = _SWEEPS = 12
+"""Edges over which moves out of solids spread."""
+
+
+def leave_solid(surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Returns the moves of vertices inside a solid that put them outside, in units, shape [m, 3].
+
+    Args:
+        surface: The surface.
+        x: Its positions, in units, shape [n, 3].
+        faces: Numbers of the faces of the solid, int.
+        vertices: Vertices that are inside, sorted, int, shape [m].
+    """
+    closest, normals = closest_points(surface, x, faces, x[vertices])
+    ways = closest - x[vertices]
+    depths = np.linalg.norm(ways, axis=1)
+    moves = ways + _GAP * surface.edge * normals
+    is_inside = np.zeros(len(x), dtype=bool)
+    is_inside[vertices] = True
+    part = connected_components(len(x), surface.edges[is_inside[surface.edges].all(axis=1)])[vertices]
+    for number in np.unique(part):
+        (rows,) = np.nonzero(part == number)
+        deepest = depths[rows].max()
+        if deepest == 0.0:
+            continue
+        chosen = rows[np.argsort(-depths[rows], kind="stable")[np.linspace(0, len(rows) - 1, _SAMPLES).astype(int)]]
+        directions = np.concatenate([ways[chosen], ways[rows].sum(axis=0, keepdims=True)])
+        lengths = np.linalg.norm(directions, axis=1)
+        directions = directions[lengths > 0.0] / lengths[lengths > 0.0, None]
+        exits = exit_distances(surface, x, faces, x[vertices[rows]], directions)
+        longest = exits.max(axis=0)
+        best = np.argmin(longest)
+        if longest[best] <= _LONGEST * deepest:
+            moves[rows] = (exits[:, best, None] + _GAP * surface.edge) * directions[best]
+    return moves
+
+
+def spread_exits(
+    surface: Surface, x: np.ndarray, moves: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns positions after moves of some vertices that others join, and which vertices may have moved.
+
+    Args:
+        surface: The surface.
+        x: Positions, in units, shape [n, 3].
+        moves: Moves, 0 where there are none, in units, shape [n, 3].
+        moved: Vertices that they are for, bool, shape [n].
+    """
+    reach = near(surface, np.flatnonzero(moved), _RINGS)
+    return surface.rounded(x + Springs(surface, reach).spread(moves, moved, _SWEEPS)), reach
