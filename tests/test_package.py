@@ -44,7 +44,7 @@ PACKAGES = {
     "checker": {"_arguments"},
     "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names"},
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
-    "repair": {"detection", "response", "usd", "replay", "_arguments"},
+    "repair": {"detection", "response", "usd", "replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_version"},
     "bench": {"detection", "kernels", "usd", "checker", "response", "repair", "_arguments", "_private_names"},

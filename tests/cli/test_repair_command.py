@@ -1,11 +1,13 @@
 """The command ``warp-bsc repair``: errors by name, and valid partial files."""
 
 import contextlib
+import json
 import os
 import signal
 
 import pytest
 from pxr import Usd
+from replay_files import Page
 from stages import add_mesh, new_stage, save
 
 from warp_bsc.cli.main import main
@@ -32,7 +34,7 @@ def repair(path, output, *options):
     [
         (["--keep", "/None"], "--keep: no mesh matches /None"),
         (["--max-move", "0"], "--max-move"),
-        (["--separation", "x"], "--separation"),
+        (["--min-distance", "x"], "--min-distance"),
         (["--prims", "/None"], "--prims"),
     ],
 )
@@ -50,25 +52,92 @@ def test_bad_outputs(tmp_path, capsys, output):
     assert str(tmp_path / output) in capsys.readouterr().err
 
 
-def test_interrupted_repair_leaves_a_partial_layer(tmp_path, monkeypatch):
-    path = crossing_twice(tmp_path)
-    shot = __import__("warp_bsc.cli.repair", fromlist=["repair_shot"])
-    whole = shot.repair_shot
+def stop_after_one_stretch(monkeypatch, stop):
+    """Lets a function of no arguments stop the repair after its first stretch."""
+    run = __import__("warp_bsc.cli.repair_run", fromlist=["repair_shot"])
+    whole = run.repair_shot
 
-    def interrupted(*arguments, **options):
+    def stopped(*arguments, **options):
         stretches = whole(*arguments, **options)
         yield next(stretches)
-        os.kill(os.getpid(), signal.SIGINT)
+        stop()
         yield from stretches
 
-    monkeypatch.setattr(shot, "repair_shot", interrupted)
-    assert repair(path, tmp_path / "fixed.usdc") == 130
+    monkeypatch.setattr(run, "repair_shot", stopped)
+
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_interrupted_repair_leaves_a_partial_layer(tmp_path, monkeypatch):
+    path = crossing_twice(tmp_path)
+    stop_after_one_stretch(monkeypatch, interrupt)
+    assert repair(path, tmp_path / "fixed.usdc", "--report", str(tmp_path / "page.html")) == 130
+    page = Page((tmp_path / "page.html").read_text())
+    assert page.data["partial"] == "Partial: interrupted. The layer has not been replayed."
+    assert page.data["after"] is None and page.data["tiles"][0][0] == "?"
     stage = Usd.Stage.Open(str(tmp_path / "fixed.usdc"))
     facts = stage.GetRootLayer().customLayerData["repair"]
     assert facts["complete"] is False and facts["stretches"] == 1 and facts["stopped"] == "interrupted"
     assert 10 < stage.GetEndTimeCode() < 40
     assert stage.GetPrimAtPath("/World/Quad").GetAttribute("points").GetTimeSamples()[-1] == stage.GetEndTimeCode()
     assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+class Killed(BaseException):
+    """Ends a run as if the process had been killed: nothing is written after it."""
+
+
+@pytest.mark.parametrize("how", ["interrupted", "killed", "killed while it wrote"])
+def test_resumed_repair_is_the_same(tmp_path, monkeypatch, capsys, how):
+    path = crossing_twice(tmp_path)
+    whole, fixed = tmp_path / "whole.usda", tmp_path / "fixed.usda"
+    part = tmp_path / "fixed.usda.part"
+    assert repair(path, whole) == 0 and not (tmp_path / "whole.usda.part").exists()
+    with monkeypatch.context() as patch:
+        if how == "interrupted":
+            stop_after_one_stretch(patch, interrupt)
+            assert repair(path, fixed) == 130
+        else:
+            run = __import__("warp_bsc.cli.repair_run", fromlist=["RepairRun"])
+            patch.setattr(run.RepairRun, "close", lambda run: None)
+            stop_after_one_stretch(patch, lambda: (_ for _ in ()).throw(Killed))
+            with pytest.raises(Killed):
+                repair(path, fixed)
+            assert not fixed.exists()
+    if how == "killed while it wrote":
+        part.write_bytes(part.read_bytes()[:-10])
+    capsys.readouterr()
+    found = __import__("warp_bsc.cli.repair_run", fromlist=["find"])
+    activities = []
+    monkeypatch.setattr(found, "find", lambda *args, find=found.find: (activities.append(args[1]), find(*args))[1])
+    assert repair(path, fixed, "--resume", "--json") == 0
+    assert activities == []  # what the earlier run found was read
+    assert fixed.read_text() == whole.read_text() and not part.exists()
+    assert len(json.loads(capsys.readouterr().out)["stretches"]) == 2
+
+
+def test_other_options_cannot_resume(tmp_path, monkeypatch, capsys):
+    path = crossing_twice(tmp_path)
+    with monkeypatch.context() as patch:
+        stop_after_one_stretch(patch, interrupt)
+        assert repair(path, tmp_path / "fixed.usdc") == 130
+    for options, error in (
+        (["--max-move", "0.5"], "max_move was None, and is 0.5"),
+        (["--keep", "/World/Plate"], "keep was [], and is ['/World/Plate']"),
+    ):
+        assert repair(path, tmp_path / "fixed.usdc", "--resume", *options) == 2
+        assert (
+            f"fixed.usdc.part: written with other options or files; cannot resume: {error}" in capsys.readouterr().err
+        )
+    with open(path, "a") as file:
+        file.write("\n")
+    assert repair(path, tmp_path / "fixed.usdc", "--resume") == 2
+    assert "the scene's files have changed" in capsys.readouterr().err
+    (tmp_path / "fixed.usdc.part").write_text("other")
+    assert repair(path, tmp_path / "fixed.usdc", "--resume") == 2
+    assert "fixed.usdc.part: not a resumable repair of this version" in capsys.readouterr().err
 
 
 @contextlib.contextmanager

@@ -4,49 +4,14 @@ import json
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom
+from dipping import FRAMES, HIT, SIZE, dipping_sheet, points_of, quads, repaired, sheet
+from pxr import Gf, Usd, UsdGeom, UsdSkel
 from stages import add_mesh, find, new_stage, save
 
-from warp_bsc import Scene, replay
-from warp_bsc.cli.main import main
-from warp_bsc.repair.shot import BLEND, blend, find_collisions, repair_shot
-
-SIZE, FRAMES, HIT = 8, 34, 16
-
-
-def sheet(height, bump=0.0):
-    """A square sheet of quads, with a bump in its middle."""
-    y, x = np.mgrid[: SIZE + 1, : SIZE + 1] / SIZE - 0.5
-    z = height + bump * np.exp(-30.0 * (x * x + y * y))
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
-
-
-def quads():
-    corner = np.arange(SIZE)[:, None] * (SIZE + 1) + np.arange(SIZE)
-    return np.stack([corner, corner + 1, corner + SIZE + 2, corner + SIZE + 1], axis=-1).reshape(-1).tolist()
-
-
-def dipping_sheet(folder, last=FRAMES):
-    """A sheet whose middle dips through a plate below it, once."""
-    stage = new_stage(folder / "shot.usda")
-    plate = sheet(0.0) * np.float32(3.0)
-    add_mesh(stage, "/World/Plate", [tuple(map(float, point)) for point in plate], [4] * SIZE**2, quads())
-    dips = {time: -0.12 if time == HIT else 0.0 for time in range(last)}
-    points = {time: [tuple(map(float, p)) for p in sheet(0.1 + 0.001 * time, dips[time])] for time in dips}
-    add_mesh(stage, "/World/Sheet", points, [4] * SIZE**2, quads())
-    return stage
-
-
-def repaired(stage, *options, status=0):
-    path = save(stage) if isinstance(stage, Usd.Stage) else str(stage)
-    output = path.replace("shot.usda", "fixed.usdc")
-    assert main(["repair", path, "--output", output, "--device", "cpu", *options]) == status
-    return output
-
-
-def points_of(path, time, prim="/World/Sheet"):
-    stage = Usd.Stage.Open(path)
-    return np.array(UsdGeom.Mesh(stage.GetPrimAtPath(prim)).GetPointsAttr().Get(time))
+from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
+from warp_bsc.repair.blend import BLEND, blend
+from warp_bsc.repair.findings import find_collisions
+from warp_bsc.repair.shot import repair_shot
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +125,7 @@ def test_blend():
     [
         ({"keep": ("/None",)}, "keep: no mesh matches /None"),
         ({"max_move": -1.0}, "max_move"),
-        ({"separation": 0.0}, "separation"),
+        ({"min_distance": -1.0}, "min_distance"),
     ],
 )
 def test_errors_name_the_argument(dipped, options, error):
@@ -171,6 +136,91 @@ def test_errors_name_the_argument(dipped, options, error):
 
 def test_findings_know_where_a_mesh_jumps(tmp_path):
     stage = dipping_sheet(tmp_path, last=4)
-    findings = list(find_collisions(replay(Scene(save(stage)), device="cpu")))
+    scene = Scene(save(stage))
+    findings = list(find_collisions(scene, replay(scene, device="cpu")))
     assert [finding.is_joined for finding in findings] == [False, True, True]
     assert all(finding.is_free for finding in findings)
+
+
+def skinned_dipping_sheet(folder, *, by_blend_shape):
+    """The sheet of :func:`dipping_sheet`, moved by a joint or a blend shape; its skeleton stands elsewhere."""
+    stage = new_stage(folder / "shot.usda")
+    plate = sheet(0.0) * np.float32(3.0)
+    add_mesh(stage, "/World/Plate", [tuple(map(float, point)) for point in plate], [4] * SIZE**2, quads())
+    UsdSkel.Root.Define(stage, "/World/Model").AddTranslateOp().Set((0.05, 0.02, 0.3))
+    skeleton = UsdSkel.Skeleton.Define(stage, "/World/Model/Skeleton")
+    skeleton.AddRotateZOp().Set(30.0)
+    rest = Gf.Matrix4d(1.0)
+    skeleton.CreateJointsAttr(["root", "root/tip"])
+    skeleton.CreateBindTransformsAttr([rest, rest])
+    skeleton.CreateRestTransformsAttr([rest, rest])
+    animation = UsdSkel.Animation.Define(stage, "/World/Model/Animation")
+    # the binding is inherited from the root
+    binding = UsdSkel.BindingAPI.Apply(stage.GetPrimAtPath("/World/Model"))
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = add_mesh(stage, "/World/Model/Sheet", sheet(-0.1).tolist(), [4] * SIZE**2, quads())
+    own = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    bump = sheet(0.0, -1.0)[:, 2]
+    if by_blend_shape:
+        shape = UsdSkel.BlendShape.Define(stage, "/World/Model/Sheet/Dip")
+        shape.CreateOffsetsAttr([(0.0, 0.0, float(z)) for z in bump])
+        own.CreateBlendShapesAttr(["Dip"])
+        own.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath()])
+        animation.CreateBlendShapesAttr(["Dip"])
+        for time in range(FRAMES):
+            animation.CreateBlendShapeWeightsAttr().Set([0.25 if time == HIT else 0.01 * (time % 2)], time)
+    else:
+        animation.CreateJointsAttr(["root", "root/tip"])
+        animation.CreateRotationsAttr([Gf.Quatf(1.0)] * 2)
+        animation.CreateScalesAttr([Gf.Vec3h(1.0)] * 2)
+        for time in range(FRAMES):
+            down = -0.25 if time == HIT else -0.01 * (time % 2)
+            animation.CreateTranslationsAttr().Set([(0, 0, 0), (0, 0, down)], time)
+        own.CreateJointIndicesPrimvar(False, 2).Set([0, 1] * len(bump))
+        weights = [float(w) for z in bump for w in (1.0 + z, -z)]
+        own.CreateJointWeightsPrimvar(False, 2).Set(weights)
+    return stage
+
+
+@pytest.mark.parametrize("by_blend_shape", [False, True])
+def test_skinned_mesh_gets_points_of_its_own(tmp_path, capsys, by_blend_shape):
+    stage = skinned_dipping_sheet(tmp_path, by_blend_shape=by_blend_shape)
+    output = repaired(stage, "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert all(found["before"].values()) and not any(found["left"].values())
+    before, after = (list(Scene(str(path))) for path in (save(stage), output))
+    plays = Usd.Stage.Open(output)
+    cache = UsdSkel.Cache()
+    root = UsdSkel.Root(plays.GetPrimAtPath("/World/Model"))
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    assert not cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)  # nothing deforms the points a second time
+    mesh = UsdGeom.Mesh(plays.GetPrimAtPath("/World/Model/Sheet"))
+    assert len(mesh.GetPointsAttr().GetTimeSamples()) == FRAMES
+    for index in (0, 5):  # free frames play back as before
+        np.testing.assert_allclose(after[index].x0, before[index].x0, atol=1e-6)
+    assert np.abs(after[HIT].x0 - before[HIT].x0).max() > 0.01
+
+
+def test_minimum_distance_is_kept_between_samples(tmp_path, capsys):
+    stage = dipping_sheet(tmp_path, dip=-0.1)  # to 0.016 above the plate
+    repaired(stage)
+    assert "Nothing was moved" in capsys.readouterr().out
+    output = repaired(stage, "--min-distance", "0.03", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["before"]["pairs nearer than 0.03"] and not found["left"]["pairs nearer than 0.03"]
+    assert not found["stretches"][0]["uncertified"] and found["initially_near"] == 0
+    for interval in Scene(output):
+        faces, count = interval.segment.faces, interval.segment.vertex_count
+        detector = CollisionDetector(CollisionMesh(faces, count, device="cpu"), method="exact", min_distance=0.03)
+        found = detector.detect(interval.x0, interval.x1)
+        assert not len(found.vertex_face) and not len(found.edge_edge)
+
+
+def test_pairs_that_start_too_near_come_no_nearer(tmp_path, capsys):
+    stage = dipping_sheet(tmp_path)
+    repaired(stage, "--min-distance", "0.105", "--json")  # the sheet begins 0.1 above the plate
+    found = json.loads(capsys.readouterr().out)
+    assert found["initially_near"] > 0
+    distances = [points_of(tmp_path / "fixed.usdc", time)[:, 2].min() for time in (0, HIT)]
+    assert distances[0] == np.float32(0.1) and distances[1] > 0.0999

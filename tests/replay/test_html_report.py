@@ -218,15 +218,15 @@ def test_page_in_chromium(tmp_path, browser):
 def test_near_and_inside_in_chromium(near_and_inside, tmp_path, browser):
     browser.open(replay(near_and_inside, "--clearance", "0.3")[3])
     assert browser.value("document.getElementById('viewer-title').textContent").endswith(
-        "; 1 part inside at the start, 1 at the end; 1 pair near at the start, 1 at the end"
+        "; 1 part inside at the start, 1 at the end; 1 pair within the clearance at the start, 1 at the end"
     )
     legend = browser.value("document.getElementById('viewer-legend').textContent")
     assert "part of a mesh inside another" in legend and "proximity" in legend
     kinds = "[...document.querySelectorAll('#rows tr[data-at] td.kind')].map((cell) => cell.textContent)"
-    assert browser.value(kinds) == ["inside", "inside", "near", "inside", "near"]
+    assert browser.value(kinds) == ["inside", "inside", "proximity", "inside", "proximity"]
     browser.click("#rows tr[data-at]", 4)
     browser.wait("!document.getElementById('selected').hidden")
-    assert browser.value("document.getElementById('selected').textContent").startswith("near at time 2: ")
+    assert browser.value("document.getElementById('selected').textContent").startswith("proximity at time 2: ")
     assert "0.125 apart" in browser.value("document.getElementById('rows').textContent")
     assert browser.console == []
 

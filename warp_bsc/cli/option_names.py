@@ -22,7 +22,6 @@ _OPTIONS = {
         "method",
         "min_distance",
         "prims",
-        "separation",
         "subdivide",
         "validate",
         "workers",

@@ -8,7 +8,6 @@ import os
 import shlex
 import time
 from collections.abc import Generator
-from dataclasses import asdict
 from typing import Any
 
 from .._atomic_file import STDOUT, naming, unfinished_path
@@ -31,7 +30,7 @@ from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .options import Commands, add_command
 from .progress import RunProgress
-from .replay_options import DESCRIPTION, EPILOG, add_replay_options
+from .replay_options import DESCRIPTION, EPILOG, add_replay_options, describe_selection
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
@@ -331,11 +330,8 @@ def _track(
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
     """Returns the options that the results depend on, except method, device and clearance."""
-    selection = asdict(scene.selection)
-    del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
-    names = "frames", "subdivide", "strict", "allow_missing", "intersections", "ignore_initial", "validate"
-    options = {name: getattr(arguments, name) for name in names}
-    return selection | options | {"frames": asdict(arguments.frames) if arguments.frames else None}
+    names = "subdivide", "intersections", "ignore_initial", "validate"
+    return describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}
 
 
 def _read_pairs(path: str) -> list[tuple[str, str]]:

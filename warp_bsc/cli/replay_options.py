@@ -2,16 +2,18 @@
 
 import argparse
 import math
-from typing import Literal
+from dataclasses import asdict
+from typing import Any, Literal
 
 from .._atomic_file import STDOUT
 from ..replay.workers import checked_address
 from ..usd.frames import FrameRange
+from ..usd.scene import Scene
 from ..usd.selection import PURPOSES
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_detection_options, add_fail_on, distance, positive
 
-__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options", "add_scene_selection"]
+__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options", "add_scene_selection", "describe_selection"]
 
 DESCRIPTION = """\
 Find the collisions of the meshes of a USD scene, with themselves and with each
@@ -203,6 +205,14 @@ def add_scene_selection(which: argparse._ArgumentGroup) -> None:
         "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
         "may always be missing",
     )
+
+
+def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Returns the options of :func:`add_scene_selection` that results depend on, and the scene's selection, as JSON."""
+    selection = asdict(scene.selection)
+    del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
+    frames = asdict(arguments.frames) if arguments.frames else None
+    return selection | {"frames": frames, "strict": arguments.strict, "allow_missing": arguments.allow_missing}
 
 
 def _output(text: str) -> str:

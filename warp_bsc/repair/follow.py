@@ -8,19 +8,24 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
+from ..detection.detector import CollisionDetector
+from ..detection.mesh import CollisionMesh
 from ..response.solver_ccd import SolverCCD
 from .follow_kernels import normalize, smooth
+from .motion import Contacts, as_contacts, projected
 
 __all__ = ["FollowedFrame", "Follower"]
 
 _SWEEPS = 64, 32, 16
-"""Sweeps that spread the displacements of the first, second and third response of a step over the mesh."""
-_WIDE_SEPARATION = 0.02
-"""Distance that these responses move contacts apart, as a share of the median edge length, so that few are left."""
+"""Sweeps that spread the displacements by the first contacts of a step over the mesh, by the second ones, and so on."""
+_DETECTIONS = 4
+"""Detections after which contacts are not moved apart anew before their displacements are spread."""
+_PROJECTIONS = 20
+"""Sweeps over the contacts after each detection."""
+_GAP = 0.02
+"""Distance that these contacts are moved apart, as a share of the median edge length, so that few are left."""
 _SMALLEST = 1e-4
-"""Displacement, as a share of that length, that is none: a response does not reach all of a mesh."""
-_TOLERANCE = 0.02
-"""Displacement by a response, as a share of that length, that is not spread: the neighbourhood need not follow."""
+"""Displacement, as a share of that length, that is none: a contact does not reach all of a mesh."""
 _LARGEST_STEP = 1.0
 """Largest displacement of a vertex that is spread, as a share of that length."""
 
@@ -31,9 +36,9 @@ class FollowedFrame:
 
     Attributes:
         x: Positions, float32, shape [vertex_count, 3].
-        displacement: The displacements that were added to the given positions before the last response, float64, shape
-            [vertex_count, 3].
-        certified: Whether the straight motion to these positions is free of collisions.
+        displacement: The displacements that were added to the given positions before the last contacts were moved
+            apart, float64, shape [vertex_count, 3].
+        certified: Whether the straight motion to these positions is free of collisions, and keeps the distance.
     """
 
     x: np.ndarray
@@ -42,11 +47,11 @@ class FollowedFrame:
 
 
 class Follower:
-    """Moves a mesh from positions that are free to others near given ones, behind :class:`SolverCCD`.
+    """Moves a mesh from positions that are free to others near given ones.
 
-    The stage moves the vertices of contacts only, which would strain the edges around them. So its displacements are
-    spread over the mesh and added to the given positions, and the stage responds again: first widely, then less. The
-    neighbourhood of a contact then moves with it, and keeps the shape that it has in the given positions.
+    Contacts are moved apart, which would strain the edges around them. So their displacements are spread over the mesh,
+    first widely, then less, and added to the given positions: the neighbourhood of a contact moves with it, and keeps
+    the shape that it has in the given positions. What then still collides is left to :class:`SolverCCD`.
 
     Attributes:
         edges: Vertices of the edges of the movable part, the smaller first, shape [n, 2].
@@ -59,7 +64,7 @@ class Follower:
         x: np.ndarray,
         is_movable: np.ndarray,
         *,
-        separation: float | None = None,
+        min_distance: float = 0.0,
         device: wp.DeviceLike = None,
     ):
         """Makes the stages.
@@ -69,7 +74,7 @@ class Follower:
             x: Positions at the start, float, shape [vertex_count, 3].
             is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
                 move as given.
-            separation: Distance that contacts are moved apart at the end; default: that of :class:`SolverCCD`.
+            min_distance: Distance that pairs keep, see :class:`SolverCCD`.
             device: Warp device.
         """
         self._is_movable = is_movable
@@ -86,10 +91,13 @@ class Follower:
         model = builder.finalize(device=device)
         self._device = model.device
         self._playback = _Playback(model)
-        wide = max(_WIDE_SEPARATION * self.length, separation or 0.0)
-        options = {"friction": 0.0, "restitution": 0.0, "substeps": None}
-        self._wide = SolverCCD(self._playback, separation=wide, **options)
-        self._last = SolverCCD(self._playback, separation=separation, **options)
+        options = {"friction": 0.0, "restitution": 0.0, "substeps": None, "min_distance": min_distance}
+        self._stage = SolverCCD(self._playback, **options)
+        mesh = CollisionMesh(faces, len(x), device=self._device)
+        self._gaps = {CollisionDetector(mesh): _GAP * self.length}
+        if min_distance:
+            detector = CollisionDetector(mesh, min_distance=min_distance)
+            self._gaps[detector] = min_distance + _GAP * self.length
         self._start, self._end = model.state(), model.state()
         both = np.concatenate([edges, edges[:, ::-1]])
         order = np.argsort(both[:, 0], kind="stable")
@@ -100,49 +108,92 @@ class Follower:
         self._values = wp.empty(len(x), dtype=wp.vec4, device=self._device)
         self._smoothed = wp.empty_like(self._values)
         self._spread = wp.empty(len(x), dtype=wp.vec3, device=self._device)
+        options = {"device": self._device, "record_cmd": True}
+        neighbours = [self._first, self._neighbours]
+        self._two_sweeps = [
+            wp.launch(smooth, len(x), [*neighbours, values], [smoothed], **options)
+            for values, smoothed in ((self._values, self._smoothed), (self._smoothed, self._values))
+        ]
 
-    def follow(self, start: np.ndarray, given: np.ndarray, displacement: np.ndarray) -> FollowedFrame:
+    def follow(
+        self, start: np.ndarray, given: np.ndarray, displacement: np.ndarray, *, tolerance: float
+    ) -> FollowedFrame:
         """Returns positions near given ones that a straight motion reaches without a collision.
 
         Args:
             start: Positions at the start of the motion, float32, shape [vertex_count, 3].
             given: Positions to follow, float32, shape [vertex_count, 3]. Vertices that no response displaces get these
                 bit for bit.
-            displacement: Displacements to begin with, float64, shape [vertex_count, 3].
+            displacement: Displacements to begin with, float, shape [vertex_count, 3].
+            tolerance: Displacement by contacts, as a share of the median edge length, that is not spread: the
+                neighbourhood need not follow.
         """
+        best: tuple[float, FollowedFrame] | None = None
         for sweeps in _SWEEPS:
             target = _displaced(given, displacement)
-            x, certified = self._respond(self._wide, start, target)
-            residual = np.where(x == target, 0.0, x.astype(np.float64) - target)
+            x, is_free = self._moved_apart(start, target)
+            residual = x.astype(np.float64) - target
             size = np.linalg.norm(residual, axis=1, keepdims=True)
-            if certified and size.max(initial=0.0) < _TOLERANCE * self.length:
-                return FollowedFrame(x, displacement, certified)
+            unspread = float(size.max(initial=0.0))
+            if is_free and (best is None or unspread < best[0]):
+                best = unspread, FollowedFrame(x, displacement, True)
+                if unspread < tolerance * self.length:
+                    return best[1]
             largest = _LARGEST_STEP * self.length
             residual *= np.minimum(1.0, largest / np.maximum(size, largest))
             displacement = displacement + self._spread_out(residual, sweeps)
-        x, certified = self._respond(self._last, start, _displaced(given, displacement))
+        if best is not None:
+            return best[1]
+        x, certified = self._respond(start, _displaced(given, displacement))
         return FollowedFrame(x, displacement, certified)
 
-    def _respond(self, stage, start, target) -> tuple[np.ndarray, bool]:
-        """Returns the positions that a stage makes of a motion, and whether it certifies the motion to them."""
+    def _moved_apart(self, start, target) -> tuple[np.ndarray, bool]:
+        """Returns a target at which contacts are moved apart, and whether the motion to it is free of others."""
+        known: list[Contacts] = []
+        x = target
+        for _ in range(_DETECTIONS):
+            contacts, is_free = self._contacts(start, x)
+            if is_free:
+                return x, True
+            known.append(contacts)
+            goal = target.astype(np.float64)
+            x = projected(~self._is_movable, goal, Contacts.joined(known), _PROJECTIONS).astype(np.float32)
+        return x, False
+
+    def _contacts(self, start, target) -> tuple[Contacts, bool]:
+        """Returns the contacts of a motion that can be moved apart, and whether nothing collides or comes too near.
+
+        Pairs that start too near are left to the stage, which lets them come no nearer. Those of which no vertex is
+        movable do not count.
+        """
+        found, is_free = [], True
+        for detector, gap in self._gaps.items():
+            contacts = as_contacts(detector.mesh, detector.detect(start, target), gap)
+            contacts = contacts.rows(np.asarray(self._is_movable[contacts.vertices].any(axis=1)))
+            is_free &= not len(contacts.toi)
+            found.append(contacts.rows(contacts.toi > 0.0) if detector.min_distance else contacts)
+        return Contacts.joined(found), is_free
+
+    def _respond(self, start, target) -> tuple[np.ndarray, bool]:
+        """Returns the positions that the stage makes of a motion, and whether it certifies the motion to them."""
         assert self._start.particle_q is not None and self._end.particle_q is not None
         self._start.particle_q.assign(start)
         self._playback.target = target
-        stage.reset(self._start)
+        self._stage.reset(self._start)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
-            stage.step(self._start, self._end, None, None, 1.0)
-        return self._end.particle_q.numpy().copy(), stage.report.certified
+            self._stage.step(self._start, self._end, None, None, 1.0)
+        return self._end.particle_q.numpy().copy(), self._stage.report.certified
 
     def _spread_out(self, displacement, sweeps) -> np.ndarray:
         """Returns the displacements of some vertices, and of those around them."""
         weights = (displacement != 0.0).any(axis=1, keepdims=True)
         self._values.assign(np.concatenate([displacement, weights], axis=1).astype(np.float32))
-        values, smoothed, count = self._values, self._smoothed, len(weights)
-        for _ in range(sweeps):
-            wp.launch(smooth, count, [self._first, self._neighbours, values], [smoothed], device=self._device)
-            values, smoothed = smoothed, values
-        wp.launch(normalize, count, [values, sweeps, self._movable], [self._spread], device=self._device)
+        for _ in range(sweeps // 2):
+            for sweep in self._two_sweeps:
+                sweep.launch()
+        inputs = [self._values, sweeps, self._movable]
+        wp.launch(normalize, len(weights), inputs, [self._spread], device=self._device)
         spread = self._spread.numpy().astype(np.float64)
         return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < _SMALLEST * self.length, 0.0, spread)
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..detection.collisions import Collisions
+from ..detection.mesh import CollisionMesh
 from .surface import Surface, differ
 
-__all__ = ["move_freely", "near_pairs", "push_apart"]
+__all__ = ["Contacts", "as_contacts", "move_freely", "near_pairs", "projected", "push_apart"]
 
 _PROJECTIONS = 6
 """Detections after which contacts no longer slide, but stop."""
@@ -31,7 +32,7 @@ _KEY = np.array([2**31, 1])
 
 
 @dataclass(frozen=True, eq=False)
-class _Contacts:
+class Contacts:
     """Contacts of a motion, vertex-face and edge-edge ones alike.
 
     Attributes:
@@ -50,16 +51,14 @@ class _Contacts:
     toi: np.ndarray
     gap: np.ndarray
 
-    def rows(self, which: np.ndarray) -> "_Contacts":
+    def rows(self, which: np.ndarray) -> "Contacts":
         """Returns some of the contacts."""
-        return _Contacts(*(values[which] for values in vars(self).values()))
+        return Contacts(*(values[which] for values in vars(self).values()))
 
     @staticmethod
-    def joined(contacts: list["_Contacts"]) -> "_Contacts":
+    def joined(contacts: list["Contacts"]) -> "Contacts":
         """Returns the contacts of a list."""
-        return _Contacts(
-            *(np.concatenate(values) for values in zip(*(vars(c).values() for c in contacts), strict=True))
-        )
+        return Contacts(*(np.concatenate(values) for values in zip(*(vars(c).values() for c in contacts), strict=True)))
 
 
 def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +73,7 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
         goal: Likewise, as rounded to the type of the input.
     """
     stopped = np.zeros(len(start), dtype=bool)
-    known: list[_Contacts] = []
+    known: list[Contacts] = []
     near = near_pairs(surface, start)
     for detection in range(_DETECTIONS):
         contacts = _contacts(surface, start, goal, near)
@@ -83,7 +82,7 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
         stopped[contacts.vertices] = True
         if detection < _PROJECTIONS:
             known.append(contacts)
-            goal = _projected(surface, goal, _Contacts.joined(known))
+            goal = projected(surface.fixed, goal, Contacts.joined(known))
         else:
             kept = np.ones(len(start))
             np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
@@ -103,7 +102,7 @@ def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
             best, fewest, since = x, len(near.keys), 0
         if not len(near.keys):
             break
-        x, _ = move_freely(surface, x, surface.rounded(_projected(surface, x, near)))
+        x, _ = move_freely(surface, x, surface.rounded(projected(surface.fixed, x, near)))
     return best
 
 
@@ -112,14 +111,14 @@ def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
     return _near_contacts(surface, x).keys if surface.min_distance else np.zeros(0, dtype=np.int64)
 
 
-def _near_contacts(surface: Surface, x: np.ndarray) -> _Contacts:
+def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
     positions = surface.positions(x)
     found = surface.distance_detector.detect(positions, positions)
-    return _as_contacts(surface, found, surface.min_distance * _MORE_DISTANCE)
+    return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
 
 
-def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> _Contacts:
+def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
     """Returns the contacts of a motion between positions in units; pairs at rest stay as they are.
 
     Args:
@@ -129,24 +128,23 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
     """
     x0, x1 = surface.positions(start), surface.positions(goal)
-    contacts = _as_contacts(surface, surface.detector.detect(x0, x1), _GAP * surface.edge)
+    contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1), _GAP * surface.edge)
     if surface.min_distance:
         found = surface.distance_detector.detect(x0, x1)
-        too_near = _as_contacts(surface, found, surface.min_distance * _MORE_DISTANCE)
+        too_near = as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
         too_near = too_near.rows(~np.isin(too_near.keys, near))
-        contacts = _Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
+        contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
     moves = differ(start, goal)
-    return contacts.rows(moves[contacts.vertices].any(axis=1))
+    return contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1)))
 
 
-def _as_contacts(surface: Surface, found: Collisions, gap: float) -> _Contacts:
-    """Returns collisions with faces and edges in one form."""
-    mesh = surface.mesh
+def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float) -> Contacts:
+    """Returns collisions of a mesh with faces and edges in one form; ``gap`` is the distance that they are to have."""
     beta = found.vertex_face_coordinates
     s, r = found.edge_edge_coordinates[:, 0, None], found.edge_edge_coordinates[:, 1, None]
     vertex_face, edge_edge = found.vertex_face.astype(np.int64), found.edge_edge.astype(np.int64)
     toi = np.concatenate([found.vertex_face_toi, found.edge_edge_toi])
-    return _Contacts(
+    return Contacts(
         np.concatenate([vertex_face @ _KEY, -1 - edge_edge @ _KEY]),
         np.concatenate(
             [np.column_stack([vertex_face[:, 0], mesh.faces[vertex_face[:, 1]]]), mesh.edges[edge_edge].reshape(-1, 4)]
@@ -158,12 +156,19 @@ def _as_contacts(surface: Surface, found: Collisions, gap: float) -> _Contacts:
     )
 
 
-def _projected(surface: Surface, x: np.ndarray, contacts: _Contacts) -> np.ndarray:
-    """Returns positions at which contacts have their gaps along their normals: Jacobi sweeps, averaged by vertex."""
+def projected(fixed: np.ndarray, x: np.ndarray, contacts: Contacts, sweeps: int = _SWEEPS) -> np.ndarray:
+    """Returns positions at which contacts have their gaps along their normals: Jacobi sweeps, averaged by vertex.
+
+    Args:
+        fixed: Vertices that stay, bool, shape [n].
+        x: Positions, float64, shape [n, 3].
+        contacts: The contacts.
+        sweeps: Number of sweeps.
+    """
     vertices, weights, normals = contacts.vertices, contacts.weights, contacts.normals
-    movable = np.where(surface.fixed[vertices], 0.0, weights)
+    movable = np.where(fixed[vertices], 0.0, weights)
     inverse = 1.0 / np.maximum((movable**2).sum(axis=1), _LEAST_MOBILITY)
-    for _ in range(_SWEEPS):
+    for _ in range(sweeps):
         short = contacts.gap - np.einsum("ik,ikj,ij->i", weights, x[vertices], normals)
         push = np.where(short > 0.0, short * inverse, 0.0)
         moves = (movable * push[:, None])[:, :, None] * normals[:, None, :]

@@ -1,25 +1,17 @@
 """Writes a page that shows the collisions of a replay interval by interval, in one file that needs no network.
 
-The folder ``page`` contains the page's parts. Every interval is a block of compressed arrays, which the page's script
-unpacks when the interval is shown. Text from the scene's file enters the page as JSON, in which no markup can begin,
-and the script inserts it as text. The page's content security policy blocks everything else: other scripts, handlers
-in attributes, addresses.
+Every interval is a block of compressed arrays, which the page's script unpacks when the interval is shown.
 """
 
-import base64
-import hashlib
-import html
-import json
 import os
-import zlib
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..usd.scene import Scene
+from .html_page import block, fill_page, inert, shared_part, spread
 from .outputs import RecordFile
 from .page_view import choose_faces
 from .results import IntervalResult
@@ -36,11 +28,10 @@ _FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... within these bounds
 _ALL_ROWS = 600_000  # in the table, likewise; the time to open the page grows with them
 _FEWEST_ROWS, _MOST_ROWS = 100, 50_000
 _VIEW_BYTES = 64 << 20  # of all views together
-_SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
 _MAX_PAIRS = 10_000  # of meshes
 _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
-_CROSSES, _TOUCHES, _INSIDE, _PROXIMITY = range(4, 8)  # kinds of rows, after those of collisions: see data.js
+_CROSSES, _TOUCHES, _INSIDE, _PROXIMITY = range(4, 8)  # kinds of rows, after those of collisions: see rows.js
 _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "second_1")
 
 _AtRest = SceneIntersections | SceneProximities
@@ -60,25 +51,9 @@ class ReportPage(RecordFile):
             OSError: If it cannot be written.
         """
         super().__init__(path)
-        folder = resources.files("warp_bsc.replay") / "page"
-        texts = [
-            (folder / name).read_text(encoding="utf-8") for name in ("data.js", "viewer.js", "table.js", "page.js")
-        ]
-        style = (folder / "page.css").read_text(encoding="utf-8")
-        script = "\n".join(texts)
-        fields = {
-            "title": html.escape(_title(scene)),
-            "style_hash": _policy_hash(style),
-            "script_hash": _policy_hash(script),
-            "style": style,
-            "script": script,
-        }
-        # Text, name, text, name, ...: the filled-in texts may contain braces.
-        parts = (folder / "page.html").read_text(encoding="utf-8").replace("{{", "}}").split("}}")
-        filled = [fields.get(part, part) if index % 2 else part for index, part in enumerate(parts)]
-        blocks, data = filled.index("blocks"), filled.index("data")
-        self._before, self._between = "".join(filled[:blocks]), "".join(filled[blocks + 1 : data])
-        self._after = "".join(filled[data + 1 :])
+        names = "blocks.js", "rows.js", "elements.js", "view3d.js", "viewer.js", "table.js", "page.js"
+        page = fill_page(shared_part("page.html"), map(shared_part, names), _title(scene))
+        self._before, self._between, self._after = page
         self._most_faces = int(np.clip(_ALL_FACES // len(scene), _FEWEST_FACES, _MOST_FACES))
         self._most_rows = int(np.clip(_ALL_ROWS // (2 * len(scene)), _FEWEST_ROWS, _MOST_ROWS))
         self._view_bytes = 0
@@ -110,7 +85,7 @@ class ReportPage(RecordFile):
             arrays |= {"kind": contacts.kind[rows], "toi": contacts.toi[rows].astype(np.float32)}
             if contacts.phase is not None and contacts.separate is not None:
                 arrays |= {"phase": contacts.phase[rows], "separate": contacts.separate[rows]}
-            yield _block(f"hits-{index}", {"of": len(contacts)}, arrays)
+            yield block(f"hits-{index}", {"of": len(contacts)}, arrays)
         at_rest, near = result.intersections or (), result.proximities or ()
         rest_rows, text = self._at_rest("rest", index, at_rest[0], numbers) if at_rest else (0, "")
         near_rows, more = self._at_rest("near", index, near[0], numbers) if near else (0, "")
@@ -135,7 +110,7 @@ class ReportPage(RecordFile):
         data["meshes"] = [{"name": name, "moves": moves} for name, moves in zip(self._meshes, self._moves, strict=True)]
         data["center"] = self._center.tolist() if self._center is not None else [0, 0, 0]
         data["notes"] += self._notes(summary, data["rows"])
-        return text + self._between + _inert(data) + self._after
+        return text + self._between + inert(data) + self._after
 
     def shrink(self) -> bool:
         """Drops the last intervals."""
@@ -170,11 +145,11 @@ class ReportPage(RecordFile):
             curves = found.cuts.points
             arrays |= {
                 "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
-                "curves": self._placed(curves[_spread(len(curves), self._most_rows)]),
+                "curves": self._placed(curves[spread(len(curves), self._most_rows)]),
                 "through": self._placed(found.position[np.intersect1d(rows, found.of_curves)]),
             }
             facts["curves"] = len(curves)
-        return len(rows), _block(f"{name}-{index}", facts, arrays)
+        return len(rows), block(f"{name}-{index}", facts, arrays)
 
     def _view(self, result: IntervalResult, positions: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
         """Yields the blocks of the triangles that move in an interval: all, or those around the given positions.
@@ -196,13 +171,13 @@ class ReportPage(RecordFile):
         else:
             elements = [segment.faces[shown]]
             if segment.has_strands:
-                elements += [own[_spread(len(own), self._most_faces)] for own in (segment.free_edges, segment.points)]
+                elements += [own[spread(len(own), self._most_faces)] for own in (segment.free_edges, segment.points)]
             vertices, corners = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
             parts = np.split(corners, np.cumsum([own.size for own in elements])[:-1])
             number = interval.index
             arrays: dict[str, np.ndarray] = dict(zip(("faces", "edges", "points"), parts, strict=False))
             arrays["mesh_of_vertex"] = numbers[segment.locate_vertices(vertices)[0]]
-            texts.append(_block(f"faces-{number}", {}, arrays))
+            texts.append(block(f"faces-{number}", {}, arrays))
             if len(shown) == len(segment.faces) and len(vertices) == segment.vertex_count:
                 self._faces = segment, number
         arrays = {
@@ -210,7 +185,7 @@ class ReportPage(RecordFile):
             "end": self._placed(interval.x1[vertices]),
             "lit": np.searchsorted(shown, np.intersect1d(lit, shown)),
         }
-        texts.append(_block(f"view-{interval.index}", {"faces": number, "of": len(segment.faces)}, arrays))
+        texts.append(block(f"view-{interval.index}", {"faces": number, "of": len(segment.faces)}, arrays))
         self._view_bytes += sum(map(len, texts))
         yield from texts
 
@@ -350,50 +325,14 @@ def _pairs_of_meshes(summary: Summary) -> list[dict]:
     ]
 
 
-def _spread(count: int, most: int) -> np.ndarray:
-    """Returns the numbers below a count, or ``most`` of them, spread evenly."""
-    return np.linspace(0, count - 1, min(count, most)).astype(int)
-
-
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
     """Returns the rows of the pairs in the page: all, or ``most``, spread evenly, with the first of each two meshes."""
     if len(pairs) <= most:
         return np.arange(len(pairs))
     firsts = np.unique(pairs.mesh_keys(), return_index=True)[1][:most]
     others = np.delete(np.arange(len(pairs)), firsts)
-    return np.union1d(firsts, others[_spread(len(others), most - len(firsts))])
-
-
-def _block(name: str, facts: dict, arrays: dict[str, np.ndarray]) -> str:
-    """Returns arrays as an element that the page's script unpacks by its name.
-
-    The content is a JSON header and the arrays in 32 bits, with the first bytes of all numbers before the second ones,
-    which compress better; all of it in base64. It is compressed unless it is small, as each unpacking takes a browser
-    a millisecond.
-    """
-    columns = {}
-    for key, array in arrays.items():
-        kind = np.float32 if array.dtype.kind == "f" else np.int32
-        columns[key] = np.ascontiguousarray(array, dtype=np.dtype(kind).newbyteorder("<")).reshape(-1)
-    header = json.dumps(facts | {"arrays": [(key, column.dtype.kind, len(column)) for key, column in columns.items()]})
-    planes = [column.view(np.uint8).reshape(-1, 4).T.tobytes() for column in columns.values()]
-    content, packed = b"".join([len(header).to_bytes(4, "little"), header.encode(), *planes]), ""
-    if len(content) > _SMALL_BLOCK:
-        content, packed = zlib.compress(content), ' data-packed="deflate"'
-    return f'<script type="text/plain" id="{name}"{packed}>{base64.b64encode(content).decode()}</script>\n'
+    return np.union1d(firsts, others[spread(len(others), most - len(firsts))])
 
 
 def _title(scene):
     return f"Collisions in {Path(scene.path).name}"
-
-
-def _inert(data) -> str:
-    """Returns JSON in which no tag and no comment can begin or end."""
-    text = json.dumps(data, allow_nan=False)
-    for character in "<>&":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
-
-
-def _policy_hash(text) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

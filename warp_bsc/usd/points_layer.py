@@ -5,6 +5,7 @@
 
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,13 +76,18 @@ class PointsLayer:
             raise ValueError(f"{path}: the name of a layer of USD must end in .usda, .usdc or .usd")
         self._format = "usda" if suffix == ".usda" else "usdc"
         self._scene = scene
-        self._moved: dict[str, dict[tuple[float, bool], tuple[np.ndarray, np.ndarray]]] = {}  # by name of the mesh
+        self._moved: dict[str, dict[tuple[float, bool], tuple[int, int]]] = {}  # by name: places in the file, numbers
         self._metadata = layer_metadata(scene)
         self.end: float | None = None
         self.file = OutputFile(path)
+        self._moves = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed by discard)
 
     def add(self, frame: MovedFrame) -> None:
-        """Adds the moved vertices of one time."""
+        """Adds the moved vertices of one time.
+
+        Raises:
+            OSError: If the disk is full.
+        """
         rows = np.full(frame.segment.vertex_count, -1)
         rows[frame.vertices] = np.arange(len(frame.vertices))
         for number, mesh in enumerate(frame.segment.meshes):
@@ -89,8 +95,12 @@ class PointsLayer:
             if (own >= 0).any():
                 prim = self._scene.prim_of(mesh.name)
                 x = prim.to_own_space(frame.x[own[own >= 0]], frame.time, before=frame.before)
+                points = mesh.points[own >= 0]
                 at = self._moved.setdefault(mesh.name, {})
-                at[frame.time, frame.before] = mesh.points[own >= 0], x
+                at[frame.time, frame.before] = self._moves.tell(), len(points)
+                rest = memoryview(points.astype(np.int64).tobytes() + x.tobytes())
+                while rest:
+                    rest = rest[self._moves.write(rest) :]
 
     def finish(self, facts: dict[str, Any]) -> None:
         """Writes the layer and moves it to its path.
@@ -133,7 +143,8 @@ class PointsLayer:
         return True
 
     def discard(self) -> None:
-        """Removes the temporary file."""
+        """Removes the temporary files."""
+        self._moves.close()
         self.file.discard()
 
     def _describe(self, layer, facts) -> None:
@@ -201,7 +212,11 @@ class PointsLayer:
         if moved is None:
             return old, old
         new = old.copy()
-        new[moved[0]] = moved[1]
+        place, count = moved
+        self._moves.seek(place)
+        points = np.frombuffer(self._moves.read(8 * count), np.int64)
+        new[points] = np.frombuffer(self._moves.read(12 * count), np.float32).reshape(-1, 3)
+        self._moves.seek(0, os.SEEK_END)
         return old, new
 
 

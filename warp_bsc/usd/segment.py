@@ -134,6 +134,11 @@ class Segment:
         self._moving = self._reader(self._kept, moving)
         self._jumping = self._reader(self._kept, jumping) if jumping else None
 
+    @property
+    def start_positions(self) -> np.ndarray:
+        """Positions of all vertices in world space at the first time, shape [vertex_count, 3]; not to be written to."""
+        return self._start
+
     def positions(self, time: float, *, before: bool = False, last: np.ndarray | None = None) -> np.ndarray:
         """Returns the positions of all vertices in world space.
 

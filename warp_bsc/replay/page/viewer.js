@@ -1,4 +1,4 @@
-// Shows an interval in 3D: triangles that move from start to end, contacts, cut curves. WebGL 2, no library.
+// Shows an interval in 3D: triangles that move from start to end, contacts, cut curves.
 "use strict";
 
 const MESH_COLORS = [[0.52, 0.68, 0.86], [0.62, 0.78, 0.6], [0.8, 0.7, 0.55], [0.72, 0.62, 0.8], [0.55, 0.76, 0.76], [0.84, 0.66, 0.72]];
@@ -18,16 +18,6 @@ void main() {
   vec4 at = view * vec4(mix(start, end, time), 1.0);
   place = at.xyz; tint = color;
   gl_Position = projection * at;
-}`;
-const TRIANGLE_COLOR = `#version 300 es
-precision highp float;
-in vec3 place; in vec3 tint;
-uniform vec4 only;
-out vec4 result;
-void main() {
-  vec3 normal = normalize(cross(dFdx(place), dFdy(place)));
-  float light = 0.42 + 0.5 * abs(dot(normal, normalize(vec3(0.25, 0.45, 0.85)))) + 0.08 * abs(normal.y);
-  result = vec4(mix(tint, only.rgb, only.a) * light, 1.0);
 }`;
 // Points of the scene.
 const STRAND_SHADER = `#version 300 es
@@ -90,63 +80,7 @@ uniform float fade;
 out vec4 result;
 void main() { result = vec4(tint, fade); }`;
 
-function multiply(a, b) {
-  const result = new Float32Array(16);
-  for (let column = 0; column < 4; column += 1)
-    for (let row = 0; row < 4; row += 1)
-      for (let k = 0; k < 4; k += 1) result[4 * column + row] += a[4 * k + row] * b[4 * column + k];
-  return result;
-}
-
-function program(gl, vertex, fragment) {
-  const made = gl.createProgram();
-  for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(type);
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-    gl.attachShader(made, shader);
-  }
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
-  return made;
-}
-
-// Attributes: [name, values, width], followed by stride and offset in bytes for values by instance.
-function vertexArray(gl, made, attributes, indices) {
-  const array = gl.createVertexArray(), buffers = [];
-  const fill = (target, values) => {
-    const buffer = gl.createBuffer();
-    buffers.push(buffer);
-    gl.bindBuffer(target, buffer);
-    gl.bufferData(target, values, gl.STATIC_DRAW);
-  };
-  gl.bindVertexArray(array);
-  for (const [name, values, width, strided] of attributes) {
-    const place = gl.getAttribLocation(made, name);
-    fill(gl.ARRAY_BUFFER, values);
-    gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, width, gl.FLOAT, false, ...(strided || [0, 0]));
-    if (strided) gl.vertexAttribDivisor(place, 1);
-  }
-  if (indices) fill(gl.ELEMENT_ARRAY_BUFFER, indices);
-  gl.bindVertexArray(null);
-  return { array, free: () => { gl.deleteVertexArray(array); buffers.forEach((buffer) => gl.deleteBuffer(buffer)); } };
-}
-
-function boxOf(arrays) {
-  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
-  for (const values of arrays)
-    for (let i = 0; i < values.length; i += 1) {
-      low[i % 3] = Math.min(low[i % 3], values[i]);
-      high[i % 3] = Math.max(high[i % 3], values[i]);
-    }
-  const center = low.map((value, axis) => (value + high[axis]) / 2);
-  return { center, radius: Math.max(1e-9, Math.hypot(...high.map((value, axis) => value - low[axis])) / 2) };
-}
-
 const NO_FLOATS = new Float32Array(0), NO_INTS = new Int32Array(0);
-const css = (color) => `rgb(${color.map((value) => Math.round(255 * value)).join(" ")})`;
 const meshColor = (mesh) => (data.meshes[mesh].moves ? MESH_COLORS[mesh % MESH_COLORS.length] : REST_COLOR);
 const strandColor = (mesh) => meshColor(mesh).map((value) => STRAND_SHADE * value);
 
@@ -177,7 +111,7 @@ function makeViewer() {
   const message = byId("viewer-message");
   const say = (text) => { message.textContent = text; message.hidden = !text; };
   const canvas = byId("canvas");
-  const gl = canvas.getContext("webgl2", { antialias: true });
+  const { gl, camera, turned, ask, frame, begin, set, turn } = makeCanvas(canvas, data.up_axis === "Z", draw);
   if (!gl) say("This browser has no WebGL 2, which the view in 3D needs.");
   if (LAST < 0) say("There is nothing to show.");
 
@@ -185,18 +119,7 @@ function makeViewer() {
   const points = gl && program(gl, POINT_SHADER, POINT_COLOR);
   const strands = gl && program(gl, STRAND_SHADER, STRAND_COLOR);
   const lines = gl && program(gl, CURVE_SHADER, CURVE_COLOR_SHADER);
-  // Up is the scene's: y in the view.
-  const zUp = data.up_axis === "Z";
-  const turned = zUp ? ([x, y, z]) => [x, z, -y] : (point) => point;
-  const camera = { yaw: 0.65, pitch: 0.42, distance: 1, center: [0, 0, 0] };
-  const state = { time: 0, playing: false, last: 0, asked: false, index: -1, shown: null, parts: [], chosen: null, framed: false };
-  const FIELD = 0.62;
-
-  function frame(box) {
-    camera.center = turned(box.center);
-    camera.distance = ((0.8 * box.radius) / Math.sin(FIELD / 2)) * Math.max(1, canvas.clientHeight / Math.max(1, canvas.clientWidth));
-    ask();
-  }
+  const state = { time: 0, playing: false, last: 0, index: -1, shown: null, parts: [], chosen: null, framed: false };
 
   // Shows an interval. `at`, if given, is a row of the table: {from, place, time}, from "hits", "rest" or "near".
   async function show(index, at = null) {
@@ -307,7 +230,6 @@ function makeViewer() {
   }
 
   function draw(now) {
-    state.asked = false;
     const { shown } = state;
     if (!shown) return;
     if (state.playing) {
@@ -315,38 +237,7 @@ function makeViewer() {
       showTime();
     }
     state.last = now;
-    const scale = Math.min(2, devicePixelRatio || 1);
-    const [width, height] = [Math.round(canvas.clientWidth * scale), Math.round(canvas.clientHeight * scale)];
-    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    gl.viewport(0, 0, width, height);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.enable(gl.DEPTH_TEST);
-    gl.enable(gl.BLEND);
-    gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-
-    const { distance, yaw, pitch, center } = camera, { radius } = shown.whole;
-    const [nearest, farthest] = [Math.max(distance - 3 * radius, distance * 0.01), distance + 60 * radius];
-    const focal = 1 / Math.tan(FIELD / 2);
-    const projection = new Float32Array(16);
-    projection.set([focal / (width / height), 0, 0, 0, 0, focal, 0, 0, 0, 0, (nearest + farthest) / (nearest - farthest), -1, 0, 0, (2 * nearest * farthest) / (nearest - farthest), 0]);
-    const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
-    const orbit = new Float32Array([cy, -sy * sp, sy * cp, 0, 0, cp, sp, 0, -sy, -cy * sp, cy * cp, 0, 0, 0, -distance, 1]);
-    const shift = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, -center[0], -center[1], -center[2], 1]);
-    const axes = zUp ? new Float32Array([1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]) : null;
-    let view = multiply(orbit, shift);
-    if (axes) view = multiply(view, axes);
-
-    const set = (made, values) => {
-      gl.useProgram(made);
-      gl.uniformMatrix4fv(gl.getUniformLocation(made, "view"), false, view);
-      gl.uniformMatrix4fv(gl.getUniformLocation(made, "projection"), false, projection);
-      for (const [name, value] of Object.entries(values)) {
-        const place = gl.getUniformLocation(made, name);
-        if (Array.isArray(value)) gl[`uniform${value.length}fv`](place, value);
-        else gl.uniform1f(place, value);
-      }
-    };
+    const { scale, width, height } = begin(shown.whole.radius);
     gl.enable(gl.POLYGON_OFFSET_FILL);
     for (const [part, length, only, offset] of [[shown.some, shown.lit.length, [...LIT_COLOR, 0.85], 0], [shown.all, shown.faces.length, [0, 0, 0, 0], 1]]) {
       gl.polygonOffset(offset, offset);
@@ -391,57 +282,12 @@ function makeViewer() {
     if (state.playing) ask();
   }
 
-  function ask() {
-    if (state.asked || !gl) return;
-    state.asked = true;
-    requestAnimationFrame(draw);
-  }
-
   function showTime() {
     const [from, to] = data.intervals[state.index];
     byId("time").value = Math.round(1000 * state.time);
     byId("time-label").textContent = `time ${short(from + state.time * (to - from))}`;
   }
 
-  function turn(dx, dy) {
-    camera.yaw -= 0.1 * dx;
-    camera.pitch = Math.max(-1.55, Math.min(1.55, camera.pitch + 0.1 * dy));
-    ask();
-  }
-
-  function move(dx, dy) {
-    const step = (2 * camera.distance * Math.tan(FIELD / 2)) / canvas.clientHeight;
-    const [cy, sy, cp, sp] = [Math.cos(camera.yaw), Math.sin(camera.yaw), Math.cos(camera.pitch), Math.sin(camera.pitch)];
-    const [right, up] = [[cy, 0, -sy], [-sy * sp, cp, -cy * sp]];
-    camera.center = camera.center.map((value, axis) => value - step * (dx * right[axis] - dy * up[axis]));
-  }
-
-  const held = new Map(); // pointers that are down, by their last events
-  canvas.addEventListener("pointerdown", (event) => {
-    canvas.setPointerCapture(event.pointerId);
-    held.set(event.pointerId, event);
-  });
-  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => held.delete(event.pointerId));
-  canvas.addEventListener("pointermove", (event) => {
-    const last = held.get(event.pointerId);
-    if (!last) return;
-    const [dx, dy] = [event.clientX - last.clientX, event.clientY - last.clientY];
-    held.set(event.pointerId, event);
-    if (held.size === 2) {
-      const other = [...held.values()].find(({ pointerId }) => pointerId !== event.pointerId);
-      const from = (one) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY) || 1;
-      camera.distance *= from(last) / from(event);
-      move(dx / 2, dy / 2);
-    } else if (event.shiftKey || event.buttons === 2) move(dx, dy);
-    else turn(dx * 0.08, dy * 0.08);
-    ask();
-  });
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    camera.distance *= Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.0015)));
-    ask();
-  }, { passive: false });
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   byId("time").addEventListener("input", (event) => { state.time = event.target.value / 1000; showTime(); ask(); });
   byId("play").addEventListener("click", () => {
     state.playing = !state.playing;
@@ -451,6 +297,5 @@ function makeViewer() {
   });
   byId("frame-all").addEventListener("click", () => { if (state.shown) frame({ center: state.shown.whole.center, radius: 1.15 * state.shown.whole.radius }); });
   byId("frame-contacts").addEventListener("click", () => { if (state.shown) frame(state.shown.near); });
-  new ResizeObserver(ask).observe(canvas);
   return { show, turn };
 }

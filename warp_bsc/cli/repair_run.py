@@ -1,0 +1,255 @@
+"""A run of warp-bsc repair: finds collisions, repairs, and writes the layer and what a later run needs to resume."""
+
+import argparse
+import errno
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from .._atomic_file import naming, unfinished_path
+from ..repair.findings import Finding, find_collisions
+from ..repair.journal import Journal
+from ..repair.report import RepairPage
+from ..repair.shot import repair_shot
+from ..repair.stretch import RepairedStretch
+from ..replay.intervals import replay
+from ..replay.results import IntervalResult
+from ..usd.points_layer import PointsLayer
+from ..usd.scene import Scene
+from .error_boundary import describe
+from .interrupts import INTERRUPTS, Interrupted
+from .progress import RunProgress
+
+__all__ = ["RepairRun", "count_found", "find"]
+
+
+class RepairRun:
+    """Finds collisions, repairs, and writes the layer of the stretches that are done.
+
+    Attributes:
+        scene: The scene.
+        journal: The findings, and the stretches with their frames, also those of an earlier run.
+        found: Numbers of what was found before, by its name.
+        initially_near: Number of pairs that are nearer than the minimum distance from the start.
+        stretches: The stretches, without their frames.
+        frames: Times and numbers of moved vertices of the moved frames, by stretch.
+        earlier: Number of stretches of an earlier run.
+        seconds: Times to find and to repair [s].
+        interrupt: The signal that ended it.
+        problems: Messages of errors.
+        notes: Messages on what else did not work.
+        output: Path of the layer.
+        is_written: Whether there is a layer: there is none if nothing is moved.
+        page: Path of the report, once it is written.
+    """
+
+    def __init__(self, scene: Scene, arguments: argparse.Namespace, device: str, facts: dict[str, Any]):
+        """Opens the files.
+
+        Args:
+            scene: The scene.
+            arguments: The options.
+            device: Name of the Warp device.
+            facts: Scene and options, which must be the same in a run that resumes this one.
+        """
+        self.scene, self._arguments, self._device = scene, arguments, device
+        self._layer = PointsLayer(arguments.output, scene=scene)
+        try:
+            self.journal = Journal(unfinished_path(arguments.output), facts, resume=arguments.resume)
+        except BaseException:
+            self._layer.discard()
+            raise
+        self.found: dict[str, int] = {}
+        self.initially_near = 0
+        self.stretches: list[RepairedStretch] = []
+        self.frames: list[list[tuple[float, int]]] = []
+        self.earlier = 0
+        self.seconds = {"finding": 0.0, "repairing": 0.0}
+        self.interrupt: KeyboardInterrupt | None = None
+        self.problems: list[str] = []
+        self.notes: list[str] = []
+        self.output, self.is_written = arguments.output, False
+        self.page: Path | None = None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether neither a signal nor an error has stopped it."""
+        return not self.interrupt and not self.problems
+
+    def run(self) -> None:
+        """Repairs the scene as far as no signal or error stops it, and writes the layer."""
+        done = 0
+        with INTERRUPTS.held():
+            try:
+                with INTERRUPTS.raised():
+                    for number in self._repair():
+                        done = number
+                        INTERRUPTS.check()
+                    done = len(self.scene)
+            except KeyboardInterrupt as stopped:
+                self.interrupt = stopped if isinstance(stopped, Interrupted) else Interrupted()
+            except Exception as error:
+                self.interrupt = INTERRUPTS.came  # a library may have turned it into another error
+                self.problems += [] if self.interrupt else [describe(error)]
+            if not any(stretch.moved for stretch in self.stretches):
+                return  # an earlier file is better than an empty one
+            if done < len(self.scene):
+                self._layer.end = self.scene.times[done]
+            self._finish()
+
+    def close(self) -> None:
+        """Removes the temporary files; what a later run can resume stays."""
+        self._layer.discard()
+        self.journal.close(remove=self.is_whole)
+
+    def _repair(self) -> Iterator[int]:
+        """Finds and repairs; yields the number of intervals that are done after each stretch."""
+        scene, arguments, journal = self.scene, self._arguments, self.journal
+        started = time.perf_counter()
+        if journal.findings is None:
+            findings = find(scene, "Finding", arguments.min_distance, self._device)
+            self._keep(lambda: journal.begin(findings))
+        assert journal.findings is not None
+        self.found = count_found(journal.findings, arguments.min_distance)
+        self.initially_near = sum(finding.initially_near for finding in journal.findings)
+        if self.initially_near:
+            self.notes.append(
+                f"pairs that are nearer than {arguments.min_distance:g} from the start: {self.initially_near:,}, which "
+                "are not counted; where the scene is repaired, they come no nearer"
+            )
+        self.seconds["finding"] = time.perf_counter() - started
+        done = 0
+        for stretch in journal.stretches(scene):
+            self._add(stretch)
+            done = scene.times.index(stretch.end)
+            yield done
+        self.earlier = len(self.stretches)
+        started = time.perf_counter()
+        with RunProgress("Repairing") as progress:
+            progress.show(done, len(scene))
+            for stretch in repair_shot(
+                scene,
+                journal.findings,
+                keep=arguments.keep,
+                max_move=arguments.max_move,
+                min_distance=arguments.min_distance,
+                device=self._device,
+                start=done,
+                progress=lambda number: progress.show(number, len(scene)),
+            ):
+                scene.files.check()
+                if journal.is_open:
+                    self._keep(functools.partial(journal.add, stretch))
+                self._add(stretch)
+                self.seconds["repairing"] = time.perf_counter() - started
+                yield scene.times.index(stretch.end)
+
+    def _keep(self, write: Callable[[], None]) -> None:
+        """Writes to the journal; without space for it, the run goes on without one."""
+        try:
+            with naming(self.journal.path):
+                write()
+        except OSError as error:
+            self.journal.close(remove=True)
+            self.notes.append(f"a later run cannot resume this one: {describe(error)}")
+
+    def _add(self, stretch: RepairedStretch) -> None:
+        """Adds a stretch to the layer and to the numbers."""
+        for frame in stretch.frames:
+            with naming(self._arguments.output):
+                self._layer.add(frame)
+        self.frames.append([(frame.time, len(frame.vertices)) for frame in stretch.frames])
+        self.stretches.append(replace(stretch, frames=()))
+
+    def _finish(self) -> None:
+        """Writes the layer, without its last frames if the disk is full."""
+        shortage = ""
+        while True:
+            facts = self.found | {"stretches": len(self.stretches)}
+            stopped = shortage or str(self.interrupt or "") or "; ".join(self.problems)
+            try:
+                with naming(self._arguments.output):
+                    self._layer.finish(facts | ({"stopped": stopped} if stopped else {}))
+            except Exception as error:
+                number = error.errno if isinstance(error, OSError) else None
+                is_full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+                if is_full and self._layer.shrink():
+                    shortage = describe(error)
+                    continue
+                self.problems.append(f"{self._arguments.output}: not written: {describe(error)}")
+                return
+            self.is_written = True
+            if shortage:
+                self.problems.append(f"not all of it is written: {shortage}")
+            return
+
+    def report(self, page: RepairPage, kept: dict[str, str], after: list[Finding] | None) -> None:
+        """Writes the page of what is done; ``after`` is what a replay finds in the layer, None if it was not replayed.
+
+        Without space on the disk there is no page, and a problem says so.
+        """
+        assert self.journal.findings is not None
+        stopped = str(self.interrupt or "") or "; ".join(self.problems)
+        try:
+            if self.stretches and not self.journal.is_open:
+                raise OSError(f"it needs {self.journal.path}, which could not be written")
+            with naming(page.file.name):
+                page.write(
+                    self.scene,
+                    stretches=lambda: self.journal.stretches(self.scene),
+                    before=self.journal.findings,
+                    after=after,
+                    kept=kept,
+                    min_distance=self._arguments.min_distance,
+                    stopped=stopped,
+                )
+            self.page = page.file.path
+        except Exception as error:
+            self.problems.append(f"{page.file.name}: not written: {describe(error)}")
+
+    def facts(self, kept: dict[str, str], left: dict[str, int]) -> dict[str, Any]:
+        """Returns what was done, for programs."""
+        stretches = []
+        for stretch, frames in zip(self.stretches, self.frames, strict=True):
+            values = asdict(stretch)
+            of_frames = [
+                {"time": time, "moved": moved, "largest_move": move}
+                for (time, moved), move in zip(frames, values.pop("largest_moves"), strict=True)
+            ]
+            stretches.append(values | {"frames": of_frames})
+        return {
+            "scene": self.scene.path,
+            "output": str(self._arguments.output) if self.is_written else None,
+            "before": self.found,
+            "left": left,
+            "initially_near": self.initially_near,
+            "kept": kept,
+            "stretches": stretches,
+            "seconds": self.seconds,
+        }
+
+
+def find(scene: Scene, activity: str, min_distance: float, device: str) -> list[Finding]:
+    """Returns what an exact replay of a scene finds, and shows its progress."""
+    return list(find_collisions(scene, _tracked(scene, activity, device), min_distance=min_distance, device=device))
+
+
+def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
+    """Returns the numbers of collisions and intersections, and of pairs that are too near, by their names."""
+    crossings = sum(finding.crossings[0] for finding in findings) + findings[-1].crossings[1]
+    counts = {"collisions": sum(finding.hits for finding in findings), "intersections": crossings}
+    if min_distance:
+        counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
+    return counts
+
+
+def _tracked(scene: Scene, activity: str, device: str) -> Iterator[IntervalResult]:
+    """Yields what an exact replay finds, and shows its progress."""
+    with RunProgress(activity) as progress:
+        progress.show(0, len(scene))
+        for result in replay(scene, method="exact", device=device):
+            yield result
+            progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")

@@ -1,0 +1,80 @@
+"""Prints what warp-bsc repair did: a table of the repaired stretches, and what is left."""
+
+from .option_names import with_option
+from .repair_run import RepairRun
+from .tables import LONGEST, Console, count, make_table, say
+
+__all__ = ["print_repair"]
+
+
+def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: dict[str, int]) -> None:
+    """Prints what was done, and what is left."""
+    scene = run.scene
+    say(
+        console,
+        f"{scene.path}: {count(len(scene.names), 'mesh', 'meshes')}, {scene.vertex_count:,} vertices, "
+        f"{count(len(scene), 'interval')}",
+    )
+    for warning in scene.warnings:
+        say(console, f"note: {with_option(warning)}")
+    for note in run.notes:
+        say(console, f"note: {note}")
+    for name, reason in list(kept.items())[:LONGEST]:
+        say(console, f"note: {name} is not moved: {reason}")
+    if len(kept) > LONGEST:
+        say(console, f"note: {len(kept) - LONGEST} more are not moved")
+    if run.earlier:
+        say(console, f"note: stretches that an earlier run has repaired: {run.earlier:,}")
+    if run.stretches:
+        _print_stretches(console, run)
+    for stretch in run.stretches[:LONGEST]:
+        for reason in stretch.left:
+            say(console, f"Left from {stretch.start:g} to {stretch.end:g}: {reason}.")
+        if stretch.uncertified:
+            times = ", ".join(f"{time:g}" for time in stretch.uncertified[:4])
+            say(console, f"Not certified: {count(len(stretch.uncertified), 'frame')}, the first at {times}.")
+    for what, number in run.found.items():
+        say(console, f"{what.capitalize()}: {number:,} before, {left[what]:,} left.")
+    seconds = run.seconds
+    say(
+        console,
+        f"Finding took {1e3 * seconds['finding'] / len(scene):,.1f} ms an interval, repairing "
+        f"{1e3 * seconds['repairing'] / len(scene):,.1f} ms.",
+    )
+    if run.is_written:
+        say(console, f"Wrote {run.output}.")
+    else:
+        say(console, "Nothing was moved: no layer was written.")
+    if run.page:
+        say(console, f"Wrote {run.page}.")
+
+
+def _print_stretches(console: Console, run: RepairRun) -> None:
+    """Prints a table of the stretches."""
+    table = make_table(
+        "time",
+        "frames",
+        "points",
+        "largest move",
+        "mean",
+        "edges",
+        "acceleration",
+        caption="Points: the most of a frame. Moves and the added acceleration a frame in median edge lengths, in "
+        "parentheses that of the scene; edges: the shortest and the longest against the scene at the same time.",
+    )
+    for stretch, frames in zip(run.stretches[:LONGEST], run.frames, strict=False):
+        unit = stretch.edge_length
+        low, high = stretch.edge_ratio
+        added, own = stretch.acceleration
+        table.add_row(
+            f"{stretch.start:g} → {stretch.end:g}",
+            f"{len(frames):,}",
+            f"{stretch.moved:,}",
+            f"{stretch.largest_move / unit:.3f}",
+            f"{stretch.mean_move / unit:.3f}",
+            f"{low:.2f} to {high:.2f}",
+            f"{added / unit:.3f} ({own / unit:.3f})",
+        )
+    console.print(table)
+    if len(run.stretches) > LONGEST:
+        say(console, f"{len(run.stretches) - LONGEST} stretches are not listed; --json has all.")

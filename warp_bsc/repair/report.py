@@ -1,0 +1,301 @@
+"""Writes a page that shows a repaired shot before and after, frame by frame, in one file that needs no network."""
+
+import os
+from collections.abc import Callable, Iterable
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._atomic_file import OutputFile
+from ..replay.html_page import block, fill_page, inert, shared_part, spread
+from ..replay.page_view import choose_faces
+from ..usd.points_layer import MovedFrame
+from ..usd.scene import Scene
+from ..usd.segment import Segment
+from .findings import Finding
+from .stretch import RepairedStretch
+
+__all__ = ["RepairPage"]
+
+_ALL_FACES = (
+    3_000_000  # about 25 MB, in the views of all frames together; divided by their number, the limit of a frame ...
+)
+_FEWEST_FACES, _MOST_FACES = 2_000, 150_000  # ... within these bounds
+_MOST_VIEWS = 1_500  # frames with a view
+_STEPS = 1 << 16  # positions in the shot are rounded to this part of the size of what is shown
+_MAX_ROWS = 200
+
+
+class RepairPage:
+    """A page with a timeline, moved frames in 3D before and after, and the stretches.
+
+    Attributes:
+        file: The file.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        """Opens the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        self.file = OutputFile(path)
+
+    def write(
+        self,
+        scene: Scene,
+        *,
+        stretches: Callable[[], Iterable[RepairedStretch]],
+        before: list[Finding],
+        after: list[Finding] | None,
+        kept: dict[str, str],
+        min_distance: float = 0.0,
+        stopped: str = "",
+    ) -> None:
+        """Writes the page and moves it to its path.
+
+        Args:
+            scene: The scene that was repaired.
+            stretches: Returns its stretches with their frames, in order; called twice.
+            before: What a replay has found in it.
+            after: What a replay has found in the layer, None if that was not replayed.
+            kept: Reasons of the meshes that are not moved, by name.
+            min_distance: Distance that was to be kept, in the scene's unit of length.
+            stopped: Why the repair was stopped, in words; empty if it was not.
+
+        Raises:
+            OSError: If the disk is full.
+            ValueError: If the scene cannot be read again.
+        """
+        page = resources.files("warp_bsc.repair") / "page"
+        shared = (shared_part(name) for name in ("blocks.js", "elements.js", "view3d.js"))
+        head, between, end = fill_page(page / "page.html", [*shared, page / "repair.js"], _title(scene))
+        self.file.write(head)
+        summary = _Summary(scene, stretches())
+        views = _Views(scene, summary)
+        number = 0
+        for stretch in stretches():
+            for moved in stretch.frames:
+                if number in views.numbers:
+                    for text in views.of(moved, number):
+                        self.file.write(text)
+                number += 1
+        data = summary.data(before, after, kept, min_distance)
+        data["partial"] = f"Partial: {stopped}. The layer has not been replayed." if stopped else ""
+        data["notes"] += views.notes()
+        for index, frame in enumerate(data["frames"]):
+            frame["view"] = index if index in views.numbers else None
+        self.file.write(between + inert(data) + end)
+        self.file.commit()
+
+    def discard(self) -> None:
+        """Removes the temporary file."""
+        self.file.discard()
+
+
+class _Summary:
+    """The numbers of a repair, and the vertices that it moved.
+
+    Attributes:
+        frames: The moved frames, for the page.
+        moved: Vertices that are moved at some time, bool, by the number of their segment.
+        segments: The segments with moved frames, in order.
+    """
+
+    def __init__(self, scene: Scene, stretches: Iterable[RepairedStretch]):
+        self._scene = scene
+        self._stretches: list[RepairedStretch] = []
+        self.frames: list[dict[str, Any]] = []
+        self.segments: list[Segment] = []
+        self.moved: list[np.ndarray] = []
+        for stretch in stretches:
+            for frame, move in zip(stretch.frames, stretch.largest_moves, strict=True):
+                moved = len(frame.vertices)
+                self.frames.append({"time": frame.time, "before": frame.before, "move": move, "moved": moved})
+                if not self.segments or frame.segment is not self.segments[-1]:
+                    self.segments.append(frame.segment)
+                    self.moved.append(np.zeros(frame.segment.vertex_count, dtype=bool))
+                self.moved[-1][frame.vertices] = True
+            self._stretches.append(stretch)
+
+    def data(
+        self, before: list[Finding], after: list[Finding] | None, kept: dict[str, str], min_distance: float
+    ) -> dict[str, Any]:
+        """Returns what the page's script shows beside the views; arguments are those of :meth:`RepairPage.write`."""
+        scene, stretches = self._scene, self._stretches
+        unit = max((stretch.edge_length for stretch in stretches), default=1.0)
+        largest = max((frame["move"] for frame in self.frames), default=0.0)
+        moves = dict.fromkeys(scene.times, 0.0)
+        for frame in self.frames:
+            moves[frame["time"]] = max(moves[frame["time"]], frame["move"])
+        uncertified = sum(len(stretch.uncertified) for stretch in stretches)
+        tiles = [
+            _left(before, after, "collisions", lambda found: found.hits),
+            _left(before, after, "intersections", lambda found: found.crossings[0], last=True),
+        ]
+        if min_distance:
+            tiles.append(_left(before, after, f"pairs nearer than {min_distance:g}", lambda found: found.near))
+        ratios = [stretch.edge_ratio for stretch in stretches]
+        tiles += [
+            (f"{len(moves.keys() & {frame['time'] for frame in self.frames}):,} of {len(moves):,}", "frames moved"),
+            (f"{largest / unit:.3g}", "largest move, in edges"),
+            (f"{max((high for _, high in ratios), default=1.0):.3g}", "longest edge against the scene"),
+            (f"{min((low for low, _ in ratios), default=1.0):.3g}", "shortest edge against the scene"),
+            ("yes" if not uncertified else f"all but {uncertified:,}", "moved frames certified"),
+        ]
+        return {
+            "title": _title(scene),
+            "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}",
+            "tiles": tiles,
+            "edge_length": unit,
+            "largest": largest or 1.0,
+            "has_distance": min_distance > 0.0,
+            "moves": [
+                (time, following, moves[time])
+                for time, following in pairwise([*scene.times, 2.0 * scene.times[-1] - scene.times[-2]])
+            ],
+            "before": _rows(scene, before),
+            "after": None if after is None else _rows(scene, after),
+            "frames": self.frames,
+            "meshes": [{"name": name, "kept": name in kept} for name in scene.names],
+            "up_axis": scene.up_axis,
+            "stretches": [
+                (
+                    [f"{stretch.start:g} to {stretch.end:g}", "; ".join(stretch.left)],
+                    f"{len(stretch.largest_moves):,}",
+                    f"{stretch.moved:,}",
+                    f"{stretch.largest_move / stretch.edge_length:.3f}",
+                    f"{stretch.edge_ratio[0]:.2f} to {stretch.edge_ratio[1]:.2f}",
+                )
+                for stretch in stretches[:_MAX_ROWS]
+            ],
+            "facts": [
+                ("File", scene.path),
+                *scene.comments,
+                ("Up axis", scene.up_axis),
+                ("Metres per unit", f"{scene.meters_per_unit:g}"),
+                ("Median edge length", f"{unit:g}"),
+                ("Vertices", f"{scene.vertex_count:,}"),
+                ("Triangles", f"{scene.face_count:,}"),
+                *((f"Kept: {name}", reason) for name, reason in list(kept.items())[:_MAX_ROWS]),
+            ],
+            "notes": [
+                "Moves are distances from the scene at the same time; edges are compared with the scene at the same "
+                "time.",
+                *scene.warnings,
+                *([f"{len(stretches) - _MAX_ROWS:,} stretches are not listed."] if len(stretches) > _MAX_ROWS else []),
+            ],
+        }
+
+
+class _Views:
+    """The blocks of the moved frames: triangles, positions in the shot, and displacements.
+
+    Attributes:
+        numbers: The frames that have a view: all, or some, spread evenly, and the one with the largest move.
+    """
+
+    def __init__(self, scene: Scene, summary: _Summary):
+        self._scene, self._summary = scene, summary
+        count = len(summary.frames)
+        self.numbers = set(spread(count, _MOST_VIEWS).tolist()) if count else set()
+        if count > _MOST_VIEWS:
+            self.numbers.add(int(np.argmax([frame["move"] for frame in summary.frames])))
+        most = int(np.clip(_ALL_FACES // max(1, len(self.numbers)), _FEWEST_FACES, _MOST_FACES))
+        self._faces = [
+            _faces_to_show(segment, moved, most) for segment, moved in zip(summary.segments, summary.moved, strict=True)
+        ]
+        self._written: set[int] = set()
+        self._segment, self._number = None, -1
+        self._meshes = {name: number for number, name in enumerate(scene.names)}
+        self._center: np.ndarray | None = None
+
+    def of(self, moved: MovedFrame, number: int) -> list[str]:
+        """Returns the blocks of a frame, with its number among all."""
+        segment = moved.segment
+        if segment is not self._segment:
+            self._segment, self._number = segment, self._number + 1
+        faces = self._faces[self._number]
+        vertices, corners = np.unique(segment.faces[faces], return_inverse=True)
+        texts = []
+        if self._number not in self._written:
+            self._written.add(self._number)
+            names = [segment.meshes[mesh].name for mesh in segment.locate_vertices(vertices)[0]]
+            meshes = np.array([self._meshes[name] for name in names], dtype=np.int64)
+            texts.append(block(f"faces-{self._number}", {}, {"faces": corners, "mesh_of_vertex": meshes}))
+        x = self._shot(moved)[vertices].astype(np.float64)
+        if self._center is None:
+            self._center = (x.min(axis=0) + x.max(axis=0)) / 2.0
+        low = x.min(axis=0)
+        step = max(float((x.max(axis=0) - low).max()) / (_STEPS - 1), np.finfo(np.float32).tiny)
+        is_shown = np.isin(moved.vertices, vertices)
+        rows = np.searchsorted(vertices, moved.vertices[is_shown])
+        arrays = {
+            "before": np.rint((x - low) / step).astype(np.int32),
+            "moved": rows,
+            "displacement": moved.x[is_shown] - x[rows],
+        }
+        facts = {"faces": self._number, "of": len(segment.faces), "low": (low - self._center).tolist(), "step": step}
+        return [*texts, block(f"frame-{number}", facts, arrays)]
+
+    def notes(self) -> list[str]:
+        """Returns sentences on what the page omits."""
+        notes = [f"Positions in the views are rounded to 1/{_STEPS:,} of the size of what is shown; moves are not."]
+        count = len(self._summary.frames)
+        if len(self.numbers) < count:
+            notes.append(f"{len(self.numbers):,} of {count:,} moved frames have a view in 3D, spread evenly.")
+        for segment, faces in zip(self._summary.segments, self._faces, strict=True):
+            if len(faces) < len(segment.faces):
+                notes.append(
+                    f"The views have the {len(faces):,} of {len(segment.faces):,} triangles around what is moved."
+                )
+        return list(dict.fromkeys(notes))
+
+    def _shot(self, moved: MovedFrame) -> np.ndarray:
+        """Returns the positions of the shot in a frame."""
+        index = self._scene.times.index(moved.time)
+        if moved.before or index == len(self._scene):
+            return self._scene.interval(index - 1).x1
+        return self._scene.interval(index).x0
+
+
+def _faces_to_show(segment: Segment, moved: np.ndarray, most: int) -> np.ndarray:
+    """Returns the faces that a page shows: all, or those around vertices that are moved at some time."""
+    x = segment.start_positions
+    (lit,) = np.nonzero(moved[segment.faces].any(axis=1))
+    return choose_faces(x[segment.faces[:, 0]], x[moved], lit, most)
+
+
+def _rows(scene: Scene, findings: list[Finding]) -> list[tuple[float, float, int, int, int]]:
+    """Returns for each interval its times, and the numbers of collisions, intersections and pairs too near."""
+    rows = [
+        (start, end, found.hits, found.crossings[0], found.near)
+        for (start, end), found in zip(pairwise(scene.times), findings, strict=True)
+    ]
+    if findings[-1].crossings[1]:  # those at the end belong to the last bar
+        start, end, hits, crossings, near = rows[-1]
+        rows[-1] = start, end, hits, crossings + findings[-1].crossings[1], near
+    return rows
+
+
+def _left(
+    before: list[Finding],
+    after: list[Finding] | None,
+    what: str,
+    number: Callable[[Finding], int],
+    *,
+    last: bool = False,
+) -> tuple[str, str]:
+    """Returns how many findings are left and were there before, in words; ``last`` adds the crossings at the end."""
+    sums = [
+        None if findings is None else sum(map(number, findings)) + last * findings[-1].crossings[1]
+        for findings in (before, after)
+    ]
+    return "?" if sums[1] is None else f"{sums[1]:,}", f"{what}, of {sums[0]:,} before"
+
+
+def _title(scene: Scene) -> str:
+    return f"Repair of {Path(scene.path).name}"

@@ -1,0 +1,146 @@
+"""A repaired stretch of a shot: its moved vertices, and how far they moved, in numbers."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..usd.points_layer import MovedFrame
+
+__all__ = ["FollowedMesh", "RepairedStretch", "ShotFrame", "StretchRecorder"]
+
+
+@dataclass(frozen=True)
+class RepairedStretch:
+    """Consecutive frames of a shot of which some are moved.
+
+    Attributes:
+        start: Time code of its first frame.
+        end: Time code of its last frame.
+        frames: The frames with moved vertices.
+        largest_moves: Largest distance of a vertex from the shot in each of these, in its unit of length.
+        moved: Number of moved vertices, the most of all frames.
+        largest_move: The largest of all these.
+        mean_move: Mean of the distances of moved vertices.
+        edge_length: Median edge length of the meshes that may move, at the start.
+        edge_ratio: Smallest and largest length of an edge, as shares of its length in the shot at the same time.
+        acceleration: Largest second difference of the displacement of a vertex over three frames, and of its position
+            in the shot, in the unit of length.
+        uncertified: Times of the frames whose motion from the frame before is not certified.
+        left: Why collisions are left, in words; empty where none should be.
+    """
+
+    start: float
+    end: float
+    frames: tuple[MovedFrame, ...] = field(repr=False)
+    largest_moves: tuple[float, ...] = field(repr=False)
+    moved: int
+    largest_move: float
+    mean_move: float
+    edge_length: float
+    edge_ratio: tuple[float, float]
+    acceleration: tuple[float, float]
+    uncertified: tuple[float, ...]
+    left: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ShotFrame:
+    """A frame of a stretch: the shot, the positions that follow it, and what was added to it.
+
+    Attributes:
+        given: Positions in the shot, float32, shape [vertex_count, 3].
+        x: Positions that follow it, likewise.
+        displacement: What was added to the shot before the last response, float32, likewise.
+        certified: Whether the motion from the frame before is certified.
+    """
+
+    given: np.ndarray
+    x: np.ndarray
+    displacement: np.ndarray
+    certified: bool = True
+
+    @staticmethod
+    def of_shot(given: np.ndarray) -> "ShotFrame":
+        """Returns the frame that is as in the shot."""
+        return ShotFrame(given, given, np.zeros_like(given))
+
+    @property
+    def differs(self) -> bool:
+        """Whether it differs from the shot."""
+        return self.x is not self.given and not np.array_equal(self.x, self.given)
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedMesh:
+    """The mesh of a stretch, as far as its numbers need it.
+
+    Attributes:
+        is_movable: Whether each vertex may be moved, bool, shape [vertex_count].
+        edges: Vertices of the edges of the movable part, shape [n, 2].
+        length: Median length of these.
+    """
+
+    is_movable: np.ndarray
+    edges: np.ndarray
+    length: float
+
+
+class StretchRecorder:
+    """Collects the frames of a stretch, in order. It holds the moved vertices alone."""
+
+    def __init__(self, mesh: FollowedMesh):
+        self._mesh = mesh
+        self._frames: list[MovedFrame] = []
+        self._times: list[float] = []
+        self._uncertified: list[float] = []
+        self._largest: list[float] = []
+        self._moved, self._sum, self._count = 0, 0.0, 0
+        self._ratio = 1.0, 1.0
+        self._last: list[tuple[np.ndarray, np.ndarray]] = []  # displacements and positions of the last two frames
+        self._acceleration = 0.0, 0.0
+
+    def add(self, frame: ShotFrame, moved: MovedFrame) -> None:
+        """Adds a frame; ``moved`` has its moved vertices."""
+        self._times.append(moved.time)
+        if not frame.certified:
+            self._uncertified.append(moved.time)
+        added = frame.x - frame.given
+        own = frame.given[self._mesh.is_movable]
+        if len(self._last) == 2:
+            (a, x), (b, y) = self._last
+            differences = (_largest(a - 2.0 * b + added), _largest(x - 2.0 * y + own))
+            self._acceleration = tuple(map(max, self._acceleration, differences))
+        self._last = [*self._last[-1:], (added, own)]
+        if not len(moved.vertices):
+            return
+        self._frames.append(moved)
+        moves = np.linalg.norm(added[moved.vertices], axis=1)
+        self._moved = max(self._moved, len(moves))
+        self._largest.append(float(moves.max()))
+        self._sum, self._count = self._sum + float(moves.sum(dtype=np.float64)), self._count + len(moves)
+        edges = self._mesh.edges
+        lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
+        ratio = lengths[0] / np.maximum(lengths[1], 1e-12 * self._mesh.length)
+        self._ratio = min(self._ratio[0], float(ratio.min())), max(self._ratio[1], float(ratio.max()))
+
+    def finish(self, left: list[str]) -> RepairedStretch:
+        """Returns the stretch; ``left`` says why collisions are left."""
+        return RepairedStretch(
+            start=self._times[0],
+            end=self._times[-1],
+            frames=tuple(self._frames),
+            largest_moves=tuple(self._largest),
+            moved=self._moved,
+            largest_move=max(self._largest, default=0.0),
+            mean_move=self._sum / max(1, self._count),
+            edge_length=self._mesh.length,
+            edge_ratio=self._ratio,
+            acceleration=(self._acceleration[0], self._acceleration[1]),
+            uncertified=tuple(self._uncertified),
+            left=tuple(left),
+        )
+
+
+def _largest(vectors: np.ndarray) -> float:
+    """Returns the largest length of some vectors."""
+    return float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
