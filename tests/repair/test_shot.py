@@ -9,9 +9,9 @@ from pxr import Gf, Usd, UsdGeom, UsdSkel
 from stages import add_mesh, find, new_stage, save
 
 from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
-from warp_bsc.repair.blend import BLEND, blend
-from warp_bsc.repair.findings import find_collisions
-from warp_bsc.repair.shot import repair_shot
+from warp_bsc.repair.shot.blend import BLEND, blend
+from warp_bsc.repair.shot.findings import find_collisions
+from warp_bsc.repair.shot.repair_shot import repair_shot
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import json
 import os
 
 from .._atomic_file import STDOUT, unfinished_path
-from ..repair.report import RepairPage
-from ..repair.shot import kept_meshes
+from ..repair.shot.repair_shot import kept_meshes
+from ..repair.shot.report import RepairPage
 from ..replay.hit_files import replay_facts
 from ..usd.frames import FrameRange
 from ..usd.scene import Scene

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from .._atomic_file import naming, unfinished_path
-from ..repair.findings import Finding, find_collisions
-from ..repair.journal import Journal
-from ..repair.report import RepairPage
-from ..repair.shot import repair_shot
-from ..repair.stretch import RepairedStretch
+from ..repair.shot.findings import Finding, find_collisions
+from ..repair.shot.journal import Journal
+from ..repair.shot.repair_shot import repair_shot
+from ..repair.shot.report import RepairPage
+from ..repair.shot.stretch import RepairedStretch
 from ..replay.intervals import replay
 from ..replay.results import IntervalResult
 from ..usd.points_layer import PointsLayer

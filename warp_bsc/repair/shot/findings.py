@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from .._arguments import check_instance, checked_distance
-from ..detection.detector import CollisionDetector
-from ..detection.mesh import CollisionMesh
-from ..replay.results import IntervalResult
-from ..replay.scene_contacts import find_contacts
-from ..usd.interval import Interval
-from ..usd.scene import Scene
-from ..usd.segment import Segment
-from ..usd.selection import Selection
+from ..._arguments import check_instance, checked_distance
+from ...detection.detector import CollisionDetector
+from ...detection.mesh import CollisionMesh
+from ...replay.results import IntervalResult
+from ...replay.scene_contacts import find_contacts
+from ...usd.interval import Interval
+from ...usd.scene import Scene
+from ...usd.segment import Segment
+from ...usd.selection import Selection
 
 __all__ = ["Finding", "find_collisions"]
 

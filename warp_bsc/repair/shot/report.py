@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from .._atomic_file import OutputFile
-from ..replay.html_page import block, fill_page, inert, shared_part, spread
-from ..replay.page_view import choose_faces
-from ..usd.points_layer import MovedFrame
-from ..usd.scene import Scene
-from ..usd.segment import Segment
+from ..._atomic_file import OutputFile
+from ...replay.html_page import block, fill_page, inert, shared_part, spread
+from ...replay.page_view import choose_faces
+from ...usd.points_layer import MovedFrame
+from ...usd.scene import Scene
+from ...usd.segment import Segment
 from .findings import Finding
 from .stretch import RepairedStretch
 
@@ -70,7 +70,7 @@ class RepairPage:
             OSError: If the disk is full.
             ValueError: If the scene cannot be read again.
         """
-        page = resources.files("warp_bsc.repair") / "page"
+        page = resources.files("warp_bsc.repair.shot") / "page"
         shared = (shared_part(name) for name in ("blocks.js", "elements.js", "view3d.js"))
         head, between, end = fill_page(page / "page.html", [*shared, page / "repair.js"], _title(scene))
         self.file.write(head)

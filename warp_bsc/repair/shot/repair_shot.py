@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from .._arguments import check_instance, checked_distance, checked_integer, checked_strings
-from ..usd.interval import Interval
-from ..usd.points_layer import MovedFrame
-from ..usd.scene import Scene
-from ..usd.segment import Segment
-from ..usd.selection import Selection
+from ..._arguments import check_instance, checked_distance, checked_integer, checked_strings
+from ...usd.interval import Interval
+from ...usd.points_layer import MovedFrame
+from ...usd.scene import Scene
+from ...usd.segment import Segment
+from ...usd.selection import Selection
+from ..repair import repair
 from .blend import MARGIN, blend
 from .findings import Finding
 from .follow import Follower
-from .repair import repair
 from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
 
 __all__ = ["kept_meshes", "repair_shot"]

@@ -9,9 +9,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..replay.earlier import describe_difference
-from ..usd.points_layer import MovedFrame
-from ..usd.scene import Scene
+from ...replay.earlier import describe_difference
+from ...usd.points_layer import MovedFrame
+from ...usd.scene import Scene
 from .findings import Finding
 from .stretch import RepairedStretch
 

@@ -8,11 +8,12 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
-from ..detection.detector import CollisionDetector
-from ..detection.mesh import CollisionMesh
-from ..response.solver_ccd import SolverCCD
+from ...detection.detector import CollisionDetector
+from ...detection.launch import launch, launch_in_turn
+from ...detection.mesh import CollisionMesh
+from ...response.solver_ccd import SolverCCD
+from ..motion import Contacts, as_contacts, projected
 from .follow_kernels import normalize, smooth
-from .motion import Contacts, as_contacts, projected
 
 __all__ = ["FollowedFrame", "Follower"]
 
@@ -108,12 +109,6 @@ class Follower:
         self._values = wp.empty(len(x), dtype=wp.vec4, device=self._device)
         self._smoothed = wp.empty_like(self._values)
         self._spread = wp.empty(len(x), dtype=wp.vec3, device=self._device)
-        options = {"device": self._device, "record_cmd": True}
-        neighbours = [self._first, self._neighbours]
-        self._two_sweeps = [
-            wp.launch(smooth, len(x), [*neighbours, values], [smoothed], **options)
-            for values, smoothed in ((self._values, self._smoothed), (self._smoothed, self._values))
-        ]
 
     def follow(
         self, start: np.ndarray, given: np.ndarray, displacement: np.ndarray, *, tolerance: float
@@ -189,11 +184,16 @@ class Follower:
         """Returns the displacements of some vertices, and of those around them."""
         weights = (displacement != 0.0).any(axis=1, keepdims=True)
         self._values.assign(np.concatenate([displacement, weights], axis=1).astype(np.float32))
-        for _ in range(sweeps // 2):
-            for sweep in self._two_sweeps:
-                sweep.launch()
-        inputs = [self._values, sweeps, self._movable]
-        wp.launch(normalize, len(weights), inputs, [self._spread], device=self._device)
+        inputs = [self._first, self._neighbours]
+        values = [self._values, self._smoothed]
+        smoothed = launch_in_turn(smooth, len(weights), sweeps, inputs=inputs, values=values)
+        launch(
+            normalize,
+            len(weights),
+            inputs=[smoothed, sweeps, self._movable],
+            outputs=[self._spread],
+            device=self._device,
+        )
         spread = self._spread.numpy().astype(np.float64)
         return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < _SMALLEST * self.length, 0.0, spread)
 
