@@ -32,7 +32,8 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         springs: Springs of the vertices that may move.
         max_strain: Largest strain.
     """
-    best, best_score = x, _score(surface, x, max_strain)
+    best, score = x, _score(surface, x, max_strain)
+    best_score = score
     held, stalled = np.zeros(len(x), dtype=bool), 0
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
@@ -42,11 +43,11 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         held |= stopped
         change = np.abs(moved - x).max(initial=0.0)
         x = moved
-        score = _score(surface, x, max_strain)
-        stalled = 0 if _is_better(best_score, score) else stalled + 1
+        before, score = score, _score(surface, x, max_strain)
+        stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
-        if change < _SETTLED * surface.edge or stalled >= (_PATIENCE if best_score[0] else 1):
+        if change < _SETTLED * surface.edge or stalled >= (_PATIENCE if score[0] else 1):
             break
     return best
 
