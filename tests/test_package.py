@@ -65,7 +65,7 @@ PACKAGES = {
 LIBRARIES = {
     "newton": {
         "response",
-        "warp_bsc/repair/shot/follow.py",  # plays positions back as a solver
+        "warp_bsc/repair/shot/playback.py",  # plays positions back as a solver
         "warp_bsc/repair/state.py",  # repairs a state of a model
         "warp_bsc/repair/model_surface.py",  # takes the surface from it
         "warp_bsc/_private_names/of_newton.py",

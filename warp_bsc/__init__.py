@@ -40,8 +40,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     )
     from .detection.query_points import query_points
     from .repair.repair import repair
-    from .repair.results import RepairResult, StateRepairResult, UnresolvedContour
-    from .repair.state import repair_state
+    from .repair.results import RepairResult, UnresolvedContour
+    from .repair.state import StateRepairResult, repair_state
     from .replay.intervals import replay
     from .replay.results import IntervalResult, IntervalSummary
     from .replay.scene_contacts import SceneContacts
@@ -78,7 +78,7 @@ _MODULES = {
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverReport": "response.report",
-    "StateRepairResult": "repair.results",
+    "StateRepairResult": "repair.state",
     "UnresolvedContour": "repair.results",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",

@@ -43,11 +43,9 @@ examples:
 {explain_statuses()}"""
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
-    command = add_command(
-        commands, "detector", _run, summary="measure the detector", description=_DESCRIPTION, epilog=_EPILOG
-    )
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
+    command = add_command(commands, "detector", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to measure")
     command.add_argument(
         "--interval", type=natural, default=0, metavar="N", help="interval of a USD file, counted from 0 (default: 0)"

@@ -41,11 +41,9 @@ examples:
 After a signal, the runs that were complete are printed or written first."""
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
-    command = add_command(
-        commands, "newton", _run, summary="measure Newton's own examples", description=_DESCRIPTION, epilog=_EPILOG
-    )
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
+    command = add_command(commands, "newton", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     command.add_argument(
         "examples", metavar="EXAMPLE", nargs="*", help="the examples to run, by name, with their options in quotes"
     )

@@ -43,11 +43,9 @@ examples:
 _FIGURES = (".png", ".svg", ".pdf")
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
-    command = add_command(
-        commands, "paper", _run, summary="measure the paper's benchmarks", description=_DESCRIPTION, epilog=_EPILOG
-    )
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
+    command = add_command(commands, "paper", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to measure (default: the paper's five)")
     command.add_argument("--quick", action="store_true", help="measure only a few intervals and queries")
     command.add_argument(

@@ -37,11 +37,9 @@ examples:
 {explain_statuses()}"""
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
-    command = add_command(
-        commands, "queries", _run, summary="measure elementary queries", description=_DESCRIPTION, epilog=_EPILOG
-    )
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
+    command = add_command(commands, "queries", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     command.add_argument(
         "--count", type=positive, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
     )

@@ -41,13 +41,13 @@ examples:
 After a signal, the repairs that were complete are printed or written first."""
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
     command = add_command(
         commands,
         "repair",
         _run,
-        summary="measure what repair frees, and how",
+        summary=summary,
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )

@@ -58,13 +58,13 @@ examples:
 After a signal, the runs that were complete are printed or written first."""
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
     command = add_command(
         commands,
         "response",
         _run,
-        summary="measure stretch, rest, energy and time of contact",
+        summary=summary,
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )

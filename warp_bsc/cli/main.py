@@ -1,24 +1,13 @@
 """The command line ``warp-bsc``: parses the arguments and runs the command that they name."""
 
 import argparse
+import importlib
 import sys
 from typing import NoReturn
 
 from .._version import __version__
-from . import (
-    bench_detector,
-    bench_newton,
-    bench_paper,
-    bench_queries,
-    bench_repair,
-    bench_response,
-    query,
-    repair,
-    replay,
-)
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
-from .options import add_command
 
 __all__ = ["main", "run"]
 
@@ -50,14 +39,20 @@ examples:
 
 {explain_statuses()}"""
 
-_BENCHMARKS = {
-    "paper": bench_paper,
-    "detector": bench_detector,
-    "queries": bench_queries,
-    "newton": bench_newton,
-    "response": bench_response,
-    "repair": bench_repair,
+_COMMANDS = {
+    "replay": "find the collisions in a USD scene",
+    "repair": "move the meshes of a USD scene so that they do not collide",
+    "query": "decide queries of CSV files",
 }
+_BENCHMARKS = {
+    "paper": "measure the paper's benchmarks",
+    "detector": "measure the detector",
+    "queries": "measure elementary queries",
+    "newton": "measure Newton's own examples",
+    "response": "measure stretch, rest, energy and time of contact",
+    "repair": "measure what repair frees, and how",
+}
+"""The commands and the benchmarks. Each is a module of this package, imported when it is named: some take seconds."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -78,11 +73,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def run(argv: list[str]) -> int:
     """Runs the command line as :func:`main` does, but raises every error."""
-    arguments = _build_parser().parse_args(_with_joined_frames(_with_benchmark(argv)))
+    argv = _with_joined_frames(_with_benchmark(argv))
+    arguments = _build_parser(argv).parse_args(argv)
     return arguments.run(arguments)
 
 
-def _build_parser() -> argparse.ArgumentParser:
+def _build_parser(argv: list[str] | None = None) -> argparse.ArgumentParser:
+    """Returns the parser, with the options of the command that the arguments name; without any, of all commands."""
     parser = _Parser(
         prog="warp-bsc",
         description="Continuous collision detection for deforming triangle meshes.",
@@ -91,21 +88,26 @@ def _build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"warp-bsc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    replay.add_to(commands)
-    repair.add_to(commands)
-    query.add_to(commands)
-    bench = add_command(
-        commands,
+    _add(commands, _COMMANDS, "", None if argv is None else argv[:1])
+    bench = commands.add_parser(
         "bench",
-        None,
-        summary="measure detection, SolverCCD and repair",
+        help="measure detection, SolverCCD and repair",
         description=_BENCH,
         epilog=_BENCH_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     benchmarks = bench.add_subparsers(required=True, metavar="BENCHMARK")
-    for benchmark in _BENCHMARKS.values():
-        benchmark.add_to(benchmarks)
+    _add(benchmarks, _BENCHMARKS, "bench_", None if argv is None else argv[1:2] if argv[:1] == ["bench"] else [])
     return parser
+
+
+def _add(commands: argparse._SubParsersAction, summaries: dict[str, str], prefix: str, named: list[str] | None) -> None:
+    """Adds commands: with options those that are named, or all, and without options, which --help omits, the others."""
+    for name, summary in summaries.items():
+        if named is None or name in named:
+            importlib.import_module(f".{prefix}{name}", __package__).add_to(commands, summary)
+        else:
+            commands.add_parser(name, help=summary)
 
 
 def _with_benchmark(argv: list[str]) -> list[str]:

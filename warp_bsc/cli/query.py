@@ -43,11 +43,9 @@ examples:
 _QUERIES: dict[str, Callable[..., QueryResult]] = dict(zip(KINDS, (query_vertex_face, query_edge_edge), strict=True))
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
-    command = add_command(
-        commands, "query", _run, summary="decide queries of CSV files", description=_DESCRIPTION, epilog=_EPILOG
-    )
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
+    command = add_command(commands, "query", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     command.add_argument(
         "paths", metavar="FILE", nargs="+", help="a CSV file, or a folder: all CSV files in it and below"
     )

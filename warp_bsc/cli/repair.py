@@ -53,13 +53,13 @@ examples:
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
     command = add_command(
         commands,
         "repair",
         _run,
-        summary="move the meshes of a USD scene so that they do not collide",
+        summary=summary,
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )

@@ -37,13 +37,13 @@ from .tables import Console, say
 __all__ = ["add_to", "open_scene", "run_replay"]
 
 
-def add_to(commands: Commands) -> None:
-    """Adds the command with its options."""
+def add_to(commands: Commands, summary: str) -> None:
+    """Adds the command with its options, and a line for the list of commands."""
     command = add_command(
         commands,
         "replay",
         _run,
-        summary="find the collisions in a USD scene",
+        summary=summary,
         description=DESCRIPTION,
         epilog=EPILOG,
     )

@@ -2,9 +2,6 @@
 
 import warp as wp
 
-from ..response.state.mesh import Placement
-from ..response.state.planes import transformed_plane
-
 wp.set_module_options({"enable_backward": False})
 
 _ZERO = wp.constant(wp.float64(0.0))
@@ -162,10 +159,3 @@ def find_exits(
     i, j = wp.tid()
     query = wp.mesh_query_ray(surface, points[i], directions[j], wp.inf)
     distances[i, j] = wp.where(query.result, query.t, wp.inf)
-
-
-@wp.kernel
-def place_planes(place: Placement, planes: wp.array[wp.vec4d]):
-    """Writes the infinite planes of a model where its bodies are."""
-    i = wp.tid()
-    planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)

@@ -9,8 +9,8 @@ from ..detection.body_parts import connect_cells
 from ..detection.launch import launch
 from ..detection.mesh import CollisionMesh
 from ..response.inside import Inside, InsideFinder
-from ..response.state.mesh import ModelMesh, elements_of
-from .kernels import place_planes
+from ..response.state.mesh import ModelMesh, Placement, elements_of
+from ..response.state.planes import transformed_plane
 from .solids import leave_solid, spread_exits
 from .surface import Surface, differ, weld_borders, welded
 
@@ -116,11 +116,18 @@ class ModelSurface:
         return x, movable
 
 
+@wp.kernel(enable_backward=False, module="unique")
+def _place_planes(place: Placement, planes: wp.array[wp.vec4d]):
+    """Writes the infinite planes of a model where its bodies are."""
+    i = wp.tid()
+    planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)
+
+
 def _planes_in(mesh: ModelMesh, state: newton.State) -> np.ndarray:
     """Returns the infinite planes in a state: unit normal out of the solid, and offset [m], float64, shape [n, 4]."""
     planes = wp.zeros(len(mesh.planes.shape), dtype=wp.vec4d, device=mesh.device)
     place = mesh.place(state.particle_q, state.body_q)
-    launch(place_planes, len(planes), inputs=[place], outputs=[planes], device=mesh.device)
+    launch(_place_planes, len(planes), inputs=[place], outputs=[planes], device=mesh.device)
     return planes.numpy().reshape(-1, 4)
 
 

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.mesh import CollisionMesh
-from ..response.inside import Inside
 from .contours import ContourKind
 
-__all__ = ["RepairResult", "StateRepairResult", "UnresolvedContour"]
+__all__ = ["RepairResult", "UnresolvedContour"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,26 +53,3 @@ class RepairResult:
     moved: np.ndarray
     max_strain: float
     unresolved: tuple[UnresolvedContour, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class StateRepairResult(RepairResult):
-    """The result of :func:`warp_bsc.repair_state`. Rows of arrays are particles.
-
-    Pairs of which no vertex can move do not count: two shapes, or what is kinematic.
-
-    Attributes:
-        inside_before: Number of particles inside rigid shapes, soft bodies and the solids of infinite planes in the
-            input; one that is inside several counts for each.
-        inside: Those in ``x``, see :class:`warp_bsc.response.inside.Inside`.
-        inverted_before: Number of tetrahedra whose volume is not positive in the input.
-        inverted: Number of those in ``x``. A tetrahedron that has a positive volume keeps one.
-        mesh: The mesh of ``UnresolvedContour.elements``: the particles, then the vertices of shapes, then four for each
-            infinite plane and world.
-    """
-
-    inside_before: int
-    inside: Inside
-    inverted_before: int
-    inverted: int
-    mesh: CollisionMesh

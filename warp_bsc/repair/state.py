@@ -1,22 +1,48 @@
 """Repairs a state of a Newton model: a legal start, in which nothing crosses and nothing is inside shapes."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import newton
 import numpy as np
 import warp as wp
 
 from .._arguments import check_instance, checked_distance, checked_number
+from ..detection.mesh import CollisionMesh
+from ..response.inside import Inside
 from .arguments import checked_layers
 from .free import free, restore_parts
 from .layers import separate_layers
 from .model_surface import ModelSurface
 from .motion import near_pairs
-from .results import StateRepairResult
+from .results import RepairResult
 from .tetrahedra import are_inverted, follow_surface, restore_inverted
 from .unresolved import unresolved_contours
 
-__all__ = ["repair_state"]
+__all__ = ["StateRepairResult", "repair_state"]
+
+
+@dataclass(frozen=True, eq=False)
+class StateRepairResult(RepairResult):
+    """The result of :func:`warp_bsc.repair_state`. Rows of arrays are particles.
+
+    Pairs of which no vertex can move do not count: two shapes, or what is kinematic.
+
+    Attributes:
+        inside_before: Number of particles inside rigid shapes, soft bodies and the solids of infinite planes in the
+            input; one that is inside several counts for each.
+        inside: Those in ``x``, see :class:`warp_bsc.response.inside.Inside`.
+        inverted_before: Number of tetrahedra whose volume is not positive in the input.
+        inverted: Number of those in ``x``. A tetrahedron that has a positive volume keeps one.
+        mesh: The mesh of ``UnresolvedContour.elements``: the particles, then the vertices of shapes, then four for each
+            infinite plane and world.
+    """
+
+    inside_before: int
+    inside: Inside
+    inverted_before: int
+    inverted: int
+    mesh: CollisionMesh
 
 
 def repair_state(

@@ -1,19 +1,20 @@
 """Positions of a mesh at one time from those at the time before: near given ones, and reached without a collision."""
 
-import warnings
+import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverBase
 
 from ...detection.detector import CollisionDetector
 from ...detection.launch import launch, launch_in_turn
 from ...detection.mesh import CollisionMesh
-from ...response.solver_ccd import SolverCCD
 from ..motion import Contacts, as_contacts, projected
 from .follow_kernels import normalize, smooth
+
+if TYPE_CHECKING:
+    from .playback import Playback
 
 __all__ = ["FollowedFrame", "Follower"]
 
@@ -52,7 +53,7 @@ class Follower:
 
     Contacts are moved apart, which would strain the edges around them. So their displacements are spread over the mesh,
     first widely, then less, and added to the given positions: the neighbourhood of a contact moves with it, and keeps
-    the shape that it has in the given positions. What then still collides is left to :class:`SolverCCD`.
+    the shape that it has in the given positions. What then still collides is left to :class:`warp_bsc.SolverCCD`.
 
     Attributes:
         edges: Vertices of the edges of the movable part, the smaller first, shape [n, 2].
@@ -75,7 +76,7 @@ class Follower:
             x: Positions at the start, float, shape [vertex_count, 3].
             is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
                 move as given.
-            min_distance: Distance that pairs keep, see :class:`SolverCCD`.
+            min_distance: Distance that pairs keep, see :class:`warp_bsc.SolverCCD`.
             device: Warp device.
         """
         self._is_movable = is_movable
@@ -84,22 +85,14 @@ class Follower:
         lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
         self.length = float(np.median(lengths)) if len(lengths) else 1.0
         self.edges = edges
-        builder = newton.ModelBuilder()
-        positions = np.asarray(x, np.float32)
-        masses = is_movable.astype(float).tolist()
-        builder.add_particles(positions.tolist(), np.zeros_like(positions).tolist(), masses)
-        builder.add_triangles(*np.asarray(faces, np.int64).T.tolist())
-        model = builder.finalize(device=device)
-        self._device = model.device
-        self._playback = _Playback(model)
-        options = {"friction": 0.0, "restitution": 0.0, "substeps": None, "min_distance": min_distance}
-        self._stage = SolverCCD(self._playback, **options)
-        mesh = CollisionMesh(faces, len(x), device=self._device)
+        self._x, self._min_distance = np.asarray(x, np.float32), min_distance
+        mesh = CollisionMesh(faces, len(x), device=device)
+        self._device = mesh.device
         self._gaps = {CollisionDetector(mesh): _GAP * self.length}
         if min_distance:
             detector = CollisionDetector(mesh, min_distance=min_distance)
             self._gaps[detector] = min_distance + _GAP * self.length
-        self._start, self._end = model.state(), model.state()
+        self._mesh = mesh
         both = np.concatenate([edges, edges[:, ::-1]])
         order = np.argsort(both[:, 0], kind="stable")
         first = np.concatenate([[0], np.cumsum(np.bincount(both[:, 0], minlength=len(x)))])
@@ -139,7 +132,7 @@ class Follower:
             displacement = displacement + self._spread_out(residual, sweeps)
         if best is not None:
             return best[1]
-        x, certified = self._respond(start, _displaced(given, displacement))
+        x, certified = self._playback.step(start, _displaced(given, displacement))
         return FollowedFrame(x, displacement, certified)
 
     def _moved_apart(self, start, target) -> tuple[np.ndarray, bool]:
@@ -169,16 +162,12 @@ class Follower:
             found.append(contacts.rows(contacts.toi > 0.0) if detector.min_distance else contacts)
         return Contacts.joined(found), is_free
 
-    def _respond(self, start, target) -> tuple[np.ndarray, bool]:
-        """Returns the positions that the stage makes of a motion, and whether it certifies the motion to them."""
-        assert self._start.particle_q is not None and self._end.particle_q is not None
-        self._start.particle_q.assign(start)
-        self._playback.target = target
-        self._stage.reset(self._start)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
-            self._stage.step(self._start, self._end, None, None, 1.0)
-        return self._end.particle_q.numpy().copy(), self._stage.report.certified
+    @functools.cached_property
+    def _playback(self) -> "Playback":
+        """The stage behind a solver that moves particles to given positions."""
+        from .playback import Playback  # noqa: PLC0415 (Newton takes seconds, and few shots need it)
+
+        return Playback(self._mesh.faces, self._x, self._is_movable, self._min_distance, self._device)
 
     def _spread_out(self, displacement, sweeps) -> np.ndarray:
         """Returns the displacements of some vertices, and of those around them."""
@@ -196,21 +185,6 @@ class Follower:
         )
         spread = self._spread.numpy().astype(np.float64)
         return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < _SMALLEST * self.length, 0.0, spread)
-
-
-class _Playback(SolverBase):
-    """A solver that moves particles to given positions.
-
-    Attributes:
-        target: The positions, float32, shape [particle_count, 3].
-    """
-
-    target: np.ndarray
-
-    def step(self, state_in, state_out, control, contacts, dt):
-        """Writes the target, and the velocity that reaches it."""
-        state_out.particle_q.assign(self.target)
-        state_out.particle_qd.assign((self.target - state_in.particle_q.numpy()) / np.float32(dt))
 
 
 def _displaced(given, displacement) -> np.ndarray:

@@ -1,0 +1,69 @@
+"""Steps SolverCCD behind a solver that moves particles to given positions."""
+
+import warnings
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from ...response.solver_ccd import SolverCCD
+
+__all__ = ["Playback"]
+
+
+class Playback:
+    """The stage behind a solver that moves the vertices of a mesh to given positions."""
+
+    def __init__(
+        self, faces: np.ndarray, x: np.ndarray, is_movable: np.ndarray, min_distance: float, device: wp.DeviceLike
+    ):
+        """Makes the model.
+
+        Args:
+            faces: Vertices of the faces, integers, shape [face_count, 3].
+            x: Positions at the start, float32, shape [vertex_count, 3].
+            is_movable: Whether the stage may move each vertex, bool, shape [vertex_count].
+            min_distance: Distance that pairs keep.
+            device: Warp device.
+        """
+        builder = newton.ModelBuilder()
+        builder.add_particles(x.tolist(), np.zeros_like(x).tolist(), is_movable.astype(float).tolist())
+        builder.add_triangles(*np.asarray(faces, np.int64).T.tolist())
+        model = builder.finalize(device=device)
+        self._given = _Given(model)
+        options = {"friction": 0.0, "restitution": 0.0, "substeps": None, "min_distance": min_distance}
+        self._stage = SolverCCD(self._given, **options)
+        self._start, self._end = model.state(), model.state()
+
+    def step(self, start: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Returns the positions that the stage makes of a motion, and whether it certifies the motion to them.
+
+        Args:
+            start: Positions at the start, float32, shape [vertex_count, 3].
+            target: Positions at the end of the motion, likewise.
+        """
+        assert self._start.particle_q is not None and self._end.particle_q is not None
+        self._start.particle_q.assign(start)
+        self._given.target = target
+        self._stage.reset(self._start)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
+            warnings.filterwarnings("ignore", "edges pass through")  # of a first frame that could not be freed
+            self._stage.step(self._start, self._end, None, None, 1.0)
+        return self._end.particle_q.numpy().copy(), self._stage.report.certified
+
+
+class _Given(SolverBase):
+    """A solver that moves particles to given positions.
+
+    Attributes:
+        target: The positions, float32, shape [particle_count, 3].
+    """
+
+    target: np.ndarray
+
+    def step(self, state_in, state_out, control, contacts, dt):
+        """Writes the target, and the velocity that reaches it."""
+        state_out.particle_q.assign(self.target)
+        state_out.particle_qd.assign((self.target - state_in.particle_q.numpy()) / np.float32(dt))
