@@ -12,7 +12,7 @@ from warp_bsc.bench.repair import FILE, KNOWN_MESH, RepairAttempt, RepairRun, me
 from warp_bsc.bench.repair_scenes import TangledMesh, damaged, load_tangled
 
 
-def cross(*, size=16):
+def cross(*, size=32):
     """Two sheets, one through the other from border to border."""
     u, v = np.mgrid[:size, :size].reshape(2, -1) / (size - 1.0)
     i = np.arange(size * size).reshape(size, size)

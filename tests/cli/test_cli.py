@@ -441,7 +441,7 @@ def test_error_while_the_program_is_loaded(safe_scene, tmp_path):
     (tmp_path / "rich.py").write_text("raise RuntimeError('broken\\ninstallation')")
     done = run_program("replay", safe_scene, env={**os.environ, "PYTHONPATH": str(tmp_path)})
     assert done.returncode == 2
-    assert done.stderr.startswith("warp-bsc: error: RuntimeError: broken installation (bench_detector.py:")
+    assert done.stderr.startswith("warp-bsc: error: RuntimeError: broken installation (")
     assert len(done.stderr.splitlines()) == 1
 
 

@@ -590,6 +590,7 @@ VALUES: dict[str, list[str]] = {
     "--validate": [*NUMERIC, "ALL"],
     "--workers": [*NUMERIC, "head:8786", "tcp://", "://head:8786"],
     "--modes": ["", "x", "plain,x"],
+    "--kinds": ["", "x", "bodies,x"],
     "--configurations": ["", "x", "plain,x"],
     "--seconds": ["", "x", "nan", "inf", "-1", "0", "1e400", "True"],
     "--perturb": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
