@@ -219,3 +219,13 @@ def test_positions_that_are_not_finite_are_refused(device):
     state.particle_q.assign(x)
     with pytest.raises(ValueError, match=r"positions of the state\[7\]"):
         bsc.repair_state(model, state)
+
+
+def test_a_body_deep_in_the_ground_leaves_it_as_a_whole(device):
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    add_block(builder, (0.0, 0.0, -0.15))
+    result, _ = repaired(builder, device)
+    assert result.inside_before > 100 and len(result.inside) == 0
+    assert 0.15 < result.moved.max() < 0.17
+    assert result.max_strain < 0.15

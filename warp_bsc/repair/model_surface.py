@@ -11,7 +11,8 @@ from ..detection.mesh import CollisionMesh
 from ..response.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.planes import transformed_plane
-from .solids import leave_solid, spread_exits
+from .contours import connected_components
+from .solids import leave_solid, leave_solid_whole, spread_exits
 from .surface import Surface, differ, weld_borders, welded
 
 __all__ = ["ModelSurface"]
@@ -86,33 +87,45 @@ class ModelSurface:
         """Returns the particles inside shapes, soft bodies and solids of planes at positions in units."""
         return self._finder.find(self.positions(x)[: self._of_model.vertex_count], self._planes)
 
-    def leave_solids(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Puts particles that are inside solids outside, and others with them.
+    def leave_solids(self, x: np.ndarray, *, whole: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Puts particles that are inside solids outside.
 
         Args:
             x: Positions, in units, shape [n, 3].
+            whole: Whether what is connected moves as a whole, if it is free to; otherwise those around the particles
+                follow.
 
         Returns:
             Positions in units, and which vertices may have moved, bool, shape [n].
         """
         surface, movable = self.surface, np.zeros(len(x), dtype=bool)
         corners = self.mesh.faces[:, 0]
+        body = connected_components(len(x), surface.edges)
+        is_held = np.isin(body, body[surface.fixed])
         for _ in range(_ESCAPES):
             inside = self.inside(x)
             vertices = self.weld[inside.particles]
-            free = ~surface.fixed[vertices]
-            if not free.any():
+            leaves = ~(is_held if whole else surface.fixed)[vertices]
+            if not leaves.any():
                 break
-            solids = np.column_stack([inside.shapes, inside.soft_bodies, self._world[inside.particles]])[free]
+            solids = np.column_stack([inside.shapes, inside.soft_bodies, self._world[inside.particles]])[leaves]
             moves, moved = np.zeros_like(x), np.zeros(len(x), dtype=bool)
             for shape, soft_body, world in np.unique(solids, axis=0):
-                of_solid = np.unique(vertices[free][(solids == (shape, soft_body, world)).all(axis=1)])
+                of_solid = np.unique(vertices[leaves][(solids == (shape, soft_body, world)).all(axis=1)])
                 is_face = (self._shape[corners] == shape) & (self._world[corners] == world)
-                is_face &= self._soft_body[corners] == soft_body
-                moves[of_solid] = leave_solid(surface, x, np.flatnonzero(is_face), of_solid)
-                moved[of_solid] = True
-            x, reach = spread_exits(surface, x, moves, moved)
-            movable |= reach
+                (faces,) = np.nonzero(is_face & (self._soft_body[corners] == soft_body))
+                if whole:
+                    of_bodies = leave_solid_whole(surface, x, faces, of_solid, body)
+                    moves = np.where(differ(of_bodies, np.zeros_like(x))[:, None], of_bodies, moves)
+                else:
+                    moves[of_solid] = leave_solid(surface, x, faces, of_solid)
+                    moved[of_solid] = True
+            if whole:
+                movable |= differ(moves, np.zeros_like(x))
+                x = surface.rounded(x + moves)
+            else:
+                x, reach = spread_exits(surface, x, moves, moved)
+                movable |= reach
         return x, movable
 
 

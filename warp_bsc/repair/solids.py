@@ -7,7 +7,7 @@ from .contours import connected_components
 from .elastic import Springs, near
 from .surface import Surface
 
-__all__ = ["leave_solid", "spread_exits"]
+__all__ = ["leave_solid", "leave_solid_whole", "spread_exits"]
 
 _GAP = 0.25
 """Distance from the solid at which a vertex is put, in edges."""
@@ -38,19 +38,56 @@ def leave_solid(surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np
     part = connected_components(len(x), surface.edges[is_inside[surface.edges].all(axis=1)])[vertices]
     for number in np.unique(part):
         (rows,) = np.nonzero(part == number)
-        deepest = depths[rows].max()
-        if deepest == 0.0:
-            continue
-        chosen = rows[np.argsort(-depths[rows], kind="stable")[np.linspace(0, len(rows) - 1, _SAMPLES).astype(int)]]
-        directions = np.concatenate([ways[chosen], ways[rows].sum(axis=0, keepdims=True)])
-        lengths = np.linalg.norm(directions, axis=1)
-        directions = directions[lengths > 0.0] / lengths[lengths > 0.0, None]
-        exits = exit_distances(surface, x, faces, x[vertices[rows]], directions)
-        longest = exits.max(axis=0)
-        best = np.argmin(longest)
-        if longest[best] <= _LONGEST * deepest:
-            moves[rows] = (exits[:, best, None] + _GAP * surface.edge) * directions[best]
+        direction, exits = _common_way(surface, x, faces, vertices[rows], ways[rows])
+        if exits.max() <= _LONGEST * depths[rows].max():
+            moves[rows] = (exits[:, None] + _GAP * surface.edge) * direction
     return moves
+
+
+def leave_solid_whole(
+    surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np.ndarray, body: np.ndarray
+) -> np.ndarray:
+    """Returns the moves of all vertices, in units, that put the bodies of vertices inside a solid outside of it.
+
+    Args:
+        surface: The surface.
+        x: Its positions, in units, shape [n, 3].
+        faces: Numbers of the faces of the solid, int.
+        vertices: Vertices that are inside, sorted, int.
+        body: Body of each vertex, which moves as a whole, int, shape [n].
+    """
+    closest, _ = closest_points(surface, x, faces, x[vertices])
+    moves = np.zeros_like(x)
+    for number in np.unique(body[vertices]):
+        (rows,) = np.nonzero(body[vertices] == number)
+        direction, exits = _common_way(surface, x, faces, vertices[rows], (closest - x[vertices])[rows])
+        if np.isfinite(exits).all():
+            moves[body == number] = (exits.max() + _GAP * surface.edge) * direction
+    return moves
+
+
+def _common_way(
+    surface: Surface, x: np.ndarray, faces: np.ndarray, vertices: np.ndarray, ways: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the direction in which vertices leave a solid soonest, all of them, and how far each one is from outside.
+
+    Args:
+        surface: The surface.
+        x: Its positions, in units, shape [n, 3].
+        faces: Numbers of the faces of the solid, int.
+        vertices: Vertices that are inside, int, shape [m].
+        ways: Their ways to the closest points of the solid, in units, shape [m, 3].
+    """
+    deepest = np.argsort(-np.linalg.norm(ways, axis=1), kind="stable")
+    chosen = deepest[np.linspace(0, len(ways) - 1, _SAMPLES).astype(int)]
+    directions = np.concatenate([ways[chosen], ways.sum(axis=0, keepdims=True)])
+    lengths = np.linalg.norm(directions, axis=1)
+    if not lengths.any():
+        return np.zeros(3), np.full(len(vertices), np.inf)
+    directions = directions[lengths > 0.0] / lengths[lengths > 0.0, None]
+    exits = exit_distances(surface, x, faces, x[vertices], directions)
+    best = np.argmin(exits.max(axis=0))
+    return directions[best], exits[:, best]
 
 
 def spread_exits(

@@ -147,17 +147,25 @@ class _Faults:
 
 
 def _repaired(placed: ModelSurface, before: _Faults, layer: np.ndarray | None, max_strain: float) -> _Faults:
-    """Returns the best positions that are found, the input if these are not better."""
-    surface = placed.surface
+    """Returns the best positions that are found, the input if these are not better.
+
+    What is deep inside a solid may leave it only as a whole: that is tried if the way out of its particles is not free.
+    """
+    surface, best = placed.surface, before
     start = surface.home if layer is None else separate_layers(surface, placed.layer)
-    start, movable = placed.leave_solids(start)
-    x = free(surface, start, max_strain, movable=movable if layer is None else ~surface.fixed)
-    if len(placed.tetrahedra):
-        x = restore_inverted(surface, follow_surface(surface, x, placed.tetrahedra), placed.tetrahedra)
-    found = _Faults(placed, x)
-    if found:
-        inside = placed.weld[before.inside.particles], placed.weld[found.inside.particles]
-        restored = _Faults(placed, restore_parts(surface, x, (before.crossings, found.crossings), inside))
-        if restored.are_no_more(before):
-            found = restored
-    return found if found.are_no_more(before) and found.counts < before.counts else before
+    for whole in (False, True) if len(before.inside) else (False,):
+        outside, movable = placed.leave_solids(start, whole=whole)
+        x = free(surface, outside, max_strain, movable=movable if layer is None else ~surface.fixed)
+        if len(placed.tetrahedra):
+            x = restore_inverted(surface, follow_surface(surface, x, placed.tetrahedra), placed.tetrahedra)
+        found = _Faults(placed, x)
+        if found:
+            inside = placed.weld[before.inside.particles], placed.weld[found.inside.particles]
+            restored = _Faults(placed, restore_parts(surface, x, (before.crossings, found.crossings), inside))
+            if restored.are_no_more(before):
+                found = restored
+        if found.are_no_more(before) and found.counts < best.counts:
+            best = found
+        if not best:
+            break
+    return best
