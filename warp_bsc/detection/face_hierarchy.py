@@ -314,28 +314,14 @@ def group_count(places: int) -> int:
 
 def make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
     """Allocates the hierarchy of a mesh on its device."""
-    device, order = mesh.device, mesh.face_order
+    device, order, places = mesh.device, mesh.face_order, mesh.device_places
     hierarchy = FaceHierarchy()
-
-    def by_place(values: np.ndarray) -> wp.array:
-        return wp.array(values[order] if len(order) else values, dtype=int, device=device)
-
-    hierarchy.order = wp.array(order, dtype=int, device=device)
     hierarchy.all_faces = len(mesh.cells) == len(mesh.faces)
     hierarchy.only_free = mesh.only_free
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
-    hierarchy.faces = by_place(mesh.cells)
-    hierarchy.face_edges = by_place(mesh.cell_edges)
-    hierarchy.owned = by_place(mesh.cell_owned)
-    hierarchy.edges = mesh.device_edges
-    vertex_rows, edge_rows = np.full(mesh.vertex_count, -1), np.empty(len(mesh.edges))
-    filled = np.flatnonzero(order >= 0)
-    for i in range(3):
-        for rows, elements, bit in ((vertex_rows, mesh.cells, i), (edge_rows, mesh.cell_edges, 3 + i)):
-            representing = filled[(mesh.cell_owned[order[filled]] >> bit) & 1 == 1]
-            rows[elements[order[representing], i]] = 3 * representing + i
-    hierarchy.vertex_rows = wp.array(vertex_rows.astype(np.int32), dtype=int, device=device)
-    hierarchy.edge_rows = wp.array(edge_rows.astype(np.int32), dtype=int, device=device)
+    hierarchy.order, hierarchy.faces, hierarchy.face_edges = places.order, places.faces, places.face_edges
+    hierarchy.owned, hierarchy.edges = places.owned, mesh.device_edges
+    hierarchy.vertex_rows, hierarchy.edge_rows = places.vertex_rows, places.edge_rows
     hierarchy.vertex_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
     hierarchy.edge_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
     hierarchy.face_boxes = wp.empty((len(order), 4), dtype=wp.vec3, device=device)

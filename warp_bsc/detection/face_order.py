@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..kernels.pipeline.hierarchy import WIDTH
-from .launch import launch
+from .launch import launch, launch_over
 from .settings import NO_GRADIENTS
 
 __all__ = ["CLUSTER", "GROUP", "order_faces"]
@@ -20,6 +20,9 @@ _GROUP = wp.constant(GROUP)
 
 _LARGE = wp.constant(4096)
 """Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
+
+_STAMPS = 16
+"""Stamps that halving a part takes, at most."""
 
 _MIN_OWN_CLUSTER = 8
 """Connected components with fewer faces share clusters, so that at most three of four places are empty."""
@@ -218,67 +221,60 @@ def _count_cut(
         for k in range(links.shape[1]):
             other = links[sorted_faces[i], k]
             if other >= 0:
-                if visited[other] == stamp:
+                place = place_of[other]
+                if place >= begin and place < end and visited[other] == stamp:
                     cut += 1
     return cut
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _order_components(
+def _halve_parts(
+    first: int,
     links: wp.array2d[int],
-    starts: wp.array[int],
-    sizes: wp.array[int],
+    parts: wp.array[wp.vec2i],
+    stamp: int,
     # in and out
     order: wp.array[int],
     place_of: wp.array[int],
     visited: wp.array[int],
     # scratch
-    stack: wp.array2d[int],
     queue: wp.array[int],
     keys: wp.array[int],
     buckets: wp.array[int],
     distances: wp.array2d[int],
+    # out
+    splits: wp.array[int],
 ):
-    """Orders each component by recursive bisection."""
-    stamp = int(0)
-    for component in range(starts.shape[0]):
-        stack[0, 0] = starts[component]
-        stack[0, 1] = starts[component] + sizes[component]
-        depth = int(1)
-        while depth > 0:
-            depth -= 1
-            begin = stack[depth, 0]
-            end = stack[depth, 1]
-            if end - begin > _CLUSTER:
-                stamp += 1
-                _visit(links, begin, end, order[begin], stamp, order, place_of, visited, queue, distances[0])
-                pole = queue[end - 1]
-                for i in range(4):
-                    if i > 0:
-                        pole = _farthest(begin, end, order, distances, i)
-                    stamp += 1
-                    _visit(links, begin, end, pole, stamp, order, place_of, visited, queue, distances[i])
-                for i in range(begin, end):
-                    order[i] = queue[i]
-                split = _split_at(begin, end)
-                best = int(0)
-                least_cut = int(2147483647)
-                for axis in range(wp.where(end - begin > _LARGE, 4, 8)):
-                    _sort(begin, end, axis, order, distances, keys, buckets, queue)
-                    stamp += 1
-                    cut = _count_cut(links, begin, split, end, stamp, queue, place_of, visited)
-                    if cut < least_cut:
-                        least_cut = cut
-                        best = axis
-                _sort(begin, end, best, order, distances, keys, buckets, queue)
-                for i in range(begin, end):
-                    order[i] = queue[i]
-                    place_of[queue[i]] = i
-                stack[depth, 0] = begin
-                stack[depth, 1] = split
-                stack[depth + 1, 0] = split
-                stack[depth + 1, 1] = end
-                depth += 2
+    """Orders each part by the half that its faces are in; parts may be halved at once, as no face is in two.
+
+    A part has the places from the first to before the second of its numbers. ``stamp`` is :data:`_STAMPS` more than in
+    the launch before.
+    """
+    i = first + wp.tid()
+    begin = parts[i][0]
+    end = parts[i][1]
+    _visit(links, begin, end, order[begin], stamp, order, place_of, visited, queue, distances[0])
+    pole = queue[end - 1]
+    for k in range(4):
+        if k > 0:
+            pole = _farthest(begin, end, order, distances, k)
+        _visit(links, begin, end, pole, stamp + 1 + k, order, place_of, visited, queue, distances[k])
+    for k in range(begin, end):
+        order[k] = queue[k]
+    split = _split_at(begin, end)
+    best = int(0)
+    least_cut = int(2147483647)
+    for axis in range(wp.where(end - begin > _LARGE, 4, 8)):
+        _sort(begin, end, axis, order, distances, keys, buckets, queue)
+        cut = _count_cut(links, begin, split, end, stamp + 5 + axis, queue, place_of, visited)
+        if cut < least_cut:
+            least_cut = cut
+            best = axis
+    _sort(begin, end, best, order, distances, keys, buckets, queue)
+    for k in range(begin, end):
+        order[k] = queue[k]
+        place_of[queue[k]] = k
+    splits[i] = split
 
 
 def _links(faces: np.ndarray) -> np.ndarray:
@@ -358,11 +354,17 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     numbers = np.full(places[-1], -1, dtype=np.int32)
     numbers[place_of] = np.arange(n)
 
-    large = sizes > CLUSTER
-    result = on_host(numbers)
-    scratch = [wp.empty((64, 2), dtype=int, device="cpu"), *(wp.empty_like(result) for _ in range(3))]
-    scratch.append(wp.empty((4, n), dtype=int, device="cpu"))
-    inputs = [on_host(links), on_host(places[:-1][large]), on_host(sizes[large])]
-    inputs += [result, on_host(place_of), on_host(np.zeros(n)), *scratch]
-    launch(_order_components, 1, inputs=inputs, device="cpu", record_tape=False)
+    device = wp.get_device("cpu")
+    result, links_on_host, place_of, visited = on_host(numbers), on_host(links), on_host(place_of), on_host(np.zeros(n))
+    scratch = [*(wp.empty_like(result) for _ in range(3)), wp.empty((4, n), dtype=int, device=device)]
+    parts = np.stack([places[:-1], places[:-1] + sizes], axis=1)
+    stamp = 1
+    while len(parts := parts[parts[:, 1] - parts[:, 0] > CLUSTER]):
+        splits = wp.empty(len(parts), dtype=int, device=device)
+        inputs = [links_on_host, wp.array(parts.astype(np.int32), dtype=wp.vec2i, device=device), stamp]
+        inputs += [result, place_of, visited, *scratch]
+        launch_over(_halve_parts, len(parts), inputs=inputs, outputs=[splits], device=device, chunk=1)
+        middle = splits.numpy()
+        parts = np.concatenate([np.stack([parts[:, 0], middle], axis=1), np.stack([middle, parts[:, 1]], axis=1)])
+        stamp += _STAMPS
     return np.where(result.numpy() < 0, -1, face_of[result.numpy()])

@@ -118,18 +118,18 @@ def _decided(
         mesh: The mesh.
         x: Positions, array of vec3 or vec3d.
         edges: Vertices of both ends of each edge, two-dimensional array of int.
-        across: Vertices across the sides of each face, as of :meth:`IntersectionFinder._across`, likewise.
+        across: Vertices across the sides of each face, as of :attr:`.CollisionMesh.across`, likewise.
         pairs: (edge, face), array of vec2i.
         status: Status of each pair, array of int8, which is overwritten.
-        count: Number of pairs.
+        count: Number of pairs, at least 1.
     """
     for limbs in BITS:
-        if not (status.numpy()[:count] == UNSURE).any():
+        if not (status[:count].numpy() == UNSURE).any():
             break
         inputs = [x, edges, mesh.device_faces, across, pairs]
         kernel = _decide_exactly(x.dtype, limbs)
         launch_over(kernel, count, inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
-    return status.numpy()[:count]
+    return status[:count].numpy()
 
 
 def points_on_faces(mesh: CollisionMesh, x: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -145,6 +145,8 @@ def points_on_faces(mesh: CollisionMesh, x: np.ndarray, points: np.ndarray, face
         Bool array of shape [n].
     """
     device, n = mesh.device, len(points)
+    if not n:
+        return np.zeros(0, dtype=bool)
     dtype = wp.vec3 if x.dtype == np.float32 else wp.vec3d
     positions = wp.array(np.concatenate([x, points]), dtype=dtype, device=device)
     rows = np.arange(n)
@@ -294,9 +296,9 @@ class IntersectionFinder:
     @one_at_a_time
     def _find(self, x: np.ndarray | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
         """Returns which of the pairs that a function enqueues for positions on the device meet."""
-        mesh = self._mesh
+        mesh, given = self._mesh, x
         x = mesh.device_positions(x, "x")
-        positions = x.numpy()
+        positions = x.numpy() if isinstance(given, wp.array) else np.asarray(given)
         check_finite(positions, "x", mesh.vertices)
 
         def launch() -> None:
@@ -304,15 +306,17 @@ class IntersectionFinder:
             self._keep_crossings(x)
 
         retry_until_fits(launch, self, mesh.device)
-        status = _decided(mesh, x, mesh.device_edges, self._device_across, self._kept, self._status, self._count)
-        pairs = self._kept.numpy()[: self._count]
+        if not self._count:
+            return Intersections(np.zeros((0, 2), dtype=np.int32), np.zeros(0, dtype=bool))
+        status = _decided(mesh, x, mesh.device_edges, mesh.device_across, self._kept, self._status, self._count)
+        pairs = self._kept[: self._count].numpy()
         meets, crosses = status != FREE, status == HIT
         (unsure,) = np.nonzero(status == UNSURE)
         if len(unsure):
             edges, faces = pairs[unsure].T
             edges, across, faces = (
                 positions[mesh.edges[edges]],
-                positions[self._across[faces]],
+                positions[mesh.across[faces]],
                 positions[mesh.faces[faces]],
             )
             meets[unsure] = checker.edge_face_crossings(edges, faces)
@@ -329,23 +333,6 @@ class IntersectionFinder:
             self._allocate(capacity_for(self._count, "intersections"))
             return True
         return grown
-
-    @functools.cached_property
-    def _across(self) -> np.ndarray:
-        """Third vertex of the only neighbour at each side of each face; of the face itself where there is none."""
-        sides = self._mesh.face_edges.ravel()
-        opposite = np.roll(self._mesh.faces, 1, axis=1).ravel()  # side i goes from corner i to the next
-        order = np.argsort(sides, kind="stable")
-        of_edge = sides[order]
-        first = np.flatnonzero((of_edge[1:] == of_edge[:-1]) & (np.bincount(sides + 1)[of_edge[1:] + 1] == 2))
-        one, other = order[first], order[first + 1]
-        across = opposite.copy()
-        across[one], across[other] = opposite[other], opposite[one]
-        return across.reshape(-1, 3)
-
-    @functools.cached_property
-    def _device_across(self) -> wp.array:
-        return wp.array(self._across, dtype=int, device=self._mesh.device)
 
     def _allocate(self, capacity: int) -> None:
         self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -11,7 +12,28 @@ from .face_order import order_faces
 from .settings import DistanceKind, PairKind
 from .start import checked_device
 
-__all__ = ["CollisionMesh"]
+__all__ = ["CollisionMesh", "DevicePlaces"]
+
+
+@dataclass(frozen=True, eq=False)
+class DevicePlaces:
+    """What is at the places of the broad phase's hierarchy, which detectors of a mesh share: Warp arrays of int.
+
+    Attributes:
+        order: Cell at each place, -1 for none.
+        faces: Vertices of the cell at each place, two-dimensional.
+        face_edges: Edges of the cell at each place, two-dimensional.
+        owned: The elements whose representative the cell at each place is.
+        vertex_rows: Row of boxes of each vertex, three a place, -1 if no cell uses it.
+        edge_rows: Row of boxes of each edge.
+    """
+
+    order: wp.array
+    faces: wp.array
+    face_edges: wp.array
+    owned: wp.array
+    vertex_rows: wp.array
+    edge_rows: wp.array
 
 
 class CollisionMesh:
@@ -155,9 +177,57 @@ class CollisionMesh:
         return first, order // 3
 
     @functools.cached_property
+    def across(self) -> np.ndarray:
+        """Third vertex of the only neighbour at each side of each face, int32, shape [face_count, 3].
+
+        That of the face itself where there is no neighbour, or more than one.
+        """
+        sides = self.face_edges.ravel()
+        opposite = np.roll(self.faces, 1, axis=1).ravel()  # side i goes from corner i to the next
+        order = np.argsort(sides, kind="stable")
+        of_edge = sides[order]
+        are_neighbours = (of_edge[1:] == of_edge[:-1]) & (of_edge[1:] >= 0)
+        first = np.flatnonzero(are_neighbours & (np.bincount(sides + 1)[of_edge[1:] + 1] == 2))
+        one, other = order[first], order[first + 1]
+        across = opposite.copy()
+        across[one], across[other] = opposite[other], opposite[one]
+        return across.reshape(-1, 3)
+
+    @functools.cached_property
+    def device_across(self) -> wp.array:
+        """The same on the device, two-dimensional Warp array of int."""
+        return wp.array(self.across, dtype=int, device=self.device)
+
+    @functools.cached_property
     def face_order(self) -> np.ndarray:
         """Cell at each place of the broad phase's hierarchy, int32, see :func:`.face_order.order_faces`."""
         return order_faces(self.cells, None if self.world is None else self.world[self.cells[:, 0]])
+
+    @functools.cached_property
+    def device_places(self) -> "DevicePlaces":
+        """What is at the places of the hierarchy, on the device."""
+        order = self.face_order
+
+        def array(values: np.ndarray) -> wp.array:
+            return wp.array(values.astype(np.int32, copy=False), dtype=int, device=self.device)
+
+        def by_place(values: np.ndarray) -> wp.array:
+            return array(values[order] if len(order) else values)
+
+        vertex_rows, edge_rows = np.full(self.vertex_count, -1), np.empty(len(self.edges), dtype=int)
+        filled = np.flatnonzero(order >= 0)
+        for i in range(3):
+            for rows, elements, bit in ((vertex_rows, self.cells, i), (edge_rows, self.cell_edges, 3 + i)):
+                representing = filled[(self.cell_owned[order[filled]] >> bit) & 1 == 1]
+                rows[elements[order[representing], i]] = 3 * representing + i
+        return DevicePlaces(
+            order=array(order),
+            faces=by_place(self.cells),
+            face_edges=by_place(self.cell_edges),
+            owned=by_place(self.cell_owned),
+            vertex_rows=array(vertex_rows),
+            edge_rows=array(edge_rows),
+        )
 
     def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
         """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.

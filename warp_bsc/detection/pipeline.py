@@ -197,6 +197,7 @@ class DetectionPipeline:
         *,
         refit: bool = False,
         changed: wp.array | None = None,
+        proximities: bool | None = None,
         sort: bool = False,
         timer: StageTimer = _UNTIMED,
         side_stream: wp.Stream | None = None,
@@ -211,6 +212,8 @@ class DetectionPipeline:
             changed: Nonzero for each vertex whose motion has changed since the run before, or that was in a contact
                 then. Pairs without one of these vertices have no contact again, and are excluded. Warp array of int;
                 None for all.
+            proximities: Whether contacts with minimum distances include pairs that are only near; None for those of
+                runs that do not ``refit``.
             sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
             timer: Measures the stages.
             side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
@@ -229,7 +232,8 @@ class DetectionPipeline:
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
         if self._min_distances is not None:
             options = {"tolerance": self.tolerance, "timer": timer}
-            run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=not refit, **options)
+            near = not refit if proximities is None else proximities
+            run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=near, **options)
         elif self.device_radius is None:
             run_narrow_phases(narrow_phases, x0, x1, **options)
         else:

@@ -19,11 +19,11 @@ def near(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
 
 
 def within(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
-    """Returns which vertices are within some edges of given ones, bool, shape [n]."""
+    """Returns which vertices are within some edges of given ones, a mask or indices, bool, shape [n]."""
     reached = np.zeros(len(surface.home), dtype=bool)
     reached[vertices] = True
     first, second = surface.ends
-    for _ in range(rings):
+    for _ in range(rings if reached.any() else 0):
         from_first, from_second = reached[first], reached[second]
         reached[second[from_first]] = True
         reached[first[from_second]] = True
@@ -93,15 +93,8 @@ class Springs:
 def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:
     """Returns the pairs of vertices opposite an edge in two of its faces, near movable vertices, int, shape [m, 2]."""
     mesh = surface.mesh
-    (faces,) = np.nonzero(movable[mesh.faces].any(axis=1)) if len(mesh.faces) else (np.zeros(0, int),)
-    # neighbours of these faces are needed as well
-    is_edge = np.zeros(len(mesh.edges) + 1, dtype=bool)
-    is_edge[mesh.face_edges[faces]] = True
-    is_edge[-1] = False  # that of sides without an edge
-    (sides,) = np.nonzero(is_edge[mesh.face_edges.ravel()])
-    of_sides = mesh.face_edges.ravel()[sides]
-    order = np.argsort(of_sides, kind="stable")
-    opposite = mesh.faces[sides // 3, (sides + 2) % 3][order]
-    (first,) = np.nonzero(of_sides[order][1:] == of_sides[order][:-1])
-    across = np.stack([opposite[first], opposite[first + 1]], axis=1)
-    return across[(across[:, 0] != across[:, 1]) & movable[across].any(axis=1)]
+    (faces,) = np.nonzero((movable[mesh.faces] | movable[mesh.across]).any(axis=1))
+    opposite, across = np.roll(mesh.faces[faces], 1, axis=1).ravel(), mesh.across[faces].ravel()
+    # both faces of an edge have the pair
+    rows = (opposite < across) & (movable[opposite] | movable[across])
+    return np.stack([opposite[rows], across[rows]], axis=1)

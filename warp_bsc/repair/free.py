@@ -15,20 +15,31 @@ _RINGS = 10
 """Edges around vertices that are pushed apart within which others may follow."""
 
 
-def free(surface: Surface, start: np.ndarray, max_strain: float, *, movable: np.ndarray | None = None) -> np.ndarray:
+def free(
+    surface: Surface,
+    start: np.ndarray,
+    crossings: np.ndarray,
+    max_strain: float,
+    *,
+    movable: np.ndarray | None = None,
+) -> np.ndarray:
     """Returns positions near the input at which less crosses, or is near, in units of the surface; or worse ones.
 
     Args:
         surface: The surface.
         start: Where the search begins, in units, shape [n, 3].
+        crossings: What crosses there, (edge, face), shape [m, 2].
         max_strain: Largest strain that is sought.
         movable: Vertices that may move, bool, shape [n], beside those near contours and near pairs.
     """
-    untangled = untangle(surface, start, surface.crossings(start))
+    untangled = untangle(surface, start, crossings)
     x = push_apart(surface, untangled.x) if surface.min_distance else untangled.x
     (pushed,) = np.nonzero(differ(x, untangled.x))
-    may_move = untangled.movable | near(surface, pushed, _RINGS)
-    return approach(surface, x, Springs(surface, may_move if movable is None else may_move | movable), max_strain)
+    may_move = untangled.springs.movable | near(surface, pushed, _RINGS)
+    if movable is not None:
+        may_move |= movable
+    is_known = (may_move == untangled.springs.movable).all()
+    return approach(surface, x, untangled.springs if is_known else Springs(surface, may_move), max_strain)
 
 
 def restore_parts(

@@ -165,14 +165,18 @@ def projected(fixed: np.ndarray, x: np.ndarray, contacts: Contacts, sweeps: int 
         contacts: The contacts.
         sweeps: Number of sweeps.
     """
-    vertices, weights, normals = contacts.vertices, contacts.weights, contacts.normals
-    movable = np.where(fixed[vertices], 0.0, weights)
+    weights, normals = contacts.weights, contacts.normals
+    involved, rows = np.unique(contacts.vertices, return_inverse=True)
+    rows, at = rows.reshape(contacts.vertices.shape), x[involved]
+    movable = np.where(fixed[contacts.vertices], 0.0, weights)
     inverse = 1.0 / np.maximum((movable**2).sum(axis=1), _LEAST_MOBILITY)
     for _ in range(sweeps):
-        short = contacts.gap - np.einsum("ik,ikj,ij->i", weights, x[vertices], normals)
+        short = contacts.gap - np.einsum("ik,ikj,ij->i", weights, at[rows], normals)
         push = np.where(short > 0.0, short * inverse, 0.0)
         moves = (movable * push[:, None])[:, :, None] * normals[:, None, :]
-        total = np.stack([np.bincount(vertices.ravel(), moves[:, :, i].ravel(), len(x)) for i in range(3)], axis=1)
-        count = np.bincount(vertices.ravel(), np.repeat(push > 0.0, 4), len(x))
-        x = x + total / np.maximum(count, 1.0)[:, None]
-    return x
+        total = np.stack([np.bincount(rows.ravel(), moves[:, :, i].ravel(), len(at)) for i in range(3)], axis=1)
+        count = np.bincount(rows.ravel(), np.repeat(push > 0.0, 4), len(at))
+        at = at + total / np.maximum(count, 1.0)[:, None]
+    result = x.copy()
+    result[involved] = at
+    return result

@@ -99,10 +99,10 @@ def repair(
     if history is not None and (count := len(surface.crossings(history))):
         raise ValueError(f"x_previous must not cross, but {count} edges meet faces in it")
     near_before = near_pairs(surface, surface.home)
-    final = surface.home
+    final, crossings, near = surface.home, before, near_before
     if len(before) or len(near_before):
-        final = _repaired(surface, before, history, layer if order is not None else None, strain)
-    crossings, near = surface.crossings(final), near_pairs(surface, final)
+        final, crossings = _repaired(surface, before, history, layer if order is not None else None, strain)
+        near = near_pairs(surface, final)
     if (len(crossings), len(near)) >= (len(before), len(near_before)):
         final, crossings, near = surface.home, before, near_before
     positions = surface.positions(final)[weld]
@@ -140,18 +140,24 @@ def _labels(mesh: CollisionMesh, layer: np.ndarray) -> np.ndarray:
 
 def _repaired(
     surface: Surface, before: np.ndarray, history: np.ndarray | None, layer: np.ndarray | None, max_strain: float
-) -> np.ndarray:
-    """Returns the best positions that are found for an input, in units of the surface; they may be worse."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the best positions that are found, in units of the surface, and what crosses there; they may be worse."""
     if history is not None:
         reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
         # fixed vertices that contact keeps from their places cannot stay elsewhere
         if (reached == surface.home)[surface.fixed].all():
-            return reached
-    start = surface.home if layer is None else separate_layers(surface, layer)
-    x = free(surface, start, max_strain, movable=None if layer is None else ~surface.fixed)
+            return reached, surface.crossings(reached)
+    if layer is None:
+        x = free(surface, surface.home, before, max_strain)
+    else:
+        start = separate_layers(surface, layer)
+        x = free(surface, start, surface.crossings(start), max_strain, movable=~surface.fixed)
     left = surface.crossings(x)
-    restored = restore_parts(surface, x, (before, left)) if len(left) else x
-    return restored if len(surface.crossings(restored)) <= len(before) else x
+    if not len(left):
+        return x, left
+    restored = restore_parts(surface, x, (before, left))
+    crossings = surface.crossings(restored)
+    return (restored, crossings) if len(crossings) <= len(before) else (x, left)
 
 
 def _as_given(result: np.ndarray, x: np.ndarray | wp.array) -> np.ndarray | wp.array:

@@ -155,7 +155,8 @@ def _repaired(placed: ModelSurface, before: _Faults, layer: np.ndarray | None, m
     start = surface.home if layer is None else separate_layers(surface, placed.layer)
     for whole in (False, True) if len(before.inside) else (False,):
         outside, movable = placed.leave_solids(start, whole=whole)
-        x = free(surface, outside, max_strain, movable=movable if layer is None else ~surface.fixed)
+        movable = movable if layer is None else ~surface.fixed
+        x = free(surface, outside, surface.crossings(outside), max_strain, movable=movable)
         if len(placed.tetrahedra):
             x = restore_inverted(surface, follow_surface(surface, x, placed.tetrahedra), placed.tetrahedra)
         found = _Faults(placed, x)

@@ -133,12 +133,23 @@ class Surface:
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units as those of the input: of its type, with its bits where nothing has moved."""
-        with np.errstate(over="ignore"):
-            return np.where(x == self.home, self._input, (x * self.unit).astype(self._dtype))
+        positions = self._input.copy()
+        rows, moved = self._moved(x)
+        positions[rows] = np.where(x[rows] == self.home[rows], positions[rows], moved)
+        return positions
 
     def rounded(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units as they will be returned, rounded to the type of the input."""
-        return np.where(x == self.home, self.home, self.positions(x).astype(np.float64) / self.unit)
+        rounded = self.home.copy()
+        rows, moved = self._moved(x)
+        rounded[rows] = np.where(x[rows] == self.home[rows], rounded[rows], moved.astype(np.float64) / self.unit)
+        return rounded
+
+    def _moved(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the vertices that are not at their input, and their positions, of the type of the input."""
+        (rows,) = np.nonzero(differ(x, self.home))
+        with np.errstate(over="ignore"):
+            return rows, (x[rows] * self.unit).astype(self._dtype)
 
     def crossings(self, x: np.ndarray) -> np.ndarray:
         """Returns the edges that meet faces at positions in units, exactly, as returned: (edge, face), shape [n, 2]."""

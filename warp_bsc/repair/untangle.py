@@ -14,7 +14,7 @@ import warp as wp
 
 from ..detection.launch import launch
 from .contours import faces_of_edges, trace_contours
-from .elastic import Springs, within
+from .elastic import Springs, near, within
 from .kernels import contour_gradients
 from .surface import Surface
 
@@ -43,12 +43,12 @@ class Untangled:
     Attributes:
         x: Positions, in units of the surface, float64, shape [n, 3].
         crossings: What still crosses there, (edge, face), int32, shape [m, 2].
-        movable: Vertices that the search could move, bool, shape [n].
+        springs: Springs of the vertices that the search could move.
     """
 
     x: np.ndarray
     crossings: np.ndarray
-    movable: np.ndarray
+    springs: Springs
 
 
 def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangled:
@@ -63,15 +63,14 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
         x: The start, in units of the surface, shape [n, 3].
         crossings: What crosses there, (edge, face), shape [m, 2].
     """
-    movable = np.zeros(len(x), dtype=bool)
-    inner, springs = movable, Springs(surface, movable)
-    best, since, iteration = Untangled(x, crossings, movable), 0, 0
+    inner = np.zeros(len(x), dtype=bool)
+    springs = Springs(surface, inner)
+    best, since, iteration = Untangled(x, crossings, springs), 0, 0
     while not surface.are_fixed(crossings).all() and since < _PATIENCE:
         vertices = _vertices_of(surface, crossings)
         if not inner[vertices].all():
             inner = inner | within(surface, vertices, _MORE_RINGS)
-            movable = movable | (within(surface, vertices, _RINGS + _MORE_RINGS) & ~surface.fixed)
-            springs = Springs(surface, movable)
+            springs = Springs(surface, near(surface, inner, _RINGS))
         if since >= _STUCK and since % 2 == 0:
             x = springs.spread(x, ~within(surface, vertices, 1), _SMOOTHING_SWEEPS)
         else:
@@ -81,7 +80,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
         crossings = surface.crossings(x)
         iteration, since = iteration + 1, since + 1
         if len(crossings) < len(best.crossings):
-            best, since = Untangled(x, crossings, movable), 0
+            best, since = Untangled(x, crossings, springs), 0
     return best
 
 
@@ -121,11 +120,14 @@ def _contour_moves(
     # edge and face share the step, unless one of them is fixed
     shares = np.where(weights[:, :2].any(axis=1) & weights[:, 2:].any(axis=1), 0.5, 1.0)[:, None]
     moves = (np.array([1.0, 1.0, -1.0, -1.0, -1.0]) * weights * shares)[:, :, None] * step[:, None, :]
-    total = _sums(vertices.ravel(), moves.reshape(-1, 3), len(x))
-    weight = np.bincount(vertices.ravel(), weights.ravel(), len(x))
-    given = np.zeros(len(x), dtype=bool)
-    given[vertices] = True
-    return total / np.maximum(weight, 0.5)[:, None], given & ~surface.fixed
+    involved, rows = np.unique(vertices, return_inverse=True)
+    rows = rows.reshape(-1)
+    total = _sums(rows, moves.reshape(-1, 3), len(involved))
+    weight = np.bincount(rows, weights.ravel(), len(involved))
+    moves, given = np.zeros_like(x), np.zeros(len(x), dtype=bool)
+    moves[involved] = total / np.maximum(weight, 0.5)[:, None]
+    given[involved] = ~surface.fixed[involved]
+    return moves, given
 
 
 def _ways_to_ends(surface: Surface, x: np.ndarray, ends: np.ndarray) -> np.ndarray:
