@@ -96,6 +96,21 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
     return poses
 
 
+def pose_rebaseline_mask(solver: SolverVBD) -> wp.array:
+    """Returns which worlds start their next step with bodies at rest where the state has them.
+
+    Contract: ``SolverVBD`` that integrates bodies has ``_rigid_pose_rebaseline_mask``, bool, one for each world and a
+    last one for bodies of no world. Where it is True, a step sets ``body_q_prev`` to the poses of the state.
+
+    Raises:
+        RuntimeError: If VBD has no such array: friction of the first step would have another gradient than result.
+    """
+    name = "_rigid_pose_rebaseline_mask"
+    if not hasattr(solver, name):
+        raise missing("newton", f"SolverVBD.{name}", "steps with bodies carry no gradients")
+    return getattr(solver, name)
+
+
 def may_allocate(solver: SolverBase) -> bool:
     """Returns whether a step of a solver may allocate memory, which the body of a condition in a CUDA graph must not.
 

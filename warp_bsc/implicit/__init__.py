@@ -1,0 +1,1 @@
+"""Gradients through implicit time steps, by the implicit function theorem."""

@@ -1,0 +1,122 @@
+"""Forces over elements of one kind: evaluated, differentiated, and multiplied with their Jacobians."""
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from .._private_names.of_warp import empty_struct, struct_fields, struct_type
+from ..response.adjoint.arrays import launch_adjoint
+from . import element_kernels
+
+
+class Elements:
+    """Elements of one kind, each with the same number of particles, and a kernel that computes the forces on these.
+
+    The buffers are made once, and hold what belongs to one step at a time.
+
+    Attributes:
+        vertices: Particles of the elements, -1 for none, int32, shape [capacity, size].
+        count: Elements in use.
+        jacobian: Derivatives of the forces with respect to positions at the end, float64, shape
+            [capacity, 3 size, size] of vec3: row 3 i + j belongs to component j of the force on particle i.
+    """
+
+    def __init__(self, kernel: wp.Kernel, vertices: wp.array, parameters: Sequence):
+        """Allocates buffers for forces on ``vertices``.
+
+        Args:
+            kernel: A kernel as in :mod:`.energies`.
+            vertices: Particles of the elements, int32, shape [capacity, size].
+            parameters: What the kernel reads beside positions; arrays that require gradients get them.
+        """
+        self.kernel, self.vertices, self.parameters = kernel, vertices, parameters
+        self.device = device = vertices.device
+        self.count, self._size = vertices.shape
+        shape, rows = (self.count, 1, self._size), 3 * self._size
+
+        def zeros(*dimensions):
+            return wp.zeros(dimensions, dtype=wp.vec3d, device=device)
+
+        self._x1, self._x0, self._forces = zeros(*shape), zeros(*shape), zeros(*shape)
+        self._of_x1, self._of_x0, self._of_forces = zeros(*shape), zeros(*shape), zeros(*shape)
+        self.jacobian = zeros(self.count, rows, self._size)
+        self._units = zeros(1, rows, self._size)
+        self._launch(element_kernels.set_units, self._units.shape, [], [self._units])
+
+    def load(self, x1: wp.array, x0: wp.array) -> None:
+        """Takes positions of particles at the end and at the start of a step, vec3d, shape [particle_count]."""
+        shape = self.count, self._size
+        self._launch(element_kernels.gather, shape, [self.vertices, x1], [self._x1])
+        self._launch(element_kernels.gather, shape, [self.vertices, x0], [self._x0])
+
+    def add_forces(self, dt: float, forces: wp.array) -> None:
+        """Adds the forces to those of particles, vec3d, shape [particle_count]."""
+        inputs = [wp.float64(dt), self._x1, self._x0, *self.parameters]
+        self._launch(self.kernel, (self.count, 1), inputs, [self._forces])
+        self._launch(element_kernels.scatter, (self.count, self._size), [self.vertices, self._forces], [forces])
+
+    def differentiate(self, dt: float) -> None:
+        """Computes the Jacobian."""
+        shape = self.count, 3 * self._size, self._size
+        x1, x0, units = (_repeated(array, shape) for array in (self._x1, self._x0, self._units))
+        self.jacobian.zero_()
+        constants = [_without_gradients(value) for value in self.parameters]
+        adjoints = [None, self.jacobian, None, *(empty_struct(value) for value in constants)]
+        inputs = [wp.float64(dt), x1, x0, *constants]
+        options = {"adj_inputs": adjoints, "adj_outputs": [units], "adjoint": True, "device": self.device}
+        wp.launch(self.kernel, shape[:2], inputs=inputs, outputs=[units], **options)
+
+    def add_product(self, alpha: float, x: wp.array, z: wp.array, is_fixed: wp.array, *, transposed: bool) -> None:
+        """Subtracts alpha J x, or alpha J^T x, from z; rows and columns of fixed particles are 0."""
+        inputs = [wp.float64(alpha), int(transposed), self.vertices, is_fixed, self.jacobian, x]
+        self._launch(element_kernels.add_product, (self.count, self._size), inputs, [z])
+
+    def add_blocks(self, is_fixed: wp.array, blocks: wp.array) -> None:
+        """Subtracts the blocks of the Jacobian on the diagonal from those of particles, mat33d."""
+        inputs = [self.vertices, is_fixed, self.jacobian]
+        self._launch(element_kernels.add_blocks, (self.count, self._size), inputs, [blocks])
+
+    def add_gradients(self, dt: float, of_forces: wp.array, of_x1: wp.array, of_x0: wp.array) -> None:
+        """Adds gradients with respect to positions, given those with respect to the forces, vec3d, [particle_count].
+
+        Parameters that require gradients get them as well.
+        """
+        shape = self.count, self._size
+        for array in (self._of_x1, self._of_x0):
+            array.zero_()
+        self._launch(element_kernels.gather, shape, [self.vertices, of_forces], [self._of_forces])
+        x1, x0 = with_gradient(self._x1, self._of_x1), with_gradient(self._x0, self._of_x0)
+        inputs = [wp.float64(dt), x1, x0, *self.parameters]
+        launch_adjoint(self.kernel, (self.count, 1), inputs, [self._of_forces], self.device)
+        self._launch(element_kernels.scatter, shape, [self.vertices, self._of_x1], [of_x1])
+        self._launch(element_kernels.scatter, shape, [self.vertices, self._of_x0], [of_x0])
+
+    def _launch(self, kernel, size, inputs, outputs):
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def with_gradient(values: wp.array, gradient: wp.array | None) -> wp.array:
+    """Returns an array of the same values whose gradient is another array; the values themselves if that is None."""
+    if gradient is None or not len(values):
+        return values
+    alias = values[:]
+    alias.grad, alias.retain_grad = gradient, True
+    return alias
+
+
+def _without_gradients(value):
+    """Returns an array, or a struct with arrays, of the same values without gradients; other values as they are."""
+    if wp.types.is_struct(value):
+        constant = struct_type(value)()
+        for name in struct_fields(struct_type(value)):
+            setattr(constant, name, _without_gradients(getattr(value, name)))
+        return constant
+    if not isinstance(value, wp.array) or not value.requires_grad:
+        return value
+    return wp.array(ptr=value.ptr, dtype=value.dtype, shape=value.shape, strides=value.strides, device=value.device)
+
+
+def _repeated(values: wp.array, shape: tuple[int, ...]) -> wp.array:
+    """Returns an array that repeats values along all dimensions of length 1; it does not keep the values alive."""
+    strides = [0 if n == 1 else stride for n, stride in zip(values.shape, values.strides, strict=True)]
+    return wp.array(ptr=values.ptr, dtype=values.dtype, shape=shape, strides=tuple(strides), device=values.device)

@@ -1,0 +1,179 @@
+"""The equations that a step of VBD solves, and their derivatives.
+
+The end x1 of a step balances all forces on each particle: inertia m / dt^2 (x0 + dt v0 + dt^2 (g + f / m) - x1), and
+those of elements. Of a gradient g with respect to x1, the implicit function theorem makes gradients with respect to
+all that the forces depend on: with A = -d forces / d x1 and A^T l = g, they are those of the forces, given l.
+"""
+
+from typing import NamedTuple
+
+import newton
+import warp as wp
+from newton import ParticleFlags
+from newton.solvers import SolverVBD
+
+from ..response.adjoint.arrays import launch_adjoint
+from . import energies, kernels, matrix_kernels
+from .contacts import ContactElements, RecordedContacts
+from .elements import Elements, with_gradient
+from .matrix import ElasticMatrix
+
+
+class Step(NamedTuple):
+    """What a step began and ended with.
+
+    Attributes:
+        dt: Length of the step [s].
+        x0: Positions at the start [m], vec3, shape [particle_count], like all that follow.
+        v0: Velocities at the start [m/s].
+        x1: Positions at the end [m].
+        force: External forces [N], or None.
+        contacts: Contacts with shapes, or None.
+    """
+
+    dt: float
+    x0: wp.array
+    v0: wp.array
+    x1: wp.array
+    force: wp.array | None
+    contacts: RecordedContacts | None
+
+
+class Equations:
+    """The forces on the particles of a model, and their derivatives, for one step at a time.
+
+    Attributes:
+        forces: Sum of the forces on each particle, 0 for fixed ones [N], vec3d, shape [particle_count].
+        is_fixed: 1 for particles that VBD does not move, int32.
+    """
+
+    def __init__(self, solver: SolverVBD):
+        """Allocates buffers for VBD of a model with particles."""
+        model = self.model = solver.model
+        self.device, n = model.device, model.particle_count
+        self._x1, self._x0, self._of_x1, self._of_x0, self.forces = (self.zeros() for _ in range(5))
+        self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
+        self._blocks = wp.zeros(n, dtype=wp.mat33d, device=self.device)
+        self._elastic, self._contacts = _elastic_elements(model), ContactElements(solver)
+        self._in_contact: list[Elements] = []
+        self._matrix = ElasticMatrix(self._elastic, self.is_fixed)
+        self._step: Step | None = None
+
+    def zeros(self) -> wp.array:
+        """Returns a zero vector of float64 for each particle."""
+        return wp.zeros(self.model.particle_count, dtype=wp.vec3d, device=self.device)
+
+    def load(self, step: Step) -> None:
+        """Takes a step."""
+        self._step = step
+        inputs = [self.model.particle_flags, int(ParticleFlags.ACTIVE), self.model.particle_mass]
+        self._launch(kernels.find_fixed, inputs, [self.is_fixed])
+        self._launch(kernels.to_double, [step.x0], [self._x0])
+        self._in_contact = self._contacts.load(step.contacts)
+        self.load_end(step.x1)
+
+    def load_end(self, x1: wp.array) -> None:
+        """Takes another end of the step."""
+        self._launch(kernels.to_double, [x1], [self._x1])
+        for elements in self._elements():
+            elements.load(self._x1, self._x0)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the matrix A of the step is symmetric: without contacts, whose friction depends on their load."""
+        return not self._in_contact
+
+    def evaluate(self) -> wp.array:
+        """Returns the forces, which vanish where the step is solved."""
+        assert self._step is not None
+        self._launch(energies.inertial_forces, self._inertial(self._x1, self._x0), [self.forces])
+        for elements in self._elements():
+            elements.add_forces(self._step.dt, self.forces)
+        self._launch(kernels.clear_fixed, [self.is_fixed], [self.forces])
+        return self.forces
+
+    def differentiate(self) -> None:
+        """Computes the matrix A, the derivative of minus the forces, and the blocks of the preconditioner."""
+        assert self._step is not None
+        dt = self._step.dt
+        for elements in self._elements():
+            elements.differentiate(dt)
+        mass = self.model.particle_mass
+        assert mass is not None
+        self._matrix.assemble(dt, mass, self._blocks)
+        for elements in self._in_contact:
+            elements.add_blocks(self.is_fixed, self._blocks)
+        self._launch(matrix_kernels.invert_blocks, [self._matrix.inertia], [self._blocks])
+
+    def product(self, x: wp.array, y: wp.array, z: wp.array, alpha: float, beta: float) -> None:
+        """Sets z to alpha A x + beta y; rows and columns of fixed particles are those of the identity."""
+        self._product(x, y, z, alpha, beta, transposed=False)
+
+    def transposed_product(self, x: wp.array, y: wp.array, z: wp.array, alpha: float, beta: float) -> None:
+        """Sets z to alpha A^T x + beta y."""
+        self._product(x, y, z, alpha, beta, transposed=True)
+
+    def _product(self, x, y, z, alpha, beta, *, transposed):
+        self._matrix.product(x, y, z, alpha, beta)
+        for elements in self._in_contact:
+            elements.add_product(alpha, x, z, self.is_fixed, transposed=transposed)
+
+    def precondition(self, x: wp.array, y: wp.array, z: wp.array, alpha: float, beta: float) -> None:
+        """Sets z to alpha M x + beta y, with the inverted blocks M of the diagonal."""
+        self._launch(matrix_kernels.apply_blocks, [wp.float64(alpha), wp.float64(beta), self._blocks, x, y], [z])
+
+    def add_gradients(self, multipliers: wp.array, of_velocity: wp.array | None, of_force: wp.array | None):
+        """Adds the gradients with respect to all that forces depend on, and returns those with respect to positions.
+
+        Args:
+            multipliers: Gradients with respect to the forces, l above, vec3d.
+            of_velocity: The array to add to for velocities at the start, vec3; None for none.
+            of_force: The array to add to for external forces, vec3; None for none.
+
+        Returns:
+            The gradients with respect to positions at the end and at the start, vec3d, which the next call overwrites.
+        """
+        assert self._step is not None
+        for array in (self._of_x1, self._of_x0):
+            array.zero_()
+        x1, x0 = with_gradient(self._x1, self._of_x1), with_gradient(self._x0, self._of_x0)
+        inputs = self._inertial(x1, x0, of_velocity, of_force)
+        launch_adjoint(energies.inertial_forces, len(x1), inputs, [multipliers], self.device)
+        for elements in self._elements():
+            elements.add_gradients(self._step.dt, multipliers, self._of_x1, self._of_x0)
+        return self._of_x1, self._of_x0
+
+    def _elements(self):
+        return [*self._elastic, *self._in_contact]
+
+    def _inertial(self, x1, x0, of_velocity=None, of_force=None):
+        step, model = self._step, self.model
+        assert step is not None
+        velocity = with_gradient(step.v0, of_velocity)
+        force = None if step.force is None else with_gradient(step.force, of_force)
+        masses = model.particle_mass, model.particle_inv_mass
+        inputs = [wp.float64(step.dt), x1, x0, velocity, force, *masses]
+        return [*inputs, model.gravity, model.particle_world, self.is_fixed]
+
+    def _launch(self, kernel, inputs, outputs):
+        wp.launch(kernel, self.model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _elastic_elements(model: newton.Model) -> list[Elements]:
+    """Returns the elements of a model that VBD gives energy to."""
+    membrane = [model.tri_poses, model.tri_areas, model.tri_materials]
+    bending = [model.edge_indices, model.edge_rest_angle, model.edge_rest_length, model.edge_bending_properties]
+    tetrahedra = [model.tet_poses, model.tet_materials]
+    springs = [model.spring_rest_length, model.spring_stiffness, model.spring_damping]
+    kinds = (
+        (energies.membrane_forces, model.tri_indices, membrane),
+        (energies.bending_forces, model.edge_indices, bending),
+        (energies.tetrahedron_forces, model.tet_indices, tetrahedra),
+        (energies.spring_forces, model.spring_indices, springs),
+    )
+    found = []
+    for kernel, vertices, parameters in kinds:
+        if vertices is not None and len(vertices):
+            vertices = vertices.reshape((-1, 2)) if vertices.ndim == 1 else vertices  # noqa: PLW2901
+            found.append(Elements(kernel, vertices, parameters))
+    return found

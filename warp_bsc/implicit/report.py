@@ -1,0 +1,89 @@
+"""The report of implicit steps: how well they were solved, and what became of their gradients."""
+
+import warnings
+
+import numpy as np
+import warp as wp
+
+from .worlds import Worlds
+
+RESIDUAL_LIMIT = 0.01
+"""Residual of a step, relative to the weight, above which a step warns: gradients may be off by 10% or more."""
+
+
+class ImplicitReport:
+    """Residuals of steps and failures of linear solves; reading an attribute synchronizes with the device.
+
+    The residual of a step is the force that is left on free particles at its end, as the root of the sum of squares,
+    relative to that of their weights. VBD makes it smaller with each iteration. Gradients are those of a solved step:
+    the larger it is, the less they are those of the result that was computed.
+    """
+
+    def __init__(self, worlds: Worlds):
+        """Makes a report of no steps."""
+        self._worlds = worlds
+        device, count = worlds.of_particles.device, worlds.count
+        self.device_residuals = wp.zeros((2, count), dtype=wp.float64, device=device)  # last, largest
+        self.device_counts = wp.zeros(4, dtype=wp.int64, device=device)
+        self._host = wp.zeros(4, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
+        self._said = set()
+
+    @property
+    def worlds(self) -> np.ndarray:
+        """The world that each row of :attr:`residuals` is of, -1 for particles of no world, int32, shape [n]."""
+        return self._worlds.ids
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """Residual of the last step on a tape, relative to the weight, float64, shape [n]."""
+        return self.device_residuals.numpy()[0]
+
+    @property
+    def largest_residuals(self) -> np.ndarray:
+        """Largest residual of all steps on tapes, relative to the weight, float64, shape [n]."""
+        return self.device_residuals.numpy()[1]
+
+    @property
+    def steps(self) -> int:
+        """Steps on tapes so far."""
+        return self._count(0)
+
+    @property
+    def unconverged_steps(self) -> int:
+        """Steps on tapes with a residual of more than 0.01 of the weight in a world."""
+        return self._count(1)
+
+    @property
+    def solves(self) -> int:
+        """Steps that gradients went back through."""
+        return self._count(2)
+
+    @property
+    def failed_solves(self) -> int:
+        """Linear solves that did not converge, each world of a step for itself; their gradients are NaN."""
+        return self._count(3)
+
+    def _count(self, i):
+        return int(self.device_counts.numpy()[i])
+
+    def copy_counts(self) -> None:
+        """Begins to copy the counts to the host, for :meth:`warn`."""
+        wp.copy(self._host, self.device_counts)
+
+    def warn(self) -> None:
+        """Warns once of steps that are not converged, and once of solves that failed, as far as the host knows."""
+        _, unconverged, _, failed = self._host.numpy()
+        if unconverged:
+            self._warn_once(
+                "residual",
+                f"a step of VBD on a tape ended with forces of more than {RESIDUAL_LIMIT:.0%} of the weight (see "
+                "report.residuals): gradients are those of a solved step, not of this one; give VBD more iterations, "
+                "or pass polish=3",
+            )
+        if failed:
+            self._warn_once("solve", "a linear solve did not converge: gradients are NaN (see report.failed_solves)")
+
+    def _warn_once(self, subject, message):
+        if subject not in self._said:
+            self._said.add(subject)
+            warnings.warn(message, stacklevel=4)
