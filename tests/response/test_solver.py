@@ -311,13 +311,16 @@ def test_coefficients_may_be_arrays_that_each_step_reads(device):
         )
         for stage in (solver, number):
             rollout = Rollout(model, stage)
+            velocities = rollout.states[0].particle_qd.numpy()
+            velocities[velocities[:, 2] != 0.0, 0] = 2.0  # it slides where it hits, which friction slows
+            rollout.states[0].particle_qd.assign(velocities)
             for _ in range(8):
                 rollout.step()
             assert stage.report.totals.steps == 8
             ends.append(rollout.states[0].particle_qd.numpy().copy())
     np.testing.assert_array_equal(ends[0], ends[1])
     np.testing.assert_array_equal(ends[2], ends[3])
-    assert np.abs(ends[0] - ends[2]).max() > 1e-3
+    assert np.abs(ends[0] - ends[2]).max() > 0.1
 
 
 @pytest.mark.parametrize("plane", [False, True])

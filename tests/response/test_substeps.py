@@ -421,12 +421,6 @@ def test_what_cannot_take_substeps_is_refused(device):
         bsc.SolverCCD(SOLVERS["vbd"](model), substeps=1)
     with pytest.raises(ValueError, match="'auto', not 'always'"):
         bsc.SolverCCD(SOLVERS["vbd"](model), substeps="always")
-    builder = newton.ModelBuilder()
-    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0))
-    builder.color()
-    differentiable = builder.finalize(device=device, requires_grad=True)
-    with pytest.raises(NotImplementedError, match="no gradients"):
-        bsc.SolverCCD(SOLVERS["semi_implicit"](differentiable), substeps=4)
 
 
 def vbd_with_self_contact(model):

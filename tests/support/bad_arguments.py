@@ -169,6 +169,7 @@ def solver() -> Idle:
     builder.add_cloth_grid(
         pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), dim_x=1, dim_y=1, cell_x=0.1, cell_y=0.1, mass=0.1
     )
+    builder.color()
     return Idle(builder.finalize(device="cpu"))
 
 
@@ -366,7 +367,7 @@ def calls_of_scenes() -> dict[str, Call]:
 def calls_of_solvers() -> dict[str, Call]:
     """Returns the callables of the collision stage."""
     inner = solver()
-    stage = bsc.SolverCCD(inner)
+    stage, vbd = bsc.SolverCCD(inner), newton.solvers.SolverVBD(inner.model)
     start, end = inner.model.state(), inner.model.state()
     solvers = {**OBJECTS, "model": inner.model}
     count = inner.model.particle_count
@@ -391,6 +392,8 @@ def calls_of_solvers() -> dict[str, Call]:
                 "substeps": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
                 "max_iterations": NOT_COUNT | {"too many": 41},
+                "report_contacts": without(NOT_COUNT, "bool") | {"zero": 0},
+                "report_worlds": FLAGS,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
                 "contact_layer": FLAGS,
@@ -401,7 +404,12 @@ def calls_of_solvers() -> dict[str, Call]:
         "CollisionMonitor": Call(
             bsc.CollisionMonitor,
             {"solver": inner},
-            {"solver": solvers, "min_distance": without(DISTANCES, "None"), "particle_radius": radii},
+            {
+                "solver": solvers,
+                "min_distance": without(DISTANCES, "None"),
+                "particle_radius": radii,
+                "report_worlds": FLAGS,
+            },
             raises=bsc.CollisionMonitor.__init__,
         ),
         "ContactLayer": Call(
@@ -414,8 +422,20 @@ def calls_of_solvers() -> dict[str, Call]:
                 "restitution": coefficient | {"above 1": 1.5},
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "bodies": {"unknown": "moved", "flag": True, "None": None},
             },
             raises=bsc.ContactLayer.__init__,
+        ),
+        "SolverImplicitAdjoint": Call(
+            bsc.SolverImplicitAdjoint,
+            {"solver": vbd},
+            {
+                "solver": {**solvers, "another": inner},
+                "polish": NOT_COUNT | {"too many": 101},
+                "tolerance": {**NUMBERS, "zero": 0.0, "negative": -1.0, "above 1": 1.5},
+                "max_iterations": NOT_COUNT | {"zero": 0},
+            },
+            raises=bsc.SolverImplicitAdjoint.__init__,
         ),
         "CapturedSteps": Call(
             bsc.CapturedSteps,
@@ -444,11 +464,19 @@ def calls_of_solvers() -> dict[str, Call]:
         ("SolverCCD", stage),
         ("CollisionMonitor", bsc.CollisionMonitor(inner)),
         ("ContactLayer", bsc.ContactLayer(inner)),
+        ("SolverImplicitAdjoint", bsc.SolverImplicitAdjoint(vbd)),
     ):
+        masks = {
+            "list": [True, True],
+            "NumPy": np.ones(2, dtype=bool),
+            "integers": wp.ones(2, dtype=int, device="cpu"),
+            "shape": wp.ones(1, dtype=bool, device="cpu"),
+        }
+        bad = {"dt": {**NUMBERS, "zero": 0.0, "negative": -0.01}}
         found[f"{name}.step"] = Call(
             cls.step,
             states,
-            {"dt": {**NUMBERS, "zero": 0.0, "negative": -0.01}},
+            bad | {"world_mask": masks} if name in ("SolverCCD", "CollisionMonitor") else bad,
             exempt=frozenset({"state_in", "state_out", "control", "contacts", "options"}),
         )
     return found
@@ -473,8 +501,8 @@ RESULTS = {
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 
 PASSED_ON = re.compile(
-    r"(SolverCCD|CollisionMonitor|ContactLayer)\.(coupling_\w+|notify_model_changed|observables|reset|set_collision_frequency|"
-    r"update_contacts|validate_observables)$"
+    r"(SolverCCD|CollisionMonitor|ContactLayer|SolverImplicitAdjoint)\.(coupling_\w+|notify_model_changed|observables|reset|"
+    r"set_collision_frequency|update_contacts|validate_observables)$"
 )
 """Methods that delegate to the inner solver, which checks their arguments."""
 

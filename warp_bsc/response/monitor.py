@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
+from .._arguments import checked_flag
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
 from .options import checked_min_distance, checked_radii, default_separation, friction_of
@@ -35,6 +36,7 @@ class CollisionMonitor(CollisionStage):
         *,
         min_distance: float | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
+        report_worlds: bool = False,
     ):
         """Puts the monitor behind a solver.
 
@@ -42,6 +44,7 @@ class CollisionMonitor(CollisionStage):
             solver: Any Newton solver that moves particles.
             min_distance: Distance that pairs should keep [m], as for :class:`.solver_ccd.SolverCCD`.
             particle_radius: Radius of each particle [m], as for :class:`.solver_ccd.SolverCCD`.
+            report_worlds: Whether ``report.worlds`` has results by world, as for :class:`.solver_ccd.SolverCCD`.
 
         Raises:
             TypeError: If an argument has another type.
@@ -49,6 +52,7 @@ class CollisionMonitor(CollisionStage):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
+        report_worlds = checked_flag(report_worlds, "report_worlds")
         min_distance, radii = checked_min_distance(min_distance), checked_radii(particle_radius, self.model)
         keeps_distances = min_distance > 0.0 or bool(radii.any())
         mesh = ModelMesh(self.model, strands=keeps_distances)
@@ -58,18 +62,24 @@ class CollisionMonitor(CollisionStage):
         friction = friction_of(mesh, nothing[:1], nothing)
         motion = ModelMotion(mesh, friction)
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
+        if report_worlds:
+            self._count_worlds(responds=False)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         end = arrays_of(state_out)
-        run_on_host(lambda: self._inspect(end, dt), self.mesh.device)
+        mask = self._mask
+        run_on_host(lambda: self._inspect(end, dt, mask), self.mesh.device)
 
     @one_at_a_time
-    def _inspect(self, end, dt):
+    def _inspect(self, end, dt, mask):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._timed():
             self._motion.set_end(end, dt)
-            work = self._work
-            inspect(work)
-            inputs = [work.vertices.outcome, self.model.particle_count]
-            work.launch(finish_inspection, self.mesh.vertex_count, inputs, [work.status])
-            self._count_step()
+            with self._masked(mask):
+                work = self._work
+                inspect(work)
+                inputs = [work.vertices.outcome, self.model.particle_count]
+                work.launch(finish_inspection, self.mesh.vertex_count, inputs, [work.status])
+                if self._counter is not None:
+                    self._counter.count()
+                self._count_step()

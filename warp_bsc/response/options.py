@@ -22,9 +22,9 @@ from .._private_names.of_newton import has_external_rigid_solver
 from .schedule import MAX_ITERATIONS
 from .state.friction import Friction
 from .state.mesh import ModelMesh
-from .tuning import SEPARATION
+from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
 
-MAX_SUBSTEPS = 1024
+MAX_SUBSTEPS, MAX_CONTACTS = 1024, 2**28
 MAX_FLOAT = float(np.finfo(np.float32).max)
 Bodies = Literal["pushed", "separated", "left"]
 
@@ -35,6 +35,7 @@ class StageOptions:
 
     Coefficients are arrays; ``reads_friction`` says whether each step reads those of friction again. The default of
     ``separation`` follows from the mesh, and is None here. ``radii`` has the radius of each particle [m].
+    ``report_contacts`` is the number of contacts that are listed at most, 0 for none.
     """
 
     separation: float | None
@@ -48,6 +49,8 @@ class StageOptions:
     contact_layer: bool
     lift_speed_limit: bool
     max_iterations: int
+    report_contacts: int
+    report_worlds: bool
 
     @classmethod
     def of(
@@ -64,14 +67,14 @@ class StageOptions:
         contact_layer=True,
         lift_speed_limit=True,
         max_iterations=MAX_ITERATIONS,
+        report_contacts: bool | int = False,
+        report_worlds=False,
     ) -> "StageOptions":
         """Returns the options, with arguments and errors as of :class:`.solver_ccd.SolverCCD`."""
         if separation is not None:
             separation = checked_distance(separation, "separation", zero=False)
             checked_number(separation, "separation", 0.0, MAX_FLOAT)
         substeps = checked_substeps(substeps)
-        if isinstance(substeps, int) and model.requires_grad:
-            raise NotImplementedError("substeps: steps in substeps carry no gradients; omit substeps, or requires_grad")
         return cls(
             separation=separation,
             friction=checked_friction(friction, model),
@@ -84,6 +87,8 @@ class StageOptions:
             contact_layer=checked_flag(contact_layer, "contact_layer"),
             lift_speed_limit=checked_flag(lift_speed_limit, "lift_speed_limit"),
             max_iterations=checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS),
+            report_contacts=checked_capacity(report_contacts, model),
+            report_worlds=checked_flag(report_worlds, "report_worlds"),
         )
 
     @property
@@ -107,9 +112,21 @@ class StageOptions:
 
 
 def default_separation(mesh: ModelMesh) -> float:
-    """Returns the distance that contacts are moved apart by default [m]: a share of the median edge length."""
+    """Returns the distance that contacts are moved apart by default [m]: a share of the median edge length.
+
+    It has eight bits: copies of a mesh that are turned have other lengths in the last bits, and each world of a model
+    moves as it would alone.
+    """
     lengths = particle_edge_lengths(mesh)
-    return SEPARATION * (float(np.median(lengths)) if lengths.any() else 1.0)
+    if not lengths.any():
+        return SEPARATION
+    return in_eight_bits(SEPARATION * np.median(lengths))
+
+
+def in_eight_bits(x: float) -> float:
+    """Returns a number rounded to eight bits."""
+    fraction, exponent = np.frexp(x)
+    return float(np.ldexp(np.round(fraction * 256.0), exponent - 8))
 
 
 def particle_edge_lengths(mesh: ModelMesh) -> np.ndarray:
@@ -127,6 +144,13 @@ def checked_substeps(substeps) -> int | Literal["auto"] | None:
     if isinstance(substeps, str):
         raise ValueError(f"substeps takes 2 substeps or more, or 'auto', not {given(substeps)}")
     return checked_integer(substeps, "substeps", 2, MAX_SUBSTEPS)
+
+
+def checked_capacity(report_contacts, model: newton.Model) -> int:
+    """Returns the argument ``report_contacts`` as a number of contacts, 0 for none."""
+    if report_contacts is True or report_contacts is False:
+        return max(MIN_CONTACTS, CONTACTS_PER_PARTICLE * model.particle_count) if report_contacts else 0
+    return checked_integer(report_contacts, "report_contacts", 1, MAX_CONTACTS)
 
 
 def checked_min_distance(min_distance) -> float:

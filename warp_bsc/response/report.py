@@ -8,16 +8,19 @@ import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
+from .forces.contact_report import ContactReport
 from .inside import Inside, InsideFinder
 from .schedule import Result, views_of
 from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
 from .tuning import MAX_STRAIN
+from .worlds.world_report import WorldsOfReport
 
 _CROSSINGS_WARNING = (
     "edges pass through faces at the start of a step, and their contacts are left to the solver: "
     "warp_bsc.repair_state(model, state) moves them apart before the first step"
 )
+_LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it; shorten steps"
 
 
 @wp.struct
@@ -37,6 +40,7 @@ class StepTotals:
     crossing_steps: wp.array[wp.int64]
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
+    outrun_steps: wp.array[wp.int64]
 
 
 @dataclass(frozen=True)
@@ -82,14 +86,17 @@ class GradientTotals:
             NaN, see :class:`.captured_steps.CapturedSteps`.
         layerless_steps: Steps whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
             Contacts then act where they hit, and results are not continuous.
+        outrun_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or are
+            between bodies. Results are not continuous there.
     """
 
     grazing: int
     lost_steps: int
     layerless_steps: int
+    outrun_steps: int
 
 
-class SolverReport:
+class SolverReport(ContactReport, WorldsOfReport):
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
     :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
@@ -115,6 +122,7 @@ class SolverReport:
         self._host_totals = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)
         self._said: set[str] = set()  # the warnings that have been given
         self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
+        self.thickness: wp.array[wp.float64] | None = None  # of that layer [m]
         self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
 
     def copy_totals(self) -> None:
@@ -122,7 +130,7 @@ class SolverReport:
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once of a step whose :attr:`strain` is more than 0.2, and once of a start that crosses itself.
+        """Warns once each of a :attr:`strain` above 0.2, a start that crosses itself, and a layer that was passed.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
@@ -131,6 +139,8 @@ class SolverReport:
             self._warn_once("strain", self._strain_warning)
         if known["crossing_steps"] and self._responds:
             self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
+        if known["outrun_steps"] and self._mesh.model.requires_grad:
+            self._warn_once("layer", lambda: _LAYER_WARNING)
 
     def _warn_once(self, subject, message):
         if subject not in self._said:
@@ -329,14 +339,19 @@ class SolverReport:
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        return Totals(*self._read_totals()[:-2])
+        return Totals(*self._read_totals()[:-3])
 
     @property
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
-        layerless = 0 if self.layerless_steps is None else int(self.layerless_steps.numpy()[0])
-        grazing, lost_steps = self._read_totals()[-2:]
-        return GradientTotals(grazing, lost_steps, layerless)
+        layerless = 0 if self.layerless_steps is None else _read(self.layerless_steps)
+        grazing, lost_steps, outrun = self._read_totals()[-3:]
+        return GradientTotals(grazing, lost_steps, layerless, outrun)
+
+    @property
+    def layer_thickness(self) -> float | None:
+        """Thickness of the contact layer around the inner solver [m], see :mod:`.layer.thickness`; None without one."""
+        return None if self.thickness is None else float(self.thickness.numpy()[0])
 
     def _read_totals(self):
         return list(map(int, self.total_values.numpy()))
@@ -364,6 +379,10 @@ class SolverReport:
             line += f", {totals.not_finite_steps} steps with positions that are not finite"
         if gradients.grazing or gradients.lost_steps:
             line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
+        if self.layer_thickness is not None:
+            line += f"; contact layer of {1e3 * self.layer_thickness:.3g} mm"
+        if gradients.outrun_steps:
+            line += f", which contacts passed in {gradients.outrun_steps} steps"
         if gradients.layerless_steps:
             line += f"; {gradients.layerless_steps} steps without their contact layer"
         return line

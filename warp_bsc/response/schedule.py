@@ -97,6 +97,15 @@ class Result(IntEnum):
 
 
 @wp.struct
+class WorldCounts:
+    """Contacts of each world, shape [worlds]; empty if the report is not asked for worlds."""
+
+    found: wp.array[int]  # by the detection in progress
+    hits: wp.array[int]  # of the predicted motion
+    remaining: wp.array[int]  # that the last detection found
+
+
+@wp.struct
 class SolveStatus:
     """How far a step is, and its limits."""
 
@@ -105,6 +114,8 @@ class SolveStatus:
     results: wp.array[int]  # of Result
     contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
     is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
+    crossings: wp.array[int]  # of each world, edges that cross faces at the start
+    of_worlds: WorldCounts
     max_iterations: int
     max_slow_iterations: int
     max_truncations: int  # or divisions
@@ -133,7 +144,7 @@ def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, reco
     status = SolveStatus()
     for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
         setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
-    for name in ("contact_iteration", "is_fast"):
+    for name in ("contact_iteration", "is_fast", "crossings"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
     status.max_iterations = max_iterations
     status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
@@ -220,6 +231,22 @@ def count_contact(status: SolveStatus, world: int):
     """Counts a contact that a detection found."""
     wp.atomic_add(status.detection, int(Detection.HITS), 1)
     status.contact_iteration[world] = status.loop[Loop.ITERATION]
+    if status.of_worlds.found:
+        wp.atomic_add(status.of_worlds.found, world, 1)
+
+
+@wp.kernel
+def decide_worlds(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus):
+    """Takes over the contacts that a detection found in each world, before :func:`decide` does so for all."""
+    world = wp.tid()
+    of_worlds = status.of_worlds
+    found = of_worlds.found[world]
+    of_worlds.found[world] = 0
+    if can_search and status.results[Result.UNDETECTED] == 0 and has_overflowed(counts, capacities):
+        return  # a search finds them again
+    if status.results[Result.COUNTED] == 0:
+        of_worlds.hits[world] += found
+    of_worlds.remaining[world] = found
 
 
 @wp.kernel

@@ -4,16 +4,20 @@ import contextlib
 import functools
 from typing import Literal
 
+import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D
 
+from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, with_contacts
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
-from .integration.vbd_speed_limit import has_speed_limit, without_speed_limit
+from .forces.contact_forces import ContactForces
+from .integration.vbd_speed_limit import has_self_contact, has_speed_limit, without_speed_limit
+from .integration.wrapped_solver import innermost
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, Loop
@@ -23,11 +27,12 @@ from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
 from .step import resolve
 from .substeps.inner_contacts import InnerContacts
+from .substeps.small_steps import SmallSteps
 from .substeps.strain import StrainMeter
 from .substeps.style3d_contacts import Style3DContacts
 from .substeps.substeps import Substeps, reason_to_omit_substeps
 from .tuning import SUBSTEPS
-from .write_back import count_record, write_back
+from .write_back import count_outrun, count_record, write_back
 
 _COUPLED = "a coupled solver steps the stage"
 
@@ -103,6 +108,8 @@ class SolverCCD(CollisionStage):
         contact_layer: bool = True,
         lift_speed_limit: bool = True,
         max_iterations: int = MAX_ITERATIONS,
+        report_contacts: bool | int = False,
+        report_worlds: bool = False,
     ):
         """Puts the stage behind a solver.
 
@@ -120,7 +127,9 @@ class SolverCCD(CollisionStage):
                 contacts strain cloth, soft bodies or springs by more than 2% is taken in 2 to 32 substeps, and the next
                 ones are while they need it. It takes none behind Style3D, whose iterations see the contacts instead,
                 see :mod:`.substeps.style3d_contacts`, where gradients are asked for, in coupled solvers, and in CUDA
-                graphs behind solvers whose steps allocate; ``report.substeps_omitted`` says why. In steps that may have
+                graphs behind solvers whose steps allocate; ``report.substeps_omitted`` says why. If the model requires
+                gradients, and behind a contact layer, a number makes as many steps of each, each with its contacts and
+                one of its own in the report, see :mod:`.substeps.small_steps`. In steps that may have
                 substeps, and behind Style3D, the stage resolves contacts of particles with shapes alone, also if
                 ``contacts`` are passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that
                 distance. If contacts strain an edge by more than 20% in a step, or a substep, the stage warns once.
@@ -143,8 +152,8 @@ class SolverCCD(CollisionStage):
                 ``model.particle_radius``: pairs keep the sum of their radii beside ``min_distance``. That of an edge or
                 a face is the largest one of its vertices, that of a shape 0.
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
-                inner solver if the model requires gradients, no pair keeps a distance, and no shape moves with a body.
-                Without a layer, results jump where a contact comes or goes, and gradients miss those jumps.
+                inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
+                layer, results jump where a contact comes or goes, and gradients miss those jumps.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
                 keeps them apart. Otherwise VBD cuts the path of every particle, see
                 :mod:`.integration.vbd_speed_limit`. If its iterations are too few for the step, VBD does not hold heavy
@@ -152,12 +161,15 @@ class SolverCCD(CollisionStage):
                 effect on other solvers; ``report.speed_limit_lifted`` is true where it has.
             max_iterations: Iterations of detect and project, 0 to 40; what still collides then is divided, see
                 :mod:`.schedule`. Fewer bound the time of a step, and leave more vertices with cut paths.
+            report_contacts: Whether ``report`` has the contacts of each step and their impulses, see
+                :class:`.forces.contact_report.ContactReport`. A number is that of the contacts that are listed at most;
+                True stands for 8 for each particle, and at least 4,096. Sums have the contacts beyond that too.
+            report_worlds: Whether ``report.worlds`` has results by world, :class:`.worlds.world_report.Worlds`.
 
         Raises:
             TypeError: If an argument has another type.
             ValueError: If a number, or the friction of a shape that collides with particles, is out of range.
-            NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`, or
-                if a number of ``substeps`` is given with ``requires_grad`` or behind a contact layer.
+            NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
         options = StageOptions.of(
@@ -172,6 +184,8 @@ class SolverCCD(CollisionStage):
             contact_layer=contact_layer,
             lift_speed_limit=lift_speed_limit,
             max_iterations=max_iterations,
+            report_contacts=report_contacts,
+            report_worlds=report_worlds,
         )
         self._reads_friction = options.reads_friction
         self.friction, self.restitution = options.friction, options.restitution
@@ -181,18 +195,23 @@ class SolverCCD(CollisionStage):
         if options.keeps_distances:
             mesh.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
-        if isinstance(self.substeps, int) and inner is not solver:
-            raise NotImplementedError("substeps: steps in substeps have no contact layer; omit substeps, or the layer")
-        moves, separates = options.moves_bodies(mesh, inner), options.bodies == "separated"
+        integrator = innermost(solver)
+        moves, separates = options.moves_bodies(mesh, integrator), options.bodies == "separated"
         coefficients = friction_of(mesh, self.friction)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
-        needs_layer = options.contact_layer and self.model.requires_grad and inner is solver
-        if needs_layer and not options.keeps_distances and not mesh.has_shapes_on_bodies:
-            self.solver = ContactLayer(solver, friction=self.friction, restitution=self.restitution)
+        if options.contact_layer and self.model.requires_grad and inner is solver:
+            self.solver = ContactLayer(
+                solver,
+                friction=self.friction,
+                restitution=self.restitution,
+                min_distance=min_distance,
+                particle_radius=particle_radius,
+                bodies=options.bodies,
+            )
         if isinstance(self.solver, ContactLayer):
-            self.report.layerless_steps = self.solver.skipped
-        self._limited = inner if options.lift_speed_limit and has_speed_limit(inner) else None
+            self.report.layerless_steps, self.report.thickness = self.solver.skipped, self.solver.thickness_values
+        self._limited = integrator if options.lift_speed_limit and has_speed_limit(integrator) else None
         self.report.speed_limit_lifted = self._limited is not None
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
@@ -204,24 +223,84 @@ class SolverCCD(CollisionStage):
         if self.substeps == "auto" and self.report.substeps_omitted is None and isinstance(inner, SolverStyle3D):
             self.report.substeps_omitted = "SolverStyle3D sees the contacts in its iterations"
             self._inner_rows = Style3DContacts(self._work)
-        if self.substeps is not None and self.report.substeps_omitted is None:
+        self._small_steps: SmallSteps | None = None
+        if isinstance(self.substeps, int) and (self.model.requires_grad or isinstance(self.solver, ContactLayer)):
+            self._small_steps = SmallSteps(self.model, self.substeps)
+            self.report.last_substeps.fill_(self.substeps)
+        elif self.substeps is not None and self.report.substeps_omitted is None:
             choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
             substeps_of_steps = Substeps(self._step_solver, solver, self._work, self._meter, choices)
             self._substepping = substeps_of_steps, InnerContacts(mesh, moves_bodies=motion.moves_bodies)
             self.report.last_substeps, self.report.last_strain = substeps_of_steps.substeps, substeps_of_steps.strain
+        self._forces: ContactForces | None = None
+        if options.report_contacts:
+            in_substeps = self._substepping is not None
+            self._forces = ContactForces(self._work, options.report_contacts, in_substeps=in_substeps)
+            self.report.keep_contacts(self._forces.rows, self._forces.published, self._forces.shapes_of_worlds)
+            if self._substepping is not None:
+                self._substepping[0].forces = self._forces
+        if self._inner_rows is not None:
+            self.report.impulses_elsewhere = "SolverStyle3D pushes in its iterations"
+        elif isinstance(self.solver, ContactLayer):
+            self.report.impulses_elsewhere = "the contact layer pushes before the stage"
+        elif has_self_contact(integrator):
+            self.report.impulses_elsewhere = "SolverVBD has self-contact"
+        if options.report_worlds:
+            self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
+            if self._substepping is not None:
+                self._substepping[0].taken = wp.zeros(self._work.worlds, dtype=int, device=mesh.device)
+
+    @property
+    def _predicted_substeps(self):
+        return None if self._substepping is None else self._substepping[0].predicted
+
+    @one_at_a_time
+    def step(
+        self,
+        state_in: newton.State,
+        state_out: newton.State,
+        control: newton.Control | None,
+        contacts: newton.Contacts | None,
+        dt: float,
+        **options,
+    ) -> None:
+        """Steps the inner solver, and resolves the collisions of its motion, see :meth:`.stage.CollisionStage.step`.
+
+        On a tape, minimum distances raise NotImplementedError only if there are particles without faces and springs.
+        """
+        if self._small_steps is None:
+            super().step(state_in, state_out, control, contacts, dt, **options)
+            return
+        checked_number(dt, "dt", 0.0, above=True)
+        with paused_tape() as tape:
+            self._check_tape(tape, state_in, state_out)
+
+        def step(start, end, small_dt):
+            super(SolverCCD, self).step(start, end, control, contacts, small_dt, **options)
+
+        on_tape = tape is not None and self.model.requires_grad
+        self._small_steps.take(step, state_in, state_out, dt, on_tape=on_tape)
+
+    def _count_step(self):
+        if self.report.thickness is not None:
+            self._work.launch(count_outrun, 1, [self._work.status], [self.report.device_totals])
+        super()._count_step()
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
             return
         if state_in is state_out:
             raise ValueError("on a tape, state_out must not be state_in")
-        if self.mesh.distances is not None:
+        if self._work.detector.points:
             raise NotImplementedError(
-                "on a tape, steps that keep a distance carry no gradients: omit min_distance and particle_radius"
+                "on a tape, particles without faces and springs that keep a distance carry no gradients: "
+                "omit min_distance and particle_radius"
             )
 
     def _begin_step(self, state, contacts):
         self._in_substeps, self._inner_contacts = None, None
+        if self._forces is not None:
+            self._forces.begin(arrays_of(state), remembers=not self.model.requires_grad)
         if self._coupled is not None and self._inner_rows is not None:
             self._inner_rows, self.report.substeps_omitted = None, _COUPLED
         if self._substepping is None:
@@ -265,14 +344,16 @@ class SolverCCD(CollisionStage):
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)
+        mask = self._mask
         if self._in_substeps is not None and self._inner_contacts is not None:
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
             solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
-            run_on_host(lambda: self._resolve(end, dt, solve), device)
+            run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
         elif tape is not None and end.particle_q is not None and end.particle_q.requires_grad:
             self._record(arrays_of(state_in), end, dt, tape)
         else:
-            run_on_host(lambda: self._resolve(end, dt, functools.partial(resolve, self._work, dt)), device)
+            solve = functools.partial(resolve, self._work, dt)
+            run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
 
     def _record(self, start, end, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
@@ -308,20 +389,23 @@ class SolverCCD(CollisionStage):
         return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
-    def _resolve(self, end, dt, solve):
+    def _resolve(self, end, dt, solve, mask=None):
         """Solves the motion from the start of the step to its end, as it was predicted, and changes the end."""
         with self._timed():
             if self._reads_friction:
                 self._motion.friction.read()
             self._motion.set_end(end, dt)
-            solve()
-            if self._in_substeps is None:
-                if self._substepping is not None:
-                    self._substepping[0].substeps.zero_()
-                self.report.last_strain.zero_()
-                measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
-                wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
-            self._write_end(end)
+            if self._forces is not None:
+                self._forces.end(end, mask)
+            with self._masked(mask):
+                solve()
+                if self._in_substeps is None:
+                    if self._substepping is not None:
+                        self._substepping[0].substeps.zero_()
+                    self.report.last_strain.zero_()
+                    measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
+                    wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
+                self._write_end(end)
 
     def _write_end(self, end):
         """Writes the resolved motion to the arrays of a state, and counts the step."""
@@ -329,6 +413,10 @@ class SolverCCD(CollisionStage):
         poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
         outputs = [end, poses, self._work.status]
         self._work.launch(write_back, size, [self._work.vertices], outputs)
+        if self._forces is not None:
+            self._forces.publish()
+        if self._counter is not None:
+            self._counter.count(None if self._in_substeps is None else self._in_substeps.taken)
         self._count_step()
 
     def update_contacts(self, contacts, state=None):

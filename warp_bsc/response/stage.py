@@ -1,6 +1,7 @@
 """What both stages behind a solver do: step it, keep the motion of the step, and count the step in a report."""
 
 import contextlib
+import functools
 import time
 
 import newton
@@ -16,6 +17,8 @@ from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.workspace import Workspace
 from .step import prepare
+from .worlds.count_worlds import WorldCounter
+from .worlds.world_mask import WorldMask, checked_mask
 from .write_back import count_step
 
 
@@ -24,6 +27,8 @@ class CollisionStage(CouplingHooks):
 
     mesh: ModelMesh
     report: SolverReport
+    _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
+    _mask: wp.array | None = None  # of the step in progress, if worlds take no part in it
 
     def _allocate(
         self,
@@ -45,6 +50,11 @@ class CollisionStage(CouplingHooks):
             motion.remember(self._work.vertices.x1)
         self.report = SolverReport(self._work, responds=responds)
 
+    def _count_worlds(self, max_impulse: wp.array | None = None, *, responds: bool = True):
+        """Makes the report have results by world."""
+        self._counter = WorldCounter(self._work, responds=responds, max_impulse=max_impulse)
+        self.report.keep_worlds(self._counter.worlds)
+
     @one_at_a_time
     def step(
         self,
@@ -53,6 +63,8 @@ class CollisionStage(CouplingHooks):
         control: newton.Control | None,
         contacts: newton.Contacts | None,
         dt: float,
+        *,
+        world_mask: wp.array[wp.bool] | None = None,
         **options,
     ) -> None:
         """Steps the inner solver, and detects the collisions of its motion.
@@ -67,29 +79,64 @@ class CollisionStage(CouplingHooks):
             contacts: As for the inner solver. In steps that may have substeps, it gets only those that the stage does
                 not resolve, see :mod:`.substeps.inner_contacts`.
             dt: Length of the step [s], more than 0.
+            world_mask: Which worlds take part in the step, and as the last entry whether everything that is in all
+                worlds does, shape [world_count + 1], as of :meth:`reset`; None for all. The others end the step in the
+                state in which they begin it, bit by bit, and the stage looks at none of their elements. The inner
+                solver steps them all the same, as solvers of Newton know no mask: what it keeps of them beside the
+                state, such as multipliers of its own contacts, may change. Custom attributes of the state are the inner
+                solver's in all worlds.
             options: As for the inner solver.
 
         Raises:
-            TypeError: If ``dt`` is no number.
-            ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients of the response, and
-                ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients of a response that keeps a distance.
+            TypeError: If ``dt`` is no number, or ``world_mask`` no array of bool.
+            ValueError: If ``dt`` is not finite or not more than 0, if ``world_mask`` has another shape or device, or if
+                a tape records gradients of the response, and ``state_out`` is ``state_in``.
+            NotImplementedError: If a tape records gradients of a response that keeps a distance, or in a part of the
+                worlds.
             RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
-                recorded no step outside one before.
+                recorded no step outside one before, or if the first ``world_mask`` is given in a graph.
         """
         checked_number(dt, "dt", 0.0, above=True)
+        mask = checked_mask(world_mask, self.model)
         with paused_tape() as tape:
             self._check_tape(tape, state_in, state_out)
+            if mask is not None and tape is not None and self.model.requires_grad:
+                raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
+            self._mask = mask
+            if mask is not None:
+                self._world_mask.begin(start)
             passed = self._begin_step(state_in, contacts)
         self._step_inner(state_in, state_out, control, passed, dt, **options)
         with paused_tape() as tape:
+            if mask is not None:
+                self._world_mask.restore(mask, state_out)
             self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
         if not self.mesh.device.is_capturing:
             self.report.warn()
+
+    @functools.cached_property
+    def _world_mask(self):
+        """Holds worlds that take no part in a step; made where it is first needed.
+
+        Raises:
+            RuntimeError: If that is in a graph.
+        """
+        if self.mesh.device.is_capturing:
+            raise RuntimeError("world_mask needs memory: step once with one before capturing")
+        return WorldMask(self.solver, self._work, self._motion, self._predicted_substeps)
+
+    def _masked(self, mask):
+        """Lets the stage look at the worlds alone that take part, at all if there is no mask."""
+        return contextlib.nullcontext() if mask is None else self._world_mask.applied(mask)
+
+    @property
+    def _predicted_substeps(self):
+        """Predicted number of substeps of each world; None if steps have none."""
+        return None
 
     def _check_tape(self, tape, state_in, state_out):
         """Raises an error if the step cannot be recorded on a tape."""

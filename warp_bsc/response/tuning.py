@@ -79,7 +79,9 @@ PLANE_DEPTH = wp.constant(wp.float64(0.05))
 
 # contact layer
 LAYER_THICKNESS = 0.25, 0.45
-"""Default thickness, as a share of the median edge length, and its limit as a share of the shortest edge length."""
+"""Thickness, as a share of the median edge length, and its limit as a share of the shortest edge length."""
+PATHS_IN_LAYER = wp.constant(2.0)
+"""Paths of a step that a layer should hold, see :mod:`.layer.thickness`; with a quarter less, gradients fail."""
 PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""
@@ -136,5 +138,7 @@ ITERATIONS_RESERVED = 3
 """Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
 MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
+CONTACTS_PER_PARTICLE, MIN_CONTACTS = 8, 4096
+"""Contacts that a report lists, for each particle, and at least."""
 BLOCKS = 8
 """Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""

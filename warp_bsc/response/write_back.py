@@ -93,3 +93,9 @@ def count_record(counts: RecordCounts, totals: StepTotals):
     """Adds the record of a step to the totals."""
     totals.grazing[0] += wp.int64(counts.grazing[0])
     totals.lost_gradients[0] += wp.int64(1 - counts.complete[0])
+
+
+@wp.kernel
+def count_outrun(status: SolveStatus, totals: StepTotals):
+    """Counts a step in which a contact layer left contacts to the stage."""
+    totals.outrun_steps[0] += wp.int64(wp.min(status.results[Result.FIRST_HITS], 1))

@@ -14,7 +14,7 @@ from ..schedule import SWEEPS_PER_BATCH
 from ..state.record import GROWING, OFFSETS, RecordCounts, check_complete
 from ..state.structs import SUMS, Constraints, add_zeros, allocate
 from ..state.workspace import Workspace
-from . import kernels, restore, structs
+from . import kernels, pose_kernels, restore, structs
 from .arrays import copied, filled, launch_adjoint, with_gradients
 from .structs import Move, Projection, RestoredStep
 
@@ -146,12 +146,12 @@ class StepAdjoint:
         self._launch(restore.begin_gradients, both, restored, of_states, gradients, of_motion)
         self._launch(restore.restore_velocities, both, restored, gradients)  # as they were before the turn
         self._move_cursor(Move.END)
-        self._launch(kernels.set_centres, self._bodies, motion, step.vertices.bodies.pose, step.vertices.bodies)
+        self._launch(pose_kernels.set_centres, self._bodies, motion, step.vertices.bodies.pose, step.vertices.bodies)
         self._through_turn()
         wp.capture_while(cursor.more_sweeps, self._batch, through=self._through_velocity_sweep)
         self._through_initialization()
         self._through_centres(step.vertices.bodies.pose)
-        self._launch(kernels.set_centres, self._bodies, motion, motion.bodies.end, step.vertices.bodies)
+        self._launch(pose_kernels.set_centres, self._bodies, motion, motion.bodies.end, step.vertices.bodies)
         wp.capture_while(cursor.more_iterations, self._through_iteration)
         self._through_vertices_of_bodies(kernels.place_vertices, "x1")
         inputs = [restored, gradients, of_motion, of_states, of_model]
@@ -168,9 +168,9 @@ class StepAdjoint:
         self._through_poses()
         shapes, planes = mesh.device_shape_vertices, mesh.device_planes
         inputs = [step.motion, shapes.body, shapes.position, mesh.model.particle_count, self._restored.dt]
-        self._launch_adjoint(kernels.place_shape_vertices, len(shapes.body), inputs)
+        self._launch_adjoint(pose_kernels.place_shape_vertices, len(shapes.body), inputs)
         inputs = [step.motion, planes.point, planes.normal, planes.body, self._restored.planes]
-        self._launch_adjoint(kernels.place_planes, len(planes.body), inputs)
+        self._launch_adjoint(pose_kernels.place_planes, len(planes.body), inputs)
 
     def _through_turn(self):
         """Goes back through the turn that restores angular momentum."""
@@ -255,7 +255,7 @@ class StepAdjoint:
         """Turns gradients with respect to where impulses act into those with respect to the poses given."""
         if self._moves_bodies:
             inputs = [self._step.motion, poses, self._step.vertices.bodies]
-            self._launch_adjoint(kernels.set_centres, self._bodies, inputs)
+            self._launch_adjoint(pose_kernels.set_centres, self._bodies, inputs)
             self._of_moved_bodies.centre.zero_()
             self._of_moved_bodies.inverse_inertia.zero_()
 

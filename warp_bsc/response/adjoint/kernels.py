@@ -6,7 +6,7 @@ For launches over vertices and bodies see :mod:`.adjoint.restore`.
 import warp as wp
 
 from ...kernels.closest import contact_weights, weights_across
-from ..contacts.collect import level, offset_from
+from ..contacts.collect import distances_from_plane, offset_from
 from ..contacts.constraints import (
     approach_of,
     contact_friction,
@@ -16,7 +16,7 @@ from ..contacts.constraints import (
     sagitta,
 )
 from ..contacts.first_contact import truncated_path
-from ..contacts.impacts import impact_of
+from ..contacts.impacts import contact_at, contact_within_reach, impact_of, kept_distance, time_at_distance
 from ..schedule import is_reversible, widened
 from ..solve.angular_momentum import (
     Moments,
@@ -36,11 +36,10 @@ from ..solve.sweeps import (
     velocity_multiplier_after,
     with_momentum,
 )
-from ..state.motion import moves_with_body, predicted_velocity
-from ..state.planes import MovingPlanes, signed_distance, time_of_entry, transformed_plane
-from ..state.poses import centre_of, in_world, pose_between, turned_pose, velocity_between, velocity_on_body
+from ..state.planes import signed_distance, time_of_entry
+from ..state.poses import pose_between, turned_pose, velocity_between, velocity_on_body
 from ..state.record import NO_CONTACT, truncation_at
-from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Motion, MovedBodies, Pace, Step, can_move
+from ..state.structs import HELD, MASS, MOMENTS, Constraints, ContactKind, Pace, Step, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double, to_single
 from ..tuning import SHARE_OF_PATH
 from .structs import Paths, Projection, RestoredStep, entry_of
@@ -195,10 +194,19 @@ def make_constraints(restored: RestoredStep, found: Constraints):
         plane = restored.planes.end[found.plane[i]]
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         separation = offset_from(step, restored.planes, found.plane[i], corners[0], restored.status)
+        if motion.distances.radius:
+            of_plane, _reach = distances_from_plane(motion, restored.planes, found.plane[i], corners[0])
+            separation += wp.max(of_plane, ZERO)
         friction = contact_friction(motion.friction[corners[0]], restored.planes.friction[found.plane[i]])
     else:
         friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    if kind < ContactKind.PLANE:
+    kept, reach = kept_distance(motion, corners, kind)
+    if kind < ContactKind.PLANE and motion.distances.radius:
+        at_distance, towards = contact_within_reach(step, corners, kind, weight, normal, kept, iteration <= 0, reach)
+        weight = at_distance
+        normal = towards
+        separation = widened(step.separation, restored.status)
+    elif kind < ContactKind.PLANE:
         coordinates = wp.vec3d(-weight[1], -weight[2], -weight[3])
         if kind == ContactKind.EDGE_EDGE:
             coordinates = wp.vec3d(weight[1], -weight[3], ZERO)
@@ -207,16 +215,17 @@ def make_constraints(restored: RestoredStep, found: Constraints):
         weight = contact_weights(kind_of_pair(kind), impact.coordinates)
         normal = impact.normal
         separation = widened(step.separation, restored.status)
+    if kind < ContactKind.PLANE:
         if found.pace[i] == Pace.SLOW:
-            before = wp.dot(normal, relative(weight, corners, motion.x0))
+            before = wp.dot(normal, relative(weight, corners, motion.x0)) - kept
             separation = feasible(step, corners, separation, before)
-        separation += sagitta(step, corners)
+        separation += sagitta(step, corners) + kept
     elif kind > ContactKind.PLANE:
         a, b, c, d = corners_of(motion.x0, corners)
         across, direction, distance = weights_across(kind_of_pair(kind), a, b, c, d)
         weight = across
         normal = direction
-        separation = feasible(step, corners, step.separation, distance)
+        separation = kept + feasible(step, corners, step.separation, distance - kept)
     constraints.weights[i] = weight
     constraints.normal[i] = normal
     constraints.separation[i] = separation
@@ -237,10 +246,15 @@ def find_truncation_times(restored: RestoredStep, times: wp.array[wp.float64]):
         plane = corners[1]
         before, _error = signed_distance(planes.start[plane], step.motion.x0[vertex])
         after, _error_after = signed_distance(planes.end[plane], step.vertices.x1[vertex])
-        lowest = level(step.motion, planes, plane, vertex)
+        lowest, _reach = distances_from_plane(step.motion, planes, plane, vertex)
         times[entry] = time_of_entry(before - lowest, after - lowest)
     else:
         kind, within_tolerance, toi = record.kind[entry], record.within_tolerance[entry], record.toi[entry]
+        if step.motion.distances.radius:
+            weights, direction = contact_at(step, corners, record.kind[entry], toi)
+            kept, _reach_of_pair = kept_distance(step.motion, corners, record.kind[entry])
+            times[entry] = time_at_distance(step, corners, weights, direction, kept)
+            return
         coordinates, normal = record.coordinates[entry], record.normal[entry]
         impact = impact_of(step, corners, kind, within_tolerance, toi, coordinates, normal)
         times[entry] = impact.toi
@@ -323,42 +337,3 @@ def vertex_velocities(step: Step, velocities: wp.array[wp.vec3]):
     if can_move(motion, body):
         arm = to_double(vertices.x1[vertex]) - vertices.bodies.centre[body]
         velocities[vertex] = velocity_on_body(vertices.bodies.velocity[body], arm)
-
-
-@wp.kernel
-def set_centres(motion: Motion, poses: wp.array[wp.transform], moved: MovedBodies):
-    """Computes where impulses act on bodies in given poses, see :func:`.solve.bodies.move_to_end`."""
-    body = wp.tid()
-    if can_move(motion, body):
-        moved.centre[body] = centre_of(motion.bodies, body, poses[body])
-        moved.inverse_inertia[body] = in_world(motion.bodies.inverse_inertia[body], poses[body])
-
-
-@wp.kernel
-def place_shape_vertices(
-    motion: Motion, bodies: wp.array[int], positions: wp.array[wp.vec3], particle_count: int, dt: float
-):
-    """Computes the predicted motion of vertices of shapes from that of their bodies, see :mod:`.state.motion`."""
-    i = wp.tid()
-    vertex = particle_count + i
-    body = bodies[i]
-    if body < 0 or motion.is_not_finite[vertex] != 0:
-        return
-    start = wp.transform_point(motion.bodies.start[body], positions[i])
-    end = wp.transform_point(motion.bodies.end[body], positions[i])
-    motion.x0[vertex] = start
-    motion.x1[vertex] = end
-    if moves_with_body(motion, vertex):
-        motion.velocity[vertex] = predicted_velocity(motion, vertex, end)
-    else:
-        motion.velocity[vertex] = (end - start) / dt
-
-
-@wp.kernel
-def place_planes(
-    motion: Motion, points: wp.array[wp.vec3], normals: wp.array[wp.vec3], bodies: wp.array[int], planes: MovingPlanes
-):
-    """Computes the planes at the start and at the end of a step, see :mod:`.state.motion`."""
-    i = wp.tid()
-    planes.start[i] = transformed_plane(points[i], normals[i], bodies[i], motion.bodies.start)
-    planes.end[i] = transformed_plane(points[i], normals[i], bodies[i], motion.bodies.end)

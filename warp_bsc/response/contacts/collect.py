@@ -28,7 +28,15 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 
 @wp.kernel(enable_backward=False)
-def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: wp.array[int]):
+def count_crossings(
+    # in
+    step: Step,
+    pairs: wp.array[wp.vec2i],
+    counts: wp.array[wp.int64],
+    # out
+    count: wp.array[int],
+    of_worlds: wp.array[int],
+):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     i = wp.tid()
     mesh = step.mesh
@@ -41,6 +49,7 @@ def count_crossings(step: Step, pairs: wp.array[wp.vec2i], counts: wp.array[wp.i
     if movable or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
         if rules.crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
+            wp.atomic_add(of_worlds, step.motion.world[corners[0]], 1)
 
 
 @wp.func
@@ -81,7 +90,7 @@ def offset_from(step: Step, planes: MovingPlanes, i: int, vertex: int, status: S
 
 
 @wp.func
-def _distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int):
+def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int):
     """Returns the distance that a vertex is kept at from a plane, and how much farther away it is near [m].
 
     Like a pair, a particle may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
@@ -111,7 +120,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         if planes.world[i] >= 0 and planes.world[i] != world:
             continue
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
-        kept, reach = _distances_from_plane(motion, planes, i, vertex)
+        kept, reach = distances_from_plane(motion, planes, i, vertex)
         if not (after <= kept + wp.max(reach, error_after)):  # nor where the plane is not finite
             continue
         near = after > kept + error_after  # not a contact
@@ -130,6 +139,8 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             continue
         if ahead:
             wp.atomic_add(status.results, int(Result.FIRST_HITS), wp.where(near, 0, 1))
+            if status.of_worlds.hits:
+                wp.atomic_add(status.of_worlds.hits, world, wp.where(near, 0, 1))
         else:
             count_contact(status, world)
             vertices.changed[vertex] = 1
@@ -191,7 +202,8 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
         start, kept = constraints.distances_at_start(motion, corners, kind)
         added.min_distance = kept
         bound = start
-    may_cross = status.results[Result.CROSSINGS] > 0
+    world = motion.world[corners[0]]
+    may_cross = status.crossings[world] > 0
     found = rules.classify_contact(step, kind, contacts.pairs[i], corners, owner, bound, may_cross)
     if found == ContactClass.CROSSED:
         wp.atomic_add(status.detection, int(Detection.EXCLUDED), wp.where(near, 0, 1))
@@ -200,7 +212,6 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
         mark_changed(vertices, corners)
     if found != ContactClass.OURS:
         return
-    world = motion.world[corners[0]]
     iteration = status.loop[Loop.ITERATION]
     added.vertices = corners
     added.pace = constraints.pace_of(motion, corners, kind)

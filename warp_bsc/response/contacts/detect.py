@@ -5,7 +5,7 @@ import warp as wp
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
 from ...detection.settings import Count
-from ..schedule import Loop, Result, decide
+from ..schedule import Loop, Result, decide, decide_worlds
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
 from .impacts import count_grazing
@@ -21,9 +21,11 @@ def detect_crossings(work: Workspace) -> None:
 def _count_crossings(work):
     candidates, crossings = work.crossing_candidates, work.results[Result.CROSSINGS]
     crossings.zero_()
+    work.status.crossings.zero_()
     retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
-    inputs = [work.step, candidates.pairs, candidates.counts, crossings]
-    work.launch_over(count_crossings, [(candidates.pairs, candidates.counts, Count.QUEUED)], inputs)
+    with work.all_worlds():
+        inputs = [work.step, candidates.pairs, candidates.counts, crossings, work.status.crossings]
+        work.launch_over(count_crossings, [(candidates.pairs, candidates.counts, Count.QUEUED)], inputs)
 
 
 def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
@@ -38,10 +40,12 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
     With ``only_changed``, only vertices that changed since the last detection are looked at.
     """
     detector, vertices = work.detector, work.vertices
-    changed = vertices.changed if only_changed else None
+    changed = vertices.changed if only_changed else work.active
+    refit = only_changed or changed is not None  # a tree of which little is looked at need not be the best
 
     def find():
-        detector.find_contacts(work.step.motion.x0, vertices.x1, refit=only_changed, changed=changed)
+        ends = work.step.motion.x0, vertices.x1
+        detector.find_contacts(*ends, refit=refit, changed=changed, proximities=not only_changed)
 
     retry_until_fits(find, detector, work.device)
     work.reserve(work.max_contacts)
@@ -72,4 +76,6 @@ def _search(work, overflow):
 def _decide(work, overflow):
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
+    if work.status.of_worlds.found is not None:
+        work.launch(decide_worlds, work.worlds, [*overflow, work.status])
     work.launch(decide, 1, [work.step, *overflow], [work.status])

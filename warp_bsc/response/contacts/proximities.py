@@ -7,7 +7,7 @@ from ...detection.launch import retry_until_fits
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ..schedule import Result, SolveStatus, is_projecting
+from ..schedule import SolveStatus, is_projecting
 from ..state.structs import ContactKind, Pace, Step
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
@@ -83,7 +83,7 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
         return
     if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
-    if status.results[Result.CROSSINGS] > 0:
+    if status.crossings[world] > 0:
         if crossed_at_start(step, kind, candidates.pairs[i]):
             return
     elif nearest and _is_behind(corners, kind, normal, distance, nearest):

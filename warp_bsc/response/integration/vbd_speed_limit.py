@@ -8,6 +8,11 @@ from newton.solvers import SolverBase, SolverVBD
 from ..._private_names.of_newton import vbd_truncation, vbd_truncation_replaced
 
 
+def has_self_contact(solver: SolverBase) -> TypeGuard[SolverVBD]:
+    """Returns whether a solver is VBD with self-contact."""
+    return isinstance(solver, SolverVBD) and solver.particle_enable_self_contact
+
+
 def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:
     """Returns whether a solver is VBD with self-contact, whose limit can be lifted; warns if this Newton forbids it.
 
@@ -15,9 +20,7 @@ def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:
     ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
     other.
     """
-    if not isinstance(solver, SolverVBD) or not solver.particle_enable_self_contact:
-        return False
-    return vbd_truncation(solver) is not None
+    return has_self_contact(solver) and vbd_truncation(solver) is not None
 
 
 @contextlib.contextmanager

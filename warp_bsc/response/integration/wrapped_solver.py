@@ -59,6 +59,13 @@ class WrappedSolver(SolverBase, CouplingInterface):
         return getattr(self.solver, name)
 
 
+def innermost(solver: SolverBase) -> SolverBase:
+    """Returns the solver inside all wrappers of this package: the one that integrates."""
+    while isinstance(solver, WrappedSolver):
+        solver = solver.solver
+    return solver
+
+
 def _delegated_method(name, owner):
     """Returns a method that is that of the inner solver; hooks of the coupling interface have a default."""
 

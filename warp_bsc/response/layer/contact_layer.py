@@ -11,6 +11,9 @@ Contacts of one vertex divide its mass among them, by the squares of their depth
 one pass without sweeps, in which a contact that comes or goes does nothing at that moment. Several contacts push a
 little less than one, so that some hundredths more of the speed come back. Friction is Coulomb's where contacts slide
 fast; near its limit it is less, without a corner, so that what rests on a slope creeps. All is differentiable.
+
+A body takes part with its inverse mass at the contact, 1/m + (r x n) I^-1 (r x n), and divides it among its contacts in
+the same way. Its pushes act where it was predicted to be.
 """
 
 import newton
@@ -20,33 +23,42 @@ from newton.solvers import SolverBase
 
 from ..._arguments import checked_distance, checked_number
 from ..._one_thread import one_at_a_time
+from ..._private_names.of_newton import body_q_prev
 from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
-from ..adjoint.arrays import copied, filled, launch_adjoint, with_gradients
-from ..contacts.queue import PairQueue, queues_of
-from ..integration.wrapped_solver import WrappedSolver
-from ..options import StageOptions, friction_of, particle_edge_lengths
+from ..adjoint.arrays import filled
+from ..adjoint.pose_kernels import set_centres
+from ..adjoint.structs import StateGradients
+from ..contacts.queue import queues_of
+from ..integration.wrapped_solver import WrappedSolver, innermost
+from ..options import Bodies, StageOptions, friction_of, in_eight_bits, particle_edge_lengths
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, arrays_of
+from ..state.structs import add_zeros
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
 from . import kernels
+from .adjoint import RecordedPushes, go_back, record_pushes
+from .pushes import Layer
+from .thickness import ThicknessRule, choose_thickness, find_extremes
 
 
 class ContactLayer(WrappedSolver):
     """Lets another solver step, then pushes what has come into a layer around all surfaces.
 
     Behind it, ``SolverCCD(ContactLayer(solver))``, the stage resolves what the layer leaves: pairs that passed each
-    other since the start of the step, and contacts with dynamic bodies that the inner solver integrates. With the layer
-    results are continuous in the inputs, and gradients hold where contacts come and go. Pushes conserve linear
+    other since the start of the step. With the layer results are continuous in the inputs, and gradients hold where
+    contacts come and go. Particles and dynamic bodies push each other, as in the stage. Pushes conserve linear
     momentum, but angular momentum only to the first order of the step, as they act along directions at y (see above).
 
     Cloth rests on the layer, and should start outside of it: otherwise it is pushed out within a few steps.
 
     Limitations:
-        Only contacts within one step are seen: what a program moves between steps is passed on to the stage. On a tape,
-        a layer carries no gradients to poses of bodies: a step raises NotImplementedError if shapes move with bodies.
+        Only contacts within one step are seen: what a program moves between steps is passed on to the stage. Contacts
+        between bodies, and of bodies with infinite planes, are left to the inner solver and the stage; they make
+        results jump. So does what moves farther in a step than the layer is thick: behind the layer,
+        ``report.gradients.outrun_steps`` of the stage counts such steps.
 
     References:
         R. Tonge, F. Benevolenski and A. Voroshilov, Mass Splitting for Jitter-Free Parallel Rigid Body Simulation, ACM
@@ -55,9 +67,10 @@ class ContactLayer(WrappedSolver):
     Attributes:
         solver: The inner solver.
         mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
-        thickness: Thickness of the layer [m].
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
+        thickness_values: Thickness [m], Warp array of float64, shape [1], as :attr:`thickness`.
+        skipped: Steps as of :attr:`skipped_steps`, Warp array of int64, shape [1].
     """
 
     def __init__(
@@ -69,18 +82,23 @@ class ContactLayer(WrappedSolver):
         restitution: float | wp.array[float] | None = None,
         min_distance: float | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
+        bodies: Bodies = "pushed",
     ):
         """Puts the layer around a solver.
 
         Args:
             solver: Any Newton solver that moves particles.
-            thickness: Thickness of the layer [m], above the minimum distances. It should be more than the longest path
-                of a step, and less than half of the shortest edge, as neighbours beyond the next push each other as
-                well. Default: a quarter of the median edge length, at most 0.45 of the shortest.
+            thickness: Thickness of the layer [m], above the minimum distances. It should be more than twice the longest
+                path of a step, and with the minimum distance less than half of the shortest edge, as neighbours beyond
+                the next push each other as well. Default: a quarter of the median edge length, or 0.45 of the shortest
+                less the minimum distance where the first step shows that motion is too fast for that, see
+                :mod:`.layer.thickness`.
             friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``.
             restitution: Share of the approaching velocity that comes back, in [0, 1].
             min_distance: Distance of pairs at the bottom of the layer [m]; None or 0: they touch.
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all.
+            bodies: Whether particles push dynamic bodies, as for :class:`.solver_ccd.SolverCCD`; ``"separated"`` is as
+                ``"pushed"`` here.
 
         Raises:
             TypeError: If an argument has another type.
@@ -94,33 +112,50 @@ class ContactLayer(WrappedSolver):
             restitution=restitution,
             min_distance=min_distance,
             particle_radius=particle_radius,
+            bodies=bodies,
         )
         self.mesh = mesh = ModelMesh(self.model, strands=options.keeps_distances)
         self.friction, self.restitution = options.friction, options.restitution
         self._reads_friction = options.reads_friction
-        if thickness is None:
-            lengths = particle_edge_lengths(mesh)
-            shares = np.array(LAYER_THICKNESS) * ((np.median(lengths), lengths.min()) if len(lengths) else (1.0, 1.0))
-            thickness = float(shares.min())
-        self.thickness = checked_distance(thickness, "thickness", zero=False)
-        moves_bodies = options.moves_bodies(mesh, solver)
+        of_pairs = options.min_distance + 2.0 * float(options.radii.max(initial=0.0))
+        thin, thick = default_thicknesses(mesh, of_pairs)
+        if thickness is not None:
+            thin = thick = checked_distance(thickness, "thickness", zero=False)
+        moves_bodies = options.moves_bodies(mesh, innermost(solver))
         self._motion = ModelMotion(mesh, friction_of(mesh, self.friction), moves_bodies=moves_bodies)
-        layer = kernels.Layer()
-        layer.thickness, layer.restitution = self.thickness, self.restitution
+        layer, device = Layer(), mesh.device
+        n, body_count = mesh.vertex_count, self.model.body_count if moves_bodies else 0
+        layer.thickness = self.thickness_values = wp.full(1, thin, dtype=wp.float64, device=device)
+        layer.restitution = self.restitution
         layer.motion, layer.planes = self._motion.vertices, self._motion.planes
-        layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.thickness)
-        device, n = mesh.device, mesh.vertex_count
+        layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=thick)
+        self._rule = rule = ThicknessRule()
+        rule.thin, rule.thick = thin, thick
+        add_zeros(rule, ["is_chosen"], 1, device)
+        rule.is_chosen.fill_(int(thickness is not None))
+        rule.least = wp.full(4, np.inf, dtype=float, device=device)
+        rule.largest = wp.full(4, -np.inf, dtype=float, device=device)
+        self._chooses_thickness = thickness is None
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
-        self._share_sums = wp.zeros(n, dtype=wp.int64, device=device)
-        layer.shares = wp.zeros(n, dtype=wp.float64, device=device)
-        self._layer = layer
-        self._sums = wp.zeros((n, 3), dtype=wp.int64, device=device)
+        self._share_sums = wp.zeros(n + body_count, dtype=wp.int64, device=device)
+        layer.shares = wp.zeros(n + body_count, dtype=wp.float64, device=device)
+        self._sums = wp.zeros((n + body_count, 6 if body_count else 3), dtype=wp.int64, device=device)
+        if body_count:
+            add_zeros(layer.bodies, ("centre", "inverse_inertia"), body_count, device)
+            add_zeros(layer, ["changes"], body_count, device)
+            self._poses = wp.zeros(body_count, dtype=wp.transform, device=device)
+        self._layer, self._body_count = layer, body_count
         self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
         self._motion.set_start(arrays_of(self.model))
         self._motion.set_end(arrays_of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
+
+    @property
+    def thickness(self) -> float:
+        """Thickness of the layer [m]; before the first step, that for slow motion. Synchronizes with the device."""
+        return float(self.thickness_values.numpy()[0])
 
     @property
     def skipped_steps(self) -> int:
@@ -148,19 +183,14 @@ class ContactLayer(WrappedSolver):
             TypeError: If ``dt`` is no number.
             ValueError: If ``dt`` is not finite or not more than 0, or if a tape records gradients, and ``state_out`` is
                 ``state_in``.
-            NotImplementedError: If a tape records gradients, and shapes move with bodies.
             RuntimeError: If another thread is using this layer.
         """
         checked_number(dt, "dt", 0.0, above=True)
         with paused_tape() as tape:
-            if tape is not None and self.model.requires_grad:
-                if state_in is state_out:
-                    raise ValueError("on a tape, state_out must not be state_in")
-                if self.mesh.has_shapes_on_bodies:
-                    raise NotImplementedError(
-                        "on a tape, a contact layer carries no gradients to poses of bodies: omit the layer"
-                    )
-            self._motion.set_start(arrays_of(state_in))
+            if tape is not None and self.model.requires_grad and state_in is state_out:
+                raise ValueError("on a tape, state_out must not be state_in")
+            start = arrays_of(state_in)  # now: some solvers replace it
+            self._motion.set_start(start)
         self.solver.step(state_in, state_out, control, contacts, dt, **options)
         with paused_tape() as tape:
             end, device = arrays_of(state_out), self.mesh.device
@@ -169,22 +199,34 @@ class ContactLayer(WrappedSolver):
             if tape is None or not end.particle_q.requires_grad:
                 run_on_host(lambda: self._push(end, dt), device)
                 return
-            arrays = [state_in.particle_q, end.particle_q, end.particle_qd]
-            read = [self._motion.friction.of_particles, self._motion.friction.of_shapes, self.restitution]
-            read = [a for a in [*read, self.model.particle_inv_mass] if a is not None and len(a) and a.requires_grad]
-            pushed: tuple[kernels.Layer, list[PairQueue]] | None = None
+            self._record(start, end, dt, tape)
 
-            def forward():
-                nonlocal pushed
-                pushed = self._push(end, dt, record=True)
+    def _record(self, start, end, dt, tape):
+        """Pushes the end of a step; a tape records the adjoint."""
+        model, motion, device = self.model, self._motion, self.mesh.device
+        of_state = StateGradients()
+        arrays = {"start_q": start.particle_q, "particle_q": end.particle_q, "particle_qd": end.particle_qd}
+        if model.body_count:
+            arrays |= {"start_body_q": start.body_q, "body_q": end.body_q, "body_qd": end.body_qd}
+        read = [motion.friction.of_particles, motion.friction.of_shapes, self.restitution, model.particle_inv_mass]
+        if self._body_count:
+            read += [model.body_inv_mass, model.body_inv_inertia, model.body_com]
+        read = [array for array in read if array is not None and len(array) and array.requires_grad]
+        pushed: RecordedPushes | None = None
 
-            def backward():
-                assert pushed is not None
-                with self._lock:
-                    self._backward(*pushed, *(array.grad for array in arrays))
+        def forward():
+            nonlocal pushed
+            pushed = self._push(end, dt, record=True)
 
-            run_on_host(forward, device)
-            tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
+        def backward():
+            assert pushed is not None
+            for name, array in arrays.items():
+                setattr(of_state, name, array.grad)
+            with self._lock:
+                go_back(pushed, motion, of_state)
+
+        run_on_host(forward, device)
+        tape.record_func(lambda: run_on_host(backward, device), [*arrays.values(), *read])
 
     def _detect(self):
         """Finds the pairs that may be in the layer."""
@@ -198,66 +240,65 @@ class ContactLayer(WrappedSolver):
         if self._reads_friction:
             self._motion.friction.read()
         self._motion.set_end(end, dt)
+        if self._chooses_thickness:
+            self._choose_thickness(dt)
         self._detect()
-        layer, detector = self._layer, self._detector
+        layer, detector, bodies = self._layer, self._detector, self._body_count
         layer.dt = dt
         pairs = queues_of(detector)
-        self._launch_over(kernels.sum_shares, pairs, self._share_sums)
+        if bodies:
+            motion = layer.motion
+            self._launch(set_centres, bodies, [motion, motion.bodies.end, layer.bodies])
+        self._launch_over(kernels.sum_shares, pairs, self._share_sums, None)
         inputs = [layer, detector.counters.array, detector.capacities, self._share_sums, self.skipped]
-        self._launch(kernels.finish_shares, len(self._y), inputs)
-        self._launch_over(kernels.sum_pushes, pairs, self._sums)
-        recorded = self._recorded(pairs) if record else None
+        self._launch(kernels.finish_shares, len(self._share_sums), inputs)
+        self._launch_over(kernels.sum_pushes, pairs, self._sums, None, None)
+        if bodies:
+            self._launch(kernels.sum_body_pushes, bodies, [layer, self._sums])
+            self._launch(kernels.push_poses, bodies, [layer, self._poses])
+        recorded = record_pushes(layer, pairs, self._motion) if record else None
         self._launch(kernels.move_particles, len(end.particle_q), [layer, self._sums, end])
+        if bodies:
+            self._launch(kernels.move_bodies, bodies, [layer, self._poses, end, body_q_prev(self.solver)])
         return recorded
 
-    def _backward(self, layer, pairs, start_q, particle_q, particle_qd):
-        """Turns gradients with respect to a pushed state into those with respect to the predicted one, in place.
-
-        Adds to the gradients of positions at the start, of inverse masses, of what coefficients of friction are read
-        from, and of restitution, where these have such arrays.
-        """
-        n, particles, device = len(layer.motion.x0), len(particle_q), self.mesh.device
-        of_changes = wp.zeros(n, dtype=wp.vec3, device=device)
-        self._launch(kernels.begin_backward, particles, [layer, particle_q, particle_qd, of_changes])
-        motion, of_motion = with_gradients(layer.motion, ("x0", "x1", "inverse_mass", "friction"))
-        planes, of_planes = with_gradients(layer.planes, ["friction"])
-        layer, of_layer = with_gradients(layer, ["shares"])
-        layer.motion, layer.planes, of_shares = motion, planes, of_layer.shares
-        over_planes = (particles, len(planes.end))
-        for queue in pairs:
-            launch_adjoint(kernels.sum_pushes, len(queue.pairs), [layer, queue, None], [of_changes], device)
-        launch_adjoint(kernels.add_pushes_of_planes, over_planes, [layer], [of_changes], device)
-        for queue in pairs:
-            launch_adjoint(kernels.sum_shares, len(queue.pairs), [layer, queue, None], [of_shares], device)
-        launch_adjoint(kernels.add_shares_of_planes, over_planes, [layer], [of_shares], device)
-        inverse_mass = self.model.particle_inv_mass
-        assert inverse_mass is not None
-        self._launch(kernels.finish_backward, particles, [of_motion, start_q, particle_q, inverse_mass.grad])
-        self._motion.friction.backward(of_motion.friction, of_planes.friction)
-
-    def _recorded(self, pairs):
-        """Copies the layer and the pairs that may be in it for the adjoint; in a CUDA graph, all of the queues."""
-        copies = []
-        for queue in pairs:
-            if count := filled(queue.pairs, queue.counts, queue.count):
-                copies.append(copied(queue, {"pairs": count, "counts": None}))
-        layer = copied(self._layer, ("shares",))
-        layer.motion = copied(self._motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
-        layer.planes = copied(self._motion.planes, ("start", "end", "friction"))
-        return layer, copies
+    def _choose_thickness(self, dt):
+        """Chooses the thickness on the device, in the first step; a captured one may run again, and keeps it then."""
+        gravity, rule = self.model.gravity, self._rule
+        self._launch(find_extremes, len(self._y), [self._motion.vertices, self._motion.planes, gravity, rule])
+        self._launch(choose_thickness, 1, [gravity, dt, rule, self.thickness_values])
+        self._chooses_thickness = self.mesh.device.is_capturing
 
     def _launch(self, kernel, size, inputs):
         wp.launch(kernel, size, inputs=inputs, device=self.mesh.device)
 
-    def _launch_over(self, kernel, pairs, sums):
+    def _launch_over(self, kernel, pairs, *outputs):
         """Launches a kernel over pairs: those found on the CPU, on one thread, as sums are not atomic."""
         for queue in pairs:
             on_cpu = self.mesh.device.is_cpu
             count = filled(queue.pairs, queue.counts, queue.count) if on_cpu else len(queue.pairs)
-            self._launch(kernel, count, [self._layer, queue, sums, None])
+            self._launch(kernel, count, [self._layer, queue, *outputs])
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
         """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
+
+
+def default_thicknesses(mesh: ModelMesh, of_pairs: float) -> tuple[float, float]:
+    """Returns the default thickness for slow motion and that for fast motion [m], see :mod:`.layer.thickness`.
+
+    They have eight bits, as :func:`.options.default_separation`.
+
+    Args:
+        mesh: The mesh.
+        of_pairs: The largest minimum distance of a pair [m], above which the layer begins.
+    """
+    lengths = particle_edge_lengths(mesh)
+    if not len(lengths) and mesh.model.particle_radius is not None:  # then diameters take the place of edges
+        lengths = 2.0 * mesh.model.particle_radius.numpy()
+        lengths = lengths[lengths > 0.0]
+    shares = np.array(LAYER_THICKNESS) * ((np.median(lengths), lengths.min()) if len(lengths) else (1.0, 1.0))
+    thick = max(shares[1] - of_pairs, 0.1 * shares[1])
+    return in_eight_bits(min(shares[0], thick)), in_eight_bits(thick)

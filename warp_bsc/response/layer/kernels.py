@@ -2,154 +2,36 @@
 
 import warp as wp
 
-from ...detection.approach_phase import MinDistances
-from ...detection.rings import are_within_rings
-from ...kernels.closest import closest_weights
-from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
 from ...kernels.pipeline.queues import has_overflowed
-from ...kernels.polynomials import EDGE_EDGE
-from ..contacts.closest import closest_vector
+from ..adjoint.structs import StateGradients
 from ..contacts.constraints import contact_friction
 from ..contacts.queue import PairQueue, has_pair, vertices_of
-from ..contacts.rules import are_on_body
-from ..state.fixed_sum import add_to_sum, from_units, sum_of, to_units, with_delta
+from ..state.fixed_sum import add_to_sum, from_units, sum_of, sums_of, to_units, with_delta
 from ..state.motion import StateArrays
-from ..state.planes import MovingPlanes, signed_distance
-from ..state.structs import Motion
-from ..state.vectors import ONE, ZERO, to_double, to_single
-from ..tuning import PARALLEL_IN_LAYER
-
-_ROOT_OF_2 = wp.constant(2.0**0.5)
-
-
-@wp.struct
-class Layer:
-    """The layer around a predicted motion."""
-
-    motion: Motion
-    planes: MovingPlanes
-    thickness: wp.float64  # [m]
-    distances: MinDistances  # of pairs [m]
-    restitution: wp.array[float]  # in [0, 1]
-    shares: wp.array[wp.float64]  # of vertices, summed over contacts, see _share_of
-    dt: float  # length of the step [s]
-
-
-@wp.func
-def _gains(restitution: float):
-    """Returns kappa and theta of the layer for a coefficient of restitution.
-
-    The roots of z^2 - (2 - 2 kappa + kappa theta) z + (1 - kappa + kappa theta) are rho exp(+-i pi / 4). Below a
-    restitution of 1/4, theta is negative: contacts act where the motion would be somewhat later.
-    """
-    rho = float(0.0)
-    if restitution > 0.0:  # at 0 there is no derivative
-        rho = wp.sqrt(wp.sqrt(restitution))
-    kappa = 1.0 + rho * (rho - _ROOT_OF_2)
-    theta = rho * (2.0 * rho - _ROOT_OF_2) / kappa
-    return wp.float64(kappa), wp.float64(theta)
-
-
-@wp.func
-def _between(motion: Motion, vertex: int, theta: wp.float64) -> wp.vec3d:
-    x1 = to_double(motion.x1[vertex])
-    return x1 + theta * (to_double(motion.x0[vertex]) - x1)
-
-
-@wp.func
-def _contact_of_pair(layer: Layer, kind: int, corners: wp.vec4i):
-    """Returns the weights of four vertices in a contact, its normal, and its depth in the layer [m], 0 if it is not.
-
-    Elements are in contact only if they are on the same sides of each other as at the start: not if they have passed.
-    """
-    _kappa, theta = _gains(layer.restitution[0])
-    a = _between(layer.motion, corners[0], theta)
-    b = _between(layer.motion, corners[1], theta)
-    c = _between(layer.motion, corners[2], theta)
-    d = _between(layer.motion, corners[3], theta)
-    weights = closest_weights(kind, a, b, c, d)
-    vector = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
-    distance = wp.length(vector)
-    depth = layer.thickness + distance_of_corners(kind, corners, layer.distances.radius) - distance
-    if depth <= ZERO or distance <= ZERO:
-        return weights, vector, ZERO
-    normal = vector / distance
-    if are_within_rings(corners, firsts_of(kind), layer.distances.rings) or are_on_body(layer.motion, corners):
-        return weights, normal, ZERO
-    _weights, at_start = closest_vector(layer.motion, corners, kind)
-    if not wp.dot(normal, at_start) > ZERO:  # nor if it is not a number
-        return weights, normal, ZERO
-    if kind == EDGE_EDGE:
-        u = b - a
-        v = d - c
-        sines = wp.length_sq(wp.cross(u, v))
-        depth *= sines / (sines + PARALLEL_IN_LAYER * wp.length_sq(u) * wp.length_sq(v))
-    return weights, normal, depth
-
-
-@wp.func
-def _contact_with_plane(layer: Layer, plane: int, vertex: int):
-    """Returns the normal of a contact of a vertex with a plane, and its depth in the layer [m], 0 if it is not."""
-    motion, planes = layer.motion, layer.planes
-    _kappa, theta = _gains(layer.restitution[0])
-    end = planes.end[plane]
-    normal = wp.vec3d(end[0], end[1], end[2])
-    if planes.world[plane] >= 0 and planes.world[plane] != motion.world[vertex]:
-        return normal, ZERO
-    before, error = signed_distance(planes.start[plane], motion.x0[vertex])
-    after, _error = signed_distance(end, motion.x1[vertex])
-    min_distance = layer.distances.radius[vertex] + layer.distances.of_planes
-    depth = layer.thickness + min_distance - after - theta * (before - after)
-    if not (depth > ZERO and before >= -error):
-        return normal, ZERO
-    return normal, depth
-
-
-@wp.func
-def _share_of(layer: Layer, depth: wp.float64) -> wp.float64:
-    """Returns the share of a contact of this depth where contacts divide the mass of a vertex."""
-    return (depth / layer.thickness) * (depth / layer.thickness)
-
-
-@wp.func
-def _push(
-    layer: Layer, normal: wp.vec3d, depth: wp.float64, path: wp.vec3d, resistance: wp.float64, friction: float
-) -> wp.vec3d:
-    """Returns the push of a contact, an impulse times a time [kg m].
-
-    Its first contact point moves along ``path`` relative to the second [m]. The ``resistance`` is the sum over its
-    vertices of inverse mass, weight, and the shares of all contacts [1/kg].
-    """
-    kappa, _theta = _gains(layer.restitution[0])
-    part = _share_of(layer, depth) / resistance  # the mass that the vertices have for this contact
-    along = kappa * depth * part
-    across = path - wp.dot(path, normal) * normal
-    length = wp.length(across)
-    if length == ZERO:
-        return along * normal
-    holding = wp.float64(friction) * along / (length * part)  # more than 1 if friction could stop the contact
-    return along * normal - across * (part * holding / wp.sqrt(ONE + holding * holding))
-
-
-@wp.func
-def _change_by_plane(layer: Layer, plane: int, vertex: int) -> wp.vec3d:
-    """Returns what the push of a plane moves a vertex by [m], 0 if there is none."""
-    motion = layer.motion
-    normal, depth = _contact_with_plane(layer, plane, vertex)
-    resistance = wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
-    if depth <= ZERO or resistance <= ZERO:
-        return wp.vec3d()
-    path = to_double(motion.x1[vertex]) - to_double(motion.x0[vertex])
-    friction = contact_friction(motion.friction[vertex], layer.planes.friction[plane])
-    return wp.float64(motion.inverse_mass[vertex]) * _push(layer, normal, depth, path, resistance, friction)
+from ..state.poses import turned_pose
+from ..state.structs import Motion, can_move
+from ..state.vectors import ZERO, to_double, to_single
+from .pushes import (
+    Layer,
+    arm_of,
+    body_of_side,
+    change_by_plane,
+    contact_of_pair,
+    contact_with_plane,
+    gains,
+    position_between,
+    push_of,
+    resistances_of_body,
+    share_of,
+)
 
 
 @wp.kernel(enable_backward=False)
 def place_vertices_between(layer: Layer, y: wp.array[wp.vec3]):
     """Writes the positions at which contacts act, to which the detection is near enough in single precision."""
     vertex = wp.tid()
-    _kappa, theta = _gains(layer.restitution[0])
-    y[vertex] = to_single(_between(layer.motion, vertex, theta))
+    _kappa, theta = gains(layer.restitution[0])
+    y[vertex] = to_single(position_between(layer.motion, vertex, theta))
 
 
 @wp.kernel
@@ -159,15 +41,25 @@ def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64], differe
     if not has_pair(queue, i):
         return
     corners = vertices_of(queue, i)
-    weights, _normal, depth = _contact_of_pair(layer, queue.kind, corners)
+    weights, _normal, depth = contact_of_pair(layer, queue.kind, corners)
     if depth <= ZERO:
         return
     for j in range(4):
-        share = wp.abs(weights[j]) * _share_of(layer, depth)
+        share = wp.abs(weights[j]) * share_of(layer, depth)
         if differentiable:
             wp.atomic_add(differentiable, corners[j], share)
         else:
             wp.atomic_add(sums, corners[j], to_units(share))
+    if layer.motion.bodies.of_vertex:
+        for side in range(2):
+            body = body_of_side(layer.motion, corners, side)
+            if body >= 0:
+                place = layer.motion.x0.shape[0] + body
+                of_body = share_of(layer, depth)
+                if differentiable:
+                    wp.atomic_add(differentiable, place, of_body)
+                else:
+                    wp.atomic_add(sums, place, to_units(of_body))
 
 
 @wp.kernel(enable_backward=False)
@@ -180,12 +72,13 @@ def finish_shares(
     layerless_steps: wp.array[wp.int64],
 ):
     """Adds the shares of contacts with planes, and writes the sums; zeros if pairs are missing: then nothing pushes."""
-    vertex = wp.tid()
+    vertex = wp.tid()  # or a body, whose contacts with planes are left to the inner solver
     share = from_units(sums[vertex])
     sums[vertex] = wp.int64(0)
-    for plane in range(layer.planes.end.shape[0]):
-        _normal, depth = _contact_with_plane(layer, plane, vertex)
-        share += _share_of(layer, depth)
+    if vertex < layer.motion.x0.shape[0]:
+        for plane in range(layer.planes.end.shape[0]):
+            _normal, depth = contact_with_plane(layer, plane, vertex)
+            share += share_of(layer, depth)
     if has_overflowed(counts, capacities):
         share = ZERO
         if vertex == 0:
@@ -197,23 +90,38 @@ def finish_shares(
 def add_shares_of_planes(layer: Layer, sums: wp.array[wp.float64]):
     """Adds as :func:`finish_shares`, differentiably, with a thread for each vertex and plane."""
     vertex, plane = wp.tid()
-    _normal, depth = _contact_with_plane(layer, plane, vertex)
-    wp.atomic_add(sums, vertex, _share_of(layer, depth))
+    _normal, depth = contact_with_plane(layer, plane, vertex)
+    wp.atomic_add(sums, vertex, share_of(layer, depth))
 
 
 @wp.kernel
-def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64], differentiable: wp.array[wp.vec3]):
-    """Adds what contacts move vertices by to the sums of these, or to ``differentiable`` ones instead."""
+def sum_pushes(
+    layer: Layer,
+    queue: PairQueue,
+    # out, sums of vertices and then of bodies
+    sums: wp.array2d[wp.int64],
+    differentiable: wp.array[wp.vec3],
+    differentiable_of_bodies: wp.array[wp.spatial_vectord],
+):
+    """Adds what contacts move vertices and bodies by to the sums of these, or to ``differentiable`` ones instead."""
     i = wp.tid()
     if not has_pair(queue, i):
         return
     motion = layer.motion
     corners = vertices_of(queue, i)
-    weights, normal, depth = _contact_of_pair(layer, queue.kind, corners)
+    weights, normal, depth = contact_of_pair(layer, queue.kind, corners)
     resistance = ZERO
     for j in range(4):
         vertex = corners[j]
         resistance += wp.abs(weights[j]) * wp.float64(motion.inverse_mass[vertex]) * layer.shares[vertex]
+    across_resistance = resistance
+    if motion.bodies.of_vertex and depth > ZERO:
+        for side in range(2):
+            body = body_of_side(motion, corners, side)
+            if body >= 0:
+                along, across = resistances_of_body(layer, body, arm_of(layer, corners, weights, body), normal)
+                resistance += along
+                across_resistance += across
     if depth <= ZERO or resistance <= ZERO:
         return
     path = wp.vec3d()
@@ -221,13 +129,27 @@ def sum_pushes(layer: Layer, queue: PairQueue, sums: wp.array2d[wp.int64], diffe
         vertex = corners[j]
         path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
     friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
-    push = _push(layer, normal, depth, path, resistance, friction)
+    push = push_of(layer, normal, depth, path, resistance, across_resistance, friction)
     for j in range(4):
         change = weights[j] * wp.float64(motion.inverse_mass[corners[j]]) * push
         if differentiable:
             wp.atomic_add(differentiable, corners[j], to_single(change))
         else:
             add_to_sum(sums, corners[j], 0, change)
+    if motion.bodies.of_vertex:
+        for side in range(2):
+            pushed = body_of_side(motion, corners, side)
+            if pushed >= 0:
+                arm = arm_of(layer, corners, weights, pushed)
+                weight = wp.float64(1.0 - 2.0 * float(side))  # the sum of those of an element
+                shift = weight * wp.float64(motion.bodies.inverse_mass[pushed]) * push
+                turn = layer.bodies.inverse_inertia[pushed] * wp.cross(arm, push)
+                if differentiable:
+                    of_body = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
+                    wp.atomic_add(differentiable_of_bodies, pushed, of_body)
+                else:
+                    add_to_sum(sums, motion.x0.shape[0] + pushed, 0, shift)
+                    add_to_sum(sums, motion.x0.shape[0] + pushed, 3, turn)
 
 
 @wp.kernel(enable_backward=False)
@@ -235,7 +157,7 @@ def move_particles(layer: Layer, sums: wp.array2d[wp.int64], end: StateArrays):
     """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
     motion, vertex = layer.motion, wp.tid()
     for plane in range(layer.planes.end.shape[0]):
-        add_to_sum(sums, vertex, 0, _change_by_plane(layer, plane, vertex))
+        add_to_sum(sums, vertex, 0, change_by_plane(layer, plane, vertex))
     change = sum_of(sums, vertex, 0)
     if wp.length_sq(change) > ZERO and motion.is_not_finite[vertex] == 0:
         motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)
@@ -246,11 +168,48 @@ def move_particles(layer: Layer, sums: wp.array2d[wp.int64], end: StateArrays):
         sums[vertex, axis] = wp.int64(0)
 
 
+@wp.kernel(enable_backward=False)
+def sum_body_pushes(layer: Layer, sums: wp.array2d[wp.int64]):
+    """Writes what the pushes of its contacts change each body by."""
+    body = wp.tid()
+    row = layer.motion.x0.shape[0] + body
+    shift, turn = sums_of(sums, row)
+    layer.changes[body] = wp.spatial_vectord(shift[0], shift[1], shift[2], turn[0], turn[1], turn[2])
+    for axis in range(6):
+        sums[row, axis] = wp.int64(0)
+
+
+@wp.kernel
+def push_poses(layer: Layer, poses: wp.array[wp.transform]):
+    """Computes the poses of bodies by the pushes of their contacts; others keep every bit."""
+    body, bodies = wp.tid(), layer.motion.bodies
+    change = layer.changes[body]
+    pose = bodies.end[body]
+    if wp.length_sq(change) > ZERO and can_move(layer.motion, body):
+        pose = turned_pose(bodies, body, pose, wp.spatial_top(change), wp.spatial_bottom(change))
+    poses[body] = pose
+
+
+@wp.kernel(enable_backward=False)
+def move_bodies(layer: Layer, poses: wp.array[wp.transform], end: StateArrays, body_q_prev: wp.array[wp.transform]):
+    """Moves each body that was pushed in the state; VBD takes its next velocity from ``body_q_prev``, if it has it."""
+    body = wp.tid()
+    change = layer.changes[body]
+    if wp.length_sq(change) > ZERO and can_move(layer.motion, body):
+        end.body_q[body] = poses[body]
+        velocity = end.body_qd[body]
+        for i in range(6):
+            velocity[i] = velocity[i] + float(change[i] / wp.float64(layer.dt))
+        end.body_qd[body] = velocity
+        if body_q_prev:
+            body_q_prev[body] = poses[body]
+
+
 @wp.kernel
 def add_pushes_of_planes(layer: Layer, changes: wp.array[wp.vec3]):
     """Adds as :func:`move_particles`, differentiably, with a thread for each particle and plane."""
     vertex, plane = wp.tid()
-    wp.atomic_add(changes, vertex, to_single(_change_by_plane(layer, plane, vertex)))
+    wp.atomic_add(changes, vertex, to_single(change_by_plane(layer, plane, vertex)))
 
 
 @wp.kernel(enable_backward=False)
@@ -261,6 +220,29 @@ def begin_backward(
     particle = wp.tid()
     if layer.motion.is_not_finite[particle] == 0:
         changes[particle] = particle_q[particle] + particle_qd[particle] / layer.dt
+
+
+@wp.kernel(enable_backward=False)
+def begin_body_backward(layer: Layer, body_qd: wp.array[wp.spatial_vector], changes: wp.array[wp.spatial_vectord]):
+    """Adds the gradient of the velocities of bodies with respect to what contacts change the bodies by."""
+    body = wp.tid()
+    if can_move(layer.motion, body):
+        for i in range(6):
+            added = wp.float64(body_qd[body][i]) / wp.float64(layer.dt)
+            changes[body][i] = changes[body][i] + added
+
+
+@wp.kernel(enable_backward=False)
+def finish_body_backward(layer: Layer, of_motion: Motion, of_state: StateGradients, body_inv_mass: wp.array[float]):
+    """Adds to the gradients of poses, and writes those of poses that pushes computed."""
+    body = wp.tid()
+    of_state.start_body_q[body] = of_state.start_body_q[body] + of_motion.bodies.start[body]
+    end = of_motion.bodies.end[body]
+    if not layer.changes:  # no body is pushed
+        end = end + of_state.body_q[body]
+    of_state.body_q[body] = end
+    if body_inv_mass and can_move(layer.motion, body):
+        body_inv_mass[body] = body_inv_mass[body] + of_motion.bodies.inverse_mass[body]
 
 
 @wp.kernel(enable_backward=False)

@@ -147,11 +147,6 @@ class ModelMesh(CollisionMesh):
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
 
-    @property
-    def has_shapes_on_bodies(self) -> bool:
-        """Whether a vertex or a plane moves with a body."""
-        return bool((self.shape_vertices.body >= 0).any() or (self.planes.body >= 0).any())
-
     def min_distances(self, min_distance: float, radii: np.ndarray, *, reach: float) -> MinDistances:
         """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
 

@@ -69,6 +69,18 @@ def continues(motion: Motion, world: int) -> bool:
     return motion.interrupted[wp.where(world < 0, last, world)] == 0
 
 
+@wp.func
+def takes_part(mask: wp.array[wp.bool], world: int) -> bool:
+    """Returns whether a world takes part in a step; -1 stands for everything that is in all worlds.
+
+    In a model of one world, that is in that world.
+    """
+    last = mask.shape[0] - 1
+    if last == 1:
+        return mask[0]
+    return mask[wp.where(world < 0, last, world)]
+
+
 @wp.kernel(enable_backward=False)
 def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
     """Marks worlds as interrupted, and as the last entry everything that is in all worlds, if any world is."""
@@ -248,6 +260,11 @@ class ModelMotion:
         planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan
         last.assign(positions)
         self.planes.end.assign(planes)
+
+    @property
+    def last(self) -> wp.array[wp.vec3] | None:
+        """Positions of the vertices at the end of the last step, None if steps do not start there."""
+        return self._last
 
     def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
         """Makes the next step begin where its state is.

@@ -1,6 +1,7 @@
 """The buffers that a step works on, and launches of kernels over their elements."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import warp as wp
@@ -13,6 +14,7 @@ from ..schedule import (
     SWEEPS_PER_BATCH,
     Loop,
     SolveStatus,
+    WorldCounts,
     allocate_status,
     clear_status,
     single_elements,
@@ -51,6 +53,10 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
     if i < worlds:
         status.contact_iteration[i] = -1
         status.is_fast[i] = 0
+        if status.of_worlds.found:
+            status.of_worlds.found[i] = 0
+            status.of_worlds.hits[i] = 0
+            status.of_worlds.remaining[i] = 0
     if i <= worlds:
         motion.interrupted[i] = 0
     if i >= vertices.x1.shape[0]:
@@ -85,6 +91,8 @@ class Workspace:
         differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
+        active: 1 of each vertex that takes part in the step, None if all do.
+        unmasked: Inverse masses of vertices and bodies while those that take no part have none.
         sweeping_threads: Threads that make all sweeps in one launch; 0 if each is launched, as those of bodies and of
             steps that may be recorded are.
     """
@@ -111,6 +119,8 @@ class Workspace:
         self.step = step = Step()
         step.mesh = mesh.connectivity
         self.motion = motion
+        self.active: wp.array[int] | None = None
+        self.unmasked: tuple[wp.array, wp.array] | None = None
         step.separation, step.restitution = separation, restitution
         size = vertices, 3
         step.vertices = allocate(Vertices, vertices, device, particle_delta_x=size, particle_delta_v=size)
@@ -140,6 +150,21 @@ class Workspace:
         at_once = not self.body_count and not differentiable
         self.sweeping_threads = threads_of_cluster(device, self.particle_count) if at_once else 0
         self._max_blocks = BLOCKS * device.sm_count
+
+    def count_worlds(self) -> WorldCounts:
+        """Counts contacts of each world from now on, and returns the counts."""
+        self.status.of_worlds = allocate(WorldCounts, self.worlds, self.device)
+        return self.status.of_worlds
+
+    @contextlib.contextmanager
+    def all_worlds(self) -> Iterator[None]:
+        """Gives the worlds that take no part in the step their masses."""
+        motion = self.step.motion
+        masses = motion.inverse_mass, motion.bodies.inverse_mass
+        if self.unmasked is not None:
+            motion.inverse_mass, motion.bodies.inverse_mass = self.unmasked
+        yield
+        motion.inverse_mass, motion.bodies.inverse_mass = masses
 
     @property
     def motion(self) -> ModelMotion:

@@ -33,6 +33,7 @@ from newton.solvers import SolverBase, SolverSemiImplicit
 
 from ..._private_names.of_newton import attributes_of, body_q_prev, iterations_shared, may_allocate
 from ..contacts.detect import detect_penetrations
+from ..forces.contact_forces import ContactForces
 from ..solve import positions, velocities
 from ..solve.bodies import begin_bodies
 from ..state.motion import ModelMotion, arrays_of
@@ -81,6 +82,8 @@ class Substeps:
     Attributes:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken in substeps.
         strain: Largest strain by contacts of the last step, or of one of its substeps, on the device.
+        forces: Keeps the impulses of contacts, if the report is to have them.
+        taken: Substeps of the last step in each world, if the report is to have them, on the device.
     """
 
     def __init__(
@@ -133,7 +136,15 @@ class Substeps:
         # a program may move bodies, or what it likes, within a step of the inner solver that is not Newton's own
         moves_alone = not model.body_count and not self.may_allocate and "step" not in attributes_of(solver)
         self._extrapolates = self._chooses and moves_alone
+        self.forces: ContactForces | None = None
+        self.taken: wp.array[int] | None = None
+        self._hits = wp.zeros(worlds, dtype=int, device=device)  # of the predicted motion, by world
         self._arrays_of_solver()
+
+    @property
+    def predicted(self) -> wp.array[int]:
+        """Predicted number of substeps of each world in the next step, 0 for none."""
+        return self._number
 
     def begin(self, state: newton.State) -> None:
         """Copies the state at the start of the step, before the inner solver changes it."""
@@ -183,6 +194,8 @@ class Substeps:
             outputs = [self._motion.vertices, arrays_of(state)]
             work.launch(kernels.extrapolate, model.particle_count, inputs, outputs)
         self.strain.zero_()
+        if self.taken is not None:
+            self.taken.zero_()
         find_contacts(work)
         self._has_constraints.zero_()
         work.launch_over_constraints(kernels.find_worlds, self._has_constraints)
@@ -228,6 +241,8 @@ class Substeps:
         add_proximities(work)
         inputs = [work.step, work.status, self._detected, self._is_fast]
         work.launch(kernels.keep_detection, work.worlds, inputs)
+        if self.taken is not None:
+            wp.copy(self._hits, work.status.of_worlds.hits)
         for array, saved in step.arrays:
             wp.copy(saved, array)
         self._is_pending.fill_(1)
@@ -235,12 +250,20 @@ class Substeps:
             self._passes.zero_()
             self._repeats.fill_(1)
             wp.capture_while(self._repeats, self._take_chosen_numbers, step=step)
+            self._report_worlds()
             inputs = [self._strain, self._final_strain, self._device_choices]
             work.launch(predict_substeps, work.worlds, inputs, [self._number, self._calm, self._patience])
         else:
             self._take_number_of_substeps(self._choices[0], step)
             self._finish(step.dt)
+            self._report_worlds()
             self._meter.measure(self._motion.vertices, self.strain)
+
+    def _report_worlds(self):
+        """Reports the substeps of each world, and the contacts of the motion that the inner solver predicted."""
+        if self.taken is not None:
+            wp.copy(self.taken, self._number)
+            wp.copy(self._work.status.of_worlds.hits, self._hits)
 
     def _take_chosen_numbers(self, step):
         """Takes the substeps of all worlds that have still to, and decides which worlds repeat theirs."""
@@ -263,6 +286,8 @@ class Substeps:
         self._remaining.fill_(substeps)
         outputs = [work.status, self._takes_substeps, self._strain]
         work.launch(kernels.begin_substeps, work.worlds, [self._number, self._is_pending, substeps], outputs)
+        if self.forces is not None:
+            self.forces.restart_worlds(self._takes_substeps)
         attributes = attributes_of(self._solver)
         kept = dict(attributes)
         start.assign(self._start)
@@ -312,6 +337,8 @@ class Substeps:
         positions.project(work, 1.0 / substeps, begins_moved=True)  # creep adds up over substeps
         self._meter.measure(substep.vertices, self._strain)
         velocities.project(work, substep_dt)
+        if self.forces is not None:
+            self.forces.keep(substeps, self._remaining)
         start.assign(self._start)
         poses = body_q_prev(self._solver) if self._moves_bodies else None
         inputs = [work.step, self._remaining, starts, poses]

@@ -1,0 +1,194 @@
+"""The part of a report that says what contacts did to momentum, as arrays on the device."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .structs import ContactRows, PublishedImpulses
+
+_NOT_ASKED = "a stage keeps contacts only if it is asked to: SolverCCD(solver, report_contacts=True)"
+_COLUMNS = "kind", "vertices", "weights", "shapes", "bodies", "world", "toi", "point", "normal", "velocity"
+_COLUMNS += "normal_impulse", "tangential_impulse"
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """The contacts of the last step that had an impulse, unsorted, as Warp arrays of which the first ``count`` count.
+
+    A contact is of two elements: of a vertex and a face, or a point and an edge or a point; of two edges; or of a
+    vertex and an infinite plane. Impulses and the normal act on the first; on the second they are the opposite. Divide
+    by the length of the step to get the mean force. A pair may have several rows, if it was in contact along several
+    normals.
+
+    Attributes:
+        count: Number of contacts, int, shape [1]; more than the capacity if not all fit.
+        kind: A :class:`.state.structs.ContactKind`: VERTEX_FACE, EDGE_EDGE or PLANE; int.
+        vertices: The vertices of both elements in ``solver.mesh``, vec4i: a vertex, then those of its face; both ends
+            of one edge, then of the other; the vertex at a plane, then -1. An edge or a point that a vertex meets is
+            listed with repeated vertices.
+        weights: Share of the impulse that each vertex bears, negative for the second element, vec4.
+        shapes: The shapes of both, vec2i, -1 for particles.
+        bodies: The bodies of both, vec2i, -1 for none.
+        world: Their world, int.
+        toi: Lower bound of the time of impact of the predicted motion, in [0, 1] of the step; 0 if the pair was near at
+            the start, and was held apart before it met; float.
+        point: The contact point on the first at the end of the step [m], vec3.
+        normal: The unit normal, from the second to the first, vec3.
+        velocity: Velocity of the first relative to the second before the contact, as the inner solver predicted it, in
+            the first substep with an impulse [m/s], vec3.
+        normal_impulse: Impulse along the normal [N s], float.
+        tangential_impulse: Impulse of friction [N s], vec3.
+    """
+
+    count: wp.array[int]
+    kind: wp.array[int]
+    vertices: wp.array[wp.vec4i]
+    weights: wp.array[wp.vec4]
+    shapes: wp.array[wp.vec2i]
+    bodies: wp.array[wp.vec2i]
+    world: wp.array[int]
+    toi: wp.array[float]
+    point: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]
+    velocity: wp.array[wp.vec3]
+    normal_impulse: wp.array[float]
+    tangential_impulse: wp.array[wp.vec3]
+    _lost: wp.array[int]
+
+    @property
+    def capacity(self) -> int:
+        """The number of contacts that fit."""
+        return len(self.kind)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all contacts of the last step are listed. Synchronizes with the device.
+
+        If there are more than fit, sums have the others too. If constraints of a CUDA graph did not fit in a step in
+        substeps, sums lack these as well; :attr:`ContactReport.impulses_complete` is false then.
+        """
+        return int(self.count.numpy()[0]) <= self.capacity and int(self._lost.numpy()[0]) == 0
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Returns the contacts on the host, sorted by kind and vertices. Synchronizes with the device."""
+        count = min(int(self.count.numpy()[0]), self.capacity)
+        found = {name: getattr(self, name).numpy()[:count] for name in _COLUMNS}
+        # rows of a pair with one normal differ in other columns
+        rest = [found[name] for name in ("toi", "normal_impulse")] + [*found["point"].T, *found["weights"].T]
+        keys = [*rest, *found["normal"].T, *found["shapes"].T, *found["vertices"].T[::-1], found["kind"]]
+        order = np.lexsort(keys)
+        return {name: values[order] for name, values in found.items()}
+
+
+class ContactReport:
+    """What contacts did to momentum in the last step, if ``report_contacts`` of the stage asks for it.
+
+    All arrays are on the device, are written anew in each step, and stay where they are, so that a program may read
+    them in a CUDA graph. They hold impulses of the stage [N s]; those of a step in substeps are sums over these. What
+    the inner solver itself pushes, such as the penalties of VBD, is no part of them: it is in the observables of that
+    solver, if it has some.
+
+    :attr:`impulses_elsewhere` says where that solver takes over contacts that the stage resolves behind others.
+
+    Sums have impulses of up to 130,000 N s, in units of 1.5e-14 N s, and are the same in any order of threads.
+
+    Attributes:
+        impulses_elsewhere: What resolves contacts before the stage, so that its impulses on them are small; None if
+            nothing is known to.
+    """
+
+    impulses_elsewhere: str | None = None
+    _rows: "ContactRows | None" = None
+    _published: "PublishedImpulses | None" = None
+    _shapes_of_worlds: np.ndarray
+
+    def keep_contacts(self, rows: ContactRows, published: PublishedImpulses, shapes_of_worlds: np.ndarray) -> None:
+        """Makes the report have contacts and impulses, from the arrays that each step writes."""
+        self._rows, self._published, self._shapes_of_worlds = rows, published, shapes_of_worlds
+
+    @property
+    def contacts(self) -> Contacts:
+        """The contacts of the last step that had an impulse.
+
+        Raises:
+            RuntimeError: If the stage was not asked to keep contacts, here and in all that follow.
+        """
+        return Contacts(*(getattr(self._listed, name) for name in ["count", *_COLUMNS, "lost"]))
+
+    @property
+    def particle_impulse(self) -> wp.array[wp.vec3]:
+        """Change of momentum of each particle by the response [N s], shape [particle_count].
+
+        It is the mass by the change of velocity that the stage made, up to rounding. Of a particle that nothing can
+        move, it is the impulse on what holds it.
+        """
+        return self._sums.particle
+
+    @property
+    def unpaired_particle_impulse(self) -> wp.array[wp.vec3]:
+        """The part of :attr:`particle_impulse` that no contact has [N s], shape [particle_count].
+
+        Velocities that follow from a path that was cut, those of frozen particles, and the turn that restores the
+        angular momentum of a world are of no pair. The turn has no linear momentum; paths that are cut do not conserve
+        it.
+        """
+        return self._sums.unpaired_particle
+
+    @property
+    def body_impulse(self) -> wp.array[wp.spatial_vector]:
+        """Impulse on each body [N s], and about its centre of mass [N m s], shape [body_count], linear first.
+
+        Of a body that the response moves, it is its change of momentum. On others, such as kinematic fingers, contacts
+        act all the same.
+        """
+        return self._sums.body
+
+    @property
+    def unpaired_body_impulse(self) -> wp.array[wp.spatial_vector]:
+        """The part of :attr:`body_impulse` that no contact has, as :attr:`unpaired_particle_impulse`."""
+        return self._sums.unpaired_body
+
+    @property
+    def shape_impulse(self) -> wp.array[wp.vec3]:
+        """Impulse of contacts on each shape [N s], shape [shape_count]."""
+        return self._sums.shape
+
+    @property
+    def shape_pair_impulse(self) -> wp.array:
+        """Impulse of contacts on one shape by another, in each world [N s], vec3, shape [world_count, n + 1, n + 1].
+
+        Rows have the shapes that the impulse acts on, columns those that it is of. Shapes are numbered as in
+        :attr:`shapes_of_worlds`; the last row and column are of all particles of the world.
+
+        Raises:
+            RuntimeError: If there are more than 2^20 entries: sum up :attr:`contacts` instead.
+        """
+        pairs, (worlds, local) = self._sums.pair, self._shapes_of_worlds.shape
+        if not len(pairs):
+            entries = worlds * (local + 1) ** 2
+            raise RuntimeError(f"shape_pair_impulse would have {entries} entries: sum up contacts by shapes instead")
+        return pairs.reshape((worlds, local + 1, local + 1))
+
+    @property
+    def shapes_of_worlds(self) -> np.ndarray:
+        """The shapes of each world, those in all worlds first, then -1, int32, shape [world_count, n]."""
+        assert self._sums is not None
+        return self._shapes_of_worlds
+
+    @property
+    def impulses_complete(self) -> bool:
+        """Whether sums have the impulses of all contacts of the last step, see :attr:`Contacts.complete`."""
+        return int(self._listed.lost.numpy()[0]) == 0
+
+    @property
+    def _listed(self):
+        if self._rows is None:
+            raise RuntimeError(_NOT_ASKED)
+        return self._rows
+
+    @property
+    def _sums(self):
+        if self._published is None:
+            raise RuntimeError(_NOT_ASKED)
+        return self._published

@@ -1,0 +1,240 @@
+"""Worlds that take no part in a step: nothing of them changes, and the stage looks at none of their elements."""
+
+import contextlib
+from collections.abc import Iterator
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverBase
+
+from ..._arguments import given
+from ..._private_names.of_newton import body_q_prev
+from ..state.mesh import host_array
+from ..state.motion import ModelMotion, continues, takes_part
+from ..state.structs import Motion
+from ..state.workspace import Workspace
+
+wp.set_module_options({"enable_backward": False})
+
+
+def _restoring(dtype: type) -> wp.Kernel:
+    """Returns the kernel below for arrays of a type: a graph on the CPU runs wrong overloads of generic ones."""
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def restore(saved: wp.array[dtype], world: wp.array[int], mask: wp.array[wp.bool], values: wp.array[dtype]):
+        """Restores what belongs to worlds that take no part in a step."""
+        i = wp.tid()
+        if not takes_part(mask, world[i]):
+            values[i] = saved[i]
+
+    return restore
+
+
+_RESTORE = {dtype: _restoring(dtype) for dtype in (wp.vec3, wp.transform, wp.spatial_vector, wp.float32)}
+
+
+@wp.kernel
+def _restore_last_poses(
+    # in
+    saved: wp.array[wp.transform],
+    state: wp.array[wp.transform],
+    world: wp.array[int],
+    mask: wp.array[wp.bool],
+    motion: Motion,
+    # out
+    last: wp.array[wp.transform],
+):
+    """Restores the poses from which the inner solver takes velocities; a world that starts anew starts in its state."""
+    body = wp.tid()
+    if not takes_part(mask, world[body]):
+        last[body] = wp.where(continues(motion, world[body]), saved[body], state[body])
+
+
+@wp.struct
+class _Held:
+    """What a step would change of worlds that take no part in it, kept until its end; and their masks."""
+
+    last: wp.array[wp.vec3]  # where vertices ended the last step
+    planes: wp.array[wp.vec4d]
+    interrupted: wp.array[int]
+    number: wp.array[int]  # of substeps, as predicted; empty if steps have none
+    inverse_mass: wp.array[float]  # 0 in these worlds
+    body_inverse_mass: wp.array[float]
+    active: wp.array[int]  # 1 of vertices in other worlds
+
+
+@wp.kernel
+def _hold(
+    # in
+    mask: wp.array[wp.bool],
+    inverse_mass: wp.array[float],
+    plane_world: wp.array[int],
+    # in and out
+    motion: Motion,
+    plane_start: wp.array[wp.vec4d],
+    plane_end: wp.array[wp.vec4d],
+    number: wp.array[int],
+    held: _Held,
+):
+    """Lets vertices and planes of worlds that take no part stand where the last step left them, without mass."""
+    i = wp.tid()
+    if i < motion.interrupted.shape[0]:
+        held.interrupted[i] = motion.interrupted[i]
+    if i < number.shape[0]:
+        held.number[i] = number[i]
+        if not takes_part(mask, i):
+            number[i] = 0
+    if i < plane_start.shape[0] and not takes_part(mask, plane_world[i]):
+        plane_start[i] = held.planes[i]
+        plane_end[i] = held.planes[i]
+    if i < motion.bodies.inverse_mass.shape[0]:
+        body_mass = motion.bodies.inverse_mass[i]
+        held.body_inverse_mass[i] = wp.where(takes_part(mask, motion.bodies.world[i]), body_mass, 0.0)
+    if i < motion.x0.shape[0]:
+        active = takes_part(mask, motion.world[i])
+        held.active[i] = wp.where(active, 1, 0)
+        held.inverse_mass[i] = wp.where(active, inverse_mass[i], 0.0)
+        if not active:
+            x = motion.x0[i]
+            if held.last and wp.isfinite(held.last[i]):
+                x = held.last[i]
+            motion.x0[i] = x
+            motion.x1[i] = x
+            motion.velocity[i] = wp.vec3()
+            motion.is_not_finite[i] = 0
+
+
+@wp.kernel
+def _release(
+    # in
+    mask: wp.array[wp.bool],
+    world: wp.array[int],
+    held: _Held,
+    # out
+    last: wp.array[wp.vec3],
+    interrupted: wp.array[int],
+    number: wp.array[int],
+):
+    """Restores what the next step of worlds that took no part begins with."""
+    i = wp.tid()
+    if i < interrupted.shape[0]:
+        is_out = not takes_part(mask, wp.where(i == interrupted.shape[0] - 1, -1, i))
+        if is_out:
+            interrupted[i] = held.interrupted[i]
+        if i < number.shape[0] and is_out:
+            number[i] = held.number[i]
+    if last and i < last.shape[0] and not takes_part(mask, world[i]):
+        last[i] = held.last[i]
+
+
+class WorldMask:
+    """Lets worlds take no part in a step of a stage.
+
+    The inner solver steps all worlds, as it knows no mask; of worlds that take no part, the state at the start is put
+    back. The stage takes their elements to stand, and to have no mass, so that it looks at no pair of them.
+    """
+
+    def __init__(self, solver: SolverBase, work: Workspace, motion: ModelMotion, number: wp.array[int] | None):
+        """Allocates buffers.
+
+        Args:
+            solver: The inner solver.
+            work: The workspace of steps.
+            motion: The motion of whole steps.
+            number: Predicted number of substeps of each world; None if steps have none.
+        """
+        self._solver, self._work, self._motion = solver, work, motion
+        model, device = motion.mesh.model, work.device
+        self._number = wp.zeros(0, dtype=int, device=device) if number is None else number
+        self._last = motion.last
+        self._held = held = _Held()
+        of_vertices = motion.vertices
+        if self._last is not None:
+            held.last = wp.empty_like(self._last)
+        held.planes, held.interrupted = wp.empty_like(motion.planes.end), wp.empty_like(of_vertices.interrupted)
+        held.number, held.inverse_mass = wp.empty_like(self._number), wp.empty_like(of_vertices.inverse_mass)
+        held.active = wp.zeros(len(held.inverse_mass), dtype=int, device=device)
+        if motion.moves_bodies:
+            held.body_inverse_mass = wp.empty_like(of_vertices.bodies.inverse_mass)
+        self._worlds: dict[str, wp.array] = {}  # of the elements of arrays
+        for name, world in (("particle", model.particle_world), ("body", model.body_world)):
+            if world is not None:
+                self._worlds[name] = world
+        if model.joint_count:
+            world = host_array(model.joint_world)
+            for name in ("joint_q", "joint_qd"):
+                counts = np.diff(host_array(getattr(model, f"{name}_start")))
+                self._worlds[name] = wp.array(np.repeat(world, counts), dtype=int, device=device)
+        self._saved = {name: wp.empty_like(array) for name, array, _world in self._arrays(model)}
+        poses = body_q_prev(solver)
+        self._last_poses = None if poses is None else wp.empty_like(poses)
+
+    def _arrays(self, state):
+        """Yields the arrays of a state that belong to worlds, with the world of each of their elements."""
+        for name in ("particle_q", "particle_qd", "body_q", "body_qd", "joint_q", "joint_qd"):
+            array, world = getattr(state, name, None), self._worlds.get(name, self._worlds.get(name.split("_")[0]))
+            if array is not None and len(array) and world is not None:
+                yield name, array, world
+
+    def begin(self, state: newton.State) -> None:
+        """Copies the state at the start of a step, before the inner solver changes it."""
+        for name, array, _world in self._arrays(state):
+            wp.copy(self._saved[name], array, count=len(self._saved[name]))
+        if self._last_poses is not None:
+            wp.copy(self._last_poses, body_q_prev(self._solver))
+        if self._last is not None:
+            wp.copy(self._held.last, self._last)
+        wp.copy(self._held.planes, self._motion.planes.end)
+
+    def restore(self, mask: wp.array[wp.bool], state: newton.State) -> None:
+        """Puts back the state at the start, in worlds that take no part."""
+        for name, array, world in self._arrays(state):
+            inputs = [self._saved[name], world, mask]
+            wp.launch(_RESTORE[array.dtype], len(world), inputs=inputs, outputs=[array], device=self._work.device)
+        if self._last_poses is not None:
+            poses, world = body_q_prev(self._solver), self._worlds["body"]
+            inputs = [self._last_poses, self._saved["body_q"], world, mask, self._motion.vertices]
+            self._work.launch(_restore_last_poses, len(world), inputs, [poses])
+
+    @contextlib.contextmanager
+    def applied(self, mask: wp.array[wp.bool]) -> Iterator[None]:
+        """Lets the stage look at the worlds alone that take part; the predicted motion is complete before."""
+        work, motion, held = self._work, self._motion, self._held
+        vertices, planes, world = motion.vertices, motion.planes, motion.vertices.world
+        masses, body_masses = vertices.inverse_mass, vertices.bodies.inverse_mass
+        size = max(len(vertices.x0), len(planes.start), len(vertices.interrupted), motion.mesh.model.body_count)
+        outputs = [vertices, planes.start, planes.end, self._number, held]
+        work.launch(_hold, size, [mask, masses, planes.world], outputs)
+        vertices.inverse_mass = held.inverse_mass
+        if motion.moves_bodies:
+            vertices.bodies.inverse_mass = held.body_inverse_mass
+        work.motion, work.active, work.unmasked = motion, held.active, (masses, body_masses)
+        try:
+            yield
+        finally:
+            vertices.inverse_mass, vertices.bodies.inverse_mass = masses, body_masses
+            work.motion, work.active, work.unmasked = motion, None, None
+        outputs = [self._last, vertices.interrupted, self._number]
+        work.launch(_release, max(len(world), len(vertices.interrupted)), [mask, world, held], outputs)
+
+
+def checked_mask(world_mask, model: newton.Model) -> wp.array | None:
+    """Returns the argument ``world_mask`` of a step.
+
+    Raises:
+        TypeError: If it is no Warp array of bool.
+        ValueError: If it has another shape, or is on another device.
+    """
+    if world_mask is None:
+        return None
+    if not isinstance(world_mask, wp.array):
+        raise TypeError(f"world_mask must be a Warp array of bool, not {given(world_mask)}")
+    if world_mask.dtype is not wp.bool:
+        raise TypeError(f"world_mask must be a Warp array of bool, not of {world_mask.dtype.__name__}")
+    shape = (max(1, model.world_count) + 1,)
+    if world_mask.shape != shape:
+        raise ValueError(f"world_mask must have shape {shape}, not {world_mask.shape}")
+    if world_mask.device != model.device:
+        raise ValueError(f"world_mask must be on device {model.device}, not {world_mask.device}")
+    return world_mask

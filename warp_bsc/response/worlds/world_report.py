@@ -1,0 +1,73 @@
+"""The part of a report that says what a step did in each world, as arrays on the device."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+_NOT_ASKED = "a stage counts worlds only if it is asked to: pass report_worlds=True"
+_NO_IMPULSES = "a stage keeps impulses only if it is asked to: SolverCCD(solver, report_contacts=True)"
+
+
+@dataclass(eq=False)
+class Worlds:
+    """Results of the last step by world, Warp arrays of shape [world_count], written anew in each step.
+
+    They are what the attributes of :class:`..report.SolverReport` with these names are for all worlds together. They
+    stay where they are, so that a program may read them in a CUDA graph.
+
+    Attributes:
+        certified: Whether the motion is certified, bool.
+        hits: Contacts of the predicted motion, int.
+        remaining: Contacts of the motion as it is stored, int.
+        truncated: Vertices and bodies whose paths were truncated, int.
+        frozen: Vertices and bodies that were frozen, int.
+        substeps: Substeps of the step, 0 if it was not taken in substeps, int.
+        crossings: Edges that cross faces at the start, int.
+    """
+
+    certified: wp.array[wp.bool]
+    hits: wp.array[int]
+    remaining: wp.array[int]
+    truncated: wp.array[int]
+    frozen: wp.array[int]
+    substeps: wp.array[int]
+    crossings: wp.array[int]
+    _max_impulse: wp.array[float] | None = None
+
+    @property
+    def max_impulse(self) -> wp.array[float]:
+        """The largest normal impulse of a contact [N s], float.
+
+        Raises:
+            RuntimeError: If the stage was not asked to keep contacts.
+        """
+        if self._max_impulse is None:
+            raise RuntimeError(_NO_IMPULSES)
+        return self._max_impulse
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Returns all results on the host. Synchronizes with the device."""
+        arrays = {name.lstrip("_"): array for name, array in vars(self).items() if array is not None}
+        return {name: array.numpy() for name, array in arrays.items()}
+
+
+class WorldsOfReport:
+    """Results of the last step by world, if ``report_worlds`` of the stage asks for them."""
+
+    _worlds: Worlds | None = None
+
+    def keep_worlds(self, worlds: Worlds) -> None:
+        """Makes the report have results by world."""
+        self._worlds = worlds
+
+    @property
+    def worlds(self) -> Worlds:
+        """Results of the last step by world, on the device.
+
+        Raises:
+            RuntimeError: If the stage was not asked for them.
+        """
+        if self._worlds is None:
+            raise RuntimeError(_NOT_ASKED)
+        return self._worlds
