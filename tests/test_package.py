@@ -44,6 +44,9 @@ PACKAGES = {
     "checker": {"_arguments"},
     "detection": {"kernels", "checker", "_arguments", "_one_thread", "_private_names"},
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names"},
+    "torch": {"response", "_arguments"},
+    "jax": {"response", "_arguments"},
+    "implicit": {"detection", "response", "_arguments", "_one_thread", "_private_names"},
     "repair": {"detection", "response", "usd", "replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_version"},
@@ -54,6 +57,7 @@ PACKAGES = {
         "_version",
         "checker",
         "detection",
+        "implicit",
         "repair",
         "replay",
         "response",
@@ -64,6 +68,7 @@ PACKAGES = {
 
 LIBRARIES = {
     "newton": {
+        "implicit",
         "response",
         "warp_bsc/repair/shot/playback.py",  # plays positions back as a solver
         "warp_bsc/repair/state.py",  # repairs a state of a model
@@ -74,6 +79,8 @@ LIBRARIES = {
         "warp_bsc/bench/crossings.py",  # of a model
         "warp_bsc/bench/response_simulation.py",  # steps its solvers
         "warp_bsc/bench/response_scenes.py",  # makes models
+        "torch",  # takes its solvers
+        "jax",
     },
     "pxr": {"usd", "warp_bsc/replay/usd_validation.py"},  # a rule of its validation framework
     "rich": {"cli"},
@@ -81,7 +88,20 @@ LIBRARIES = {
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
     "trimesh": {"bench", "response", "usd"},
-    "warp": {"kernels", "detection", "response", "repair", "bench", "cli", "_private_names"},
+    "warp": {
+        "kernels",
+        "detection",
+        "implicit",
+        "response",
+        "repair",
+        "bench",
+        "cli",
+        "_private_names",
+        "torch",
+        "jax",
+    },
+    "torch": {"torch"},
+    "jax": {"jax"},
 }
 """Who may import a library: packages, or single files."""
 
@@ -200,3 +220,12 @@ def test_libraries_are_imported_only_where_the_layout_allows(library):
     assert users
     wrong = [path for path, package in users if not {path, package} & LIBRARIES[library]]
     assert not wrong, "\n".join(sorted(wrong))
+
+
+@pytest.mark.parametrize("library", ["torch", "jax"])
+def test_a_bridge_whose_library_is_missing_says_what_to_install(library, monkeypatch):
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"warp_bsc.{library}", raising=False)
+    monkeypatch.delitem(vars(warp_bsc), library, raising=False)
+    with pytest.raises(ImportError, match=rf"warp_bsc\.{library} needs .*: pip install 'warp-bsc\[{library}\]'"):
+        getattr(warp_bsc, library)

@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
         query_vertex_vertex,
     )
     from .detection.query_points import query_points
+    from .implicit.solver import SolverImplicitAdjoint
     from .repair.repair import repair
     from .repair.results import RepairResult, UnresolvedContour
     from .repair.state import StateRepairResult, repair_state
@@ -77,6 +78,7 @@ _MODULES = {
     "SceneProximities": "replay.scene_proximities",
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
+    "SolverImplicitAdjoint": "implicit.solver",
     "SolverReport": "response.report",
     "StateRepairResult": "repair.state",
     "UnresolvedContour": "repair.results",
@@ -111,6 +113,7 @@ __all__ = [
     "SceneProximities",
     "Selection",
     "SolverCCD",
+    "SolverImplicitAdjoint",
     "SolverReport",
     "StateRepairResult",
     "UnresolvedContour",
@@ -134,9 +137,9 @@ for _name in ("repair", "replay"):
 
 
 def __getattr__(name):
-    """Imports a name when it is first used, so that the exact checker needs no Warp."""
-    if name == "checker":
-        return importlib.import_module(".checker", __name__)
+    """Imports a name when it is first used: the exact checker needs no Warp, and Warp no PyTorch or JAX."""
+    if name in ("checker", "jax", "torch"):
+        return importlib.import_module(f".{name}", __name__)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
