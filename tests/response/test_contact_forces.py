@@ -269,6 +269,17 @@ def test_contacts_beyond_the_capacity_are_counted_and_summed_up(device):
     assert np.array_equal(few.report.particle_impulse.numpy(), all_listed.report.particle_impulse.numpy())
 
 
+@pytest.mark.parametrize("mass, complete", [(1e-3, True), (1e8, False)])
+def test_impulses_that_are_too_large_for_a_sum_are_flagged(mass, complete, device):
+    model = ramp(device, 0.0)
+    model.particle_mass.fill_(mass)
+    model.particle_inv_mass.fill_(1.0 / mass)
+    solver = bsc.SolverCCD(SOLVERS["semi_implicit"](model), substeps=None, report_contacts=True)
+    step_forces(model, solver, 1.0 / 100.0, 3)
+    assert len(solver.report.contacts.numpy()["toi"])
+    assert solver.report.impulses_complete == solver.report.contacts.complete == complete
+
+
 def test_a_stage_that_is_not_asked_has_no_contacts(device):
     """And takes the same steps, bit by bit."""
     model = bullet(60, device=device)

@@ -102,6 +102,7 @@ class ContactForces:
 
     def begin(self, start: StateArrays, *, remembers: bool) -> None:
         """Takes the centres of mass at the start of a step; ``remembers`` says whether steps go on from the last."""
+        self.rows.lost.zero_()
         inputs = [start, self._work.motion.vertices, self._sides, remembers, self._centres]
         self._work.launch(keep.start_centres, len(self._centres.end), inputs)
 
@@ -127,7 +128,8 @@ class ContactForces:
         self._reserve()
         work = self._work
         inputs = [work.motion.planes, self._sides, self._centres, substeps, remaining]
-        work.launch_over_constraints(keep.keep_impulses, *inputs, self._of_constraints, self._of_planes, self._unpaired)
+        outputs = [self._of_constraints, self._of_planes, self._unpaired, self.rows.lost]
+        work.launch_over_constraints(keep.keep_impulses, *inputs, *outputs)
         size = max(len(self._unpaired.of_particles), len(self._unpaired.of_bodies))
         work.launch(keep.keep_unpaired, size, [work.step, self._unpaired])
 
@@ -136,7 +138,6 @@ class ContactForces:
         work, step, rows = self._work, self._work.step, self.rows
         self.keep()
         rows.count.zero_()
-        rows.lost.zero_()
         self.published.max_impulse.zero_()
         outputs = [self._sums, rows]
         work.launch_over_constraints(publish.publish_contacts, self._sides, self._of_constraints, *outputs)

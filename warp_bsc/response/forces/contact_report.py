@@ -66,7 +66,8 @@ class Contacts:
         """Whether all contacts of the last step are listed. Synchronizes with the device.
 
         If there are more than fit, sums have the others too. If constraints of a CUDA graph did not fit in a step in
-        substeps, sums lack these as well; :attr:`ContactReport.impulses_complete` is false then.
+        substeps, or an impulse or a sum is too large to be held, sums lack these as well;
+        :attr:`ContactReport.impulses_complete` is false then.
         """
         return int(self.count.numpy()[0]) <= self.capacity and int(self._lost.numpy()[0]) == 0
 
@@ -91,7 +92,8 @@ class ContactReport:
 
     :attr:`impulses_elsewhere` says where that solver takes over contacts that the stage resolves behind others.
 
-    Sums have impulses of up to 130,000 N s, in units of 1.5e-14 N s, and are the same in any order of threads.
+    Sums reach 130,000 N s, of impulses of up to 65,000 N s each, in units of 1.5e-14 N s, and are the same in any order
+    of threads; :attr:`impulses_complete` is false where that is not enough.
 
     Attributes:
         impulses_elsewhere: What resolves contacts before the stage, so that its impulses on them are small; None if

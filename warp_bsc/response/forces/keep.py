@@ -119,6 +119,7 @@ def keep_impulses(
     of_constraints: KeptImpulses,
     of_planes: KeptImpulses,
     unpaired: Unpaired,
+    lost: wp.array[int],
 ):
     """Adds the impulses of constraints in a substep, or without ``remaining``, after the step, to those that are kept.
 
@@ -142,13 +143,13 @@ def keep_impulses(
     if not _responds(step, i):
         for j in range(4):
             if corners[j] < sides.particle_count and weights[j] != ZERO:
-                add_impulse(unpaired.idle_of_particles, corners[j], 0, weights[j] * impulse)
+                add_impulse(unpaired.idle_of_particles, corners[j], 0, weights[j] * impulse, lost)
         for side in range(2):
             body = _body_of_side(step, sides, i, side)
             if can_move(motion, body):
                 torque = _torque_on(step, sides, centres, share, i, side, impulse)
-                add_impulse(unpaired.idle_of_bodies, body, 0, wp.where(side == 0, impulse, -impulse))
-                add_impulse(unpaired.idle_of_bodies, body, 3, torque)
+                add_impulse(unpaired.idle_of_bodies, body, 0, wp.where(side == 0, impulse, -impulse), lost)
+                add_impulse(unpaired.idle_of_bodies, body, 3, torque, lost)
         return
     if constraints.kind[i] == ContactKind.PLANE:
         plane = constraints.plane[i]

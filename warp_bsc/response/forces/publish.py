@@ -13,13 +13,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _add_to_side(sides: Sides, sums: ImpulseSums, shape: int, body: int, impulse: wp.vec3d, torque: wp.vec3d):
+def _add_to_side(sums: ImpulseSums, shape: int, body: int, impulse: wp.vec3d, torque: wp.vec3d, lost: wp.array[int]):
     """Adds the impulse on a side of a contact, if it is of a shape, to the sums of its shape and its body."""
     if shape >= 0:
-        add_impulse(sums.of_shapes, shape, 0, impulse)
+        add_impulse(sums.of_shapes, shape, 0, impulse, lost)
     if body >= 0:
-        add_impulse(sums.of_bodies, body, 0, impulse)
-        add_impulse(sums.of_bodies, body, 3, torque)
+        add_impulse(sums.of_bodies, body, 0, impulse, lost)
+        add_impulse(sums.of_bodies, body, 3, torque, lost)
 
 
 @wp.func
@@ -56,21 +56,21 @@ def _publish(
     for j in range(4):
         point += wp.max(weights[j], ZERO) * to_double(step.vertices.x1[corners[j]])
         if corners[j] < sides.particle_count and weights[j] != ZERO:
-            add_impulse(sums.of_particles, corners[j], 0, weights[j] * impulse)
+            add_impulse(sums.of_particles, corners[j], 0, weights[j] * impulse, rows.lost)
     first, second = wp.vec3d(), wp.vec3d()
     if kept.torque:
         first = kept.torque[i, 0]
         second = kept.torque[i, 1]
-    _add_to_side(sides, sums, shapes[0], bodies[0], impulse, first)
-    _add_to_side(sides, sums, shapes[1], bodies[1], -impulse, second)
+    _add_to_side(sums, shapes[0], bodies[0], impulse, first, rows.lost)
+    _add_to_side(sums, shapes[1], bodies[1], -impulse, second, rows.lost)
     world = step.motion.world[corners[0]]
     wp.atomic_max(sums.largest, world, float(along))
     if sums.of_pairs:
         size = sides.max_local + 1
         a = _local(sides, shapes[0])
         b = _local(sides, shapes[1])
-        add_impulse(sums.of_pairs, (world * size + a) * size + b, 0, impulse)
-        add_impulse(sums.of_pairs, (world * size + b) * size + a, 0, -impulse)
+        add_impulse(sums.of_pairs, (world * size + a) * size + b, 0, impulse, rows.lost)
+        add_impulse(sums.of_pairs, (world * size + b) * size + a, 0, -impulse, rows.lost)
     row = take_slot_int(rows.count)
     if row < rows.kind.shape[0]:
         rows.kind[row] = kind

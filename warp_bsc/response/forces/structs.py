@@ -66,7 +66,7 @@ class ContactRows:
     """The contacts of a step; see :class:`.contact_report.Contacts`, which has the same arrays."""
 
     count: wp.array[int]  # of contacts, whether they fit or not
-    lost: wp.array[int]  # contacts whose impulses of substeps no sum has
+    lost: wp.array[int]  # contacts whose impulses of substeps no sum has, and what was too large for a sum
     kind: wp.array[int]
     vertices: wp.array[wp.vec4i]
     weights: wp.array[wp.vec4]

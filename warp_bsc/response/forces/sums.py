@@ -9,15 +9,23 @@ wp.set_module_options({"enable_backward": False})
 
 _UNITS, _UNIT = wp.constant(wp.float64(2.0**46)), wp.constant(wp.float64(2.0**-46))
 """Units in 1 N s or N m s, and a unit: sums reach 130,000 N s, in steps of 1.5e-14 N s."""
+_MAX_IMPULSE, _MAX_UNITS = wp.constant(wp.float64(2.0**16)), wp.constant(wp.int64(2**63 - 1))
 
 
 @wp.func
-def add_impulse(sums: wp.array2d[wp.int64], i: int, column: int, x: wp.vec3d):
-    """Adds a vector to three columns of a sum, from ``column`` on."""
+def add_impulse(sums: wp.array2d[wp.int64], i: int, column: int, x: wp.vec3d, lost: wp.array[int]):
+    """Adds a vector to three columns of a sum, from ``column`` on; counts in ``lost`` what it cannot hold."""
     for axis in range(3):
-        units = wp.int64(wp.rint(_UNITS * x[axis]))
-        if units != wp.int64(0):
-            wp.atomic_add(sums, i, column + axis, units)
+        if not wp.abs(x[axis]) < _MAX_IMPULSE:  # nor if it is not a number
+            wp.atomic_add(lost, 0, 1)
+        else:
+            units = wp.int64(wp.rint(_UNITS * x[axis]))
+            if units != wp.int64(0):
+                before = wp.atomic_add(sums, i, column + axis, units)
+                if units > wp.int64(0) and before > _MAX_UNITS - units:
+                    wp.atomic_add(lost, 0, 1)
+                if units < wp.int64(0) and before < -_MAX_UNITS - units:
+                    wp.atomic_add(lost, 0, 1)
 
 
 @wp.func
