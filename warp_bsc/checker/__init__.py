@@ -74,6 +74,7 @@ from .queries import (
     vertex_vertex,
     vertex_vertex_toi,
 )
+from .tetrahedra import tetrahedron, tetrahedron_toi
 
 __all__ = [
     "edge_edge",
@@ -81,6 +82,8 @@ __all__ = [
     "edge_face_crossings",
     "edges_pass_faces",
     "rays_pass_faces",
+    "tetrahedron",
+    "tetrahedron_toi",
     "vertex_edge",
     "vertex_edge_toi",
     "vertex_face",

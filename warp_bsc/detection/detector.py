@@ -12,6 +12,7 @@ from .differentiable import CollisionArrays
 from .distance_phase import decide_distances_on_host
 from .host_function import run_on_host
 from .intersections import IntersectionFinder, find_intersections
+from .inversions import Inversions, find_inversions
 from .launch import retry_until_fits
 from .mesh import CollisionMesh
 from .narrow_phase import decide_on_host
@@ -177,6 +178,45 @@ class CollisionDetector:
             ValueError: If they have another shape or type, or are not finite.
         """
         return find_intersections(self.mesh, x)
+
+    def inversions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Inversions:
+        """Returns the tetrahedra of the mesh whose volume is 0 or negative at some time of a motion.
+
+        Decided as by the method of the detector: "conservative" counts those that floating point cannot certify.
+
+        Args:
+            x0: Positions at the start, as of :meth:`detect`; those of vertices that no tetrahedron uses may be
+                anything.
+            x1: Positions at the end, of the same type.
+
+        Raises:
+            TypeError: If the positions are no arrays of numbers.
+            ValueError: If they have another shape or type, differ in type, or are not finite.
+            RuntimeError: If the device captures a graph.
+        """
+        if self.mesh.device.is_capturing:
+            raise RuntimeError(f"{self.mesh.device} captures a graph: find inversions outside of it")
+        x0, x1 = self._checked_positions(x0, x1)
+        return find_inversions(self.mesh, x0, x1, method=self.method, tolerance=self.tolerance)
+
+    def find_inversions(self, x: np.ndarray | wp.array) -> np.ndarray:
+        """Returns the tetrahedra of the mesh whose volume is 0 or negative in one configuration, exactly.
+
+        Args:
+            x: Positions, as of :meth:`inversions`.
+
+        Returns:
+            Rows in ``mesh.tets``, sorted, int32, shape [n].
+
+        Raises:
+            TypeError: As :meth:`inversions`.
+            ValueError: As :meth:`inversions`.
+            RuntimeError: As :meth:`inversions`.
+        """
+        if self.mesh.device.is_capturing:
+            raise RuntimeError(f"{self.mesh.device} captures a graph: find inversions outside of it")
+        x = self.mesh.device_positions(x, "x")
+        return find_inversions(self.mesh, x, x, method="exact", tolerance=self.tolerance).tets
 
     def find_proximities(self, x: np.ndarray | wp.array, distance: float, *, rings: int = 1) -> Proximities:
         """Returns the pairs of elements that are near each other in one configuration, exactly.

@@ -54,6 +54,7 @@ class CollisionMesh:
             [face_count, 3].
         owned: What each face is the representative of, see :mod:`warp_bsc.kernels.pipeline.pairs`, int32, shape
             [face_count].
+        tets: Vertex indices of the tetrahedra, int32, shape [tet_count, 4].
         vertices: Indices of the vertices that faces and edges use, and of the points, sorted, int32, shape
             [used_vertex_count].
         vertex_count: Number of positions.
@@ -69,6 +70,7 @@ class CollisionMesh:
         *,
         edges: np.ndarray | wp.array | None = None,
         points: np.ndarray | wp.array | None = None,
+        tets: np.ndarray | wp.array | None = None,
         radius: float | np.ndarray | wp.array | None = None,
         world: np.ndarray | wp.array | None = None,
         only_free: bool = False,
@@ -82,6 +84,9 @@ class CollisionMesh:
             edges: Vertex indices of edges that are included although no face has them, integers, shape [n, 2], NumPy or
                 Warp array. Edges of faces among them are not counted twice.
             points: Vertices that are included although no face has them, integers, shape [n], NumPy or Warp array.
+            tets: Vertex indices of tetrahedra whose inversions can be found, integers, shape [n, 4], NumPy or Warp
+                array: the volume of a b c d is positive if d is on the side of the triangle a b c from which this is
+                counterclockwise. They do not collide: their surface is to be among the faces.
             radius: Radius of each vertex, in the unit of the positions, 0 or at least 2^-1021, float, shape
                 [vertex_count], NumPy or Warp array; or one for all. A pair collides if it comes within the sum of its
                 two radii.
@@ -93,9 +98,9 @@ class CollisionMesh:
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: If the faces, edges, points, radii or worlds have another shape or type or are out of range, an
-                index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one vertex twice, entries are
-                masked, the worlds differ within a face or an edge, or the device does not exist.
+            ValueError: If the faces, edges, points, tetrahedra, radii or worlds have another shape or type or are out
+                of range, an index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one vertex twice,
+                entries are masked, the worlds differ within a face or an edge, or the device does not exist.
         """
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
         self.only_free = checked_flag(only_free, "only_free")
@@ -107,6 +112,7 @@ class CollisionMesh:
             raise ValueError(f"edges[{same[0]}] has vertex {given_edges[same[0], 0]} twice")
         given_points = self._checked_indices(() if points is None else points, 1, "point")
         self.faces = faces
+        self.tets = self._checked_indices(() if tets is None else tets, 4, "tet")
         sides = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         rows = np.concatenate([sides, np.sort(given_edges, axis=1)]).astype(np.int64)
         # as one number for each pair of vertices: NumPy sorts rows much more slowly
@@ -228,6 +234,11 @@ class CollisionMesh:
             vertex_rows=array(vertex_rows),
             edge_rows=array(edge_rows),
         )
+
+    @functools.cached_property
+    def device_tets(self) -> wp.array:
+        """Vertex indices of the tetrahedra on the device, two-dimensional Warp array of int."""
+        return wp.array(self.tets, dtype=int, device=self.device)
 
     def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
         """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.

@@ -1,0 +1,164 @@
+"""Inversion of a moving tetrahedron by certified signs of its volume, a cubic in time (Sec. 3.2 and 5.5).
+
+Six times the volume of a tetrahedron a b c d, positive if d is on the side of the triangle a b c from which this is
+counterclockwise, is (d - a) . ((b - a) x (c - a)): the coplanarity of vertex d and face a b c, see
+:mod:`.polynomials`. A tetrahedron **inverts** in a step if its volume is 0 or negative at some time of it, both ends
+included.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from .bernstein import restrict_cubic
+from .custom_gradients import func_grad
+from .motion import all_finite, doubles, relative_motion
+from .polynomials import VERTEX_FACE, coplanarity
+from .signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign, certified_sign_cubic
+from .time_of_impact import FINEST, MAX_VISITS, clamped_tolerance, power_of_two
+
+_ZERO = wp.constant(wp.float64(0.0))
+_HALF = wp.constant(wp.float64(0.5))
+_ONE = wp.constant(wp.float64(1.0))
+_NEVER = wp.constant(wp.float64(2.0))
+_RESTRICTION = wp.constant(wp.float64(2.0))
+"""Bound after restriction, in bounds of the coefficients: it interpolates thrice, 9r k <= E, see :mod:`.roots`."""
+
+
+@wp.struct
+class Inversion:
+    """When a tetrahedron inverts first; if the status is UNSURE, it does not before ``toi``."""
+
+    status: int
+    toi: wp.float64  # time of inversion, a lower bound in [0, 1]; 2 where the status is FREE
+
+
+@wp.func
+def first_inversion(
+    # points at the start
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    # points at the end
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    # accuracy
+    roundoff: wp.float64,
+    tolerance: wp.float64,
+) -> Inversion:
+    """Returns the first inversion of a tetrahedron, by testing one interval after the other.
+
+    In an interval all of whose coefficients are certainly positive, the tetrahedron does not invert; the next one is
+    twice as long. Any other is halved, until it is as short as the tolerance and its volume is certainly negative at an
+    end: its start is the time of inversion to within the tolerance. Or until it has the shortest length, a share of the
+    tolerance; then it is not certain whether the tetrahedron inverts there, but whether it does so later may be.
+
+    Args:
+        a0: First point at the start.
+        b0: Second point at the start.
+        c0: Third point at the start.
+        d0: Fourth point at the start.
+        a1: First point at the end.
+        b1: Second point at the end.
+        c1: Third point at the end.
+        d1: Fourth point at the end.
+        roundoff: ROUNDOFF, or 0 for the signs that floating point computes.
+        tolerance: Tolerance of the time, as a share of the step, see :func:`.time_of_impact.clamped_tolerance`.
+    """
+    result = Inversion()
+    result.status = UNSURE
+    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        return result
+    y = coplanarity(relative_motion(VERTEX_FACE, d0, a0, b0, c0, d1, a1, b1, c1, roundoff))
+    if certified_sign_cubic(y.k, y.bound) > 0:
+        result.status = FREE
+        result.toi = _NEVER
+        return result
+    bound = _RESTRICTION * y.bound
+    if certified_sign(y.k[3], y.bound) < 0:
+        result.status = HIT
+    length = power_of_two(clamped_tolerance(tolerance))
+    shortest = FINEST * length
+    start = _ZERO
+    end = _ONE
+    for _ in range(MAX_VISITS):
+        k = restrict_cubic(y.k, start, end)
+        width = end - start
+        if certified_sign_cubic(k, bound) > 0:
+            if end == _ONE:
+                result.status = FREE
+                result.toi = _NEVER
+                return result
+            start = end
+            end = wp.min(end + width + width, _ONE)
+        else:
+            is_negative = certified_sign(k[0], bound) < 0 or certified_sign(k[3], bound) < 0
+            if is_negative:
+                result.status = HIT
+            if width <= shortest or (is_negative and width <= length):
+                break
+            end = start + shortest * wp.floor(_HALF * width / shortest)
+    result.toi = start
+    return result
+
+
+@wp.func
+def _find_inversion(
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    tolerance: wp.float64,
+) -> Inversion:
+    """Returns the first inversion of a tetrahedron, constant for differentiation."""
+    return first_inversion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF, tolerance)
+
+
+@func_grad(_find_inversion, Inversion)
+def _adjoint_of_find_inversion(
+    a0: wp.vec3d,
+    b0: wp.vec3d,
+    c0: wp.vec3d,
+    d0: wp.vec3d,
+    a1: wp.vec3d,
+    b1: wp.vec3d,
+    c1: wp.vec3d,
+    d1: wp.vec3d,
+    tolerance: wp.float64,
+    adj_ret: Inversion,
+):
+    """Does nothing, and keeps Warp from differentiating the code behind :func:`_find_inversion`."""
+
+
+@wp.func
+def inversion_tetrahedron(
+    a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, tolerance: wp.float64
+) -> Inversion:
+    """Returns when a moving tetrahedron a b c d first becomes flat, or is inverted already, without gradients.
+
+    Args:
+        a0: First vertex at the start, ``vec3`` or ``vec3d``.
+        b0: Second vertex at the start.
+        c0: Third vertex at the start.
+        d0: Fourth vertex at the start; the volume is positive if (d - a) . ((b - a) x (c - a)) is.
+        a1: First vertex at the end of the step.
+        b1: Second vertex at the end.
+        c1: Third vertex at the end.
+        d1: Fourth vertex at the end.
+        tolerance: Tolerance of the time, as a share of the step. It is clamped to [2^-38, 2^-10]; NaN counts as 2^-38.
+
+    Returns:
+        Status and time: FREE, the volume is certainly positive in the whole step; HIT, it is certainly 0 or negative at
+        some time; UNSURE, floating point certifies neither, also if a point is not finite. Before the time it is
+        certainly positive.
+    """
+    a, b, c, d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    return _find_inversion(a, b, c, d, to_a, to_b, to_c, to_d, tolerance)

@@ -1,0 +1,168 @@
+"""Tetrahedra that invert in a motion, or are inverted in one configuration: certified signs of their volumes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from .. import checker
+from .._arguments import check_finite
+from ..kernels.exact.inversion import tetrahedron_inverts_in
+from ..kernels.exact.polygon import BITS
+from ..kernels.inversion import first_inversion
+from ..kernels.motion import double
+from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
+from .launch import launch_over, made_once
+from .mesh import CollisionMesh
+from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Method
+
+__all__ = ["Inversions", "find_inversions"]
+
+
+@dataclass(frozen=True, eq=False)
+class Inversions:
+    """The tetrahedra whose volume is 0 or negative at some time of a motion, both ends included.
+
+    Attributes:
+        tets: Their rows in ``mesh.tets``, sorted, int32, shape [n].
+        status: Certified status by floating point, for any method: 1 HIT, 2 UNSURE; 0 FREE only by method "float";
+            int8, shape [n].
+        toi: Time before which the volume is certainly positive, as a share of the step, float64, shape [n]: the time of
+            inversion to within the tolerance, or where floating point cannot certify more. By method "float" it is
+            computed, not certain.
+    """
+
+    tets: np.ndarray
+    status: np.ndarray
+    toi: np.ndarray
+
+
+@made_once
+def _classify(dtype: type) -> wp.Kernel:
+    """Returns the kernel that finds first inversions, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def classify(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        tets: wp.array2d[int],
+        # accuracy
+        roundoff: wp.float64,
+        tolerance: wp.float64,
+        # out
+        status: wp.array[wp.int8],
+        toi: wp.array[wp.float64],
+    ):
+        i = first + wp.tid()
+        a = tets[i, 0]
+        b = tets[i, 1]
+        c = tets[i, 2]
+        d = tets[i, 3]
+        found = first_inversion(
+            double(x0[a]),
+            double(x0[b]),
+            double(x0[c]),
+            double(x0[d]),
+            double(x1[a]),
+            double(x1[b]),
+            double(x1[c]),
+            double(x1[d]),
+            roundoff,
+            tolerance,
+        )
+        status[i] = wp.int8(found.status)
+        toi[i] = found.toi
+
+    return classify
+
+
+@made_once
+def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
+    """Returns the kernel that decides UNSURE tetrahedra in wide integers, for one type of position and one width."""
+    tetrahedron_inverts = tetrahedron_inverts_in(limbs)
+
+    @wp.kernel(**NO_GRADIENTS)
+    def decide_exactly(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        tets: wp.array2d[int],
+        # in and out
+        status: wp.array[wp.int8],
+    ):
+        i = first + wp.tid()
+        if int(status[i]) != UNSURE:
+            return
+        a = tets[i, 0]
+        b = tets[i, 1]
+        c = tets[i, 2]
+        d = tets[i, 3]
+        decided = tetrahedron_inverts(
+            double(x0[a]),
+            double(x0[b]),
+            double(x0[c]),
+            double(x0[d]),
+            double(x1[a]),
+            double(x1[b]),
+            double(x1[c]),
+            double(x1[d]),
+        )
+        status[i] = wp.int8(decided)
+
+    return decide_exactly
+
+
+def find_inversions(mesh: CollisionMesh, x0: wp.array, x1: wp.array, *, method: Method, tolerance: float) -> Inversions:
+    """Returns the tetrahedra of a mesh that invert in a motion.
+
+    Args:
+        mesh: The mesh.
+        x0: Positions at the start on the mesh's device, array of vec3 or vec3d.
+        x1: Positions at the end, of the same type; those at the start for one configuration.
+        method: As of :class:`.detector.CollisionDetector`.
+        tolerance: Of the times, as a share of the step.
+
+    Raises:
+        ValueError: If a position of a tetrahedron is not finite.
+    """
+    device, tets, n = mesh.device, mesh.device_tets, len(mesh.tets)
+    status = wp.zeros(n, dtype=wp.int8, device=device)
+    toi = wp.zeros(n, dtype=wp.float64, device=device)
+
+    def classify(roundoff):
+        inputs = [x0, x1, tets, roundoff, wp.float64(tolerance)]
+        launch_over(_classify(x0.dtype), n, inputs=inputs, outputs=[status, toi], device=device)
+        return status.numpy().copy()  # on the CPU, the array itself
+
+    certified = classify(ROUNDOFF)
+    if (certified == UNSURE).any():
+        for name, x in (("x0", x0), ("x1", x1)):
+            check_finite(x.numpy(), name, np.unique(mesh.tets))
+    inverts = certified != FREE
+    if method == "float":
+        inverts = classify(wp.float64(0.0)) != FREE
+    elif method == "exact":
+        inverts = _decided(mesh, x0, x1, status) == HIT
+    (found,) = np.nonzero(inverts)
+    return Inversions(found.astype(np.int32), certified[found], np.minimum(toi.numpy()[found], 1.0))
+
+
+def _decided(mesh: CollisionMesh, x0: wp.array, x1: wp.array, status: wp.array) -> np.ndarray:
+    """Returns the status of all tetrahedra after the exact stage, and the checker where numbers are too wide for it."""
+    tets = mesh.device_tets
+    for limbs in BITS:
+        if not (status.numpy() == UNSURE).any():
+            break
+        kernel = _decide_exactly(x0.dtype, limbs)
+        inputs = [x0, x1, tets]
+        launch_over(kernel, len(mesh.tets), inputs=inputs, outputs=[status], device=mesh.device, block_dim=64)
+    decided = status.numpy()
+    (left,) = np.nonzero(decided == UNSURE)
+    if len(left):
+        corners = mesh.tets[left]
+        points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
+        decided[left] = np.where(checker.tetrahedron(points), HIT, FREE)
+    return decided
