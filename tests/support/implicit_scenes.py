@@ -8,11 +8,30 @@ import warp as wp
 
 import warp_bsc as bsc
 
-__all__ = ["CLOTH", "DT", "Rollout", "cloth_on_slope", "hanging_cloth", "soft_block", "springs"]
+__all__ = [
+    "CLOTH",
+    "DT",
+    "SELF_CONTACT",
+    "Rollout",
+    "attached_cloth",
+    "cloth_on_slope",
+    "colliding_cloths",
+    "hanging_cloth",
+    "soft_block",
+    "springs",
+]
 
 DT = 1.0 / 60.0
 
 CLOTH = {"tri_ke": 80.0, "tri_ka": 60.0, "tri_kd": 5e-3, "edge_ke": 2e-3, "edge_kd": 1e-4, "particle_radius": 0.02}
+
+
+SELF_CONTACT = {
+    "particle_enable_self_contact": True,
+    "particle_self_contact_margin": 0.01,
+    "particle_self_contact_gap": 0.02,
+}
+"""Options of VBD by which :func:`colliding_cloths` collide."""
 
 
 def _add_cloth(builder, n, at, rotation=None, **options):
@@ -96,12 +115,37 @@ def springs(device):
     return _finished(builder, device)
 
 
+def attached_cloth(device):
+    """A cloth of which one side hangs on damped attachments to a kinematic body."""
+    builder = newton.ModelBuilder()
+    body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()), is_kinematic=True)
+    _add_cloth(builder, 3, (0.0, 0.0, 1.0))
+    for row in range(4):
+        point = wp.vec3(-0.002, 0.05 * row, 0.001)
+        builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=200.0, damping=0.1)
+    builder.add_attachment_particle_body(1, body, stiffness=1000.0, enabled=False)
+    return _finished(builder, device)
+
+
+def colliding_cloths(device):
+    """A cloth that falls on another one, which is held at its sides."""
+    builder = newton.ModelBuilder()
+    turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.1, 0.15, 1.0)), 0.4)
+    _add_cloth(builder, 2, (0.04, 0.0, 0.012), turned)
+    held = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
+    _add_cloth(builder, 3, (0.0, 0.0, 0.0), **held)
+    model = _finished(builder, device)
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
+    return model
+
+
 class Rollout:
     """Steps of a model from velocities that a number moves, and a weighted sum of where they end."""
 
-    def __init__(self, model, *, steps=8, iterations=10, polish=4, start=(0.2, 0.1, -0.3), wrap=None, **options):
-        self.model, self.steps = model, steps
-        inner = newton.solvers.SolverVBD(model, iterations=iterations)
+    def __init__(self, model, *, steps=8, iterations=10, polish=4, start=(0.2, 0.1, -0.3), wrap=None, dt=DT, **options):
+        self.model, self.steps, self.dt = model, steps, dt
+        of_vbd = {name: options.pop(name) for name in SELF_CONTACT if name in options}
+        inner = newton.solvers.SolverVBD(model, iterations=iterations, **of_vbd)
         self.adjoint = bsc.SolverImplicitAdjoint(inner, polish=polish, **options)
         self.solver = self.adjoint if wrap is None else wrap(self.adjoint)
         n, rng = model.particle_count, np.random.default_rng(3)
@@ -121,7 +165,7 @@ class Rollout:
         for (start, end), contacts in zip(itertools.pairwise(states), self.contacts, strict=True):
             if contacts is not None:
                 self.pipeline.collide(start, contacts)
-            self.solver.step(start, end, None, contacts, DT)
+            self.solver.step(start, end, None, contacts, self.dt)
         return states
 
     def loss(self, velocity=None):

@@ -14,9 +14,12 @@ from newton.solvers import SolverVBD
 
 from ..response.adjoint.arrays import launch_adjoint
 from . import energies, kernels, matrix_kernels
+from .bodies import Poses
+from .contact_forces import attachment_forces
 from .contacts import ContactElements, RecordedContacts
 from .elements import Elements, with_gradient
 from .matrix import ElasticMatrix
+from .self_contacts import RecordedPairs, SelfContactElements
 
 
 class Step(NamedTuple):
@@ -29,6 +32,8 @@ class Step(NamedTuple):
         x1: Positions at the end [m].
         force: External forces [N], or None.
         contacts: Contacts with shapes, or None.
+        pairs: Pairs of self-contact, or None.
+        poses: Poses of bodies.
     """
 
     dt: float
@@ -37,6 +42,8 @@ class Step(NamedTuple):
     x1: wp.array
     force: wp.array | None
     contacts: RecordedContacts | None
+    pairs: RecordedPairs | None
+    poses: Poses
 
 
 class Equations:
@@ -54,7 +61,9 @@ class Equations:
         self._x1, self._x0, self._of_x1, self._of_x0, self.forces = (self.zeros() for _ in range(5))
         self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
         self._blocks = wp.zeros(n, dtype=wp.mat33d, device=self.device)
-        self._elastic, self._contacts = _elastic_elements(model), ContactElements(solver)
+        self._attachments = _attachment_elements(model)
+        self._elastic = _elastic_elements(model) + self._attachments
+        self._contacts, self._self_contacts = ContactElements(solver), SelfContactElements(solver)
         self._in_contact: list[Elements] = []
         self._matrix = ElasticMatrix(self._elastic, self.is_fixed)
         self._step: Step | None = None
@@ -69,7 +78,9 @@ class Equations:
         inputs = [self.model.particle_flags, int(ParticleFlags.ACTIVE), self.model.particle_mass]
         self._launch(kernels.find_fixed, inputs, [self.is_fixed])
         self._launch(kernels.to_double, [step.x0], [self._x0])
-        self._in_contact = self._contacts.load(step.contacts)
+        for elements in self._attachments:
+            elements.parameters[-2:] = step.poses.end, step.poses.start
+        self._in_contact = self._contacts.load(step.contacts, step.poses) + self._self_contacts.load(step.pairs)
         self.load_end(step.x1)
 
     def load_end(self, x1: wp.array) -> None:
@@ -177,3 +188,14 @@ def _elastic_elements(model: newton.Model) -> list[Elements]:
             vertices = vertices.reshape((-1, 2)) if vertices.ndim == 1 else vertices  # noqa: PLW2901
             found.append(Elements(kernel, vertices, parameters))
     return found
+
+
+def _attachment_elements(model: newton.Model) -> list[Elements]:
+    """Returns the attachments of particles to bodies as elements, whose last two parameters are poses, none without."""
+    if not model.attachment_particle_body_count:
+        return []
+    particles = model.attachment_particle_body_particle
+    assert particles is not None
+    names = "body", "body_point", "stiffness", "damping", "enabled"
+    parameters = [getattr(model, f"attachment_particle_body_{name}") for name in names]
+    return [Elements(attachment_forces, particles.reshape((-1, 1)), [*parameters, None, None])]

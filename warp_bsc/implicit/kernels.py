@@ -163,6 +163,20 @@ def count_failed(
     counts[3] = counts[3] + wp.int64(n)
 
 
+@wp.kernel
+def count_dropped(
+    # in
+    dropped: wp.array[int],
+    # out
+    counts: wp.array[wp.int64],
+):
+    """Counts a step in which a world has dropped pairs of self-contact. One thread."""
+    n = int(0)
+    for w in range(dropped.shape[0]):
+        n = wp.max(n, dropped[w])
+    counts[4] = counts[4] + wp.int64(n)
+
+
 @wp.func
 def _is_selected(world: wp.array[int], selected: wp.array[wp.bool], body: int):
     """Returns whether the world of a body is selected, the last of the array for bodies of no world."""

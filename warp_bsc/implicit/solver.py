@@ -1,26 +1,29 @@
 """Gradients through VBD: a solver around it whose steps are differentiated by the implicit function theorem."""
 
 import functools
+import math
 import weakref
 from typing import Any
 
 import newton
+import numpy as np
 import warp as wp
 from newton.solvers import SolverVBD
 
 from .._arguments import check_instance, checked_integer, checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import soft_contact_arrays
+from .._private_names.of_newton import displacements_since_detection, soft_contact_arrays
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from ..response.integration.wrapped_solver import WrappedSolver
-from . import kernels
+from . import kernels, matrix_kernels
 from .bodies import BodyPoses, Poses
 from .contacts import record_contacts
 from .equations import Equations, Step
 from .linear import LinearSolver
 from .polish import Polish
 from .report import RESIDUAL_LIMIT, ImplicitReport
+from .self_contacts import record_pairs
 from .worlds import Worlds
 
 _STANDARD_GRAVITY = 9.80665
@@ -103,7 +106,7 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._linear = LinearSolver(equations, worlds, tolerance=tolerance, max_iterations=max_iterations)
         self._polish = Polish(equations, worlds, self.polish, max_iterations) if self.polish else None
         self._poses = BodyPoses(solver)
-        self._has_dynamic_bodies = self._poses.has_dynamic()
+        self._has_dynamic_bodies, self._has_hard_attachments = self._poses.has_dynamic(), _has_hard_attachments(model)
         self.report = ImplicitReport(worlds)
         self._sums = wp.zeros((2, worlds.count), dtype=wp.float64, device=model.device)
         self._tape, self._first, self._launches, self._detected = _no_tape, None, 0, []
@@ -166,10 +169,7 @@ class SolverImplicitAdjoint(WrappedSolver):
         solver = self.solver
         assert isinstance(solver, SolverVBD)
         reasons = {
-            "self-contact of VBD (particle_enable_self_contact): use the stage, SolverCCD, for it": (
-                solver.particle_enable_self_contact
-            ),
-            "attachments of particles to bodies": self.model.attachment_particle_body_count > 0,
+            "attachments of infinite stiffness: give them a finite one": self._has_hard_attachments,
             "dynamic bodies that VBD integrates": self._has_dynamic_bodies,
             "contacts of a collision pipeline of VBD's own": solver.collision_pipeline is not None,
             "truncation before shapes (rigid_soft_enable_dat)": solver.rigid_soft_enable_dat,
@@ -204,14 +204,20 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     def _finish(self, state_in, state_out, x0, contacts, poses, dt):
         """Polishes the end of a step that is not recorded."""
-        recorded = record_contacts(contacts, poses, copies=False)
-        self._equations.load(Step(dt, x0, state_in.particle_qd, state_out.particle_q, state_in.particle_f, recorded))
+        recorded = record_contacts(contacts, copies=False)
+        pairs, (v0, force) = self._record_pairs(), (state_in.particle_qd, state_in.particle_f)
+        self._equations.load(Step(dt, x0, v0, state_out.particle_q, force, recorded, pairs, poses))
         self._polish_end(x0, state_out, dt)
 
     def _polish_end(self, x0, state_out, dt):
         x1 = state_out.particle_q
-        assert self._polish is not None
+        assert self._polish is not None and isinstance(self.solver, SolverVBD)
         self._polish.run(x1)
+        if self.solver.particle_enable_self_contact:  # VBD ends no step beyond its planes, and nor does polish
+            start, displacements, cut = displacements_since_detection(self.solver)
+            self._launch(kernels.set_velocity, len(x1), [1.0, start, x1], [displacements])
+            cut(state_out, None)
+            self._equations.load_end(x1)
         self._launch(kernels.set_velocity, len(x1), [float(dt), x0, x1], [state_out.particle_qd])
 
     def _record(self, tape, state_in, state_out, x0, contacts, poses, dt):
@@ -225,12 +231,12 @@ class SolverImplicitAdjoint(WrappedSolver):
             nonlocal step
             v0 = wp.clone(starts[1], requires_grad=False)
             force = None if starts[2] is None else wp.clone(starts[2], requires_grad=False)
-            recorded = record_contacts(contacts, poses, copies=True)
-            self._equations.load(Step(dt, x0, v0, ends[0], force, recorded))
+            recorded, pairs = record_contacts(contacts, copies=True), self._record_pairs()
+            self._equations.load(Step(dt, x0, v0, ends[0], force, recorded, pairs, poses))
             if self._polish is not None:
                 self._polish_end(x0, state_out, dt)
-            self._measure()
-            step = Step(dt, x0, v0, wp.clone(ends[0], requires_grad=False), force, recorded)
+            self._measure(pairs)
+            step = Step(dt, x0, v0, wp.clone(ends[0], requires_grad=False), force, recorded, pairs, poses)
 
         def backward():
             assert step is not None
@@ -249,14 +255,19 @@ class SolverImplicitAdjoint(WrappedSolver):
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]
         names += [f"shape_material_{name}" for name in ("ke", "kd", "mu")]
+        names += [f"attachment_particle_body_{name}" for name in ("body_point", "stiffness", "damping")]
         arrays = [getattr(model, name) for name in names]
         if contacts is not None and contacts.soft_contact_max:
             arrays += [getattr(contacts, f"soft_contact_{name}") for name in ("body_pos", "body_vel", "normal")]
             arrays.append(contacts.soft_contact_barycentric)
         return [array for array in arrays if array is not None and len(array) and array.requires_grad]
 
-    def _measure(self):
-        """Reports the residual of the step that the equations have loaded."""
+    def _record_pairs(self):
+        assert isinstance(self.solver, SolverVBD)
+        return record_pairs(self.solver, self._worlds)
+
+    def _measure(self, pairs):
+        """Reports the residual of the step that the equations have loaded, and whether pairs were dropped."""
         equations, model, report = self._equations, self.model, self.report
         forces = equations.evaluate()
         self._sums.zero_()
@@ -265,6 +276,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._launch(kernels.sum_residuals, len(forces), inputs, [self._sums])
         outputs = [report.device_residuals, report.device_counts]
         self._launch(kernels.report_residuals, 1, [wp.float64(RESIDUAL_LIMIT), self._sums], outputs)
+        if pairs is not None:
+            self._launch(kernels.count_dropped, 1, [pairs.dropped], [report.device_counts])
         report.copy_counts()
 
     def _backward(self, step: Step, poses: Poses, of_x0, of_v0, of_force, of_x1, of_v1):
@@ -275,6 +288,9 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._launch(kernels.of_end, n, [dt, of_x1, of_v1, equations.is_fixed], [self._of_end, self._free])
         equations.differentiate()
         multipliers = self._linear.solve(self._free, transposed=True, symmetric=equations.is_symmetric)
+        if step.pairs is not None:
+            inputs = [self._worlds.of_particles, step.pairs.dropped, wp.float64(math.nan)]
+            self._launch(matrix_kernels.set_failed, n, inputs, [multipliers])
         self._launch(kernels.count_failed, 1, [self._linear.failed], [self.report.device_counts])
         self.report.copy_counts()
         by_forces = equations.add_gradients(multipliers, of_v0, of_force)
@@ -292,6 +308,15 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies VBD, and reads again which bodies it moves."""
+        """Notifies VBD, and reads again which bodies it moves, and whether attachments are hard."""
         super().notify_model_changed(flags)
         self._has_dynamic_bodies = self._poses.has_dynamic()
+        self._has_hard_attachments = _has_hard_attachments(self.model)
+
+
+def _has_hard_attachments(model: newton.Model) -> bool:
+    """Returns whether attachments have infinite stiffness, reading them from the device."""
+    if not model.attachment_particle_body_count:
+        return False
+    assert model.attachment_particle_body_stiffness is not None
+    return bool(np.isinf(model.attachment_particle_body_stiffness.numpy()).any())
