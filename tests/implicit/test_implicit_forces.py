@@ -207,7 +207,6 @@ def test_forces_of_self_contact_are_those_of_vbd(device):
     equations = Equations(solver)
     equations.load(Step(DT, x0, v0, x1, f, None, pairs, poses))
     forces = equations.evaluate().numpy()
-    print(np.abs(forces - expected).max() / np.abs(expected).max(), pairs)
     np.testing.assert_allclose(forces, expected, atol=2e-5 * np.abs(expected).max())
     for kind in ("vertex_triangle", "edge_edge"):
         left = pairs._replace(**{kind: getattr(pairs, kind)[:0]})

@@ -122,19 +122,22 @@ def attached_cloth(device):
     _add_cloth(builder, 3, (0.0, 0.0, 1.0))
     for row in range(4):
         point = wp.vec3(-0.002, 0.05 * row, 0.001)
-        builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=200.0, damping=0.1)
+        builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=30.0, damping=0.1)
     builder.add_attachment_particle_body(1, body, stiffness=1000.0, enabled=False)
     return _finished(builder, device)
 
 
-def colliding_cloths(device):
-    """A cloth that falls on another one, which is held at its sides."""
-    builder = newton.ModelBuilder()
+def colliding_cloths(device, heights=(0.012,)):
+    """A cloth that falls on another one, which is held at its sides; a world for each height from which it falls."""
+    scene = newton.ModelBuilder()
     turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.1, 0.15, 1.0)), 0.4)
-    _add_cloth(builder, 2, (0.04, 0.0, 0.012), turned)
     held = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
-    _add_cloth(builder, 3, (0.0, 0.0, 0.0), **held)
-    model = _finished(builder, device)
+    for height in heights:
+        builder = newton.ModelBuilder()
+        _add_cloth(builder, 2, (0.04, 0.0, height), turned)
+        _add_cloth(builder, 3, (0.0, 0.0, 0.0), **held)
+        scene.add_world(builder)
+    model = _finished(scene, device)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
     return model
 
@@ -144,7 +147,7 @@ class Rollout:
 
     def __init__(self, model, *, steps=8, iterations=10, polish=4, start=(0.2, 0.1, -0.3), wrap=None, dt=DT, **options):
         self.model, self.steps, self.dt = model, steps, dt
-        of_vbd = {name: options.pop(name) for name in SELF_CONTACT if name in options}
+        of_vbd = {name: options.pop(name) for name in list(options) if name.startswith("particle_")}
         inner = newton.solvers.SolverVBD(model, iterations=iterations, **of_vbd)
         self.adjoint = bsc.SolverImplicitAdjoint(inner, polish=polish, **options)
         self.solver = self.adjoint if wrap is None else wrap(self.adjoint)
