@@ -10,6 +10,7 @@ from implicit_scenes import (
     cloth_on_slope,
     colliding_cloths,
     hanging_cloth,
+    held_cloth,
     soft_block,
     springs,
 )
@@ -34,6 +35,7 @@ MATERIALS = {
         "attachment_particle_body_damping": 0.03,
         "attachment_particle_body_body_point": 1e-3,
     },
+    held_cloth: {"attachment_particle_body_body_point": 1e-3, "tri_materials": 2.0, "particle_mass": 1e-4},
     colliding_cloths: {"tri_materials": 2.0, "particle_mass": 1e-4},
 }
 """Arrays of the model of a scene, each with the step of its central difference."""

@@ -100,16 +100,16 @@ def test_a_world_that_fails_leaves_others(device):
     assert np.isfinite(gradient[9:]).all()
 
 
-@pytest.mark.parametrize("attached", [False, True])
-def test_poses_of_kinematic_bodies_get_gradients(attached, device):
+@pytest.mark.parametrize("stiffness", [0.0, 50.0, np.inf])
+def test_poses_of_kinematic_bodies_get_gradients(stiffness, device):
     builder = newton.ModelBuilder()
     body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.0), wp.quat_identity()), is_kinematic=True)
     builder.add_shape_box(body, hx=1.0, hy=1.0, hz=0.1, cfg=newton.ModelBuilder.ShapeConfig(ke=300.0, kd=0.0, mu=0.4))
-    above = 0.2 if attached else 0.117  # with an attachment, no contact
+    above = 0.117 if stiffness == 0.0 else 0.2  # with an attachment, no contact
     builder.add_particle(wp.vec3(0.0, 0.0, above), wp.vec3(0.1, 0.0, 0.0), 0.1, radius=0.02)
-    if attached:
+    if stiffness > 0.0:
         point = wp.vec3(0.002, 0.0, 0.21)
-        builder.add_attachment_particle_body(0, body, body_point=point, stiffness=50.0, damping=0.3)
+        builder.add_attachment_particle_body(0, body, body_point=point, stiffness=stiffness, damping=0.3)
     builder.color()
     model = builder.finalize(device=device, requires_grad=True)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
@@ -268,14 +268,17 @@ class TestRefusals:
             solver.step(start, end, None, None, DT)
         solver.step(start, end, None, None, DT)  # without a tape, it is VBD
 
-    def test_attachments_of_infinite_stiffness(self, device):
+    def test_several_attachments_that_hold_a_particle(self, device):
         model = attached_cloth(device)
-        solver = bsc.SolverImplicitAdjoint(newton.solvers.SolverVBD(model, iterations=1))
-        start, end = model.state(), model.state()
+        vbd = newton.solvers.SolverVBD(model, iterations=1)
+        solver = bsc.SolverImplicitAdjoint(vbd)
         model.attachment_particle_body_stiffness.fill_(np.inf)
         solver.notify_model_changed(newton.ModelFlags.CONSTRAINT_PROPERTIES)
-        with pytest.raises(NotImplementedError, match="infinite stiffness"), wp.Tape():
-            solver.step(start, end, None, None, DT)
+        model.attachment_particle_body_particle.zero_()
+        with pytest.raises(NotImplementedError, match="hold one particle"):
+            solver.notify_model_changed(newton.ModelFlags.CONSTRAINT_PROPERTIES)
+        with pytest.raises(NotImplementedError, match="hold one particle"):
+            bsc.SolverImplicitAdjoint(vbd)
 
     @pytest.mark.filterwarnings("ignore:.*of the weight")
     def test_contacts_that_a_tape_detected_twice(self, device):

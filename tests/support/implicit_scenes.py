@@ -17,6 +17,7 @@ __all__ = [
     "cloth_on_slope",
     "colliding_cloths",
     "hanging_cloth",
+    "held_cloth",
     "soft_block",
     "springs",
 ]
@@ -115,16 +116,21 @@ def springs(device):
     return _finished(builder, device)
 
 
-def attached_cloth(device):
+def attached_cloth(device, stiffness=30.0):
     """A cloth of which one side hangs on damped attachments to a kinematic body."""
     builder = newton.ModelBuilder()
     body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()), is_kinematic=True)
     _add_cloth(builder, 3, (0.0, 0.0, 1.0))
     for row in range(4):
         point = wp.vec3(-0.002, 0.05 * row, 0.001)
-        builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=30.0, damping=0.1)
+        builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=stiffness, damping=0.1)
     builder.add_attachment_particle_body(1, body, stiffness=1000.0, enabled=False)
     return _finished(builder, device)
+
+
+def held_cloth(device):
+    """A cloth of which a kinematic body holds one side."""
+    return attached_cloth(device, stiffness=np.inf)
 
 
 def colliding_cloths(device, heights=(0.012,)):

@@ -7,10 +7,12 @@ smoothed below a velocity.
 
 An attachment pulls a particle to a point of a body. VBD iterates on a multiplier for it, whose limit is the force of a
 damped spring of length zero. That is the force here, so that a step in which the multiplier is not there yet has a
-residual.
+residual. In the limit of infinite stiffness the particle is at the point.
 """
 
 import warp as wp
+
+from .kernels import HELD
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -160,10 +162,10 @@ def attachment_forces(
     # out
     forces: wp.array3d[wp.vec3d],
 ):
-    """Computes the forces of attachments."""
+    """Computes the forces of attachments of finite stiffness."""
     e, row = wp.tid()
     forces[e, row, 0] = wp.vec3d()
-    if not enabled[e]:
+    if not enabled[e] or wp.isinf(stiffness[e]):
         return
     b, point = body[e], wp.vec3d(body_point[e])
     offset = x1[e, row, 0] - _transform(pose_1[b], point)
@@ -172,3 +174,30 @@ def attachment_forces(
         offset_0 = x0[e, row, 0] - _transform(pose_0[b], point)
         force = force + wp.float64(damping[e]) / dt * (offset - offset_0)
     forces[e, row, 0] = -force
+
+
+@wp.kernel
+def hold_forces(
+    # in
+    dt: wp.float64,
+    x1: wp.array3d[wp.vec3d],
+    x0: wp.array3d[wp.vec3d],
+    body: wp.array[int],
+    body_point: wp.array[wp.vec3],
+    stiffness: wp.array[float],
+    enabled: wp.array[wp.bool],
+    vertices: wp.array2d[int],
+    mass: wp.array[float],
+    is_fixed: wp.array[int],
+    pose_1: wp.array[wp.transform],
+    # out
+    forces: wp.array3d[wp.vec3d],
+):
+    """Computes the forces that move particles to where attachments of infinite stiffness hold them."""
+    e, row = wp.tid()
+    forces[e, row, 0] = wp.vec3d()
+    particle = vertices[e, 0]
+    if not enabled[e] or not wp.isinf(stiffness[e]) or is_fixed[particle] != HELD:
+        return
+    offset = x1[e, row, 0] - _transform(pose_1[body[e]], wp.vec3d(body_point[e]))
+    forces[e, row, 0] = -(wp.float64(mass[particle]) / (dt * dt)) * offset

@@ -6,7 +6,6 @@ import weakref
 from typing import Any
 
 import newton
-import numpy as np
 import warp as wp
 from newton.solvers import SolverVBD
 
@@ -17,6 +16,7 @@ from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from ..response.integration.wrapped_solver import WrappedSolver
 from . import kernels, matrix_kernels
+from .attachments import check_attachments
 from .bodies import BodyPoses, Poses
 from .contacts import record_contacts
 from .equations import Equations, Step
@@ -38,18 +38,26 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     The end of a step of VBD balances inertia and forces on each particle. The implicit function theorem makes gradients
     of that balance, see :mod:`.equations`: going back through a step takes one linear solve, whatever the iterations of
-    VBD were, and its memory is three vectors for each particle, and the contacts with shapes.
+    VBD were, and its memory is three vectors for each particle, and the contacts.
 
     On a tape, a step carries gradients if ``state_out.particle_q`` requires them: from positions and velocities of
     particles at its end to those at its start, to ``state_in.particle_f``, and to what requires gradients of
     ``particle_mass``, ``particle_inv_mass`` and ``gravity``; ``tri_poses``, ``tri_areas``, ``tri_materials``,
     ``edge_rest_angle``, ``edge_rest_length``, ``edge_bending_properties``, ``tet_poses``, ``tet_materials``,
     ``spring_rest_length``, ``spring_stiffness`` and ``spring_damping``; ``shape_material_ke``, ``shape_material_kd``,
-    ``shape_material_mu``, ``shape_margin`` and ``particle_radius``; poses of bodies in contact with particles; and
-    ``soft_contact_body_pos``, ``soft_contact_body_vel``, ``soft_contact_normal`` and ``soft_contact_barycentric`` of
-    contacts. Masses and inverse masses are separate inputs, as VBD reads both. The set of contacts is constant. How the
-    planes of contacts follow from positions is differentiated by Newton, if the tape records the detection, for which
-    each step needs a :class:`newton.Contacts` of its own; otherwise planes are constant.
+    ``shape_material_mu``, ``shape_margin`` and ``particle_radius``; ``attachment_particle_body_body_point``,
+    ``attachment_particle_body_stiffness`` and ``attachment_particle_body_damping``; poses of bodies that particles
+    touch or are attached to; and ``soft_contact_body_pos``, ``soft_contact_body_vel``, ``soft_contact_normal`` and
+    ``soft_contact_barycentric`` of contacts. Masses and inverse masses are separate inputs, as VBD reads both. The set
+    of contacts is constant. How the planes of contacts follow from positions is differentiated by Newton, if the tape
+    records the detection, for which each step needs a :class:`newton.Contacts` of its own; otherwise planes are
+    constant.
+
+    Self-contact of VBD (``particle_enable_self_contact``) carries gradients to positions at both ends of a step; its
+    coefficients and its distance are numbers, which have none. Its pairs are those of the last detection in the step.
+    Where they did not fit into the buffers of VBD, gradients are NaN, and ``report.overflowed_steps`` counts the step.
+    VBD cuts displacements so that nothing passes through, and so does ``polish`` at its end: a step with cuts is not
+    solved, and its residual says so. Shorter steps have fewer.
 
     Gradients are those of a solved step. As VBD makes a number of iterations, and not as many as it takes, the report
     has the force that is left in every step on a tape, and a step with much of it warns. ``polish`` removes it.
@@ -57,11 +65,10 @@ class SolverImplicitAdjoint(WrappedSolver):
     Behind the collision stage, ``SolverCCD(SolverImplicitAdjoint(SolverVBD(model)))``, gradients go through both.
 
     Limitations:
-        On a tape, or with ``polish``, a step raises NotImplementedError with self-contact of VBD
-        (``particle_enable_self_contact``: use the stage), attachments of particles to bodies, dynamic bodies that VBD
-        integrates, contacts of a collision pipeline of VBD's own, truncation before shapes
-        (``rigid_soft_enable_dat``), contacts with features of meshes, and penalties of contacts that grow
-        (``rigid_avbd_linear_beta``). Velocities of bodies at the end carry no gradients.
+        On a tape, or with ``polish``, a step raises NotImplementedError with dynamic bodies that VBD integrates,
+        contacts of a collision pipeline of VBD's own, truncation before shapes (``rigid_soft_enable_dat``), contacts
+        with features of meshes, and penalties of contacts that grow (``rigid_avbd_linear_beta``). Velocities of bodies
+        at the end carry no gradients.
 
     References:
         A. H. Chen, Z. Liu, Y. Yang and C. Yuksel, Vertex Block Descent, ACM Transactions on Graphics 43(4), 2024,
@@ -91,7 +98,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         Raises:
             TypeError: If an argument has another type; the solver must be a ``SolverVBD``.
             ValueError: If a number is out of range, or the model has no particles.
-            NotImplementedError: If the particles of a world do not follow each other in the model.
+            NotImplementedError: If the particles of a world do not follow each other in the model, or several
+                attachments of infinite stiffness hold one particle.
         """
         check_instance(solver, "solver", SolverVBD, "a newton.solvers.SolverVBD")
         super().__init__(solver)
@@ -101,12 +109,13 @@ class SolverImplicitAdjoint(WrappedSolver):
         self.polish = checked_integer(polish, "polish", 0, 100)
         tolerance = checked_number(tolerance, "tolerance", 0.0, 0.1, above=True)
         max_iterations = checked_integer(max_iterations, "max_iterations", 1)
+        check_attachments(model)
         worlds = self._worlds = Worlds(model)
         self._equations = equations = Equations(solver)
         self._linear = LinearSolver(equations, worlds, tolerance=tolerance, max_iterations=max_iterations)
         self._polish = Polish(equations, worlds, self.polish, max_iterations) if self.polish else None
         self._poses = BodyPoses(solver)
-        self._has_dynamic_bodies, self._has_hard_attachments = self._poses.has_dynamic(), _has_hard_attachments(model)
+        self._has_dynamic_bodies = self._poses.has_dynamic()
         self.report = ImplicitReport(worlds)
         self._sums = wp.zeros((2, worlds.count), dtype=wp.float64, device=model.device)
         self._tape, self._first, self._launches, self._detected = _no_tape, None, 0, []
@@ -169,7 +178,6 @@ class SolverImplicitAdjoint(WrappedSolver):
         solver = self.solver
         assert isinstance(solver, SolverVBD)
         reasons = {
-            "attachments of infinite stiffness: give them a finite one": self._has_hard_attachments,
             "dynamic bodies that VBD integrates": self._has_dynamic_bodies,
             "contacts of a collision pipeline of VBD's own": solver.collision_pipeline is not None,
             "truncation before shapes (rigid_soft_enable_dat)": solver.rigid_soft_enable_dat,
@@ -293,7 +301,7 @@ class SolverImplicitAdjoint(WrappedSolver):
             self._launch(matrix_kernels.set_failed, n, inputs, [multipliers])
         self._launch(kernels.count_failed, 1, [self._linear.failed], [self.report.device_counts])
         self.report.copy_counts()
-        by_forces = equations.add_gradients(multipliers, of_v0, of_force)
+        by_forces = equations.add_gradients(multipliers, self._of_end, of_v0, of_force)
         if of_x0 is not None:
             inputs = [dt, of_v1, equations.is_fixed, self._of_end, *by_forces]
             self._launch(kernels.add_of_start, n, inputs, [of_x0])
@@ -308,15 +316,11 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies VBD, and reads again which bodies it moves, and whether attachments are hard."""
+        """Notifies VBD, reads again which bodies it moves, and checks attachments again.
+
+        Raises:
+            NotImplementedError: If several attachments of infinite stiffness hold one particle.
+        """
         super().notify_model_changed(flags)
         self._has_dynamic_bodies = self._poses.has_dynamic()
-        self._has_hard_attachments = _has_hard_attachments(self.model)
-
-
-def _has_hard_attachments(model: newton.Model) -> bool:
-    """Returns whether attachments have infinite stiffness, reading them from the device."""
-    if not model.attachment_particle_body_count:
-        return False
-    assert model.attachment_particle_body_stiffness is not None
-    return bool(np.isinf(model.attachment_particle_body_stiffness.numpy()).any())
+        check_attachments(self.model)
