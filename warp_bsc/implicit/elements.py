@@ -29,7 +29,7 @@ class Elements:
             vertices: Particles of the elements, int32, shape [capacity, size].
             parameters: What the kernel reads beside positions; arrays that require gradients get them.
         """
-        self.kernel, self.vertices, self.parameters = kernel, vertices, parameters
+        self.kernel, self.vertices, self.parameters = kernel, vertices, list(parameters)
         self.device = device = vertices.device
         self.count, self._size = vertices.shape
         shape, rows = (self.count, 1, self._size), 3 * self._size

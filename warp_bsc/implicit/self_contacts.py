@@ -29,7 +29,8 @@ class RecordedPairs(NamedTuple):
 def record_pairs(solver: SolverVBD, worlds: Worlds) -> RecordedPairs | None:
     """Returns the pairs of the last detection of VBD, as copies; None without self-contact.
 
-    On the CPU these are the pairs that there are; elsewhere and in graphs, all that the buffers of VBD can hold.
+    On the CPU, where this reads numbers on the host, there are as many rows as pairs; elsewhere, as the buffers of VBD
+    can hold.
     """
     if not solver.particle_enable_self_contact:
         return None
@@ -45,7 +46,7 @@ def _collect(solver, name, primitives, worlds, dropped):
         getattr(solver.trimesh_collision_info, name + field) for field in ("", "_offsets", "_buffer_sizes", "_count")
     )
     device = counts.device
-    if device.is_cpu and not device.is_capturing:
+    if device.is_cpu:
         ends = np.cumsum(np.minimum(counts.numpy(), sizes.numpy()), dtype=np.int32)
         starts, n = wp.array(np.append(0, ends[:-1]), dtype=int, device=device), int(ends[-1])
     else:

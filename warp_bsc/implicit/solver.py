@@ -157,10 +157,10 @@ class SolverImplicitAdjoint(WrappedSolver):
                 poses = self._poses.read(state_in, state_out, None)
                 wp.copy(self._x0, state_in.particle_q)
                 self.solver.step(state_in, state_out, control, contacts, dt, **options)
-                run_on_host(
-                    functools.partial(self._finish, state_in, state_out, self._x0, contacts, poses, dt),
-                    self.model.device,
+                finish = functools.partial(
+                    self._finish, state_in, state_out, self._x0, contacts, poses, dt, self._cuts()
                 )
+                run_on_host(finish, self.model.device)
                 return
             if state_in is state_out:
                 raise ValueError("on a tape, state_out must not be state_in")
@@ -210,19 +210,29 @@ class SolverImplicitAdjoint(WrappedSolver):
         if self._first is None and tape.launches:
             self._first = id(tape.launches[0])
 
-    def _finish(self, state_in, state_out, x0, contacts, poses, dt):
+    def _cuts(self):
+        """Returns what :func:`.displacements_since_detection` does, now, as the stage replaces it for its step.
+
+        None without self-contact or polish.
+        """
+        solver = self.solver
+        assert isinstance(solver, SolverVBD)
+        has_cuts = self._polish is not None and solver.particle_enable_self_contact
+        return displacements_since_detection(solver) if has_cuts else None
+
+    def _finish(self, state_in, state_out, x0, contacts, poses, dt, cuts):
         """Polishes the end of a step that is not recorded."""
         recorded = record_contacts(contacts, copies=False)
         pairs, (v0, force) = self._record_pairs(), (state_in.particle_qd, state_in.particle_f)
         self._equations.load(Step(dt, x0, v0, state_out.particle_q, force, recorded, pairs, poses))
-        self._polish_end(x0, state_out, dt)
+        self._polish_end(x0, state_out, dt, cuts)
 
-    def _polish_end(self, x0, state_out, dt):
+    def _polish_end(self, x0, state_out, dt, cuts):
         x1 = state_out.particle_q
-        assert self._polish is not None and isinstance(self.solver, SolverVBD)
+        assert self._polish is not None
         self._polish.run(x1)
-        if self.solver.particle_enable_self_contact:  # VBD ends no step beyond its planes, and nor does polish
-            start, displacements, cut = displacements_since_detection(self.solver)
+        if cuts is not None:  # VBD ends no step beyond its planes, and nor does polish
+            start, displacements, cut = cuts
             self._launch(kernels.set_velocity, len(x1), [1.0, start, x1], [displacements])
             cut(state_out, None)
             self._equations.load_end(x1)
@@ -234,6 +244,7 @@ class SolverImplicitAdjoint(WrappedSolver):
         ends = state_out.particle_q, state_out.particle_qd
         starts = state_in.particle_q, state_in.particle_qd, state_in.particle_f
         step: Step | None = None
+        cuts = self._cuts()
 
         def forward():
             nonlocal step
@@ -242,7 +253,7 @@ class SolverImplicitAdjoint(WrappedSolver):
             recorded, pairs = record_contacts(contacts, copies=True), self._record_pairs()
             self._equations.load(Step(dt, x0, v0, ends[0], force, recorded, pairs, poses))
             if self._polish is not None:
-                self._polish_end(x0, state_out, dt)
+                self._polish_end(x0, state_out, dt, cuts)
             self._measure(pairs)
             step = Step(dt, x0, v0, wp.clone(ends[0], requires_grad=False), force, recorded, pairs, poses)
 
