@@ -279,6 +279,19 @@ class TestRefusals:
             solver.step(start, end, None, None, DT)
         solver.step(start, end, None, None, DT)  # without a tape, it is VBD
 
+    def test_self_contact_of_particles_that_belong_to_no_world(self, device):
+        scene, cloth = newton.ModelBuilder(), newton.ModelBuilder()
+        for builder in (scene, cloth):
+            size = {"dim_x": 1, "dim_y": 1, "cell_x": 0.1, "cell_y": 0.1, "mass": 0.01}
+            builder.add_cloth_grid(pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), **size)
+        scene.add_world(cloth)
+        scene.color()
+        model = scene.finalize(device=device, requires_grad=True)
+        solver = bsc.SolverImplicitAdjoint(newton.solvers.SolverVBD(model, iterations=1, **SELF_CONTACT))
+        start, end = model.state(), model.state()
+        with pytest.raises(NotImplementedError, match="of a world and of none"), wp.Tape():
+            solver.step(start, end, None, None, DT)
+
     def test_several_attachments_that_hold_a_particle(self, device):
         model = attached_cloth(device)
         vbd = newton.solvers.SolverVBD(model, iterations=1)

@@ -66,9 +66,11 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     Limitations:
         On a tape, or with ``polish``, a step raises NotImplementedError with dynamic bodies that VBD integrates,
-        contacts of a collision pipeline of VBD's own, truncation before shapes (``rigid_soft_enable_dat``), contacts
-        with features of meshes, and penalties of contacts that grow (``rigid_avbd_linear_beta``). Velocities of bodies
-        at the end carry no gradients.
+        self-contact between particles of a world and of none, contacts of a collision pipeline of VBD's own, truncation
+        before shapes (``rigid_soft_enable_dat``), contacts with features of meshes, and penalties of contacts that grow
+        (``rigid_avbd_linear_beta``). Velocities of bodies at the end carry no gradients. A program that moves bodies
+        between steps has to do so on the tape, as by :func:`warp.copy`: otherwise the gradients of their new poses go
+        to those that the step before was given.
 
     References:
         A. H. Chen, Z. Liu, Y. Yang and C. Yuksel, Vertex Block Descent, ACM Transactions on Graphics 43(4), 2024,
@@ -179,6 +181,9 @@ class SolverImplicitAdjoint(WrappedSolver):
         assert isinstance(solver, SolverVBD)
         reasons = {
             "dynamic bodies that VBD integrates": self._has_dynamic_bodies,
+            "self-contact between particles of a world and of none": (
+                solver.particle_enable_self_contact and self._worlds.count > 1 and -1 in self._worlds.ids
+            ),
             "contacts of a collision pipeline of VBD's own": solver.collision_pipeline is not None,
             "truncation before shapes (rigid_soft_enable_dat)": solver.rigid_soft_enable_dat,
             "penalties of contacts that grow (rigid_avbd_linear_beta)": solver.rigid_contact_k_start_value >= 0.0,
