@@ -4,18 +4,32 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from implicit_scenes import DT, cloth_on_slope, hanging_cloth, soft_block, springs
+from implicit_scenes import (
+    DT,
+    SELF_CONTACT,
+    attached_cloth,
+    cloth_on_slope,
+    colliding_cloths,
+    hanging_cloth,
+    soft_block,
+    springs,
+)
 from newton._src.geometry.soft_contacts_mesh import _make_soft_contact_filter_data
 from newton._src.solvers.vbd.particle_vbd_kernels import (
     MeshAdjacencyData,
+    accumulate_body_particle_attachment_force_and_hessian,
     accumulate_elasticity_force_and_hessian,
+    accumulate_self_contact_force_and_hessian,
     accumulate_spring_force_and_hessian,
     scatter_particle_body_contact_force_and_hessian,
 )
+from newton._src.solvers.vbd.rigid_vbd_kernels import update_duals_particle_body_attachments
 
 from warp_bsc.implicit.bodies import Poses
 from warp_bsc.implicit.contacts import record_contacts
 from warp_bsc.implicit.equations import Equations, Step
+from warp_bsc.implicit.self_contacts import record_pairs
+from warp_bsc.implicit.worlds import Worlds
 
 
 @wp.kernel(enable_backward=False)
@@ -69,9 +83,22 @@ def forces_of_vbd(
     hessians[i] = h
 
 
-def sum_of_vbd(solver, x0, x1, inertia, contacts):
+def attachment_inputs(solver, x1, poses):
+    """The multipliers of attachments to their limit at x1, and what the force of VBD reads after the colors."""
+    m, (pose_1, pose_0, _) = solver.model, poses
+    names = "body", "particle", "body_point", "stiffness", "damping", "enabled"
+    body, particle, point, stiffness, damping, enabled = (getattr(m, f"attachment_particle_body_{n}") for n in names)
+    rho, multipliers = solver._attachment_particle_body_rho, solver._attachment_particle_body_lambda
+    inputs = [body, particle, point, stiffness, enabled, x1, pose_1, rho]
+    for _ in range(300):
+        wp.launch(update_duals_particle_body_attachments, len(body), inputs=inputs, outputs=[multipliers])
+    return [pose_1, pose_0, body, particle, point, stiffness, damping, enabled, rho, multipliers]
+
+
+def sum_of_vbd(solver, x0, x1, inertia, contacts, poses):
     """The forces that a sweep of VBD sees at x1."""
     m, n = solver.model, solver.model.particle_count
+    attachments = attachment_inputs(solver, x1, poses) if m.attachment_particle_body_count else None
     forces, hessians = wp.zeros(n, dtype=wp.vec3), wp.zeros(n, dtype=wp.mat33)
     outputs = [forces, hessians]
     for color in range(len(m.particle_color_groups)):
@@ -79,6 +106,16 @@ def sum_of_vbd(solver, x0, x1, inertia, contacts):
             inputs = [DT, color, x0, x1, m.particle_colors, m.spring_count, m.spring_indices, m.spring_rest_length]
             inputs += [m.spring_stiffness, m.spring_damping]
             wp.launch(accumulate_spring_force_and_hessian, m.spring_count, inputs=inputs, outputs=outputs)
+        if attachments:
+            count, inputs = m.attachment_particle_body_count, [DT, color, x0, x1, m.particle_colors, *attachments]
+            wp.launch(accumulate_body_particle_attachment_force_and_hessian, count, inputs=inputs, outputs=outputs)
+        if solver.particle_enable_self_contact:
+            inputs = [DT, color, x0, x1, m.particle_colors, m.tri_indices, m.edge_indices]
+            inputs += [solver.trimesh_collision_info, solver.particle_self_contact_margin, m.soft_contact_ke]
+            inputs += [m.soft_contact_kd, m.soft_contact_mu, solver.friction_epsilon]
+            inputs += [solver._self_contact_edge_edge_parallel_epsilon]
+            count = solver.particle_self_contact_evaluation_kernel_launch_size
+            wp.launch(accumulate_self_contact_force_and_hessian, count, inputs=inputs, outputs=outputs)
         if contacts is not None:
             inputs = [DT, color, x0, x1, m.particle_colors, solver.friction_epsilon]
             inputs += [solver.rigid_soft_contact_use_log_barrier, m.particle_radius, contacts.soft_contact_indices]
@@ -119,12 +156,59 @@ def test_forces_are_those_of_vbd(scene, barrier, device):
     solver.step(start, end, None, contacts, DT)
     moved = x0.numpy() + rng.normal(scale=0.005, size=x.shape).astype(np.float32)
     x1 = wp.array(np.where(model.particle_mass.numpy()[:, None] > 0.0, moved, x0.numpy()), dtype=wp.vec3)
-    expected = sum_of_vbd(solver, x0, x1, solver.inertia, contacts)
+    poses = Poses(None, None)
+    expected = sum_of_vbd(solver, x0, x1, solver.inertia, contacts, poses)
     equations = Equations(solver)
-    equations.load(Step(DT, x0, v0, x1, start.particle_f, record_contacts(contacts, Poses(None, None), copies=True)))
+    equations.load(Step(DT, x0, v0, x1, start.particle_f, record_contacts(contacts, copies=True), None, poses))
     forces = equations.evaluate().numpy()
     np.testing.assert_allclose(forces, expected, atol=2e-5 * np.abs(expected).max())
     if contacts is not None:
-        equations.load(Step(DT, x0, v0, x1, start.particle_f, None))
+        equations.load(Step(DT, x0, v0, x1, start.particle_f, None, None, poses))
         without = equations.evaluate().numpy()
         assert np.abs(without - expected).max() > 0.003 * np.abs(expected).max()
+
+
+def random_poses(rng, device):
+    """Poses of one body at the start and at the end of a step."""
+    poses = np.array([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]]) + rng.normal(scale=0.01, size=(2, 1, 7))
+    poses[..., 3:] /= np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    return Poses(*(wp.array(pose, dtype=wp.transform, device=device) for pose in poses))
+
+
+def test_forces_of_attachments_are_those_of_vbd(device):
+    model, rng = attached_cloth(device), np.random.default_rng(1)
+    solver = newton.solvers.SolverVBD(model, iterations=1)
+    start, end = model.state(), model.state()
+    x0, v0, f = wp.clone(start.particle_q), wp.clone(start.particle_qd), start.particle_f
+    solver.step(start, end, None, None, DT)
+    moved = x0.numpy() + rng.normal(scale=0.005, size=(len(x0), 3))
+    x1, poses = wp.array(moved, dtype=wp.vec3, device=device), random_poses(rng, device)
+    expected = sum_of_vbd(solver, x0, x1, solver.inertia, None, poses)
+    equations = Equations(solver)
+    equations.load(Step(DT, x0, v0, x1, f, None, None, poses))
+    forces = equations.evaluate().numpy()
+    np.testing.assert_allclose(forces, expected, atol=1e-4 * np.abs(expected).max())
+    model.attachment_particle_body_enabled.zero_()
+    assert np.abs(equations.evaluate().numpy() - expected).max() > 0.1 * np.abs(expected).max()
+
+
+def test_forces_of_self_contact_are_those_of_vbd(device):
+    model, rng = colliding_cloths(device), np.random.default_rng(1)
+    model.soft_contact_kd = 0.5
+    solver = newton.solvers.SolverVBD(model, iterations=1, **SELF_CONTACT)
+    start, end = model.state(), model.state()
+    start.particle_qd.assign(np.tile((0.3, 0.1, -0.5), (model.particle_count, 1)))
+    x0, v0, f = wp.clone(start.particle_q), wp.clone(start.particle_qd), start.particle_f
+    solver.step(start, end, None, None, DT)
+    moved = end.particle_q.numpy() + rng.normal(scale=0.001, size=(len(x0), 3))
+    x1 = wp.array(np.where(model.particle_mass.numpy()[:, None] > 0.0, moved, x0.numpy()), dtype=wp.vec3, device=device)
+    poses, pairs = Poses(None, None), record_pairs(solver, Worlds(model))
+    expected = sum_of_vbd(solver, x0, x1, solver.inertia, None, poses)
+    equations = Equations(solver)
+    equations.load(Step(DT, x0, v0, x1, f, None, pairs, poses))
+    forces = equations.evaluate().numpy()
+    np.testing.assert_allclose(forces, expected, atol=2e-5 * np.abs(expected).max())
+    for kind in ("vertex_triangle", "edge_edge"):
+        left = pairs._replace(**{kind: getattr(pairs, kind)[:0]})
+        equations.load(Step(DT, x0, v0, x1, f, None, left, poses))
+        assert np.abs(equations.evaluate().numpy() - expected).max() > 0.01 * np.abs(expected).max()

@@ -1,16 +1,26 @@
 """SolverImplicitAdjoint as a solver: VBD's results, its report, what it refuses, worlds, memory, the stage on top."""
 
 import gc
-import itertools
 
 import newton
 import numpy as np
 import pytest
 import warp as wp
-from implicit_scenes import DT, Rollout, cloth_on_slope, hanging_cloth, springs
+from implicit_scenes import (
+    DT,
+    SELF_CONTACT,
+    Rollout,
+    attached_cloth,
+    cloth_on_slope,
+    colliding_cloths,
+    hanging_cloth,
+    held_cloth,
+    springs,
+)
 
 import warp_bsc as bsc
-from warp_bsc._private_names.of_newton import pose_rebaseline_mask
+import warp_bsc.implicit.solver as implicit_solver
+from warp_bsc._private_names.of_newton import displacements_since_detection, pose_rebaseline_mask
 from warp_bsc._private_names.of_warp import paused_tape
 
 
@@ -26,6 +36,15 @@ def test_results_are_those_of_vbd_bit_for_bit(device):
         assert (states[-1].particle_q.numpy() == expected[-1].particle_q.numpy()).all()
         assert (states[-1].particle_qd.numpy() == expected[-1].particle_qd.numpy()).all()
     assert (taped[0].particle_q.numpy() == model.particle_q.numpy()).all()  # which VBD overwrites
+
+
+@pytest.mark.parametrize("scene", [attached_cloth, held_cloth, colliding_cloths])
+def test_the_limit_of_vbd_is_a_solved_step(scene, device):
+    dt = 1.0 / 240.0 if scene is colliding_cloths else DT
+    rollout = Rollout(scene(device), steps=1, iterations=300, polish=0, dt=dt, **SELF_CONTACT)
+    with wp.Tape():
+        rollout.run(rollout.begin())
+    assert 0.0 < rollout.adjoint.report.residuals.max() < 1e-3
 
 
 @pytest.mark.filterwarnings("ignore:.*of the weight")
@@ -91,11 +110,16 @@ def test_a_world_that_fails_leaves_others(device):
     assert np.isfinite(gradient[9:]).all()
 
 
-def test_poses_of_kinematic_bodies_get_gradients(device):
+@pytest.mark.parametrize("stiffness", [0.0, 50.0, np.inf])
+def test_poses_of_kinematic_bodies_get_gradients(stiffness, device):
     builder = newton.ModelBuilder()
     body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.0), wp.quat_identity()), is_kinematic=True)
     builder.add_shape_box(body, hx=1.0, hy=1.0, hz=0.1, cfg=newton.ModelBuilder.ShapeConfig(ke=300.0, kd=0.0, mu=0.4))
-    builder.add_particle(wp.vec3(0.0, 0.0, 0.105), wp.vec3(0.1, 0.0, 0.0), 0.01, radius=0.02)
+    above = 0.117 if stiffness == 0.0 else 0.2  # with an attachment, no contact
+    builder.add_particle(wp.vec3(0.0, 0.0, above), wp.vec3(0.1, 0.0, 0.0), 0.1, radius=0.02)
+    if stiffness > 0.0:
+        point = wp.vec3(0.002, 0.0, 0.21)
+        builder.add_attachment_particle_body(0, body, body_point=point, stiffness=stiffness, damping=0.3)
     builder.color()
     model = builder.finalize(device=device, requires_grad=True)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
@@ -103,33 +127,30 @@ def test_poses_of_kinematic_bodies_get_gradients(device):
     pipeline = newton.CollisionPipeline(model, soft_contact_gap=0.05)
     contacts = pipeline.contacts()
 
-    def run(shift, steps=2):
-        states = [model.state() for _ in range(steps + 1)]
-        pipeline.collide(states[0], contacts)
-        solver.reset(states[0])
-        for i, state in enumerate(states):
-            pose = state.body_q.numpy()
-            pose[0, :3] = 0.002 * i * np.array([1.0, 0.5, 0.2])
-            pose[0, :3] += shift if i == 1 else 0.0
-            state.body_q.assign(pose)
-        return states
+    def run(shift):
+        """The states of two steps, and the pose to which the program moves the body between them."""
+        states = [model.state() for _ in range(3)]
+        with paused_tape():
+            pipeline.collide(states[0], contacts)
+            solver.reset(states[0])
+        pose = states[0].body_q.numpy().copy()
+        pose[0, :3] += np.array([0.002, 0.001, 0.0004]) + shift
+        pose = wp.array(pose, dtype=wp.transform, device=device, requires_grad=True)
+        solver.step(states[0], states[1], None, contacts, DT)
+        wp.copy(states[1].body_q, pose)
+        solver.step(states[1], states[2], None, contacts, DT)
+        return states, pose
 
-    def finish(states):
-        for start, end in itertools.pairwise(states):
-            pose = wp.clone(end.body_q, requires_grad=False)
-            solver.step(start, end, None, contacts, DT)
-            with paused_tape():
-                wp.copy(end.body_q, pose)  # the program moves the body between steps
-        return states[-1].particle_q.numpy()[0].astype(float) @ np.array([1.0, 0.3, 2.0])
+    def loss(shift):
+        return run(shift)[0][-1].particle_q.numpy()[0].astype(float) @ np.array([1.0, 0.3, 2.0])
 
-    states = run(np.zeros(3))
     with wp.Tape() as tape:
-        finish(states)
+        states, pose = run(np.zeros(3))
     seed = wp.array([[1.0, 0.3, 2.0]], dtype=wp.vec3, device=device)
     tape.backward(grads={states[-1].particle_q: seed})
-    gradient = states[1].body_q.grad.numpy()[0, :3]
-    h = 3e-4
-    central = [(finish(run(h * axis)) - finish(run(-h * axis))) / (2.0 * h) for axis in np.eye(3)]
+    gradient, h = pose.grad.numpy()[0, :3], 3e-4
+    central = [(loss(h * axis) - loss(-h * axis)) / (2.0 * h) for axis in np.eye(3)]
+    assert np.abs(central).max() > 0.1
     np.testing.assert_allclose(gradient, central, atol=0.01 * np.abs(central).max())
 
 
@@ -144,9 +165,77 @@ def test_without_the_name_of_the_mask_steps_with_bodies_are_refused(device):
         pose_rebaseline_mask(vbd)
 
 
+def test_without_the_cut_of_vbd_polish_is_refused_with_self_contact(device):
+    vbd = newton.solvers.SolverVBD(colliding_cloths(device), **SELF_CONTACT)
+    start, displacements, cut = displacements_since_detection(vbd)
+    assert start is vbd.pos_prev_collision_detection and displacements is vbd.particle_displacements
+    assert cut == vbd._penetration_free_truncation
+    del vbd.particle_displacements
+    with pytest.raises(RuntimeError, match="particle_displacements"):
+        displacements_since_detection(vbd)
+
+
 @pytest.mark.filterwarnings("ignore:.*of the weight")
-def test_many_tapes_take_no_more_memory(device):
-    rollout = Rollout(cloth_on_slope(device), steps=2, polish=0)
+def test_polish_does_not_leave_the_planes_of_self_contact_and_the_residual_says_so(device, monkeypatch):
+    """Contacts are too soft to hold, so that solved steps pass through each other."""
+    model = colliding_cloths(device)
+    model.soft_contact_ke = 1.0
+    mesh = bsc.CollisionMesh(model.tri_indices.numpy(), model.particle_count, device=device)
+    detector, crossings, unconverged = bsc.CollisionDetector(mesh), [], []
+    unread = [wp.zeros_like(model.particle_q) for _ in range(2)]
+    without = (*unread, lambda state, contacts: None)
+    for cuts in (True, False):
+        rollout = Rollout(model, steps=2, iterations=1, start=(0.3, 0.1, -0.6), **SELF_CONTACT)
+        if not cuts:
+            monkeypatch.setattr(implicit_solver, "displacements_since_detection", lambda solver: without)
+        with wp.Tape():
+            states = rollout.run(rollout.begin())
+        crossings.append(len(detector.find_intersections(states[-1].particle_q)))
+        unconverged.append(rollout.adjoint.report.unconverged_steps)
+    assert crossings[0] == 0 < crossings[1]
+    assert unconverged == [2, 0]
+
+
+@pytest.mark.filterwarnings("ignore:.*of the weight")
+def test_pairs_that_self_contact_dropped_give_nan_in_their_world_and_are_counted(device):
+    model = colliding_cloths(device, heights=(0.012, 0.1))  # those of the second world are not near each other
+    options = {"steps": 1, "particle_vertex_contact_buffer_size": 1}
+    rollout = Rollout(model, dt=1.0 / 240.0, start=(0.3, 0.1, -0.3), **options, **SELF_CONTACT)
+    with pytest.warns(UserWarning, match="particle_vertex_contact_buffer_size"):
+        gradient = rollout.backward()[0].particle_qd.grad.numpy()
+    free, world = model.particle_inv_mass.numpy() > 0.0, model.particle_world.numpy()
+    assert np.isnan(gradient[free & (world == 0)]).all()
+    assert np.isfinite(gradient[world == 1]).all()
+    assert rollout.adjoint.report.overflowed_steps == 1
+
+
+@pytest.mark.parametrize("scene", [attached_cloth, colliding_cloths])
+def test_gradients_in_a_graph_are_those_without(scene):
+    rollout = Rollout(scene("cpu"), steps=2, polish=2, dt=1.0 / 240.0, start=(0.3, 0.1, -0.3), **SELF_CONTACT)
+    expected, states = rollout.backward(), rollout.begin()
+    seeds = wp.zeros((2, rollout.model.particle_count), dtype=wp.vec3, device="cpu")
+    with wp.ScopedCapture("cpu") as capture:
+        with wp.Tape() as tape:
+            rollout.run(states)
+        tape.backward(grads={states[-1].particle_q: seeds[0], states[-1].particle_qd: seeds[1]})
+    for _ in range(2):
+        begun = rollout.begin()[0]
+        rollout.adjoint.solver.reset(states[0])  # the multipliers of attachments, which VBD begins with
+        states[0].assign(begun)
+        tape.zero()
+        seeds.assign(rollout.weights)
+        wp.capture_launch(capture.graph)
+        np.testing.assert_array_equal(states[-1].particle_qd.numpy(), expected[-1].particle_qd.numpy())
+        for name in ("particle_q", "particle_qd"):
+            gradients = (getattr(state, name).grad.numpy() for state in (states[0], expected[0]))
+            np.testing.assert_array_equal(*gradients)
+
+
+@pytest.mark.filterwarnings("ignore:.*of the weight")
+@pytest.mark.parametrize("scene", [cloth_on_slope, colliding_cloths])
+def test_many_tapes_take_no_more_memory(scene, device):
+    options = SELF_CONTACT if scene is colliding_cloths else {}
+    rollout = Rollout(scene(device), steps=2, polish=0, **options)
 
     def arrays():
         gc.collect()
@@ -165,14 +254,13 @@ class TestRefusals:
     @pytest.mark.parametrize(
         "options, named",
         [
-            ({"particle_enable_self_contact": True}, "particle_enable_self_contact"),
+            ({"collision_pipeline": True}, "collision pipeline"),
             ({"rigid_soft_enable_dat": True}, "rigid_soft_enable_dat|pipeline"),
         ],
     )
     def test_options_of_vbd(self, options, named, device):
         model = hanging_cloth(device)
-        if "rigid_soft_enable_dat" in options:
-            options = options | {"collision_pipeline": newton.CollisionPipeline(model)}
+        options = options | {"collision_pipeline": newton.CollisionPipeline(model)}
         solver = bsc.SolverImplicitAdjoint(newton.solvers.SolverVBD(model, iterations=1, **options))
         start, end = model.state(), model.state()
         with pytest.raises(NotImplementedError, match=named), wp.Tape():
@@ -190,6 +278,31 @@ class TestRefusals:
         with pytest.raises(NotImplementedError, match="dynamic bodies"), wp.Tape():
             solver.step(start, end, None, None, DT)
         solver.step(start, end, None, None, DT)  # without a tape, it is VBD
+
+    def test_self_contact_of_particles_that_belong_to_no_world(self, device):
+        scene, cloth = newton.ModelBuilder(), newton.ModelBuilder()
+        for builder in (scene, cloth):
+            size = {"dim_x": 1, "dim_y": 1, "cell_x": 0.1, "cell_y": 0.1, "mass": 0.01}
+            builder.add_cloth_grid(pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), **size)
+        scene.add_world(cloth)
+        scene.color()
+        model = scene.finalize(device=device, requires_grad=True)
+        solver = bsc.SolverImplicitAdjoint(newton.solvers.SolverVBD(model, iterations=1, **SELF_CONTACT))
+        start, end = model.state(), model.state()
+        with pytest.raises(NotImplementedError, match="of a world and of none"), wp.Tape():
+            solver.step(start, end, None, None, DT)
+
+    def test_several_attachments_that_hold_a_particle(self, device):
+        model = attached_cloth(device)
+        vbd = newton.solvers.SolverVBD(model, iterations=1)
+        solver = bsc.SolverImplicitAdjoint(vbd)
+        model.attachment_particle_body_stiffness.fill_(np.inf)
+        solver.notify_model_changed(newton.ModelFlags.CONSTRAINT_PROPERTIES)
+        model.attachment_particle_body_particle.zero_()
+        with pytest.raises(NotImplementedError, match="hold one particle"):
+            solver.notify_model_changed(newton.ModelFlags.CONSTRAINT_PROPERTIES)
+        with pytest.raises(NotImplementedError, match="hold one particle"):
+            bsc.SolverImplicitAdjoint(vbd)
 
     @pytest.mark.filterwarnings("ignore:.*of the weight")
     def test_contacts_that_a_tape_detected_twice(self, device):

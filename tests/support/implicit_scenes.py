@@ -8,11 +8,31 @@ import warp as wp
 
 import warp_bsc as bsc
 
-__all__ = ["CLOTH", "DT", "Rollout", "cloth_on_slope", "hanging_cloth", "soft_block", "springs"]
+__all__ = [
+    "CLOTH",
+    "DT",
+    "SELF_CONTACT",
+    "Rollout",
+    "attached_cloth",
+    "cloth_on_slope",
+    "colliding_cloths",
+    "hanging_cloth",
+    "held_cloth",
+    "soft_block",
+    "springs",
+]
 
 DT = 1.0 / 60.0
 
 CLOTH = {"tri_ke": 80.0, "tri_ka": 60.0, "tri_kd": 5e-3, "edge_ke": 2e-3, "edge_kd": 1e-4, "particle_radius": 0.02}
+
+
+SELF_CONTACT = {
+    "particle_enable_self_contact": True,
+    "particle_self_contact_margin": 0.01,
+    "particle_self_contact_gap": 0.02,
+}
+"""Options of VBD by which :func:`colliding_cloths` collide."""
 
 
 def _add_cloth(builder, n, at, rotation=None, **options):
@@ -96,12 +116,45 @@ def springs(device):
     return _finished(builder, device)
 
 
+def attached_cloth(device, stiffness=30.0):
+    """A cloth of which one side hangs on damped attachments to a kinematic body."""
+    builder = newton.ModelBuilder()
+    body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()), is_kinematic=True)
+    _add_cloth(builder, 3, (0.0, 0.0, 1.0))
+    for row in range(4):
+        point = wp.vec3(-0.002, 0.05 * row, 0.001)
+        builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=stiffness, damping=0.1)
+    builder.add_attachment_particle_body(1, body, stiffness=1000.0, enabled=False)
+    return _finished(builder, device)
+
+
+def held_cloth(device):
+    """A cloth of which a kinematic body holds one side."""
+    return attached_cloth(device, stiffness=np.inf)
+
+
+def colliding_cloths(device, heights=(0.012,)):
+    """A cloth that falls on another one, which is held at its sides; a world for each height from which it falls."""
+    scene = newton.ModelBuilder()
+    turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.1, 0.15, 1.0)), 0.4)
+    held = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
+    for height in heights:
+        builder = newton.ModelBuilder()
+        _add_cloth(builder, 2, (0.04, 0.0, height), turned)
+        _add_cloth(builder, 3, (0.0, 0.0, 0.0), **held)
+        scene.add_world(builder)
+    model = _finished(scene, device)
+    model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
+    return model
+
+
 class Rollout:
     """Steps of a model from velocities that a number moves, and a weighted sum of where they end."""
 
-    def __init__(self, model, *, steps=8, iterations=10, polish=4, start=(0.2, 0.1, -0.3), wrap=None, **options):
-        self.model, self.steps = model, steps
-        inner = newton.solvers.SolverVBD(model, iterations=iterations)
+    def __init__(self, model, *, steps=8, iterations=10, polish=4, start=(0.2, 0.1, -0.3), wrap=None, dt=DT, **options):
+        self.model, self.steps, self.dt = model, steps, dt
+        of_vbd = {name: options.pop(name) for name in list(options) if name.startswith("particle_")}
+        inner = newton.solvers.SolverVBD(model, iterations=iterations, **of_vbd)
         self.adjoint = bsc.SolverImplicitAdjoint(inner, polish=polish, **options)
         self.solver = self.adjoint if wrap is None else wrap(self.adjoint)
         n, rng = model.particle_count, np.random.default_rng(3)
@@ -121,7 +174,7 @@ class Rollout:
         for (start, end), contacts in zip(itertools.pairwise(states), self.contacts, strict=True):
             if contacts is not None:
                 self.pipeline.collide(start, contacts)
-            self.solver.step(start, end, None, contacts, DT)
+            self.solver.step(start, end, None, contacts, self.dt)
         return states
 
     def loss(self, velocity=None):

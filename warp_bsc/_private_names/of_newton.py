@@ -67,6 +67,23 @@ def vbd_truncation_replaced(solver: SolverVBD, truncate: Callable[..., None]) ->
             setattr(solver, _TRUNCATION, replaced)
 
 
+def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array, Callable[..., None]]:
+    """Returns where particles were at the last detection of self-contact, their displacements, and what cuts these.
+
+    Contract: ``SolverVBD._penetration_free_truncation(state, None)`` cuts the displacements ``particle_displacements``
+    from the positions ``pos_prev_collision_detection``, and writes the sums to ``state.particle_q``.
+
+    Raises:
+        RuntimeError: If VBD has not all of them: polish could move particles through each other.
+    """
+    names = "pos_prev_collision_detection", "particle_displacements", _TRUNCATION
+    for name in names:
+        if not hasattr(solver, name):
+            raise missing("newton", f"SolverVBD.{name}", "polish has no use with self-contact")
+    start, displacements, cut = (getattr(solver, name) for name in names)
+    return start, displacements, cut
+
+
 def has_external_rigid_solver(solver: SolverBase) -> bool:
     """Returns whether a solver is VBD that leaves bodies to another solver.
 

@@ -22,16 +22,14 @@ class RecordedContacts(NamedTuple):
         capacity: Number of contacts that there can be.
         count: Number of contacts, on the device.
         planes: Copies of the contacts, with the gradients of the program's arrays.
-        poses: Poses of bodies.
     """
 
     capacity: int
     count: wp.array
     planes: ContactPlanes
-    poses: Poses
 
 
-def record_contacts(contacts: newton.Contacts | None, poses: Poses, *, copies: bool) -> RecordedContacts | None:
+def record_contacts(contacts: newton.Contacts | None, *, copies: bool) -> RecordedContacts | None:
     """Returns the contacts that a step saw, as copies or not; None if it saw none.
 
     On the CPU these are the contacts that there are; elsewhere and in graphs, all that there can be.
@@ -48,7 +46,7 @@ def record_contacts(contacts: newton.Contacts | None, poses: Poses, *, copies: b
         array = getattr(contacts, f"soft_contact_{name}")[:capacity]
         copy = with_gradient(wp.clone(array, requires_grad=False), array.grad) if copies else array
         setattr(planes, name, copy)
-    return RecordedContacts(capacity, wp.clone(count) if copies else count, planes, poses)
+    return RecordedContacts(capacity, wp.clone(count) if copies else count, planes)
 
 
 class ContactElements:
@@ -58,8 +56,8 @@ class ContactElements:
         """Takes the coefficients of VBD and its model; the first step with contacts allocates buffers."""
         self._solver, self._elements = solver, None
 
-    def load(self, recorded: RecordedContacts | None) -> list[Elements]:
-        """Takes the contacts of a step; returns their elements, none without contacts."""
+    def load(self, recorded: RecordedContacts | None, poses: Poses) -> list[Elements]:
+        """Takes the contacts of a step and the poses of bodies; returns their elements, none without contacts."""
         if recorded is None:
             return []
         elements, n = self._elements, recorded.capacity
@@ -79,8 +77,8 @@ class ContactElements:
             elements.vertices,
             recorded.planes,
             self._settings(),
-            recorded.poses.end,
-            recorded.poses.start,
+            poses.end,
+            poses.start,
         ]
         return [elements]
 

@@ -122,3 +122,53 @@ def set_contact_vertices(
     if e < wp.min(count[0], indices.shape[0]):
         vertex = indices[e][i]
     vertices[e, i] = vertex
+
+
+@wp.kernel
+def collect_triangles(
+    # in
+    tri_indices: wp.array2d[int],
+    pairs: wp.array[int],
+    offsets: wp.array[int],
+    sizes: wp.array[int],
+    counts: wp.array[int],
+    starts: wp.array[int],
+    world: wp.array[int],
+    # out
+    vertices: wp.array2d[int],
+    dropped: wp.array[int],
+):
+    """Writes the particles of pairs of vertices and triangles, and marks worlds whose pairs did not all fit."""
+    v = wp.tid()
+    if counts[v] > sizes[v]:
+        dropped[world[v]] = 1
+    for k in range(wp.min(counts[v], sizes[v])):
+        triangle = pairs[2 * (offsets[v] + k) + 1]
+        vertices[starts[v] + k, 0] = v
+        for i in range(3):
+            vertices[starts[v] + k, i + 1] = tri_indices[triangle, i]
+
+
+@wp.kernel
+def collect_edges(
+    # in
+    edge_indices: wp.array2d[int],
+    pairs: wp.array[int],
+    offsets: wp.array[int],
+    sizes: wp.array[int],
+    counts: wp.array[int],
+    starts: wp.array[int],
+    world: wp.array[int],
+    # out
+    vertices: wp.array2d[int],
+    dropped: wp.array[int],
+):
+    """Writes the particles of pairs of edges, and marks worlds whose pairs did not all fit."""
+    e = wp.tid()
+    if counts[e] > sizes[e]:
+        dropped[world[edge_indices[e, 2]]] = 1
+    for k in range(wp.min(counts[e], sizes[e])):
+        other = pairs[2 * (offsets[e] + k) + 1]
+        for i in range(2):
+            vertices[starts[e] + k, i] = edge_indices[e, i + 2]
+            vertices[starts[e] + k, i + 2] = edge_indices[other, i + 2]

@@ -29,7 +29,7 @@ class Elements:
             vertices: Particles of the elements, int32, shape [capacity, size].
             parameters: What the kernel reads beside positions; arrays that require gradients get them.
         """
-        self.kernel, self.vertices, self.parameters = kernel, vertices, parameters
+        self.kernel, self.vertices, self.parameters = kernel, vertices, list(parameters)
         self.device = device = vertices.device
         self.count, self._size = vertices.shape
         shape, rows = (self.count, 1, self._size), 3 * self._size
@@ -60,7 +60,7 @@ class Elements:
         shape = self.count, 3 * self._size, self._size
         x1, x0, units = (_repeated(array, shape) for array in (self._x1, self._x0, self._units))
         self.jacobian.zero_()
-        constants = [_without_gradients(value) for value in self.parameters]
+        constants = [without_gradients(value) for value in self.parameters]
         adjoints = [None, self.jacobian, None, *(empty_struct(value) for value in constants)]
         inputs = [wp.float64(dt), x1, x0, *constants]
         options = {"adj_inputs": adjoints, "adj_outputs": [units], "adjoint": True, "device": self.device}
@@ -104,12 +104,12 @@ def with_gradient(values: wp.array, gradient: wp.array | None) -> wp.array:
     return alias
 
 
-def _without_gradients(value):
+def without_gradients(value):
     """Returns an array, or a struct with arrays, of the same values without gradients; other values as they are."""
     if wp.types.is_struct(value):
         constant = struct_type(value)()
         for name in struct_fields(struct_type(value)):
-            setattr(constant, name, _without_gradients(getattr(value, name)))
+            setattr(constant, name, without_gradients(getattr(value, name)))
         return constant
     if not isinstance(value, wp.array) or not value.requires_grad:
         return value

@@ -14,9 +14,12 @@ from newton.solvers import SolverVBD
 
 from ..response.adjoint.arrays import launch_adjoint
 from . import energies, kernels, matrix_kernels
+from .attachments import Attachments
+from .bodies import Poses
 from .contacts import ContactElements, RecordedContacts
 from .elements import Elements, with_gradient
 from .matrix import ElasticMatrix
+from .self_contacts import RecordedPairs, SelfContactElements
 
 
 class Step(NamedTuple):
@@ -29,6 +32,8 @@ class Step(NamedTuple):
         x1: Positions at the end [m].
         force: External forces [N], or None.
         contacts: Contacts with shapes, or None.
+        pairs: Pairs of self-contact, or None.
+        poses: Poses of bodies.
     """
 
     dt: float
@@ -37,6 +42,8 @@ class Step(NamedTuple):
     x1: wp.array
     force: wp.array | None
     contacts: RecordedContacts | None
+    pairs: RecordedPairs | None
+    poses: Poses
 
 
 class Equations:
@@ -44,7 +51,7 @@ class Equations:
 
     Attributes:
         forces: Sum of the forces on each particle, 0 for fixed ones [N], vec3d, shape [particle_count].
-        is_fixed: 1 for particles that VBD does not move, int32.
+        is_fixed: 1 for particles that VBD does not move, 2 for those that an attachment holds, int32; 0 for others.
     """
 
     def __init__(self, solver: SolverVBD):
@@ -54,7 +61,9 @@ class Equations:
         self._x1, self._x0, self._of_x1, self._of_x0, self.forces = (self.zeros() for _ in range(5))
         self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
         self._blocks = wp.zeros(n, dtype=wp.mat33d, device=self.device)
-        self._elastic, self._contacts = _elastic_elements(model), ContactElements(solver)
+        self._attachments = Attachments(model, self.is_fixed)
+        self._elastic = _elastic_elements(model) + self._attachments.springs
+        self._contacts, self._self_contacts = ContactElements(solver), SelfContactElements(solver)
         self._in_contact: list[Elements] = []
         self._matrix = ElasticMatrix(self._elastic, self.is_fixed)
         self._step: Step | None = None
@@ -69,13 +78,14 @@ class Equations:
         inputs = [self.model.particle_flags, int(ParticleFlags.ACTIVE), self.model.particle_mass]
         self._launch(kernels.find_fixed, inputs, [self.is_fixed])
         self._launch(kernels.to_double, [step.x0], [self._x0])
-        self._in_contact = self._contacts.load(step.contacts)
+        self._attachments.load(step.poses)
+        self._in_contact = self._contacts.load(step.contacts, step.poses) + self._self_contacts.load(step.pairs)
         self.load_end(step.x1)
 
     def load_end(self, x1: wp.array) -> None:
         """Takes another end of the step."""
         self._launch(kernels.to_double, [x1], [self._x1])
-        for elements in self._elements():
+        for elements in [*self._elements(), *self._attachments.holds]:
             elements.load(self._x1, self._x0)
 
     @property
@@ -90,6 +100,8 @@ class Equations:
         for elements in self._elements():
             elements.add_forces(self._step.dt, self.forces)
         self._launch(kernels.clear_fixed, [self.is_fixed], [self.forces])
+        for elements in self._attachments.holds:
+            elements.add_forces(self._step.dt, self.forces)
         return self.forces
 
     def differentiate(self) -> None:
@@ -122,11 +134,15 @@ class Equations:
         """Sets z to alpha M x + beta y, with the inverted blocks M of the diagonal."""
         self._launch(matrix_kernels.apply_blocks, [wp.float64(alpha), wp.float64(beta), self._blocks, x, y], [z])
 
-    def add_gradients(self, multipliers: wp.array, of_velocity: wp.array | None, of_force: wp.array | None):
+    def add_gradients(
+        self, multipliers: wp.array, of_end: wp.array, of_velocity: wp.array | None, of_force: wp.array | None
+    ) -> tuple[wp.array, wp.array]:
         """Adds the gradients with respect to all that forces depend on, and returns those with respect to positions.
 
         Args:
-            multipliers: Gradients with respect to the forces, l above, vec3d.
+            multipliers: Gradients with respect to the forces, l above, vec3d. Those of particles that attachments hold
+                follow from the others, and are written here.
+            of_end: Gradients with respect to positions at the end, g above, vec3d.
             of_velocity: The array to add to for velocities at the start, vec3; None for none.
             of_force: The array to add to for external forces, vec3; None for none.
 
@@ -140,6 +156,10 @@ class Equations:
         inputs = self._inertial(x1, x0, of_velocity, of_force)
         launch_adjoint(energies.inertial_forces, len(x1), inputs, [multipliers], self.device)
         for elements in self._elements():
+            elements.add_gradients(self._step.dt, multipliers, self._of_x1, self._of_x0)
+        for elements in self._attachments.holds:
+            inputs = [wp.float64(self._step.dt), self.model.particle_mass, self.is_fixed, of_end, self._of_x1]
+            self._launch(kernels.hold_multipliers, inputs, [multipliers])
             elements.add_gradients(self._step.dt, multipliers, self._of_x1, self._of_x0)
         return self._of_x1, self._of_x0
 

@@ -4,6 +4,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+FREE, FIXED, HELD = wp.constant(0), wp.constant(1), wp.constant(2)
+"""What moves a particle: forces, nothing, or the body to which an attachment of infinite stiffness holds it."""
+
 _ZERO = wp.constant(wp.float64(0.0))
 
 
@@ -30,7 +33,46 @@ def find_fixed(
 ):
     """Finds the particles that VBD leaves where they are."""
     i = wp.tid()
-    is_fixed[i] = int((flags[i] & active) == 0 or mass[i] == 0.0)
+    is_fixed[i] = wp.where((flags[i] & active) == 0 or mass[i] == 0.0, FIXED, FREE)
+
+
+@wp.kernel
+def find_held(
+    # in
+    vertices: wp.array2d[int],
+    stiffness: wp.array[float],
+    enabled: wp.array[wp.bool],
+    # in and out
+    is_fixed: wp.array[int],
+):
+    """Finds the particles that attachments hold, among those that are free."""
+    e = wp.tid()
+    particle = vertices[e, 0]
+    if enabled[e] and wp.isinf(stiffness[e]) and is_fixed[particle] == FREE:
+        is_fixed[particle] = HELD
+
+
+@wp.kernel
+def hold_multipliers(
+    # in
+    dt: wp.float64,
+    mass: wp.array[float],
+    is_fixed: wp.array[int],
+    of_end: wp.array[wp.vec3d],
+    of_x1: wp.array[wp.vec3d],
+    # out
+    multipliers: wp.array[wp.vec3d],
+):
+    """Computes the gradients with respect to the forces on held particles, 0 for others.
+
+    ``of_end`` is the gradient with respect to the end as :func:`of_end` sums it, and ``of_x1`` that of the forces on
+    free particles.
+    """
+    i = wp.tid()
+    multiplier = wp.vec3d()
+    if is_fixed[i] == HELD:
+        multiplier = dt * dt / wp.float64(mass[i]) * (of_end[i] + of_x1[i])
+    multipliers[i] = multiplier
 
 
 @wp.kernel
@@ -53,10 +95,10 @@ def of_end(
     if of_positions:
         gradient += wp.vec3d(of_positions[i])
     if of_velocities:
-        if is_fixed[i] == 0:
+        if is_fixed[i] != FIXED:
             gradient += wp.vec3d(of_velocities[i]) / dt
     of_x1[i] = gradient
-    if is_fixed[i] != 0:
+    if is_fixed[i] != FREE:
         gradient = wp.vec3d()
     free[i] = gradient
 
@@ -76,11 +118,11 @@ def add_of_start(
     """Adds the gradient with respect to the start of a step.
 
     ``of_end`` is the gradient with respect to the end as :func:`of_end` sums it, ``of_x1`` and ``of_x0`` are those of
-    the forces on free particles with respect to both ends, the first of interest for fixed particles.
+    the forces with respect to both ends, the first of interest for fixed particles.
     """
     i = wp.tid()
     gradient = of_x0[i]
-    if is_fixed[i] != 0:
+    if is_fixed[i] == FIXED:
         gradient += of_end[i] + of_x1[i]
     elif of_velocities:
         gradient -= wp.vec3d(of_velocities[i]) / dt
@@ -115,7 +157,7 @@ def sum_residuals(
 ):
     """Adds squares to sums by world: of forces to row 0, of weights to row 1, by standard gravity where it is 0."""
     i = wp.tid()
-    if is_fixed[i] != 0:
+    if is_fixed[i] == FIXED:
         return
     g = wp.float64(wp.length(gravity[particle_world[i]]))
     if g == _ZERO:
@@ -161,6 +203,20 @@ def count_failed(
         n += failed[w]
     counts[2] = counts[2] + wp.int64(1)
     counts[3] = counts[3] + wp.int64(n)
+
+
+@wp.kernel
+def count_dropped(
+    # in
+    dropped: wp.array[int],
+    # out
+    counts: wp.array[wp.int64],
+):
+    """Counts a step in which a world has dropped pairs of self-contact. One thread."""
+    n = int(0)
+    for w in range(dropped.shape[0]):
+        n = wp.max(n, dropped[w])
+    counts[4] = counts[4] + wp.int64(n)
 
 
 @wp.func

@@ -3,6 +3,7 @@
 import warp as wp
 
 from .element_kernels import block
+from .kernels import FIXED
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,10 +22,10 @@ def set_inertia(
     inertia: wp.array[wp.float64],
     values: wp.array[wp.mat33d],
 ):
-    """Sets the blocks of the diagonal to the inertia m / dt^2 of particles, 1 for fixed ones."""
+    """Sets the blocks of the diagonal to the inertia m / dt^2 of particles, 1 for those that nothing moves."""
     i = wp.tid()
     value = _ONE
-    if is_fixed[i] == 0:
+    if is_fixed[i] != FIXED:
         value = wp.float64(mass[i]) / (dt * dt)
     inertia[i] = value
     values[diagonal[i, 0]] = value * wp.identity(3, wp.float64)

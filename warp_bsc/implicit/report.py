@@ -24,8 +24,8 @@ class ImplicitReport:
         self._worlds = worlds
         device, count = worlds.of_particles.device, worlds.count
         self.device_residuals = wp.zeros((2, count), dtype=wp.float64, device=device)  # last, largest
-        self.device_counts = wp.zeros(4, dtype=wp.int64, device=device)
-        self._host = wp.zeros(4, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
+        self.device_counts = wp.zeros(5, dtype=wp.int64, device=device)
+        self._host = wp.zeros(5, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
         self._said = set()
 
     @property
@@ -63,6 +63,14 @@ class ImplicitReport:
         """Linear solves that did not converge, each world of a step for itself; their gradients are NaN."""
         return self._count(3)
 
+    @property
+    def overflowed_steps(self) -> int:
+        """Steps on tapes in which pairs did not fit into the buffers of VBD's self-contact, which drops those.
+
+        Gradients of a world that goes back through one are NaN.
+        """
+        return self._count(4)
+
     def _count(self, i):
         return int(self.device_counts.numpy()[i])
 
@@ -71,8 +79,8 @@ class ImplicitReport:
         wp.copy(self._host, self.device_counts)
 
     def warn(self) -> None:
-        """Warns once of steps that are not converged, and once of solves that failed, as far as the host knows."""
-        _, unconverged, _, failed = self._host.numpy()
+        """Warns once each of steps not converged, solves that failed and pairs dropped, as far as the host knows."""
+        _, unconverged, _, failed, overflowed = self._host.numpy()
         if unconverged:
             self._warn_once(
                 "residual",
@@ -82,6 +90,13 @@ class ImplicitReport:
             )
         if failed:
             self._warn_once("solve", "a linear solve did not converge: gradients are NaN (see report.failed_solves)")
+        if overflowed:
+            self._warn_once(
+                "overflow",
+                "self-contact of VBD dropped pairs that did not fit into its buffers: gradients are NaN (see "
+                "report.overflowed_steps); raise particle_vertex_contact_buffer_size or "
+                "particle_edge_contact_buffer_size of SolverVBD",
+            )
 
     def _warn_once(self, subject, message):
         if subject not in self._said:

@@ -1,6 +1,7 @@
 """Gradients through VBD: a solver around it whose steps are differentiated by the implicit function theorem."""
 
 import functools
+import math
 import weakref
 from typing import Any
 
@@ -10,17 +11,19 @@ from newton.solvers import SolverVBD
 
 from .._arguments import check_instance, checked_integer, checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import soft_contact_arrays
+from .._private_names.of_newton import displacements_since_detection, soft_contact_arrays
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from ..response.integration.wrapped_solver import WrappedSolver
-from . import kernels
+from . import kernels, matrix_kernels
+from .attachments import check_attachments
 from .bodies import BodyPoses, Poses
 from .contacts import record_contacts
 from .equations import Equations, Step
 from .linear import LinearSolver
 from .polish import Polish
 from .report import RESIDUAL_LIMIT, ImplicitReport
+from .self_contacts import record_pairs
 from .worlds import Worlds
 
 _STANDARD_GRAVITY = 9.80665
@@ -35,18 +38,26 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     The end of a step of VBD balances inertia and forces on each particle. The implicit function theorem makes gradients
     of that balance, see :mod:`.equations`: going back through a step takes one linear solve, whatever the iterations of
-    VBD were, and its memory is three vectors for each particle, and the contacts with shapes.
+    VBD were, and its memory is three vectors for each particle, and the contacts.
 
     On a tape, a step carries gradients if ``state_out.particle_q`` requires them: from positions and velocities of
     particles at its end to those at its start, to ``state_in.particle_f``, and to what requires gradients of
     ``particle_mass``, ``particle_inv_mass`` and ``gravity``; ``tri_poses``, ``tri_areas``, ``tri_materials``,
     ``edge_rest_angle``, ``edge_rest_length``, ``edge_bending_properties``, ``tet_poses``, ``tet_materials``,
     ``spring_rest_length``, ``spring_stiffness`` and ``spring_damping``; ``shape_material_ke``, ``shape_material_kd``,
-    ``shape_material_mu``, ``shape_margin`` and ``particle_radius``; poses of bodies in contact with particles; and
-    ``soft_contact_body_pos``, ``soft_contact_body_vel``, ``soft_contact_normal`` and ``soft_contact_barycentric`` of
-    contacts. Masses and inverse masses are separate inputs, as VBD reads both. The set of contacts is constant. How the
-    planes of contacts follow from positions is differentiated by Newton, if the tape records the detection, for which
-    each step needs a :class:`newton.Contacts` of its own; otherwise planes are constant.
+    ``shape_material_mu``, ``shape_margin`` and ``particle_radius``; ``attachment_particle_body_body_point``,
+    ``attachment_particle_body_stiffness`` and ``attachment_particle_body_damping``; poses of bodies that particles
+    touch or are attached to; and ``soft_contact_body_pos``, ``soft_contact_body_vel``, ``soft_contact_normal`` and
+    ``soft_contact_barycentric`` of contacts. Masses and inverse masses are separate inputs, as VBD reads both. The set
+    of contacts is constant. How the planes of contacts follow from positions is differentiated by Newton, if the tape
+    records the detection, for which each step needs a :class:`newton.Contacts` of its own; otherwise planes are
+    constant.
+
+    Self-contact of VBD (``particle_enable_self_contact``) carries gradients to positions at both ends of a step; its
+    coefficients and its distance are numbers, which have none. Its pairs are those of the last detection in the step.
+    Where they did not fit into the buffers of VBD, gradients are NaN, and ``report.overflowed_steps`` counts the step.
+    VBD cuts displacements so that nothing passes through, and so does ``polish`` at its end: a step with cuts is not
+    solved, and its residual says so. Shorter steps have fewer.
 
     Gradients are those of a solved step. As VBD makes a number of iterations, and not as many as it takes, the report
     has the force that is left in every step on a tape, and a step with much of it warns. ``polish`` removes it.
@@ -54,11 +65,12 @@ class SolverImplicitAdjoint(WrappedSolver):
     Behind the collision stage, ``SolverCCD(SolverImplicitAdjoint(SolverVBD(model)))``, gradients go through both.
 
     Limitations:
-        On a tape, or with ``polish``, a step raises NotImplementedError with self-contact of VBD
-        (``particle_enable_self_contact``: use the stage), attachments of particles to bodies, dynamic bodies that VBD
-        integrates, contacts of a collision pipeline of VBD's own, truncation before shapes
-        (``rigid_soft_enable_dat``), contacts with features of meshes, and penalties of contacts that grow
-        (``rigid_avbd_linear_beta``). Velocities of bodies at the end carry no gradients.
+        On a tape, or with ``polish``, a step raises NotImplementedError with dynamic bodies that VBD integrates,
+        self-contact between particles of a world and of none, contacts of a collision pipeline of VBD's own, truncation
+        before shapes (``rigid_soft_enable_dat``), contacts with features of meshes, and penalties of contacts that grow
+        (``rigid_avbd_linear_beta``). Velocities of bodies at the end carry no gradients. A program that moves bodies
+        between steps has to do so on the tape, as by :func:`warp.copy`: otherwise the gradients of their new poses go
+        to those that the step before was given.
 
     References:
         A. H. Chen, Z. Liu, Y. Yang and C. Yuksel, Vertex Block Descent, ACM Transactions on Graphics 43(4), 2024,
@@ -88,7 +100,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         Raises:
             TypeError: If an argument has another type; the solver must be a ``SolverVBD``.
             ValueError: If a number is out of range, or the model has no particles.
-            NotImplementedError: If the particles of a world do not follow each other in the model.
+            NotImplementedError: If the particles of a world do not follow each other in the model, or several
+                attachments of infinite stiffness hold one particle.
         """
         check_instance(solver, "solver", SolverVBD, "a newton.solvers.SolverVBD")
         super().__init__(solver)
@@ -98,6 +111,7 @@ class SolverImplicitAdjoint(WrappedSolver):
         self.polish = checked_integer(polish, "polish", 0, 100)
         tolerance = checked_number(tolerance, "tolerance", 0.0, 0.1, above=True)
         max_iterations = checked_integer(max_iterations, "max_iterations", 1)
+        check_attachments(model)
         worlds = self._worlds = Worlds(model)
         self._equations = equations = Equations(solver)
         self._linear = LinearSolver(equations, worlds, tolerance=tolerance, max_iterations=max_iterations)
@@ -145,10 +159,10 @@ class SolverImplicitAdjoint(WrappedSolver):
                 poses = self._poses.read(state_in, state_out, None)
                 wp.copy(self._x0, state_in.particle_q)
                 self.solver.step(state_in, state_out, control, contacts, dt, **options)
-                run_on_host(
-                    functools.partial(self._finish, state_in, state_out, self._x0, contacts, poses, dt),
-                    self.model.device,
+                finish = functools.partial(
+                    self._finish, state_in, state_out, self._x0, contacts, poses, dt, self._cuts()
                 )
+                run_on_host(finish, self.model.device)
                 return
             if state_in is state_out:
                 raise ValueError("on a tape, state_out must not be state_in")
@@ -166,11 +180,10 @@ class SolverImplicitAdjoint(WrappedSolver):
         solver = self.solver
         assert isinstance(solver, SolverVBD)
         reasons = {
-            "self-contact of VBD (particle_enable_self_contact): use the stage, SolverCCD, for it": (
-                solver.particle_enable_self_contact
-            ),
-            "attachments of particles to bodies": self.model.attachment_particle_body_count > 0,
             "dynamic bodies that VBD integrates": self._has_dynamic_bodies,
+            "self-contact between particles of a world and of none": (
+                solver.particle_enable_self_contact and self._worlds.count > 1 and -1 in self._worlds.ids
+            ),
             "contacts of a collision pipeline of VBD's own": solver.collision_pipeline is not None,
             "truncation before shapes (rigid_soft_enable_dat)": solver.rigid_soft_enable_dat,
             "penalties of contacts that grow (rigid_avbd_linear_beta)": solver.rigid_contact_k_start_value >= 0.0,
@@ -202,16 +215,32 @@ class SolverImplicitAdjoint(WrappedSolver):
         if self._first is None and tape.launches:
             self._first = id(tape.launches[0])
 
-    def _finish(self, state_in, state_out, x0, contacts, poses, dt):
-        """Polishes the end of a step that is not recorded."""
-        recorded = record_contacts(contacts, poses, copies=False)
-        self._equations.load(Step(dt, x0, state_in.particle_qd, state_out.particle_q, state_in.particle_f, recorded))
-        self._polish_end(x0, state_out, dt)
+    def _cuts(self):
+        """Returns what :func:`.displacements_since_detection` does, now, as the stage replaces it for its step.
 
-    def _polish_end(self, x0, state_out, dt):
+        None without self-contact or polish.
+        """
+        solver = self.solver
+        assert isinstance(solver, SolverVBD)
+        has_cuts = self._polish is not None and solver.particle_enable_self_contact
+        return displacements_since_detection(solver) if has_cuts else None
+
+    def _finish(self, state_in, state_out, x0, contacts, poses, dt, cuts):
+        """Polishes the end of a step that is not recorded."""
+        recorded = record_contacts(contacts, copies=False)
+        pairs, (v0, force) = self._record_pairs(), (state_in.particle_qd, state_in.particle_f)
+        self._equations.load(Step(dt, x0, v0, state_out.particle_q, force, recorded, pairs, poses))
+        self._polish_end(x0, state_out, dt, cuts)
+
+    def _polish_end(self, x0, state_out, dt, cuts):
         x1 = state_out.particle_q
         assert self._polish is not None
         self._polish.run(x1)
+        if cuts is not None:  # VBD ends no step beyond its planes, and nor does polish
+            start, displacements, cut = cuts
+            self._launch(kernels.set_velocity, len(x1), [1.0, start, x1], [displacements])
+            cut(state_out, None)
+            self._equations.load_end(x1)
         self._launch(kernels.set_velocity, len(x1), [float(dt), x0, x1], [state_out.particle_qd])
 
     def _record(self, tape, state_in, state_out, x0, contacts, poses, dt):
@@ -220,17 +249,18 @@ class SolverImplicitAdjoint(WrappedSolver):
         ends = state_out.particle_q, state_out.particle_qd
         starts = state_in.particle_q, state_in.particle_qd, state_in.particle_f
         step: Step | None = None
+        cuts = self._cuts()
 
         def forward():
             nonlocal step
             v0 = wp.clone(starts[1], requires_grad=False)
             force = None if starts[2] is None else wp.clone(starts[2], requires_grad=False)
-            recorded = record_contacts(contacts, poses, copies=True)
-            self._equations.load(Step(dt, x0, v0, ends[0], force, recorded))
+            recorded, pairs = record_contacts(contacts, copies=True), self._record_pairs()
+            self._equations.load(Step(dt, x0, v0, ends[0], force, recorded, pairs, poses))
             if self._polish is not None:
-                self._polish_end(x0, state_out, dt)
-            self._measure()
-            step = Step(dt, x0, v0, wp.clone(ends[0], requires_grad=False), force, recorded)
+                self._polish_end(x0, state_out, dt, cuts)
+            self._measure(pairs)
+            step = Step(dt, x0, v0, wp.clone(ends[0], requires_grad=False), force, recorded, pairs, poses)
 
         def backward():
             assert step is not None
@@ -249,14 +279,19 @@ class SolverImplicitAdjoint(WrappedSolver):
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]
         names += [f"shape_material_{name}" for name in ("ke", "kd", "mu")]
+        names += [f"attachment_particle_body_{name}" for name in ("body_point", "stiffness", "damping")]
         arrays = [getattr(model, name) for name in names]
         if contacts is not None and contacts.soft_contact_max:
             arrays += [getattr(contacts, f"soft_contact_{name}") for name in ("body_pos", "body_vel", "normal")]
             arrays.append(contacts.soft_contact_barycentric)
         return [array for array in arrays if array is not None and len(array) and array.requires_grad]
 
-    def _measure(self):
-        """Reports the residual of the step that the equations have loaded."""
+    def _record_pairs(self):
+        assert isinstance(self.solver, SolverVBD)
+        return record_pairs(self.solver, self._worlds)
+
+    def _measure(self, pairs):
+        """Reports the residual of the step that the equations have loaded, and whether pairs were dropped."""
         equations, model, report = self._equations, self.model, self.report
         forces = equations.evaluate()
         self._sums.zero_()
@@ -265,6 +300,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._launch(kernels.sum_residuals, len(forces), inputs, [self._sums])
         outputs = [report.device_residuals, report.device_counts]
         self._launch(kernels.report_residuals, 1, [wp.float64(RESIDUAL_LIMIT), self._sums], outputs)
+        if pairs is not None:
+            self._launch(kernels.count_dropped, 1, [pairs.dropped], [report.device_counts])
         report.copy_counts()
 
     def _backward(self, step: Step, poses: Poses, of_x0, of_v0, of_force, of_x1, of_v1):
@@ -275,9 +312,12 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._launch(kernels.of_end, n, [dt, of_x1, of_v1, equations.is_fixed], [self._of_end, self._free])
         equations.differentiate()
         multipliers = self._linear.solve(self._free, transposed=True, symmetric=equations.is_symmetric)
+        if step.pairs is not None:
+            inputs = [self._worlds.of_particles, step.pairs.dropped, wp.float64(math.nan)]
+            self._launch(matrix_kernels.set_failed, n, inputs, [multipliers])
         self._launch(kernels.count_failed, 1, [self._linear.failed], [self.report.device_counts])
         self.report.copy_counts()
-        by_forces = equations.add_gradients(multipliers, of_v0, of_force)
+        by_forces = equations.add_gradients(multipliers, self._of_end, of_v0, of_force)
         if of_x0 is not None:
             inputs = [dt, of_v1, equations.is_fixed, self._of_end, *by_forces]
             self._launch(kernels.add_of_start, n, inputs, [of_x0])
@@ -292,6 +332,11 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies VBD, and reads again which bodies it moves."""
+        """Notifies VBD, reads again which bodies it moves, and checks attachments again.
+
+        Raises:
+            NotImplementedError: If several attachments of infinite stiffness hold one particle.
+        """
         super().notify_model_changed(flags)
         self._has_dynamic_bodies = self._poses.has_dynamic()
+        check_attachments(self.model)
