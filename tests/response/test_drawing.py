@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton.viewer import ViewerNull, ViewerUSD
-from newton_scenes import DT, SOLVERS, Changed, add_patch, bullet, add_plates, place_plates
+from newton_scenes import DT, SOLVERS, Changed, add_patch, add_plates, bullet, place_plates
 from pxr import Usd, UsdGeom
 
 import warp_bsc as bsc

@@ -12,8 +12,10 @@ _NORMAL, _IMPULSE = (0.0, 0.8, 0.2), (1.0, 0.0, 1.0)
 _SHELL = (0.3, 0.7, 1.0)
 VERTEX_COLOURS = {"truncated": (1.0, 0.6, 0.0), "frozen": (0.1, 0.3, 1.0), "uncertified": (1.0, 0.0, 0.0)}
 """Colours of vertices by what became of them; the later hides the earlier where a vertex is several."""
-_NORMAL_LENGTH, _IMPULSE_LENGTH, _POINT_RADIUS = 0.5, 3.0, 0.12
-"""Lengths in median edges: of normals, of the largest impulse so far, and radius of the points of vertices."""
+_NORMAL_LENGTH, _IMPULSE_LENGTH, _POINT_RADIUS = 0.5, 2.0, 0.12
+"""Lengths in median edges: of normals, of a large impulse, and radius of the points of vertices."""
+_LARGE = 0.9
+"""Share of the impulses of a step that a large one is not less than: single ones are far larger than all others."""
 _LINE_RADIUS, _PIXELS = 0.02, 0.02
 """Half the width of lines: in median edges; and for ViewerViser, which draws a hundred pixels for each unit of it."""
 _OPACITY = 0.25
@@ -34,7 +36,7 @@ class Drawing:
         x = np.empty((0, 3)) if model.particle_q is None else model.particle_q.numpy()
         lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
         self.edge = float(np.median(lengths)) if len(lengths) else 0.05
-        self._largest = 0.0  # impulse so far [N s]
+        self._large = 0.0  # impulse, the largest of all steps so far [N s]
         radius = np.zeros(mesh.vertex_count) if mesh.distances is None else mesh.distances.radius.numpy()
         has_shell = radius > 0.0
         self._radius, self._faces = radius, mesh.faces[has_shell[mesh.faces].all(axis=1)]
@@ -59,7 +61,7 @@ class Drawing:
             x: Positions of all vertices of the mesh at the end of the step [m], shape [vertex_count, 3].
             contacts: The contacts, see :meth:`.forces.contact_report.Contacts.numpy`; None if there are none to draw.
             vertices: Which vertices of the mesh are truncated, frozen and uncertified, bool, shape [vertex_count].
-            impulse_scale: Length of an arrow by its impulse [m/(N s)]; None for one by the largest impulse so far.
+            impulse_scale: Length of an arrow by its impulse [m/(N s)]; None for two median edges for a large impulse.
         """
         self._draw_contacts(viewer, contacts, impulse_scale)
         for name, colour in VERTEX_COLOURS.items():
@@ -77,9 +79,9 @@ class Drawing:
             return
         points, normals = contacts["point"], contacts["normal"]
         impulses = contacts["normal_impulse"][:, None] * normals + contacts["tangential_impulse"]
-        self._largest = max(self._largest, float(np.linalg.norm(impulses, axis=1).max()))
+        self._large = max(self._large, float(np.quantile(np.linalg.norm(impulses, axis=1), _LARGE)))
         if impulse_scale is None:
-            impulse_scale = _IMPULSE_LENGTH * self.edge / self._largest
+            impulse_scale = _IMPULSE_LENGTH * self.edge / self._large
         width = _PIXELS if isinstance(viewer, ViewerViser) else _LINE_RADIUS * self.edge
         for name, vectors, colour, log in (
             ("/ccd/normals", _NORMAL_LENGTH * self.edge * normals, _NORMAL, viewer.log_lines),

@@ -397,6 +397,18 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _mesh(self):
         return self._work.mesh
 
+    def _find_positions(self):
+        return self._work.vertices.x1.numpy()
+
+    def _find_vertices(self, bit):
+        vertices, mesh = self._work.vertices, self._mesh
+        found = (vertices.outcome.numpy() & int(bit)) != 0
+        if vertices.bodies.outcome:
+            body = mesh.shape_vertices.body
+            of_bodies = np.append((vertices.bodies.outcome.numpy() & int(bit)) != 0, False)  # last: of no body
+            found[mesh.model.particle_count :] |= of_bodies[body]
+        return found
+
     def _count_vertices(self, bit):
         vertices = self._work.vertices
         counts = [vertices.outcome] + ([vertices.bodies.outcome] if vertices.bodies.outcome else [])
