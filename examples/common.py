@@ -30,7 +30,9 @@ class ExampleBase:
 
     def __init__(self, viewer, args):
         self.viewer = viewer
-        self.ccd = args.ccd
+        self.ccd, self.draws_contacts = args.ccd, args.draw_contacts
+        if self.draws_contacts and not self.ccd:
+            raise ValueError("--draw-contacts draws what the stage found: omit --no-ccd")
         self.frame_dt = 1.0 / self.fps
         self.sim_dt = self.frame_dt / self.sim_substeps
         self.sim_time = 0.0
@@ -47,6 +49,8 @@ class ExampleBase:
             options: Options of the stage.
         """
         self.model = model
+        if self.draws_contacts:
+            options["report_contacts"] = True
         self.solver = bsc.SolverCCD(solver, **options) if self.ccd and not isinstance(solver, bsc.SolverCCD) else solver
         self.state_0, self.state_1 = model.state(), model.state()
         self.control = model.control()
@@ -73,7 +77,13 @@ class ExampleBase:
         """Shows the frame."""
         self.viewer.begin_frame(self.sim_time)
         self.viewer.log_state(self.state_0)
+        self.draw_contacts()
         self.viewer.end_frame()
+
+    def draw_contacts(self):
+        """Draws what the stage found and did in the last step, if ``--draw-contacts`` is given."""
+        if self.draws_contacts:
+            self.solver.report.draw(self.viewer)
 
     def find_intersections(self):
         """Returns the pairs of an edge and a face of the deforming meshes that cross now."""
@@ -96,7 +106,7 @@ class ExampleBase:
 
     @classmethod
     def create_parser(cls):
-        """Returns Newton's options with a number of frames, and ``--no-ccd``."""
+        """Returns Newton's options with a number of frames, ``--no-ccd`` and ``--draw-contacts``."""
         parser = newton.examples.create_parser()
         parser.set_defaults(num_frames=cls.num_frames)
         parser.add_argument(
@@ -104,6 +114,11 @@ class ExampleBase:
             action=argparse.BooleanOptionalAction,
             default=True,
             help="Put the collision stage behind the solver.",
+        )
+        parser.add_argument(
+            "--draw-contacts",
+            action="store_true",
+            help="Draw normals and impulses of contacts, and vertices that are truncated, frozen or not certified.",
         )
         return parser
 

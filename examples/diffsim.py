@@ -136,6 +136,7 @@ class DiffsimExample(ExampleBase):
         self.viewer.begin_frame(float(self.frame))
         self.viewer.log_state(self.states[-1])
         self.viewer.log_lines("/paths", starts, ends, (0.9, 0.5, 0.2))
+        self.draw_contacts()
         self.viewer.end_frame()
 
     def test_final(self):

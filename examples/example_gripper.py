@@ -123,7 +123,7 @@ class Example(ExampleBase):
         """Returns the solver of the cloth, with the stage behind it."""
         self.stage = newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False)
         if self.ccd:
-            self.stage = bsc.SolverCCD(self.stage)
+            self.stage = bsc.SolverCCD(self.stage, report_contacts=self.draws_contacts)
         return self.stage
 
     def add_robot(self, builder):

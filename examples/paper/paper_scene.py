@@ -149,6 +149,7 @@ class PaperScene(ExampleBase):
         """Shows the frame."""
         self.viewer.begin_frame(self.frame / RECORDED_FPS)
         self.viewer.log_state(self.state_0)
+        self.draw_contacts()
         self.viewer.end_frame()
 
     def positions(self):

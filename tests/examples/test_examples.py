@@ -230,6 +230,15 @@ def test_gripper_lifts_cloth_that_does_not_slip(robot, friction):
     assert report.totals.truncated_steps == 0 or friction < 0.5
 
 
+def test_contacts_are_drawn(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(ViewerNull, "log_arrows", lambda self, name, *arguments, **options: drawn.append(name))
+    run(BULLET, 2, "--draw-contacts")
+    assert drawn.count("/ccd/impulses") == 2
+    with pytest.raises(ValueError, match="omit --no-ccd"):
+        run(BULLET, 1, "--draw-contacts", "--no-ccd")
+
+
 def test_bullet_passes_without_stage():
     example = run(BULLET, 10, "--no-ccd")
     with pytest.raises(AssertionError, match="441 particles of the patch passed"):

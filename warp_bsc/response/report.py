@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
-from .forces.contact_report import ContactReport
 from .inside import Inside, InsideFinder
+from .report_views import ReportViews
 from .schedule import Result, views_of
 from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
@@ -96,7 +96,7 @@ class GradientTotals:
     outrun_steps: int
 
 
-class SolverReport(ContactReport, WorldsOfReport):
+class SolverReport(ReportViews, WorldsOfReport):
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
     :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
@@ -130,11 +130,13 @@ class SolverReport(ContactReport, WorldsOfReport):
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once each of a :attr:`strain` above 0.2, a start that crosses itself, and a layer that was passed.
+        """Warns once each of a step that is not certified, a :attr:`strain` above 0.2, crossings, and a layer passed.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
         known = dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True))
+        if known["uncertified_steps"] and self._responds:
+            self._warn_once("uncertified", self._uncertified_warning)
         if known["strained_steps"]:
             self._warn_once("strain", self._strain_warning)
         if known["crossing_steps"] and self._responds:
@@ -226,20 +228,8 @@ class SolverReport(ContactReport, WorldsOfReport):
         is true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
         nothing but the position of a body is not finite. Gathered on the host, on each access.
         """
-        particles = self._mesh.model.particle_count
-        if self.certified:
-            return np.empty(0, dtype=np.int32)
-        if self.undetected:
-            return np.arange(particles, dtype=np.int32)
-        vertices = self._work.vertices
-        listed = vertices.changed.numpy() != 0  # those in a contact of the last detection
-        x0, x1 = (x.numpy() for x in (self._motion.vertices.x0, vertices.x1))
-        invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
-        if not self._responds:
-            invalid |= self._motion.vertices.is_not_finite.numpy() != 0
-        for elements in (self._mesh.faces, self._mesh.edges):
-            listed[elements[invalid[elements].any(axis=1)]] = True
-        return np.flatnonzero((listed | invalid)[:particles]).astype(np.int32)
+        listed = self._find_uncertified()[: self._mesh.model.particle_count]
+        return np.flatnonzero(listed).astype(np.int32)
 
     @property
     def uncertified_bodies(self) -> np.ndarray:
@@ -255,6 +245,22 @@ class SolverReport(ContactReport, WorldsOfReport):
         listed = (self._work.vertices.changed.numpy() != 0) | (self._motion.vertices.is_not_finite.numpy() != 0)
         bodies = np.unique(self._mesh.shape_vertices.body[listed[first:]])
         return bodies[bodies >= 0].astype(np.int32)
+
+    def _find_uncertified(self):
+        """Returns which vertices of the mesh the certificate of the last step lacks, bool, shape [vertex_count]."""
+        if self.certified:
+            return np.zeros(self._mesh.vertex_count, dtype=bool)
+        if self.undetected:
+            return np.arange(self._mesh.vertex_count) < self._mesh.model.particle_count
+        vertices = self._work.vertices
+        listed = vertices.changed.numpy() != 0  # those in a contact of the last detection
+        x0, x1 = (x.numpy() for x in (self._motion.vertices.x0, vertices.x1))
+        invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
+        first = self._mesh.model.particle_count if self._responds else 0  # a response leaves particles where they were
+        invalid[first:] |= self._motion.vertices.is_not_finite.numpy()[first:] != 0
+        for elements in (self._mesh.faces, self._mesh.edges):
+            listed[elements[invalid[elements].any(axis=1)]] = True
+        return listed | invalid
 
     @property
     def undetected(self) -> bool:
@@ -390,6 +396,18 @@ class SolverReport(ContactReport, WorldsOfReport):
     @property
     def _mesh(self):
         return self._work.mesh
+
+    def _find_positions(self):
+        return self._work.vertices.x1.numpy()
+
+    def _find_vertices(self, bit):
+        vertices, mesh = self._work.vertices, self._mesh
+        found = (vertices.outcome.numpy() & int(bit)) != 0
+        if vertices.bodies.outcome:
+            body = mesh.shape_vertices.body
+            of_bodies = np.append((vertices.bodies.outcome.numpy() & int(bit)) != 0, False)  # last: of no body
+            found[mesh.model.particle_count :] |= of_bodies[body]
+        return found
 
     def _count_vertices(self, bit):
         vertices = self._work.vertices

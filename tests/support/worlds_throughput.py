@@ -1,0 +1,137 @@
+"""Measures steps a second by the number of worlds: VBD, VBD with self-contact, and SolverCCD.
+
+    python tests/support/worlds_throughput.py --worlds 1 64
+
+Each world has a cloth of 200 triangles that falls from its own place on a fixed sphere and the ground. VBD gets
+Newton's contacts, the stage none. The exact detector counts the edges that cross faces of cloth or sphere once a tenth
+of the steps. On a GPU, a pair of steps is a CUDA graph.
+"""
+
+import argparse
+import time
+
+import newton
+import numpy as np
+import warp as wp
+
+import warp_bsc as bsc
+from warp_bsc.bench.crossings import CrossingCounter
+
+DT = 1.0 / 120.0  # [s]
+CELLS, SIDE, RADIUS = 10, 0.5, 0.2  # m
+CLOTH = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-3, "edge_kd": 1e-4, "particle_radius": 0.005}
+
+
+def build(worlds):
+    """Returns a model of worlds in which cloths start at random places above spheres."""
+    builder, random = newton.ModelBuilder(), np.random.default_rng(0)
+    for _ in range(worlds):
+        world = newton.ModelBuilder()
+        world.add_ground_plane()
+        at = wp.transform(wp.vec3(0.0, 0.0, RADIUS), wp.quat_identity())
+        world.add_shape_sphere(-1, radius=RADIUS, xform=at)
+        cell = SIDE / CELLS
+        corner = random.uniform(-0.05, 0.05, 2) - 0.5 * SIDE
+        world.add_cloth_grid(
+            pos=wp.vec3(*corner, 2.05 * RADIUS),
+            rot=wp.quat_identity(),
+            vel=wp.vec3(),
+            dim_x=CELLS,
+            dim_y=CELLS,
+            cell_x=cell,
+            cell_y=cell,
+            mass=0.001,
+            **CLOTH,
+        )
+        builder.add_world(world)
+    builder.color()
+    return builder.finalize()
+
+
+def vbd(model, self_contact=False):
+    """Returns VBD with five iterations."""
+    contact = {"particle_self_contact_margin": 0.01, "particle_self_contact_gap": 0.005} if self_contact else {}
+    return newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=self_contact, **contact)
+
+
+SOLVERS = {
+    "VBD": vbd,
+    "VBD, self-contact": lambda model: vbd(model, self_contact=True),
+    "SolverCCD(VBD), default": lambda model: bsc.SolverCCD(vbd(model)),
+    "SolverCCD(VBD), substeps=None": lambda model: bsc.SolverCCD(vbd(model), substeps=None),
+}
+
+
+class Run:
+    """A simulation of worlds with a solver."""
+
+    def __init__(self, make_solver, worlds):
+        self.model = model = build(worlds)
+        self.solver = make_solver(model)
+        self.states, self.control = [model.state(), model.state()], model.control()
+        self.pipeline = self.contacts = self._graph = None
+        if not isinstance(self.solver, bsc.SolverCCD):
+            self.pipeline = newton.CollisionPipeline(model)
+            self.contacts = self.pipeline.contacts()
+
+    def take_pair(self):
+        """Takes two steps, on a GPU from a CUDA graph after the first call."""
+        device = self.model.device
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        self._step_twice()
+        if device.is_cuda:
+            with wp.ScopedCapture(device) as capture:
+                self._step_twice()
+            self._graph = capture.graph
+
+    def _step_twice(self):
+        for start, end in (self.states, self.states[::-1]):
+            start.clear_forces()
+            if self.pipeline is not None:
+                self.pipeline.collide(start, self.contacts)
+            self.solver.step(start, end, self.control, self.contacts, DT)
+
+
+def measure(make_solver, worlds, steps):
+    """Returns steps a second by the clock and by processor time, crossings found, and steps not certified or None."""
+    run = Run(make_solver, worlds)
+    run.take_pair()
+    counter, device = CrossingCounter(run.model), run.model.device
+    crossings, clock, processor = 0, 0.0, 0.0
+    for _ in range(10):
+        wp.synchronize_device(device)
+        begin = time.perf_counter(), time.process_time()
+        for _ in range(steps // 20):
+            run.take_pair()
+        wp.synchronize_device(device)
+        clock += time.perf_counter() - begin[0]
+        processor += time.process_time() - begin[1]
+        crossings += counter.count(run.states[0])
+    taken = 20 * (steps // 20)
+    uncertified = run.solver.report.totals.uncertified_steps if isinstance(run.solver, bsc.SolverCCD) else None
+    return taken / clock, taken / processor, crossings, uncertified
+
+
+def main():
+    """Prints a row for each solver and number of worlds: steps a second by the clock and by processor time."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64], help="on a GPU, also 1024 4096")
+    parser.add_argument("--steps", type=int, default=100, help="a multiple of 20")
+    parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+    options = parser.parse_args()
+    if options.steps < 20 or options.steps % 20:
+        parser.error(f"--steps must be a multiple of 20, not {options.steps}")
+    wp.config.log_level = wp.LOG_WARNING
+    with wp.ScopedDevice(options.device or wp.get_preferred_device()):
+        print(f"{'solver':30}{'worlds':>7}{'steps/s':>10}{'by processor':>14}{'crossings':>11}{'uncertified':>13}")
+        for worlds in options.worlds:
+            for name, make_solver in SOLVERS.items():
+                by_clock, by_processor, crossings, uncertified = measure(make_solver, worlds, options.steps)
+                row = f"{name:30}{worlds:>7}{by_clock:>10.3g}{by_processor:>14.3g}{crossings:>11}"
+                print(f"{row}{'-' if uncertified is None else uncertified:>13}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""What a report says in words: a table of impulses by shape, and which particles and shapes a certificate lacks."""
+
+import newton
+import numpy as np
+
+_LABEL = 36  # characters
+_MOST_ROWS = 40
+_NAMED = 3  # particles or shapes that a warning names
+
+
+def shape_name(model: newton.Model, shape: int) -> str:
+    """Returns number and label of a shape."""
+    return f"shape {shape} ({model.shape_label[shape]!r})"
+
+
+def table_by_shape(model: newton.Model, contacts: dict[str, np.ndarray], dt: float | None, *, complete: bool) -> str:
+    """Returns the contacts of a step by shape: their number, and sums of normal and tangential impulses or forces.
+
+    Args:
+        model: The model.
+        contacts: The contacts, see :meth:`.forces.contact_report.Contacts.numpy`.
+        dt: Length of the step [s], for mean forces [N]; None for impulses [N s].
+        complete: Whether these are all contacts.
+    """
+    unit, share = ("N s", 1.0) if dt is None else ("N", 1.0 / dt)
+    both = contacts["shapes"] + 1  # of two particles: 0
+    first, second = both.T
+    # contacts of a shape with itself, or of two particles, count once
+    shapes = np.concatenate([first, second[first != second]])
+    size = model.shape_count + 1
+
+    def sum_up(values):
+        return np.bincount(shapes, weights=np.concatenate([values, values[first != second]]), minlength=size)
+
+    count = np.bincount(shapes, minlength=size)
+    normal = share * sum_up(contacts["normal_impulse"])
+    tangential = share * sum_up(np.linalg.norm(contacts["tangential_impulse"], axis=1))
+    rows = np.flatnonzero(count)
+    rows = rows[np.argsort(-normal[rows], kind="stable")]
+    lines = [f"{'shape':<{_LABEL}} {'contacts':>8} {f'normal [{unit}]':>15} {f'tangential [{unit}]':>17}"]
+    for row in rows[:_MOST_ROWS]:
+        label = "particles" if row == 0 else model.shape_label[row - 1]
+        if len(label) > _LABEL:
+            label = "..." + label[3 - _LABEL :]
+        lines.append(f"{label:<{_LABEL}} {count[row]:>8} {normal[row]:>15.4g} {tangential[row]:>17.4g}")
+    if not len(rows):
+        lines.append("no contact had an impulse")
+    if len(rows) > _MOST_ROWS:
+        lines.append(f"and {len(rows) - _MOST_ROWS} shapes with less")
+    if not complete:
+        lines.append("contacts are missing: raise the number that report_contacts= allows")
+    return "\n".join(lines)
+
+
+def uncertified_warning(model: newton.Model, particles: np.ndarray, shapes: np.ndarray) -> str:
+    """Returns what to say of a step that is not certified, given the particles and shapes concerned."""
+    if not len(particles) and not len(shapes):
+        return (
+            "a step was not certified, and a later one is: read report.certified after each step, "
+            "or report.totals.uncertified_steps"
+        )
+    world = None if model.particle_world is None or model.world_count <= 1 else model.particle_world.numpy()
+    of_world = "" if world is None else " of world {}"
+    named = [f"particle {i}" + of_world.format(-1 if world is None else world[i]) for i in particles[:_NAMED]]
+    if len(particles) > _NAMED:
+        named.append(f"{len(particles) - _NAMED} more particles")
+    named += [shape_name(model, shape) for shape in shapes[:_NAMED]]
+    if len(shapes) > _NAMED:
+        named.append(f"{len(shapes) - _NAMED} more shapes")
+    return (
+        f"a step is not certified, its motion may pass through something: {', '.join(named)}. To look closer: "
+        "report.uncertified_vertices and report.uncertified_bodies list all of that step, and report.draw(viewer) "
+        "shows them in red"
+    )
