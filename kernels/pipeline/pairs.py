@@ -14,6 +14,44 @@ import warp as wp
 from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
 
+@wp.struct
+class PairFilter:
+    """Which pairs of elements are left out, by their vertices; without arrays none.
+
+    Attributes:
+        group: Groups of each vertex, as bits.
+        mask: Groups that each vertex meets, as bits.
+    """
+
+    group: wp.array[int]
+    mask: wp.array[int]
+
+
+@wp.func
+def union_of_bits(bits: wp.array[int], element: wp.vec3i) -> int:
+    """Returns the bits of an element, those of its vertices together: p p p, a b b or a b c."""
+    return bits[element[0]] | bits[element[1]] | bits[element[2]]
+
+
+@wp.func
+def groups_meet(group: int, mask: int, other_group: int, other_mask: int) -> bool:
+    """Returns whether each of two has a group that is in the mask of the other."""
+    return (group & other_mask) != 0 and (other_group & mask) != 0
+
+
+@wp.func
+def is_filtered(pair_filter: PairFilter, element: wp.vec3i, other: wp.vec3i) -> bool:
+    """Returns whether a pair of elements is left out, each given as p p p, a b b or a b c."""
+    if not pair_filter.group:
+        return False
+    return not groups_meet(
+        union_of_bits(pair_filter.group, element),
+        union_of_bits(pair_filter.mask, element),
+        union_of_bits(pair_filter.group, other),
+        union_of_bits(pair_filter.mask, other),
+    )
+
+
 @wp.func
 def owns_vertex(owned: int, corner: int) -> bool:
     """Returns whether a face is the representative of the vertex at a corner."""

@@ -88,6 +88,13 @@ def bad_arrays(good: np.ndarray, *, index: bool = False) -> dict[str, Any]:
     return values
 
 
+def bad_bits(count: int) -> dict[str, Any]:
+    """Returns what is neither 32 bits nor an array of 32 bits for each of some things."""
+    arrays = without(bad_arrays(np.zeros(count, int), index=True), "None", "number", "negative", "huge")
+    one = {"bool": True, "float": 1.0, "negative": -2, "33 bits": 2**32, "10^400": 10**400}
+    return arrays | one | {"one bad": [1] * (count - 1) + [2**32], "rows": np.zeros(count + 1, int)}
+
+
 def not_finite(good: np.ndarray) -> dict[str, Any]:
     """Returns coordinates that are not finite."""
     return {
@@ -191,6 +198,8 @@ def calls() -> dict[str, Call]:
             "vertex_count": NOT_COUNT,
             "radius": without(MANY_DISTANCES, "None") | {"one bad": [1.0] * 5 + [-1.0], "masked": masked(np.ones(6))},
             "world": world | {"huge": np.full(6, 2**31), "mixed": np.arange(6)},
+            "group": bad_bits(6),
+            "mask": bad_bits(6),
             "only_free": FLAGS,
             "device": DEVICES,
         },

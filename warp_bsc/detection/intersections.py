@@ -226,10 +226,12 @@ class Intersections:
             ``mesh.edges``, sorted, int32, shape [n, 2].
         crosses: Whether the edge passes through the face, as :func:`warp_bsc.checker.edges_pass_faces` defines it. All
             other edges only touch their face. Bool, shape [n].
+        filtered: Number of pairs whose boxes overlap, but that groups and masks of the mesh leave out.
     """
 
     pairs: np.ndarray
     crosses: np.ndarray
+    filtered: int = 0
 
 
 class IntersectionFinder:
@@ -288,7 +290,8 @@ class IntersectionFinder:
         """
         hits = len(collisions.vertex_face) + len(collisions.edge_edge)
         is_slower = self._mesh.device.is_cuda or _PAIRS_OF_HIT * hits > len(self._mesh.edges)
-        if is_slower or not collisions.certified or not self._has_sides:
+        # a filter may leave out a vertex with a face, and not an edge of that vertex
+        if is_slower or not collisions.certified or not self._has_sides or self._mesh.group is not None:
             return self.find(x, is_end=True)
         pairs = self._pairs_that_may_meet(start, collisions)
         return self._find(x, lambda _: self._candidates.enqueue(pairs))
@@ -307,7 +310,7 @@ class IntersectionFinder:
 
         retry_until_fits(launch, self, mesh.device)
         if not self._count:
-            return Intersections(np.zeros((0, 2), dtype=np.int32), np.zeros(0, dtype=bool))
+            return Intersections(np.zeros((0, 2), dtype=np.int32), np.zeros(0, dtype=bool), self._filtered)
         status = _decided(mesh, x, mesh.device_edges, mesh.device_across, self._kept, self._status, self._count)
         pairs = self._kept[: self._count].numpy()
         meets, crosses = status != FREE, status == HIT
@@ -323,12 +326,13 @@ class IntersectionFinder:
             crosses[unsure] = checker.edges_pass_faces(edges, faces, across)
         pairs, crosses = pairs[meets], crosses[meets]
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-        return Intersections(pairs[order], crosses[order])
+        return Intersections(pairs[order], crosses[order], self._filtered)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
         grown = self._candidates.grow()
-        self._count = int(self._candidates.counts.numpy()[Count.FOUND])
+        counts = self._candidates.counts.numpy()
+        self._count, self._filtered = int(counts[Count.FOUND]), int(counts[Count.FILTERED])
         if self._count > len(self._kept):
             self._allocate(capacity_for(self._count, "intersections"))
             return True

@@ -130,6 +130,7 @@ class Count(enum.IntEnum):
             distance, that it does not decide: left to the host.
         REFUTED: Found pairs that the exact stage decides to be free.
         SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
+        FILTERED: Pairs that would be candidates, but are left out by groups and masks.
     """
 
     CANDIDATES = 0
@@ -144,6 +145,7 @@ class Count(enum.IntEnum):
     TOO_WIDE_8 = 9
     REFUTED = 10
     SUBDIVIDED = 11
+    FILTERED = 12
 
 
 @dataclass(frozen=True)
@@ -162,6 +164,7 @@ class PairCounts:
     too_wide_8: int = 0
     refuted: int = 0
     subdivided: int = 0
+    filtered: int = 0
 
     @classmethod
     def of(cls, values: np.ndarray) -> "PairCounts":

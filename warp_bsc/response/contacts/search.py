@@ -109,9 +109,9 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
 @wp.func
 def _pairs_of_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
     """Returns the pairs of elements that two faces represent and whose boxes overlap, as bits."""
-    left = overlapping_vertices(mesh, place, other, False) >> 3
-    left = left | ((overlapping_vertices(mesh, other, place, False) >> 3) << 3)
-    return left | ((overlapping_edges(mesh, place, other, False) >> 9) << 6)
+    left = (overlapping_vertices(mesh, place, other, False) >> 3) & 7
+    left = left | (overlapping_vertices(mesh, other, place, False) & 56)
+    return left | (((overlapping_edges(mesh, place, other, False) >> 9) & 511) << 6)
 
 
 @wp.func
