@@ -11,6 +11,7 @@ from .._arguments import checked_number
 from ..kernels import polynomials
 
 __all__ = [
+    "FILTERED_COUNTS",
     "METHODS",
     "NO_FUSED_OPERATIONS",
     "NO_GRADIENTS",
@@ -191,6 +192,9 @@ class PairCounts:
 
 _NOT_FINITE, _FACE_PAIRS, _PAIRS = 0, 1, 2
 """Indices of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
+
+FILTERED_COUNTS = range(_PAIRS + Count.FILTERED, _PAIRS + len(DistanceKind) * len(Count), len(Count))
+"""Indices of the pairs that are filtered, of each kind."""
 
 
 @dataclass(frozen=True)

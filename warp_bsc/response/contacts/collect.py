@@ -100,7 +100,7 @@ def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: i
     if not motion.distances.radius:
         return ZERO, ZERO
     before, error = signed_distance(planes.start[i], motion.x0[vertex])
-    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes, _KEPT * (before - error))
+    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (before - error))
     return wp.max(kept, ZERO), motion.distances.reach
 
 
@@ -127,6 +127,9 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         if near and not ahead:
             continue
         if kept < ZERO and after >= kept - PLANE_DEPTH * separation:
+            continue
+        if rules.is_filtered_by_plane(motion, planes, i, vertex):
+            wp.atomic_add(status.detection, int(Detection.FILTERED), wp.where(ahead, 0, 1))
             continue
         if not _stops(motion, planes, i, vertex):
             continue
@@ -195,6 +198,9 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
     corners = vertices_of(contacts, i)
     owner = rules.owner_of(motion, corners)
     if owner == ContactClass.NONE or (near and owner != ContactClass.OURS):
+        return
+    if owner == ContactClass.FILTERED:
+        wp.atomic_add(status.detection, int(Detection.FILTERED), 1)
         return
     added = constraints.Constraint()
     bound = toi

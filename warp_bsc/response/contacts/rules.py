@@ -7,8 +7,10 @@ from newton import ShapeFlags
 
 from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
+from ...kernels.pipeline.pairs import groups_meet
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
+from ..state.planes import MovingPlanes
 from ..state.structs import Bodies, Motion, Step, body_of, can_move
 from ..state.vectors import ZERO, to_double
 from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
@@ -23,6 +25,7 @@ class ContactClass(IntEnum):
     CROSSED = 1  # excludes it, because its elements crossed or touched at the start: the inner solver parts them
     OF_BODIES = 2  # counts it, and leaves it to the inner solver, because it is between bodies
     NONE = 3  # ignores it: nothing can be moved, or bodies that touched at the start
+    FILTERED = 4  # counts it: of two shapes that Newton's flags, groups or filters keep from colliding
 
 
 @wp.func
@@ -57,6 +60,19 @@ def collides(bodies: Bodies, shape: int, other: int) -> bool:
     key = wp.int64(wp.min(shape, other)) * shapes + wp.int64(wp.max(shape, other))
     place = wp.lower_bound(bodies.filtered, key)
     return place == bodies.filtered.shape[0] or bodies.filtered[place] != key
+
+
+@wp.func
+def is_filtered_by_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
+    """Returns whether groups and masks leave out a vertex and an infinite plane."""
+    of_vertices = motion.pair_filter
+    if not of_vertices.group:
+        return False
+    of_shapes = planes.shape_filter
+    shape = planes.shape[i]
+    return not groups_meet(
+        of_vertices.group[vertex], of_vertices.mask[vertex], of_shapes.group[shape], of_shapes.mask[shape]
+    )
 
 
 @wp.func
@@ -101,7 +117,7 @@ def crossed_at_start(step: Step, kind: int, pair: wp.vec2i) -> bool:
 
 @wp.func
 def owner_of(motion: Motion, corners: wp.vec4i) -> int:
-    """Returns the ContactClass of two elements as far as it follows from their vertices: OURS, OF_BODIES or NONE.
+    """Returns the ContactClass of two elements as far as it follows from their vertices, not CROSSED.
 
     Those of two bodies, or of a body and a static shape, are of bodies unless the response keeps these apart.
     """
@@ -117,7 +133,7 @@ def owner_of(motion: Motion, corners: wp.vec4i) -> int:
     if body_of(motion, corners[0]) == body_of(motion, corners[3]):
         return ContactClass.NONE
     if not collides(motion.bodies, motion.bodies.shape[a], motion.bodies.shape[b]):
-        return ContactClass.NONE
+        return ContactClass.FILTERED
     return wp.where(motion.bodies.responds == 1, int(ContactClass.OURS), int(ContactClass.OF_BODIES))
 
 

@@ -53,6 +53,9 @@ def _resolve(
     min_distance: wp.float64,
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
+    if owner == ContactClass.FILTERED:
+        wp.atomic_add(arguments.status.detection, int(Detection.FILTERED), 1)
+        return
     found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:
         wp.atomic_add(arguments.status.detection, int(Detection.EXCLUDED), 1)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...kernels.pipeline.pairs import PairFilter
 from .vectors import ONE, ZERO, to_double
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
@@ -23,6 +24,7 @@ class MovingPlanes:
     world: wp.array[int]  # -1 for all
     shape: wp.array[int]
     body: wp.array[int]  # that the plane moves with, -1 for none
+    shape_filter: PairFilter  # groups and masks of shapes; empty if no pair is left out
 
 
 @wp.func
