@@ -18,6 +18,10 @@ from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 class PairFilter:
     """Which pairs of elements are left out, by their vertices; without arrays none.
 
+    Two vertices meet if each has a group that is in the mask of the other. A pair of elements is left out unless each
+    vertex of one meets each vertex of the other. So where a pair of an edge and a face is not left out, neither are
+    those of their parts, whose contacts are the only way in which the two can come to cross.
+
     Attributes:
         group: Groups of each vertex, as bits.
         mask: Groups that each vertex meets, as bits.
@@ -25,12 +29,6 @@ class PairFilter:
 
     group: wp.array[int]
     mask: wp.array[int]
-
-
-@wp.func
-def union_of_bits(bits: wp.array[int], element: wp.vec3i) -> int:
-    """Returns the bits of an element, those of its vertices together: p p p, a b b or a b c."""
-    return bits[element[0]] | bits[element[1]] | bits[element[2]]
 
 
 @wp.func
@@ -44,12 +42,13 @@ def is_filtered(pair_filter: PairFilter, element: wp.vec3i, other: wp.vec3i) -> 
     """Returns whether a pair of elements is left out, each given as p p p, a b b or a b c."""
     if not pair_filter.group:
         return False
-    return not groups_meet(
-        union_of_bits(pair_filter.group, element),
-        union_of_bits(pair_filter.mask, element),
-        union_of_bits(pair_filter.group, other),
-        union_of_bits(pair_filter.mask, other),
-    )
+    for i in range(3):
+        group = pair_filter.group[element[i]]
+        mask = pair_filter.mask[element[i]]
+        for j in range(3):
+            if not groups_meet(group, mask, pair_filter.group[other[j]], pair_filter.mask[other[j]]):
+                return True
+    return False
 
 
 @wp.func

@@ -71,11 +71,15 @@ import warp as wp
         count = 0;
     };
 
-    auto united = [](const auto& of_vertices, const int* at, int corners) -> int {
-        int united = 0;
+    // whether each corner of one element meets each corner of the other
+    auto meet = [&](const int* at, const int* other_at) -> bool {
         for (int i = 0; i < corners; ++i)
-            united |= of_vertices.data[at[8 * i]];
-        return united;
+            for (int j = 0; j < other_corners; ++j) {
+                const int a = at[8 * i], b = other_at[8 * j];
+                if (!(group.data[a] & group_mask.data[b]) || !(group.data[b] & group_mask.data[a]))
+                    return false;
+            }
+        return true;
     };
 
     const unsigned changed = element[40];
@@ -119,15 +123,10 @@ import warp as wp
             if (!mask)
                 continue;
             if (group.data) {
-                const int* at = element + 8 + lane;
-                const int own = united(group, at, corners), met = united(group_mask, at, corners);
                 unsigned left_out = 0;
                 for (unsigned rest = mask; rest; rest &= rest - 1) {
                     const int other_lane = __builtin_ctz(rest);
-                    const int* other_at = other_element + 8 + other_lane;
-                    const bool meet = (own & united(group_mask, other_at, other_corners)) != 0
-                        && (met & united(group, other_at, other_corners)) != 0;
-                    left_out |= (unsigned)!meet << other_lane;
+                    left_out |= (unsigned)!meet(element + 8 + lane, other_element + 8 + other_lane) << other_lane;
                 }
                 filtered += __builtin_popcount(left_out);
                 mask &= ~left_out;

@@ -62,17 +62,15 @@ def test_group_zero_meets_nothing_and_a_mask_is_needed_on_both_sides(broad_phase
         assert found.stats.filtered and (len(found.vertex_face) > 0) == ("mask" in bits and "group" in bits)
 
 
-def test_an_element_has_the_groups_of_all_its_vertices():
+def test_elements_meet_where_all_of_their_vertices_do():
     faces = [[0, 1, 2], [3, 4, 5]]
     x0 = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, 1], [2, 1, 2], [1, 2, 2]], dtype=np.float32)
     x1 = x0 - np.float32([0, 0, 4]) * (np.arange(6) >= 3)[:, None]
-    # vertex 0 alone is in the group that the falling triangle meets, and with it its face
-    mesh = bsc.CollisionMesh(faces, 6, group=[2, 1, 1, 4, 4, 4], mask=[-1, -1, -1, 2, 2, 2])
-    found = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1)
-    assert found.vertex_face.tolist() == [[3, 0], [4, 0], [5, 0]] and found.stats.vertex_face.filtered == 0
-    mesh = bsc.CollisionMesh(faces, 6, group=[1, 1, 1, 4, 4, 4], mask=[-1, -1, -1, 2, 2, 2])
-    found = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1)
-    assert len(found.vertex_face) == 0 and found.stats.vertex_face.filtered == 3 and found.certified
+    for group, hits in ([1, 1, 1, 4, 4, 4], [3, 4, 5]), ([1, 1, 1, 4, 2, 4], [3, 5]), ([1, 1, 8, 4, 4, 4], []):
+        mesh = bsc.CollisionMesh(faces, 6, group=group, mask=[4, 4, 4, 1, 1, 1])
+        found = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1)
+        assert found.vertex_face.tolist() == [[vertex, 0] for vertex in hits] and found.certified
+        assert found.stats.vertex_face.filtered == 3 - len(hits)
 
 
 def test_intersections_and_proximities_are_filtered_alike(broad_phase):

@@ -389,7 +389,19 @@ def calls_of_solvers() -> dict[str, Call]:
         "one bad": [1.0] * (count - 1) + [-1.0],
         "masked": masked(np.ones(count)),
     }
+    filters = without(OBJECTS, "None") | {
+        "bits": {"particle_group": 1},
+        "too few": bsc.CollisionFilter(particle_mask=np.ones(count - 1, dtype=int)),
+        "shapes": bsc.CollisionFilter(shape_group=[1]),
+    }
+    bits = without(bad_bits(count), "rows") | {"two-dimensional": np.ones((2, 2), dtype=int)}
     found = {
+        "CollisionFilter": Call(
+            bsc.CollisionFilter,
+            {},
+            dict.fromkeys(["particle_group", "particle_mask", "shape_group", "shape_mask"], bits),
+            raises=bsc.CollisionFilter,
+        ),
         "SolverCCD": Call(
             bsc.SolverCCD,
             {"solver": inner},
@@ -405,6 +417,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "report_worlds": FLAGS,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "collision_filter": filters,
                 "contact_layer": FLAGS,
                 "lift_speed_limit": FLAGS,
             },
@@ -417,6 +430,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "solver": solvers,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "collision_filter": filters,
                 "report_worlds": FLAGS,
             },
             raises=bsc.CollisionMonitor.__init__,
@@ -431,6 +445,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "restitution": coefficient | {"above 1": 1.5},
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "collision_filter": filters,
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
             },
             raises=bsc.ContactLayer.__init__,

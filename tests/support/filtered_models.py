@@ -67,15 +67,17 @@ def pairs_of(detector, x0, x1):
     return kinds, np.concatenate(list(corners.values()))
 
 
-def judge(seed, **options):
-    """Rolls a model out, and judges each step."""
+def judge(seed, stage=bsc.SolverCCD, **options):
+    """Rolls a model out behind a stage, and judges each step."""
     model, collision_filter = build(seed)
     result = Judged()
     predicted = []
     inner = Changed(model, lambda state: predicted.append(state.particle_q.numpy().copy()))
-    solver = bsc.SolverCCD(inner, collision_filter=collision_filter, report_contacts=True, substeps=None, **options)
+    solver = stage(inner, collision_filter=collision_filter, report_contacts=True, substeps=None, **options)
     mesh, count = solver.mesh, model.particle_count
-    bits = {"group": mesh.group, "mask": mesh.mask}
+    of_both = zip(collision_filter.bits_of_particles(model), collision_filter.bits_of_shapes(model), strict=True)
+    group, mask = (np.concatenate([one, other[mesh.shape_vertices.shape]]) for one, other in of_both)
+    bits = {"group": group, "mask": mask}
     filtered = bsc.CollisionMesh(mesh.faces, mesh.vertex_count, **bits, device="cpu")
     whole = bsc.CollisionMesh(mesh.faces, mesh.vertex_count, device="cpu")
     exact, every, near = (
@@ -84,7 +86,7 @@ def judge(seed, **options):
     )
     ground = mesh.planes.shape[0]
     of_plane = [bits[ground] for bits in collision_filter.bits_of_shapes(model)]
-    meets_plane = ((mesh.group & of_plane[1]) != 0) & ((mesh.mask & of_plane[0]) != 0)
+    meets_plane = ((group & of_plane[1]) != 0) & ((mask & of_plane[0]) != 0)
     state, end, x = model.state(), model.state(), wp.empty(mesh.vertex_count, dtype=wp.vec3, device="cpu")
 
     def positions(particle_q):

@@ -5,11 +5,9 @@ import numpy as np
 
 def meet(mesh, first, second):
     """Which pairs of elements are left in, given by their vertices, shapes (n, 1 to 3) and (n, 1 to 3)."""
-    group, mask = (
-        [np.bitwise_or.reduce(bits.astype(np.int64)[corners], axis=1) for corners in (first, second)]
-        for bits in (mesh.group, mesh.mask)
-    )
-    return ((group[0] & mask[1]) != 0) & ((group[1] & mask[0]) != 0)
+    group, mask = mesh.group.astype(np.int64), mesh.mask.astype(np.int64)
+    one, other = first[:, :, None], second[:, None, :]
+    return ((group[one] & mask[other]) != 0).all(axis=(1, 2)) & ((group[other] & mask[one]) != 0).all(axis=(1, 2))
 
 
 def corners_of(mesh, kind, pairs):

@@ -290,8 +290,7 @@ class IntersectionFinder:
         """
         hits = len(collisions.vertex_face) + len(collisions.edge_edge)
         is_slower = self._mesh.device.is_cuda or _PAIRS_OF_HIT * hits > len(self._mesh.edges)
-        # a filter may leave out a vertex with a face, and not an edge of that vertex
-        if is_slower or not collisions.certified or not self._has_sides or self._mesh.group is not None:
+        if is_slower or not collisions.certified or not self._has_sides:
             return self.find(x, is_end=True)
         pairs = self._pairs_that_may_meet(start, collisions)
         return self._find(x, lambda _: self._candidates.enqueue(pairs))

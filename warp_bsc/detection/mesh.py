@@ -93,12 +93,11 @@ class CollisionMesh:
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
             group: The groups that each vertex is in, as the bits of integers in [0, 2^32), or -1 for all; shape
-                [vertex_count], NumPy or Warp array, or one for all vertices. The groups of an edge or a face are those
-                of its vertices together. Default: 1 for all, the first group.
-            mask: The groups that each vertex meets, in the same form; the mask of an edge or a face has the bits of its
-                vertices together. A pair is left out unless each of its two elements has a group that is in the mask of
-                the other. Results do not have it, certificates do not cover it, and ``stats.filtered`` counts it.
-                Default: -1 for all, that is, every group.
+                [vertex_count], NumPy or Warp array, or one for all vertices. Default: 1, the first group.
+            mask: The groups that each vertex meets, in the same form; default: -1, every group. Two vertices meet if
+                each has a group that is in the mask of the other. A pair of elements is left out unless each vertex of
+                one meets each vertex of the other: results do not have it, certificates do not cover it, and
+                ``stats.filtered`` counts it. What is not left out and certified does not come to cross.
             only_free: Whether to find only the pairs with a vertex or an edge that no face has. The others, which
                 another detector can find, then cost no time.
             device: Warp device; default: Warp's default.

@@ -57,9 +57,9 @@ class InsideFinder:
     inside if it is strictly inside: of a sheet, the part that is.
 
     The finder excludes a particle in the soft body that it belongs to or in a solid of another world, pairs that the
-    response cannot move (a pinned particle in a static shape), pairs that a filter of the mesh leaves out, particles
-    that are not active, and positions that are not finite. The groups of a soft body are those of all its particles. A
-    soft body or shape with a position that is not finite holds nothing.
+    response cannot move (a pinned particle in a static shape), particles and solids that a filter of the mesh leaves
+    out, wholly or in part, particles that are not active, and positions that are not finite. A soft body or shape with
+    a position that is not finite holds nothing.
 
     Floating-point errors cannot change the result for soft bodies and shapes. A particle is inside the solid of a plane
     if its distance is certainly negative, as in a step.
@@ -104,14 +104,14 @@ class InsideFinder:
         has_movable = np.bincount(soft[(soft >= 0) & movable[: len(soft)]], minlength=len(soft)) > 0
         is_movable = np.where(solids.shape < 0, np.append(has_movable, False)[solids.soft_body], moves[solids.body])
 
-        bits = self._bits_of_solids
+        kind_of_vertex, meets = self._meeting_solids
 
         def are_candidates(pairs):
             particle, body = particles[pairs[:, 0]], pairs[:, 1]
             found = holds[body] & (world[particle] == solids.world[body])
             found &= (soft[particle] < 0) | (soft[particle] != solids.soft_body[body])
             found &= movable[particle] | is_movable[body]
-            return found & self._meet(particle, *bits[:, body])
+            return found & meets[kind_of_vertex[particle], body]
 
         x = np.where(finite[:, None], x, 0.0)
         found = solids.finder.find_points(x, x[particles], are_candidates)
@@ -125,34 +125,34 @@ class InsideFinder:
             terms = np.column_stack([np.full(len(x), -offset), x * normal])
             deep = terms.sum(axis=1) < -(_ROUNDOFF * np.abs(terms).sum(axis=1) + _TINY)
             deep &= (of_planes.world[i] < 0) | (of_planes.world[i] == world)
-            deep &= self._meet(particles, *self._bits_of_shapes[:, of_planes.shape[i]])
+            of_plane = self._bits_of_shapes[:, of_planes.shape[i], None]
+            deep &= _meet(self._bits_of_vertices[:, particles], of_plane)
             inside = particles[deep & (movable[particles] | moves[of_planes.body[i]])]
             rows.append(np.column_stack([inside, np.full_like(inside, of_planes.shape[i]), np.full_like(inside, -1)]))
         return np.concatenate(rows)
 
-    def _meet(self, particles, group, mask):
-        """Returns which particles and solids of these groups and masks no filter leaves out."""
+    @functools.cached_property
+    def _bits_of_vertices(self) -> np.ndarray:
+        """Groups and masks of the vertices, shape [2, vertex_count]; 1 without a filter."""
         mesh = self._mesh
-        if mesh.group is None:
-            return np.ones(len(particles), dtype=bool)
-        return ((mesh.group[particles] & mask) != 0) & ((mesh.mask[particles] & group) != 0)
+        return np.ones((2, mesh.vertex_count), int) if mesh.group is None else np.stack([mesh.group, mesh.mask])
 
     @functools.cached_property
     def _bits_of_shapes(self) -> np.ndarray:
-        """Groups and masks of the shapes, shape [2, shape_count]; 0 without a filter."""
+        """Groups and masks of the shapes, shape [2, shape_count]; 1 without a filter."""
         bits = self._mesh.shape_filter
-        if not bits.group:
-            return np.zeros((2, self._mesh.model.shape_count), dtype=np.uint32)
+        if self._mesh.group is None:
+            return np.ones((2, self._mesh.model.shape_count), dtype=int)
         return np.stack([bits.group.numpy(), bits.mask.numpy()]).view(np.uint32)
 
     @functools.cached_property
-    def _bits_of_solids(self) -> np.ndarray:
-        """Groups and masks of the solids, those of their vertices together, shape [2, n]; 0 without a filter."""
-        solids, bits = self._solids, np.zeros((2, len(self._solids.shape)), dtype=np.uint32)
-        if self._mesh.group is not None:
-            for united, of_vertices in zip(bits, (self._mesh.group, self._mesh.mask), strict=True):
-                np.bitwise_or.at(united, np.repeat(solids.of_face, 3), of_vertices[solids.faces.ravel()])
-        return bits
+    def _meeting_solids(self) -> tuple[np.ndarray, np.ndarray]:
+        """The kind of each vertex, of those alike, shape [vertex_count], and which kinds meet all of which solids."""
+        solids = self._solids
+        kinds, kind_of_vertex = np.unique(self._bits_of_vertices, axis=1, return_inverse=True)
+        has = np.zeros((len(kinds.T), len(solids.shape)), dtype=bool)  # kinds of vertices that solids have
+        has[kind_of_vertex.ravel()[solids.faces], solids.of_face[:, None]] = True
+        return kind_of_vertex.ravel(), ~(~_meet(kinds[:, :, None], kinds[:, None, :]) @ has)
 
     @functools.cached_property
     def _solids(self) -> _Solids:
@@ -180,6 +180,11 @@ class InsideFinder:
             world=np.concatenate([world[soft_bodies], copies[:, 1]]),
             soft_body_of=soft_body_of,
         )
+
+
+def _meet(bits: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Returns which groups and masks meet, each of shape [2, ...]."""
+    return ((bits[0] & other[1]) != 0) & ((other[0] & bits[1]) != 0)
 
 
 def _read(values: wp.array | None, count: int) -> np.ndarray:

@@ -195,9 +195,10 @@ class SolverReport(ContactReport, WorldsOfReport):
         """Pairs that filters left out of the last step, so that its certificate does not cover them.
 
         These are the pairs that ``collision_filter`` leaves out and whose boxes overlap in the motion that the inner
-        solver predicted, near each other or not, and particles in solids of infinite planes that it leaves out. If the
-        response moves bodies, contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from
-        colliding count as well. In a CUDA graph it is a lower bound if its queues are too small.
+        solver predicted, near each other or not, and particles in solids of infinite planes that it leaves out. With
+        ``bodies="separated"`` particles count with shapes that collide with shapes alone. If the response moves bodies,
+        so do contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from colliding. In a
+        CUDA graph the number is a lower bound if its queues are too small.
         """
         return _read(self._work.results[Result.FILTERED])
 

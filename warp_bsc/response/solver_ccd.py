@@ -198,13 +198,15 @@ class SolverCCD(CollisionStage):
         self._reads_friction = options.reads_friction
         self.friction, self.restitution = options.friction, options.restitution
         self.substeps, self.max_iterations = options.substeps, options.max_iterations
-        mesh = ModelMesh(self.model, strands=options.distances.any, collision_filter=collision_filter)
+        separates, keeps_distances = options.bodies == "separated", options.distances.any
+        filters = {"collision_filter": collision_filter, "separates_bodies": separates}
+        mesh = ModelMesh(self.model, strands=keeps_distances, **filters)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
-        if options.distances.any:
+        if keeps_distances:
             mesh.distances = mesh.min_distances(options.distances, reach=self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         integrator = innermost(solver)
-        moves, separates = options.moves_bodies(mesh, integrator), options.bodies == "separated"
+        moves = options.moves_bodies(mesh, integrator)
         coefficients = friction_of(mesh, self.friction)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)

@@ -7,7 +7,7 @@ from newton import ShapeFlags
 
 from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
-from ...kernels.pipeline.pairs import groups_meet
+from ...kernels.pipeline.pairs import groups_meet, is_filtered
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
 from ..state.planes import MovingPlanes
@@ -77,7 +77,7 @@ def is_filtered_by_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: i
 
 @wp.func
 def crosses_face(step: Step, edge: int, face: int) -> bool:
-    """Returns whether an edge certainly crosses a face at the start."""
+    """Returns whether an edge certainly crosses a face at the start; not if a filter leaves the pair out."""
     mesh = step.mesh
     for end in range(2):
         for corner in range(3):
@@ -86,6 +86,9 @@ def crosses_face(step: Step, edge: int, face: int) -> bool:
     x = step.motion.x0
     p = mesh.edges[edge, 0]
     q = mesh.edges[edge, 1]
+    corners = wp.vec3i(mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2])
+    if is_filtered(step.motion.pair_filter, wp.vec3i(p, q, q), corners):
+        return False
     a = x[mesh.faces[face, 0]]
     b = x[mesh.faces[face, 1]]
     c = x[mesh.faces[face, 2]]

@@ -11,7 +11,7 @@ from ...detection.approach_phase import MinDistances, make_min_distances
 from ...detection.mesh import CollisionMesh
 from ...kernels.pipeline.pairs import PairFilter
 from ..tuning import SEGMENTS
-from .collision_filter import CollisionFilter
+from .collision_filter import CollisionFilter, bits_of_model
 from .kept_distances import KeptDistances
 from .structs import Connectivity, Incidence
 
@@ -66,8 +66,8 @@ class ModelMesh(CollisionMesh):
     vertices in each. Infinite planes have no triangles and are listed separately.
 
     Later changes of the model do not change the mesh, except for positions and inverse masses. Shapes that do not
-    collide with particles (``newton.ShapeFlags.COLLIDE_PARTICLES``) are not part of it. Particles that are not active
-    are, and are held where the program puts them.
+    collide with particles by their flags (``newton.ShapeFlags``) are not part of it. Particles that are not active are,
+    and are held where the program puts them.
 
     Attributes:
         model: The model.
@@ -90,6 +90,7 @@ class ModelMesh(CollisionMesh):
         strands: bool = False,
         segments: int = SEGMENTS,
         collision_filter: CollisionFilter | None = None,
+        separates_bodies: bool = False,
     ):
         """Tessellates the shapes and puts the mesh on the model's device.
 
@@ -101,6 +102,8 @@ class ModelMesh(CollisionMesh):
             segments: Triangles around a round shape, a multiple of four, 4 to 1024. The mesh of a sphere of radius r
                 lies up to 10 r / segments^2 below the sphere.
             collision_filter: Groups and masks of particles and shapes; None to leave out no pairs.
+            separates_bodies: Whether shapes of a model with bodies take part that collide with shapes, but not with
+                particles; a filter leaves out their pairs with particles.
 
         Raises:
             TypeError: If ``segments`` is no integer.
@@ -120,7 +123,11 @@ class ModelMesh(CollisionMesh):
             )
         shape_body, shape_world = host_array(model.shape_body), host_array(model.shape_world)
         transform = host_array(model.shape_transform).astype(np.float64)
-        collides = (host_array(model.shape_flags) & ShapeFlags.COLLIDE_PARTICLES) != 0
+        flags = host_array(model.shape_flags)
+        apart = np.zeros(len(flags), dtype=bool)
+        if separates_bodies and model.body_count:
+            apart = (flags & (ShapeFlags.COLLIDE_SHAPES | ShapeFlags.COLLIDE_PARTICLES)) == ShapeFlags.COLLIDE_SHAPES
+        collides = apart | ((flags & ShapeFlags.COLLIDE_PARTICLES) != 0)
         shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
         infinite = are_infinite_planes(model)
         tessellations = {}
@@ -142,14 +149,15 @@ class ModelMesh(CollisionMesh):
         world, faces = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)]), np.concatenate(faces)
         edges, points = _strands(model, faces) if strands else (None, None)
         worlds = world if model.world_count > 1 else None
-        shapes, bits, self.shape_filter = np.array(shapes, dtype=np.int32), {}, PairFilter()
-        if collision_filter is not None:
-            of_shapes = collision_filter.bits_of_shapes(model)
-            pairs = zip(collision_filter.bits_of_particles(model), of_shapes, strict=True)
-            bits["group"], bits["mask"] = (np.concatenate([one, other[shapes]]) for one, other in pairs)
-            group, mask = (wp.array(b.view(np.int32), dtype=int, device=model.device) for b in of_shapes)
-            self.shape_filter.group, self.shape_filter.mask = group, mask
-        super().__init__(faces, vertex_count, edges=edges, points=points, world=worlds, device=model.device, **bits)
+        shapes, group, mask = np.array(shapes, dtype=np.int32), None, None
+        bits, self.shape_filter = bits_of_model(model, collision_filter, apart), PairFilter()
+        if bits is not None:
+            of_particles, of_shapes = bits
+            group, mask = np.concatenate([of_particles, of_shapes[:, shapes]], axis=1)
+            on_device = [wp.array(b.view(np.int32), dtype=int, device=model.device) for b in of_shapes]
+            self.shape_filter.group, self.shape_filter.mask = on_device
+        options = {"edges": edges, "points": points, "world": worlds, "group": group, "mask": mask}
+        super().__init__(faces, vertex_count, **options, device=model.device)
         self.model = model
         planes = np.flatnonzero(collides & infinite).astype(np.int32)
         normals = _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0]))

@@ -62,8 +62,6 @@ def _resolves(
     shape = contacts.shape[i]
     body = stage.shape_body[shape]
     x = wp.vec3()
-    group = int(0)
-    mask = int(0)
     for corner in range(3):
         particle = contacts.indices[i][corner]
         if particle >= 0:
@@ -71,11 +69,10 @@ def _resolves(
                 return False
             x += contacts.barycentric[i][corner] * particle_q[particle]
             if stage.of_particles.group:
-                group |= stage.of_particles.group[particle]
-                mask |= stage.of_particles.mask[particle]
-    if stage.of_particles.group:
-        if not groups_meet(group, mask, stage.of_shapes.group[shape], stage.of_shapes.mask[shape]):
-            return False
+                group = stage.of_particles.group[particle]
+                mask = stage.of_particles.mask[particle]
+                if not groups_meet(group, mask, stage.of_shapes.group[shape], stage.of_shapes.mask[shape]):
+                    return False
     point = contacts.body_pos[i]
     if body >= 0:
         point = wp.transform_point(body_q[body], point)
