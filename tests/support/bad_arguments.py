@@ -531,6 +531,8 @@ PASSED_ON = re.compile(
 """Methods that delegate to the inner solver, which checks their arguments."""
 
 INTERNAL = {
+    "CollisionFilter.bits_of_particles",
+    "CollisionFilter.bits_of_shapes",
     "CollisionMesh.device_elements",
     "FrameRange.bounds",
     "FrameRange.times",

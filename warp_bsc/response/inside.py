@@ -135,7 +135,9 @@ class InsideFinder:
     def _bits_of_vertices(self) -> np.ndarray:
         """Groups and masks of the vertices, shape [2, vertex_count]; 1 without a filter."""
         mesh = self._mesh
-        return np.ones((2, mesh.vertex_count), int) if mesh.group is None else np.stack([mesh.group, mesh.mask])
+        if mesh.group is None or mesh.mask is None:
+            return np.ones((2, mesh.vertex_count), dtype=int)
+        return np.stack([mesh.group, mesh.mask])
 
     @functools.cached_property
     def _bits_of_shapes(self) -> np.ndarray:

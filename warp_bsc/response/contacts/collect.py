@@ -8,7 +8,7 @@ from ...kernels.pipeline.queues import has_overflowed, is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, is_dividing, widened
-from ..state.planes import MovingPlanes, signed_distance, time_of_entry
+from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
@@ -128,7 +128,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             continue
         if kept < ZERO and after >= kept - PLANE_DEPTH * separation:
             continue
-        if rules.is_filtered_by_plane(motion, planes, i, vertex):
+        if is_filtered_by_plane(motion, planes, i, vertex):
             wp.atomic_add(status.detection, int(Detection.FILTERED), wp.where(ahead, 0, 1))
             continue
         if not _stops(motion, planes, i, vertex):

@@ -7,10 +7,9 @@ from newton import ShapeFlags
 
 from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
-from ...kernels.pipeline.pairs import groups_meet, is_filtered
+from ...kernels.pipeline.pairs import is_filtered
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
-from ..state.planes import MovingPlanes
 from ..state.structs import Bodies, Motion, Step, body_of, can_move
 from ..state.vectors import ZERO, to_double
 from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
@@ -60,19 +59,6 @@ def collides(bodies: Bodies, shape: int, other: int) -> bool:
     key = wp.int64(wp.min(shape, other)) * shapes + wp.int64(wp.max(shape, other))
     place = wp.lower_bound(bodies.filtered, key)
     return place == bodies.filtered.shape[0] or bodies.filtered[place] != key
-
-
-@wp.func
-def is_filtered_by_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
-    """Returns whether groups and masks leave out a vertex and an infinite plane."""
-    of_vertices = motion.pair_filter
-    if not of_vertices.group:
-        return False
-    of_shapes = planes.shape_filter
-    shape = planes.shape[i]
-    return not groups_meet(
-        of_vertices.group[vertex], of_vertices.mask[vertex], of_shapes.group[shape], of_shapes.mask[shape]
-    )
 
 
 @wp.func

@@ -9,8 +9,8 @@ from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE
 from ..contacts.closest import closest_vector
 from ..contacts.constraints import contact_friction
-from ..contacts.rules import ContactClass, is_filtered_by_plane, owner_of
-from ..state.planes import MovingPlanes, signed_distance
+from ..contacts.rules import ContactClass, owner_of
+from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ..state.structs import Motion, MovedBodies, body_of, can_move
 from ..state.vectors import ONE, ZERO, to_double
 from ..tuning import PARALLEL_IN_LAYER

@@ -7,7 +7,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..._arguments import check_instance, checked_bits
+from ..._arguments import as_numpy, check_instance, checked_bits
 
 _NAMES = ("particle_group", "particle_mask", "shape_group", "shape_mask")
 _MOST_GROUPS = 16
@@ -44,8 +44,10 @@ class CollisionFilter:
 
     def __post_init__(self):
         for name in _NAMES:
-            value = _on_host(getattr(self, name))
-            checked_bits(value, name, np.size(value) if np.ndim(value) < 2 else -1)
+            value = as_numpy(_on_host(getattr(self, name)), name, "one integer or an array of integers")
+            if value.ndim > 1:
+                raise ValueError(f"{name} must be one integer or an array of one dimension, not of shape {value.shape}")
+            checked_bits(value, name, value.size)
 
     def bits_of_particles(self, model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
         """Returns groups and masks of the particles of a model, uint32; errors as of the class if they do not fit."""
