@@ -53,6 +53,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .response.monitor import CollisionMonitor
     from .response.report import SolverReport
     from .response.solver_ccd import SolverCCD
+    from .response.state.collision_filter import CollisionFilter
     from .usd.frames import FrameRange
     from .usd.scene import Scene
     from .usd.selection import Selection
@@ -62,6 +63,7 @@ _MODULES = {
     "CapturedSteps": "response.captured_steps",
     "CollisionArrays": "detection.differentiable",
     "CollisionDetector": "detection.detector",
+    "CollisionFilter": "response.state.collision_filter",
     "CollisionMesh": "detection.mesh",
     "CollisionMonitor": "response.monitor",
     "Collisions": "detection.collisions",
@@ -97,6 +99,7 @@ __all__ = [
     "CapturedSteps",
     "CollisionArrays",
     "CollisionDetector",
+    "CollisionFilter",
     "CollisionMesh",
     "CollisionMonitor",
     "Collisions",

@@ -18,6 +18,7 @@ __all__ = [
     "as_numpy",
     "check_finite",
     "check_instance",
+    "checked_bits",
     "checked_choice",
     "checked_coordinates",
     "checked_distance",
@@ -242,6 +243,32 @@ def checked_distance(distance: Any, name: str, *, zero: bool = True) -> float:
     if not zero and checked == 0.0:
         raise ValueError(f"{name} must be more than 0, not {given(distance)}")
     return float(checked)
+
+
+def checked_bits(bits: Any, name: str, count: int) -> np.ndarray:
+    """Returns 32 bits for each of some things, uint32, shape (count,).
+
+    Args:
+        bits: Integers in [0, 2^32), or -1 for all bits; one, or an array of shape (count,).
+        name: Name of the argument in errors.
+        count: Number of things.
+
+    Raises:
+        TypeError: If they are no integers.
+        ValueError: If they have another shape, are masked, or are out of range.
+    """
+    what = "one integer or an array of integers"
+    values = as_numpy(bits, name, what)
+    if values.dtype.kind not in "iu":
+        raise TypeError(f"{name} must be {what}, not {given(bits)}")
+    if values.shape not in ((), (count,)):
+        raise ValueError(f"{name} must be one integer or have shape ({count},), not {values.shape}")
+    bad = (values < -1) | (values >= 2**32)
+    if bad.any():
+        which = np.flatnonzero(bad)[0]
+        where = f"{name}[{which}]" if values.ndim else name
+        raise ValueError(f"{where} must be in [0, 2^32), or -1 for all bits, not {values.reshape(-1)[which]}")
+    return np.broadcast_to(values, count).astype(np.uint32)
 
 
 def _as_double(values: np.ndarray) -> np.ndarray:

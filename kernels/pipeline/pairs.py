@@ -14,6 +14,43 @@ import warp as wp
 from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
 
+@wp.struct
+class PairFilter:
+    """Which pairs of elements are left out, by their vertices; without arrays none.
+
+    Two vertices meet if each has a group that is in the mask of the other. A pair of elements is left out unless each
+    vertex of one meets each vertex of the other. So where a pair of an edge and a face is not left out, neither are
+    those of their parts, whose contacts are the only way in which the two can come to cross.
+
+    Attributes:
+        group: Groups of each vertex, as bits.
+        mask: Groups that each vertex meets, as bits.
+    """
+
+    group: wp.array[int]
+    mask: wp.array[int]
+
+
+@wp.func
+def groups_meet(group: int, mask: int, other_group: int, other_mask: int) -> bool:
+    """Returns whether each of two has a group that is in the mask of the other."""
+    return (group & other_mask) != 0 and (other_group & mask) != 0
+
+
+@wp.func
+def is_filtered(pair_filter: PairFilter, element: wp.vec3i, other: wp.vec3i) -> bool:
+    """Returns whether a pair of elements is left out, each given as p p p, a b b or a b c."""
+    if not pair_filter.group:
+        return False
+    for i in range(3):
+        group = pair_filter.group[element[i]]
+        mask = pair_filter.mask[element[i]]
+        for j in range(3):
+            if not groups_meet(group, mask, pair_filter.group[other[j]], pair_filter.mask[other[j]]):
+                return True
+    return False
+
+
 @wp.func
 def owns_vertex(owned: int, corner: int) -> bool:
     """Returns whether a face is the representative of the vertex at a corner."""

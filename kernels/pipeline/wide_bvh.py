@@ -60,7 +60,7 @@ import warp as wp
     constexpr int buffered = 512;
     int found[2 * buffered];
     int count = 0;
-    wp::int64 overlapping = 0;
+    wp::int64 overlapping = 0, filtered = 0;
     auto flush = [&]() {
         const wp::int64 slot = __atomic_fetch_add(&counts.data[queued_count], (wp::int64)count, __ATOMIC_RELAXED);
         for (int i = 0; i < count && slot + i < capacity; ++i) {
@@ -69,6 +69,17 @@ import warp as wp
             at[1] = found[2 * i + 1];
         }
         count = 0;
+    };
+
+    // whether each corner of one element meets each corner of the other
+    auto meet = [&](const int* at, const int* other_at) -> bool {
+        for (int i = 0; i < corners; ++i)
+            for (int j = 0; j < other_corners; ++j) {
+                const int a = at[8 * i], b = other_at[8 * j];
+                if (!(group.data[a] & group_mask.data[b]) || !(group.data[b] & group_mask.data[a]))
+                    return false;
+            }
+        return true;
     };
 
     const unsigned changed = element[40];
@@ -111,6 +122,17 @@ import warp as wp
             mask &= ~bits(shared);
             if (!mask)
                 continue;
+            if (group.data) {
+                unsigned left_out = 0;
+                for (unsigned rest = mask; rest; rest &= rest - 1) {
+                    const int other_lane = __builtin_ctz(rest);
+                    left_out |= (unsigned)!meet(element + 8 + lane, other_element + 8 + other_lane) << other_lane;
+                }
+                filtered += __builtin_popcount(left_out);
+                mask &= ~left_out;
+                if (!mask)
+                    continue;
+            }
             overlapping += __builtin_popcount(mask);
             if (!keep_separated && !at_end) {
                 Ints apart = 0;
@@ -163,6 +185,8 @@ import warp as wp
         flush();
     if (overlapping)
         __atomic_fetch_add(&counts.data[candidate_count], overlapping, __ATOMIC_RELAXED);
+    if (filtered)
+        __atomic_fetch_add(&counts.data[filtered_count], filtered, __ATOMIC_RELAXED);
 """
 )
 def pair_packet(
@@ -178,6 +202,9 @@ def pair_packet(
     other_nodes: wp.array[wp.float32],
     other_node_worlds: wp.array[wp.int32],
     level_starts: wp.array[wp.int32],
+    # filter
+    group: wp.array[wp.int32],
+    group_mask: wp.array[wp.int32],
     # options
     symmetric: int,
     ordered: int,
@@ -188,6 +215,7 @@ def pair_packet(
     # indices of counts
     candidate_count: int,
     queued_count: int,
+    filtered_count: int,
     # out
     pairs: wp.array[wp.vec2i],
 ):
@@ -197,7 +225,8 @@ def pair_packet(
     start and at the end, on the same side; with ``keep_separated`` all candidates are enqueued. With ``at_end`` the
     boxes at the end count instead of the swept ones, and all pairs that overlap are enqueued. Pairs without a changed
     element are excluded. With ``symmetric`` both are of one tree, and each pair is found once. With ``ordered`` the
-    smaller number comes first, else that of the packet.
+    smaller number comes first, else that of the packet. With groups, the pairs that a :class:`.pairs.PairFilter` leaves
+    out are counted, and are no candidates.
     """
     ...
 

@@ -396,7 +396,7 @@ def test_what_bodies_do_has_three_names(bodies, device):
         bsc.SolverCCD(SOLVERS["vbd"](model), bodies=bodies)
 
 
-def boxes(device, *, velocities, positions, static=False):
+def boxes(device, *, velocities, positions, static=False, filtered=()):
     """Boxes in a row without gravity, each smaller than the last, a static one before them if asked; cloth far away."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_patch(builder, 2, 0.05, (0.0, 0.0, 5.0))
@@ -407,6 +407,8 @@ def boxes(device, *, velocities, positions, static=False):
     for position in positions:
         add_body(builder, "box", position, inertia=(7e-3, 7e-3, 7e-3), hx=half, hy=half, hz=half)
         half -= 0.03  # edges of two boxes are not in one line
+    for pair in filtered:
+        builder.add_shape_collision_filter_pair(*pair)
     return finalize(builder, [[*velocity, 0.0, 0.0, 0.0] for velocity in velocities], device)
 
 

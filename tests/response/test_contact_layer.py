@@ -415,6 +415,7 @@ def test_the_stage_puts_a_layer_in_where_the_model_asks_for_gradients(device):
     def layer_of(requires_grad=True, body=False, **options):
         builder = newton.ModelBuilder()
         add_square(builder, 3, 0.04, (0.0, 0.0, 0.1), **SOFT)
+        builder.add_ground_plane()
         if body:
             builder.add_shape_box(builder.add_body(mass=1.0), hx=0.02, hy=0.02, hz=0.02)
         solver = bsc.SolverCCD(semi_implicit(builder.finalize(device=device, requires_grad=requires_grad)), **options)
@@ -427,6 +428,6 @@ def test_the_stage_puts_a_layer_in_where_the_model_asks_for_gradients(device):
     assert layer_of(requires_grad=False) is None
     assert layer_of(body=True) is not None
     distances = layer_of(min_distance=0.03)._layer.distances
-    assert distances.of_planes == 0.015 and (distances.radius.numpy() == 0.015).all()
+    assert (distances.radius.numpy() == 0.015).all() and distances.of_planes.numpy().tolist() == [0.015]
     kept = layer_of(min_distance=0.01)  # neighbours beyond the next stay out of the layer
     assert kept.thickness == pytest.approx(0.45 * 0.04 - 0.01, rel=0.01)

@@ -88,6 +88,13 @@ def bad_arrays(good: np.ndarray, *, index: bool = False) -> dict[str, Any]:
     return values
 
 
+def bad_bits(count: int) -> dict[str, Any]:
+    """Returns what is neither 32 bits nor an array of 32 bits for each of some things."""
+    arrays = without(bad_arrays(np.zeros(count, int), index=True), "None", "number", "negative", "huge")
+    one = {"bool": True, "float": 1.0, "negative": -2, "33 bits": 2**32, "10^400": 10**400}
+    return arrays | one | {"one bad": [1] * (count - 1) + [2**32], "rows": np.zeros(count + 1, int)}
+
+
 def not_finite(good: np.ndarray) -> dict[str, Any]:
     """Returns coordinates that are not finite."""
     return {
@@ -191,6 +198,8 @@ def calls() -> dict[str, Call]:
             "vertex_count": NOT_COUNT,
             "radius": without(MANY_DISTANCES, "None") | {"one bad": [1.0] * 5 + [-1.0], "masked": masked(np.ones(6))},
             "world": world | {"huge": np.full(6, 2**31), "mixed": np.arange(6)},
+            "group": bad_bits(6),
+            "mask": bad_bits(6),
             "only_free": FLAGS,
             "device": DEVICES,
         },
@@ -380,7 +389,19 @@ def calls_of_solvers() -> dict[str, Call]:
         "one bad": [1.0] * (count - 1) + [-1.0],
         "masked": masked(np.ones(count)),
     }
+    filters = without(OBJECTS, "None") | {
+        "bits": {"particle_group": 1},
+        "too few": bsc.CollisionFilter(particle_mask=np.ones(count - 1, dtype=int)),
+        "shapes": bsc.CollisionFilter(shape_group=[1]),
+    }
+    bits = without(bad_bits(count), "rows") | {"two-dimensional": np.ones((2, 2), dtype=int)}
     found = {
+        "CollisionFilter": Call(
+            bsc.CollisionFilter,
+            {},
+            dict.fromkeys(["particle_group", "particle_mask", "shape_group", "shape_mask"], bits),
+            raises=bsc.CollisionFilter,
+        ),
         "SolverCCD": Call(
             bsc.SolverCCD,
             {"solver": inner},
@@ -396,6 +417,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "report_worlds": FLAGS,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "collision_filter": filters,
                 "contact_layer": FLAGS,
                 "lift_speed_limit": FLAGS,
             },
@@ -408,6 +430,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "solver": solvers,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "collision_filter": filters,
                 "report_worlds": FLAGS,
             },
             raises=bsc.CollisionMonitor.__init__,
@@ -422,6 +445,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "restitution": coefficient | {"above 1": 1.5},
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
+                "collision_filter": filters,
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
             },
             raises=bsc.ContactLayer.__init__,
@@ -507,6 +531,8 @@ PASSED_ON = re.compile(
 """Methods that delegate to the inner solver, which checks their arguments."""
 
 INTERNAL = {
+    "CollisionFilter.bits_of_particles",
+    "CollisionFilter.bits_of_shapes",
     "CollisionMesh.device_elements",
     "FrameRange.bounds",
     "FrameRange.times",

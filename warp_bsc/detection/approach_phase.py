@@ -46,34 +46,35 @@ class MinDistances:
 
     Attributes:
         radius: Radius of each vertex, half of the minimum distance included [m].
-        of_planes: Radius of infinite planes, half of the minimum distance [m].
+        of_planes: Radius of each infinite plane, half of the minimum distance included [m].
         reach: Largest distance of proximities beyond their minimum distance [m].
         rings: Vertices whose elements have no minimum distance.
         group: Group of each vertex; pairs within a group are skipped. -1 for none.
     """
 
     radius: wp.array[wp.float64]
-    of_planes: wp.float64
+    of_planes: wp.array[wp.float64]
     reach: wp.float64
     rings: Rings
     group: wp.array[int]
 
 
 def make_min_distances(
-    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: float, reach: float, group: np.ndarray
+    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, group: np.ndarray
 ) -> MinDistances:
     """Returns the minimum distances of a mesh on its device, see :class:`MinDistances`.
 
     Args:
         mesh: The mesh.
         radius: Radius of each vertex, float64, shape [vertex_count].
-        of_planes: Radius of infinite planes.
+        of_planes: Radius of each infinite plane, float64, shape [plane_count].
         reach: Largest distance of proximities beyond their minimum distance.
         group: Group of each vertex, int, shape [vertex_count].
     """
     distances = MinDistances()
     distances.radius = wp.array(radius, dtype=wp.float64, device=mesh.device)
-    distances.of_planes, distances.reach = of_planes, reach
+    distances.of_planes = wp.array(of_planes, dtype=wp.float64, device=mesh.device)
+    distances.reach = reach
     distances.rings = make_rings(mesh, _RINGS)
     distances.group = wp.array(group, dtype=int, device=mesh.device)
     return distances

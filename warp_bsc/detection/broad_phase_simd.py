@@ -33,15 +33,16 @@ class BroadPhaseSimd:
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
         self.lock = threading.RLock()
+        shared = mesh.world, padding, mesh.pair_filter
 
         def of_vertices(vertices: np.ndarray) -> WideTree:
-            return WideTree(vertices.reshape(-1, 1), vertices, mesh.world, padding)
+            return WideTree(vertices.reshape(-1, 1), vertices, *shared)
 
         def of_edges(edges: np.ndarray) -> WideTree:
-            return WideTree(mesh.edges[edges], edges, mesh.world, padding)
+            return WideTree(mesh.edges[edges], edges, *shared)
 
         self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
-        self._faces = WideTree(mesh.faces, np.arange(len(mesh.faces)), mesh.world, padding)
+        self._faces = WideTree(mesh.faces, np.arange(len(mesh.faces)), *shared)
         self._edges_of_faces = self._points = self._free_edges = None
         if mesh.only_free:
             self._vertices = of_vertices(np.setdiff1d(mesh.vertices, mesh.faces))

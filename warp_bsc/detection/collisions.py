@@ -28,6 +28,8 @@ class StageCounts:
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
         host: Candidates whose exponents are too far apart for that, or that may come within a minimum distance only for
             a moment of the step. The host decides them, except in a CUDA graph, where they stay unsure.
+        filtered: Pairs that share no vertex and whose swept boxes overlap, but that groups and masks of the mesh leave
+            out. They are no candidates.
     """
 
     candidates: int = 0
@@ -37,6 +39,7 @@ class StageCounts:
     unsure: int = 0
     exact: int = 0
     host: int = 0
+    filtered: int = 0
 
     @classmethod
     def of(cls, counts: PairCounts, *, exact: bool) -> "StageCounts":
@@ -49,6 +52,7 @@ class StageCounts:
             unsure=counts.unsure,
             exact=counts.for_exact - counts.too_wide_8 if exact else 0,
             host=counts.too_wide_8 if exact else 0,
+            filtered=counts.filtered,
         )
 
 
@@ -70,6 +74,11 @@ class DetectionStats:
     vertex_edge: StageCounts
     vertex_vertex: StageCounts
     milliseconds: dict[str, float]
+
+    @property
+    def filtered(self) -> int:
+        """Number of pairs of all kinds that groups and masks of the mesh leave out, see :class:`StageCounts`."""
+        return sum(getattr(self, kind.label).filtered for kind in DistanceKind)
 
 
 def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
@@ -93,7 +102,8 @@ class Collisions:
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides
             as well. False for method "float", and if a buffer overflowed, a position was not finite, or a pair was
-            left to the host in a CUDA graph.
+            left to the host in a CUDA graph. Pairs that groups and masks of the mesh leave out are not covered;
+            ``stats.filtered`` counts those whose swept boxes overlap.
         overflows: Each buffer that was too small, so that collisions are missing, with its count and capacity. Only a
             detection in a CUDA graph can overflow: detect once outside a graph, which enlarges the buffers, and capture
             again.

@@ -27,6 +27,8 @@ __all__ = ["CollisionDetector"]
 class CollisionDetector:
     """Finds all collisions of a moving mesh: vertices with faces and edges with edges that share no vertex.
 
+    Groups and masks of the mesh leave out pairs, here and in intersections and proximities.
+
     With a minimum distance, or with radii of the mesh, a pair collides if it comes within the sum of its two radii and
     that distance, touching included. The radius of an edge or a face is the largest one of its vertices. Radii are
     added and rounded in double precision; the sum counts as exact. Points of the mesh then also collide with edges that

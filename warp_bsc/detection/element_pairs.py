@@ -5,7 +5,7 @@ import warp as wp
 from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits
-from ..kernels.pipeline.pairs import owns_edge, owns_vertex
+from ..kernels.pipeline.pairs import is_filtered, owns_edge, owns_vertex
 from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slot, take_slots, write
 from .face_hierarchy import FaceHierarchy
 from .settings import NO_GRADIENTS, Count
@@ -20,6 +20,7 @@ __all__ = [
 ]
 
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
+_FILTERED = wp.constant(int(Count.FILTERED))
 _QUEUED = wp.constant(int(Count.QUEUED))
 
 _WIDTH = wp.constant(WIDTH)
@@ -54,6 +55,11 @@ def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
 
 
 @wp.func
+def _corners(faces: wp.array2d[int], face: int) -> wp.vec3i:
+    return wp.vec3i(faces[face, 0], faces[face, 1], faces[face, 2])
+
+
+@wp.func
 def _is_face(mesh: FaceHierarchy, place: int) -> bool:
     """Returns whether the cell at a place is a face; where all are, nothing is read."""
     if mesh.all_faces:
@@ -65,7 +71,8 @@ def _is_face(mesh: FaceHierarchy, place: int) -> bool:
 def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
-    Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well.
+    Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well. Those that a filter leaves
+    out are bits 6 to 8 instead.
     """
     owned = mesh.owned[face]
     found = int(0)
@@ -76,10 +83,14 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
     for corner in range(corners):
         if owns_vertex(owned, corner):
             box = read_box(mesh.vertex_boxes, 3 * face + corner)
-            if _overlap(box, other_box) and not _has_vertex(mesh.faces, other, mesh.faces[face, corner]):
-                found = found | (1 << corner)
-                if keep_separated or not _apart(box, other_box):
-                    found = found | (8 << corner)
+            vertex = mesh.faces[face, corner]
+            if _overlap(box, other_box) and not _has_vertex(mesh.faces, other, vertex):
+                if is_filtered(mesh.pair_filter, wp.vec3i(vertex), _corners(mesh.faces, other)):
+                    found = found | (64 << corner)
+                else:
+                    found = found | (1 << corner)
+                    if keep_separated or not _apart(box, other_box):
+                        found = found | (8 << corner)
     return found
 
 
@@ -87,7 +98,8 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
 def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which edges that two faces own have overlapping boxes: bit 3 i + j for sides i and j.
 
-    Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well.
+    Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well. Those that a filter leaves
+    out are bits 18 to 26 instead.
     """
     owned = mesh.owned[face]
     other_owned = mesh.owned[other]
@@ -109,9 +121,12 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
                             other_box = read_box(mesh.edge_boxes, 3 * other + other_side)
                             if _overlap(box, other_box):
                                 bit = 3 * side + other_side
-                                found = found | (1 << bit)
-                                if keep_separated or not _apart(box, other_box):
-                                    found = found | (512 << bit)
+                                if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), wp.vec3i(c, d, d)):
+                                    found = found | (262144 << bit)
+                                else:
+                                    found = found | (1 << bit)
+                                    if keep_separated or not _apart(box, other_box):
+                                        found = found | (512 << bit)
     return found
 
 
@@ -142,6 +157,7 @@ def pair_elements(
         return
     found = wp.uint64(0)
     candidates = wp.vec2i()  # vertex-face, edge-edge
+    filtered = wp.vec2i()
     queued = wp.vec2i()
     for turn in range(turns):
         at = first + turn * _WIDTH
@@ -149,18 +165,23 @@ def pair_elements(
             face = face_pairs[at][0]
             other = face_pairs[at][1]
             vertices = overlapping_vertices(mesh, face, other, keep_separated)
-            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
+            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 9)
             edges = overlapping_edges(mesh, face, other, keep_separated)
-            candidates[0] += count_set_bits(wp.uint32(vertices & 455))
+            candidates[0] += count_set_bits(wp.uint32(vertices & 0o7007))
             candidates[1] += count_set_bits(wp.uint32(edges & 511))
+            filtered[0] += count_set_bits(wp.uint32(vertices & 0o700700))
+            filtered[1] += count_set_bits(wp.uint32(edges >> 18))
             # of the rest only what no axis separates
-            vertices = ((vertices >> 3) & 7) | ((vertices >> 6) & 56)
-            edges = edges >> 9
+            vertices = ((vertices >> 3) & 7) | ((vertices >> 9) & 56)
+            edges = (edges >> 9) & 511
             queued[0] += count_set_bits(wp.uint32(vertices))
             queued[1] += count_set_bits(wp.uint32(edges))
             found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
     raise_count(vertex_face_counts, _CANDIDATES, candidates[0])
     raise_count(edge_edge_counts, _CANDIDATES, candidates[1])
+    if mesh.pair_filter.group:
+        raise_count(vertex_face_counts, _FILTERED, filtered[0])
+        raise_count(edge_edge_counts, _FILTERED, filtered[1])
     vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
     edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
     while found != wp.uint64(0):
@@ -203,7 +224,10 @@ def _pair_edges_with_face(
             b = mesh.faces[face, _next(side)]
             if _overlap(read_box(mesh.edge_boxes, row), read_box(mesh.face_boxes, other)):
                 if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
-                    append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
+                    if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), _corners(mesh.faces, other)):
+                        take_slot(counts, _FILTERED)
+                    else:
+                        append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -244,11 +268,13 @@ def _pair_point(
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.edge_boxes, 3 * other)
         if _overlap(box, other_box):
+            point = mesh.faces[place, 0]
+            if is_filtered(mesh.pair_filter, wp.vec3i(point), _corners(mesh.faces, other)):
+                take_slot(vertex_edge_counts, _FILTERED)
+                return
             take_slot(vertex_edge_counts, _CANDIDATES)
             if keep_separated or not _apart(box, other_box):
-                append(
-                    wp.vec2i(mesh.faces[place, 0], mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED
-                )
+                append(wp.vec2i(point, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -276,8 +302,11 @@ def pair_points(
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.vertex_boxes, 3 * other)
         if _overlap(box, other_box):
+            p = mesh.faces[place, 0]
+            q = mesh.faces[other, 0]
+            if is_filtered(mesh.pair_filter, wp.vec3i(p), wp.vec3i(q)):
+                take_slot(vertex_vertex_counts, _FILTERED)
+                return
             take_slot(vertex_vertex_counts, _CANDIDATES)
             if keep_separated or not _apart(box, other_box):
-                p = mesh.faces[place, 0]
-                q = mesh.faces[other, 0]
                 append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)

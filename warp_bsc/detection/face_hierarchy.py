@@ -23,6 +23,7 @@ from ..kernels.pipeline.hierarchy import (
     overlapping_children,
     overlapping_faces,
 )
+from ..kernels.pipeline.pairs import PairFilter
 from ..kernels.pipeline.queues import raise_count
 from .launch import made_once
 from .mesh import CollisionMesh
@@ -47,6 +48,7 @@ class FaceHierarchy:
     Attributes:
         all_faces: Whether all cells are faces.
         only_free: Whether pairs of two faces are left out.
+        pair_filter: Pairs of elements that are left out.
         face_count: Number of faces; greater cells are edges.
         point_start: First cell that is a point.
         order: Cell at each place, -1 for none.
@@ -66,6 +68,7 @@ class FaceHierarchy:
 
     all_faces: wp.bool
     only_free: wp.bool
+    pair_filter: PairFilter
     face_count: int
     point_start: int
     order: wp.array[int]
@@ -317,7 +320,7 @@ def make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
     device, order, places = mesh.device, mesh.face_order, mesh.device_places
     hierarchy = FaceHierarchy()
     hierarchy.all_faces = len(mesh.cells) == len(mesh.faces)
-    hierarchy.only_free = mesh.only_free
+    hierarchy.only_free, hierarchy.pair_filter = mesh.only_free, mesh.pair_filter
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
     hierarchy.order, hierarchy.faces, hierarchy.face_edges = places.order, places.faces, places.face_edges
     hierarchy.owned, hierarchy.edges = places.owned, mesh.device_edges

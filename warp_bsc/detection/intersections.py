@@ -226,10 +226,12 @@ class Intersections:
             ``mesh.edges``, sorted, int32, shape [n, 2].
         crosses: Whether the edge passes through the face, as :func:`warp_bsc.checker.edges_pass_faces` defines it. All
             other edges only touch their face. Bool, shape [n].
+        filtered: Number of pairs whose boxes overlap, but that groups and masks of the mesh leave out.
     """
 
     pairs: np.ndarray
     crosses: np.ndarray
+    filtered: int = 0
 
 
 class IntersectionFinder:
@@ -307,7 +309,7 @@ class IntersectionFinder:
 
         retry_until_fits(launch, self, mesh.device)
         if not self._count:
-            return Intersections(np.zeros((0, 2), dtype=np.int32), np.zeros(0, dtype=bool))
+            return Intersections(np.zeros((0, 2), dtype=np.int32), np.zeros(0, dtype=bool), self._filtered)
         status = _decided(mesh, x, mesh.device_edges, mesh.device_across, self._kept, self._status, self._count)
         pairs = self._kept[: self._count].numpy()
         meets, crosses = status != FREE, status == HIT
@@ -323,12 +325,13 @@ class IntersectionFinder:
             crosses[unsure] = checker.edges_pass_faces(edges, faces, across)
         pairs, crosses = pairs[meets], crosses[meets]
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
-        return Intersections(pairs[order], crosses[order])
+        return Intersections(pairs[order], crosses[order], self._filtered)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
         grown = self._candidates.grow()
-        self._count = int(self._candidates.counts.numpy()[Count.FOUND])
+        counts = self._candidates.counts.numpy()
+        self._count, self._filtered = int(counts[Count.FOUND]), int(counts[Count.FILTERED])
         if self._count > len(self._kept):
             self._allocate(capacity_for(self._count, "intersections"))
             return True

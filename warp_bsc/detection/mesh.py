@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .._arguments import as_numpy, checked_distances, checked_flag, checked_integer, checked_shape
+from .._arguments import as_numpy, checked_bits, checked_distances, checked_flag, checked_integer, checked_shape
+from ..kernels.pipeline.pairs import PairFilter
 from .face_order import order_faces
 from .settings import DistanceKind, PairKind
 from .start import checked_device
@@ -59,6 +60,8 @@ class CollisionMesh:
             [used_vertex_count].
         vertex_count: Number of positions.
         world: World of each vertex, int32, shape [vertex_count], or None if all are in one.
+        group: Groups of each vertex as bits, uint32, shape [vertex_count], or None if no pair is left out.
+        mask: Groups that each vertex meets as bits, uint32, shape [vertex_count], or None.
         only_free: Whether pairs are left out in which both elements belong to faces.
         device: Warp device of the arrays that the detector uses.
     """
@@ -73,6 +76,8 @@ class CollisionMesh:
         tets: np.ndarray | wp.array | None = None,
         radius: float | np.ndarray | wp.array | None = None,
         world: np.ndarray | wp.array | None = None,
+        group: int | np.ndarray | wp.array | None = None,
+        mask: int | np.ndarray | wp.array | None = None,
         only_free: bool = False,
         device: wp.DeviceLike = None,
     ):
@@ -92,15 +97,22 @@ class CollisionMesh:
                 two radii.
             world: The world of each vertex, integers in [0, 2^31), shape [vertex_count], NumPy or Warp array:
                 vertices in different worlds do not collide. Default: all are in one.
+            group: The groups that each vertex is in, as the bits of integers in [0, 2^32), or -1 for all; shape
+                [vertex_count], NumPy or Warp array, or one for all vertices. Default: 1, the first group.
+            mask: The groups that each vertex meets, in the same form; default: -1, every group. Two vertices meet if
+                each has a group that is in the mask of the other. A pair of elements is left out unless each vertex of
+                one meets each vertex of the other: results do not have it, certificates do not cover it, and
+                ``stats.filtered`` counts it. What is not left out and certified does not come to cross.
             only_free: Whether to find only the pairs with a vertex or an edge that no face has. The others, which
                 another detector can find, then cost no time.
             device: Warp device; default: Warp's default.
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: If the faces, edges, points, tetrahedra, radii or worlds have another shape or type or are out
-                of range, an index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one vertex twice,
-                entries are masked, the worlds differ within a face or an edge, or the device does not exist.
+            ValueError: If the faces, edges, points, tetrahedra, radii, worlds, groups or masks have another shape or type
+                or are out of range, an index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one
+                vertex twice, entries are masked, the worlds differ within a face or an edge, or the device does not
+                exist.
         """
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
         self.only_free = checked_flag(only_free, "only_free")
@@ -149,6 +161,20 @@ class CollisionMesh:
         self.world = None
         if world is not None:
             self.world = self._checked_world(world)
+        self.group = self.mask = None
+        if group is not None or mask is not None:
+            self.group = self._checked_bits(1 if group is None else group, "group")
+            self.mask = self._checked_bits(-1 if mask is None else mask, "mask")
+
+    @functools.cached_property
+    def pair_filter(self) -> PairFilter:
+        """The groups and masks on the device."""
+        pair_filter = PairFilter()
+        if self.group is not None and self.mask is not None:
+            group, mask = self.group.view(np.int32), self.mask.view(np.int32)
+            pair_filter.group = wp.array(group, dtype=int, device=self.device)
+            pair_filter.mask = wp.array(mask, dtype=int, device=self.device)
+        return pair_filter
 
     @functools.cached_property
     def cells(self) -> np.ndarray:
@@ -302,6 +328,10 @@ class CollisionMesh:
         given = radius.numpy() if isinstance(radius, wp.array) else radius
         values = checked_distances(given, "radius", self.vertex_count)
         return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
+
+    def _checked_bits(self, bits: int | np.ndarray | wp.array, name: str) -> np.ndarray:
+        """Returns groups or masks of the vertices, uint32, shape [vertex_count]."""
+        return checked_bits(bits.numpy() if isinstance(bits, wp.array) else bits, name, self.vertex_count)
 
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
         """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""

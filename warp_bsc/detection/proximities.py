@@ -106,6 +106,7 @@ class Proximities:
         distance: Distances of the pairs in the order of the attributes above, in the unit of the positions,
             float64, shape [n + m + k + l].
         position: Points halfway between the closest points, float64, shape [n + m + k + l, 3].
+        filtered: Number of pairs that may be near, but that groups and masks of the mesh leave out.
     """
 
     vertex_face: np.ndarray
@@ -114,6 +115,7 @@ class Proximities:
     vertex_vertex: np.ndarray
     distance: np.ndarray
     position: np.ndarray
+    filtered: int = 0
 
 
 class _ProximityQueue:
@@ -213,7 +215,8 @@ class ProximityFinder:
         found = [self._decide(queue, x, largest) for queue in self._queues]
         vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
         distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
-        return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position)
+        filtered = sum(counts.filtered for counts in self._counters.read().pairs.values())
+        return Proximities(vertex_face, edge_edge, vertex_edge, vertex_vertex, distance, position, filtered)
 
     def _decide(self, queue: _ProximityQueue, x: wp.array, largest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns pairs, distances and positions of a kind, without the pairs that are farther apart."""

@@ -11,6 +11,7 @@ from .._arguments import checked_number
 from ..kernels import polynomials
 
 __all__ = [
+    "FILTERED_COUNTS",
     "METHODS",
     "NO_FUSED_OPERATIONS",
     "NO_GRADIENTS",
@@ -130,6 +131,7 @@ class Count(enum.IntEnum):
             distance, that it does not decide: left to the host.
         REFUTED: Found pairs that the exact stage decides to be free.
         SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
+        FILTERED: Pairs that would be candidates, but are left out by groups and masks.
     """
 
     CANDIDATES = 0
@@ -144,6 +146,7 @@ class Count(enum.IntEnum):
     TOO_WIDE_8 = 9
     REFUTED = 10
     SUBDIVIDED = 11
+    FILTERED = 12
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,7 @@ class PairCounts:
     too_wide_8: int = 0
     refuted: int = 0
     subdivided: int = 0
+    filtered: int = 0
 
     @classmethod
     def of(cls, values: np.ndarray) -> "PairCounts":
@@ -188,6 +192,9 @@ class PairCounts:
 
 _NOT_FINITE, _FACE_PAIRS, _PAIRS = 0, 1, 2
 """Indices of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
+
+FILTERED_COUNTS = range(_PAIRS + Count.FILTERED, _PAIRS + len(DistanceKind) * len(Count), len(Count))
+"""Indices of the pairs that are filtered, of each kind."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from ..kernels.pipeline.pairs import PairFilter
 from ..kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
 from .launch import launch_over, made_once
 from .settings import NO_GRADIENTS, Count
@@ -20,6 +21,7 @@ _CODE_BITS = 10
 """Bits of a Hilbert code an axis."""
 _CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
+_FILTERED = wp.constant(int(Count.FILTERED))
 _LOOSE = 1.5
 """Trees are sorted again if the sum of the sizes of their packets has grown by this factor since they were sorted."""
 _FEW = 2048
@@ -151,6 +153,7 @@ def _pair_packets(
     other_node_worlds: wp.array[int],
     level_starts: wp.array[int],
     # options
+    pair_filter: PairFilter,
     symmetric: int,
     ordered: int,
     keep_separated: int,
@@ -171,6 +174,8 @@ def _pair_packets(
         other_nodes,
         other_node_worlds,
         level_starts,
+        pair_filter.group,
+        pair_filter.mask,
         symmetric,
         ordered,
         keep_separated,
@@ -178,6 +183,7 @@ def _pair_packets(
         counts,
         _CANDIDATES,
         _QUEUED,
+        _FILTERED,
         pairs,
     )
 
@@ -216,7 +222,12 @@ class WideTree:
     """A wide BVH over the elements of one kind: vertices, edges or faces."""
 
     def __init__(
-        self, corners: np.ndarray, numbers: np.ndarray, world: np.ndarray | None, padding: wp.array | None = None
+        self,
+        corners: np.ndarray,
+        numbers: np.ndarray,
+        world: np.ndarray | None,
+        padding: wp.array | None = None,
+        pair_filter: "PairFilter | None" = None,
     ):
         """Allocates a tree without boxes.
 
@@ -226,8 +237,10 @@ class WideTree:
             world: World of each vertex, int32, shape [vertex_count]; None for one world.
             padding: How far boxes reach beyond an element, for each vertex, the largest of an element's, array of
                 float64; None for boxes without a padding.
+            pair_filter: Pairs that are left out; None for none.
         """
         self._padding = padding
+        self._filter = PairFilter() if pair_filter is None else pair_filter
         n = len(corners)
         packets = -(-n // 8)
         starts = [0]
@@ -335,6 +348,7 @@ class WideTree:
             other._nodes.flatten(),
             other._node_worlds.flatten(),
             other._level_starts,
+            self._filter,
             other is self,
             ordered,
             keep_separated,

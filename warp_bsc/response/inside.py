@@ -57,8 +57,9 @@ class InsideFinder:
     inside if it is strictly inside: of a sheet, the part that is.
 
     The finder excludes a particle in the soft body that it belongs to or in a solid of another world, pairs that the
-    response cannot move (a pinned particle in a static shape), particles that are not active, and positions that are
-    not finite. A soft body or shape with a position that is not finite holds nothing.
+    response cannot move (a pinned particle in a static shape), particles and solids that a filter of the mesh leaves
+    out, wholly or in part, particles that are not active, and positions that are not finite. A soft body or shape with
+    a position that is not finite holds nothing.
 
     Floating-point errors cannot change the result for soft bodies and shapes. A particle is inside the solid of a plane
     if its distance is certainly negative, as in a step.
@@ -103,11 +104,14 @@ class InsideFinder:
         has_movable = np.bincount(soft[(soft >= 0) & movable[: len(soft)]], minlength=len(soft)) > 0
         is_movable = np.where(solids.shape < 0, np.append(has_movable, False)[solids.soft_body], moves[solids.body])
 
+        kind_of_vertex, meets = self._meeting_solids
+
         def are_candidates(pairs):
             particle, body = particles[pairs[:, 0]], pairs[:, 1]
             found = holds[body] & (world[particle] == solids.world[body])
             found &= (soft[particle] < 0) | (soft[particle] != solids.soft_body[body])
-            return found & (movable[particle] | is_movable[body])
+            found &= movable[particle] | is_movable[body]
+            return found & meets[kind_of_vertex[particle], body]
 
         x = np.where(finite[:, None], x, 0.0)
         found = solids.finder.find_points(x, x[particles], are_candidates)
@@ -121,9 +125,36 @@ class InsideFinder:
             terms = np.column_stack([np.full(len(x), -offset), x * normal])
             deep = terms.sum(axis=1) < -(_ROUNDOFF * np.abs(terms).sum(axis=1) + _TINY)
             deep &= (of_planes.world[i] < 0) | (of_planes.world[i] == world)
+            of_plane = self._bits_of_shapes[:, of_planes.shape[i], None]
+            deep &= _meet(self._bits_of_vertices[:, particles], of_plane)
             inside = particles[deep & (movable[particles] | moves[of_planes.body[i]])]
             rows.append(np.column_stack([inside, np.full_like(inside, of_planes.shape[i]), np.full_like(inside, -1)]))
         return np.concatenate(rows)
+
+    @functools.cached_property
+    def _bits_of_vertices(self) -> np.ndarray:
+        """Groups and masks of the vertices, shape [2, vertex_count]; 1 without a filter."""
+        mesh = self._mesh
+        if mesh.group is None or mesh.mask is None:
+            return np.ones((2, mesh.vertex_count), dtype=int)
+        return np.stack([mesh.group, mesh.mask])
+
+    @functools.cached_property
+    def _bits_of_shapes(self) -> np.ndarray:
+        """Groups and masks of the shapes, shape [2, shape_count]; 1 without a filter."""
+        bits = self._mesh.shape_filter
+        if self._mesh.group is None:
+            return np.ones((2, self._mesh.model.shape_count), dtype=int)
+        return np.stack([bits.group.numpy(), bits.mask.numpy()]).view(np.uint32)
+
+    @functools.cached_property
+    def _meeting_solids(self) -> tuple[np.ndarray, np.ndarray]:
+        """The kind of each vertex, of those alike, shape [vertex_count], and which kinds meet all of which solids."""
+        solids = self._solids
+        kinds, kind_of_vertex = np.unique(self._bits_of_vertices, axis=1, return_inverse=True)
+        has = np.zeros((len(kinds.T), len(solids.shape)), dtype=bool)  # kinds of vertices that solids have
+        has[kind_of_vertex.ravel()[solids.faces], solids.of_face[:, None]] = True
+        return kind_of_vertex.ravel(), ~(~_meet(kinds[:, :, None], kinds[:, None, :]) @ has)
 
     @functools.cached_property
     def _solids(self) -> _Solids:
@@ -151,6 +182,11 @@ class InsideFinder:
             world=np.concatenate([world[soft_bodies], copies[:, 1]]),
             soft_body_of=soft_body_of,
         )
+
+
+def _meet(bits: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Returns which groups and masks meet, each of shape [2, ...]."""
+    return ((bits[0] & other[1]) != 0) & ((other[0] & bits[1]) != 0)
 
 
 def _read(values: wp.array | None, count: int) -> np.ndarray:

@@ -1,5 +1,7 @@
 """The stage that only watches: it reports the collisions of another solver's steps, and changes nothing."""
 
+from typing import Literal
+
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
@@ -7,8 +9,10 @@ from newton.solvers import SolverBase
 from .._arguments import checked_flag
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
-from .options import checked_min_distance, checked_radii, default_separation, friction_of
+from .options import default_separation, friction_of
 from .stage import CollisionStage
+from .state.collision_filter import CollisionFilter, checked_filter
+from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .step import inspect
@@ -34,30 +38,33 @@ class CollisionMonitor(CollisionStage):
         self,
         solver: SolverBase,
         *,
-        min_distance: float | None = None,
+        min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
+        collision_filter: CollisionFilter | None = None,
         report_worlds: bool = False,
     ):
         """Puts the monitor behind a solver.
 
         Args:
             solver: Any Newton solver that moves particles.
-            min_distance: Distance that pairs should keep [m], as for :class:`.solver_ccd.SolverCCD`.
+            min_distance: Distance that pairs should keep [m], or ``"model"``, as for :class:`.solver_ccd.SolverCCD`.
             particle_radius: Radius of each particle [m], as for :class:`.solver_ccd.SolverCCD`.
+            collision_filter: Groups and masks of particles and shapes: pairs that they leave out are not watched,
+                :class:`.state.collision_filter.CollisionFilter`.
             report_worlds: Whether ``report.worlds`` has results by world, as for :class:`.solver_ccd.SolverCCD`.
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: If a distance is out of range.
+            ValueError: If a distance is out of range, or the filter does not fit the model.
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
         report_worlds = checked_flag(report_worlds, "report_worlds")
-        min_distance, radii = checked_min_distance(min_distance), checked_radii(particle_radius, self.model)
-        keeps_distances = min_distance > 0.0 or bool(radii.any())
-        mesh = ModelMesh(self.model, strands=keeps_distances)
-        if keeps_distances:
-            mesh.distances = mesh.min_distances(min_distance, radii, reach=0.0)
+        distances = KeptDistances.of(self.model, min_distance, particle_radius)
+        collision_filter = checked_filter(collision_filter, self.model)
+        mesh = ModelMesh(self.model, strands=distances.any, collision_filter=collision_filter)
+        if distances.any:
+            mesh.distances = mesh.min_distances(distances, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
         motion = ModelMotion(mesh, friction)

@@ -12,7 +12,6 @@ from newton.solvers import SolverBase, SolverSemiImplicit, SolverVBD, SolverXPBD
 from .._arguments import (
     checked_choice,
     checked_distance,
-    checked_distances,
     checked_flag,
     checked_integer,
     checked_number,
@@ -20,7 +19,9 @@ from .._arguments import (
 )
 from .._private_names.of_newton import has_external_rigid_solver
 from .schedule import MAX_ITERATIONS
+from .state.collision_filter import CollisionFilter, checked_filter
 from .state.friction import Friction
+from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
 
@@ -34,8 +35,8 @@ class StageOptions:
     """The arguments of :class:`.solver_ccd.SolverCCD`, checked, with defaults that follow from the model.
 
     Coefficients are arrays; ``reads_friction`` says whether each step reads those of friction again. The default of
-    ``separation`` follows from the mesh, and is None here. ``radii`` has the radius of each particle [m].
-    ``report_contacts`` is the number of contacts that are listed at most, 0 for none.
+    ``separation`` follows from the mesh, and is None here. ``report_contacts`` is the number of contacts that are
+    listed at most, 0 for none.
     """
 
     separation: float | None
@@ -44,8 +45,8 @@ class StageOptions:
     restitution: wp.array
     substeps: int | Literal["auto"] | None
     bodies: Bodies
-    min_distance: float
-    radii: np.ndarray
+    distances: KeptDistances
+    collision_filter: CollisionFilter | None
     contact_layer: bool
     lift_speed_limit: bool
     max_iterations: int
@@ -64,6 +65,7 @@ class StageOptions:
         bodies="pushed",
         min_distance=None,
         particle_radius=None,
+        collision_filter=None,
         contact_layer=True,
         lift_speed_limit=True,
         max_iterations=MAX_ITERATIONS,
@@ -82,19 +84,14 @@ class StageOptions:
             restitution=checked_restitution(restitution, model),
             substeps=substeps,
             bodies=cast(Bodies, checked_choice(bodies, "bodies", get_args(Bodies))),
-            min_distance=checked_min_distance(min_distance),
-            radii=checked_radii(particle_radius, model),
+            distances=KeptDistances.of(model, min_distance, particle_radius),
+            collision_filter=checked_filter(collision_filter, model),
             contact_layer=checked_flag(contact_layer, "contact_layer"),
             lift_speed_limit=checked_flag(lift_speed_limit, "lift_speed_limit"),
             max_iterations=checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS),
             report_contacts=checked_capacity(report_contacts, model),
             report_worlds=checked_flag(report_worlds, "report_worlds"),
         )
-
-    @property
-    def keeps_distances(self) -> bool:
-        """Whether pairs keep a distance."""
-        return self.min_distance > 0.0 or bool(self.radii.any())
 
     def moves_bodies(self, mesh: ModelMesh, solver: SolverBase) -> bool:
         """Returns whether the response can move bodies behind a solver."""
@@ -151,17 +148,6 @@ def checked_capacity(report_contacts, model: newton.Model) -> int:
     if report_contacts is True or report_contacts is False:
         return max(MIN_CONTACTS, CONTACTS_PER_PARTICLE * model.particle_count) if report_contacts else 0
     return checked_integer(report_contacts, "report_contacts", 1, MAX_CONTACTS)
-
-
-def checked_min_distance(min_distance) -> float:
-    """Returns the argument ``min_distance`` [m]; None is 0."""
-    return 0.0 if min_distance is None else checked_distance(min_distance, "min_distance")
-
-
-def checked_radii(particle_radius, model: newton.Model) -> np.ndarray:
-    """Returns the argument ``particle_radius``, one for each particle [m]; None is 0."""
-    radii = particle_radius.numpy() if isinstance(particle_radius, wp.array) else particle_radius
-    return checked_distances(0.0 if radii is None else radii, "particle_radius", model.particle_count)
 
 
 def checked_friction(friction, model: newton.Model) -> wp.array:

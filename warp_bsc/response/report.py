@@ -164,9 +164,9 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         With minimum distances, a collision is a pair that comes nearer than it may, here and in what follows.
 
-        Contacts that :attr:`excluded` counts, and contacts of which no vertex can be moved, are not part of this. A
-        step with a start position that is not finite is not certified; without a response, neither is one with such an
-        end. :attr:`uncertified_vertices` lists the particles concerned.
+        Contacts that :attr:`excluded` counts, pairs that filters leave out (:attr:`filtered`), and contacts of which no
+        vertex can be moved, are not part of this. A step with a start position that is not finite is not certified;
+        without a response, neither is one with such an end. :attr:`uncertified_vertices` lists the particles concerned.
         """
         self.warn()
         return bool(_read(self._work.results[Result.CERTIFIED]))
@@ -191,6 +191,18 @@ class SolverReport(ReportViews, WorldsOfReport):
         Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
         """
         return _read(self._work.results[Result.EXCLUDED])
+
+    @property
+    def filtered(self) -> int:
+        """Pairs that filters left out of the last step, so that its certificate does not cover them.
+
+        These are the pairs that ``collision_filter`` leaves out and whose boxes overlap in the motion that the inner
+        solver predicted, near each other or not, and particles in solids of infinite planes that it leaves out. With
+        ``bodies="separated"`` particles count with shapes that collide with shapes alone. If the response moves bodies,
+        so do contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from colliding. In a
+        CUDA graph the number is a lower bound if its queues are too small.
+        """
+        return _read(self._work.results[Result.FILTERED])
 
     @property
     def body_contacts(self) -> int:
@@ -381,6 +393,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             line += f", {self.crossings} crossings at the start (warp_bsc.repair_state removes them)"
         if totals.remaining or totals.excluded:
             line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
+        if self.filtered:
+            line += f"; {self.filtered} filtered pairs in the last step, which are not certified"
         if totals.not_finite_steps:
             line += f", {totals.not_finite_steps} steps with positions that are not finite"
         if gradients.grazing or gradients.lost_steps:

@@ -24,13 +24,15 @@ finite, see :func:`decide`.
 
 What is excluded? Contacts of elements that crossed or touched at the start, and vertices that were in the solid of a
 plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for contacts of
-bodies that are left to the inner solver, see :class:`.contacts.rules.ContactClass`.
+bodies that are left to the inner solver, see :class:`.contacts.rules.ContactClass`, and for pairs that filters leave
+out, see :class:`.state.collision_filter.CollisionFilter`.
 """
 
 from enum import IntEnum
 
 import warp as wp
 
+from ..detection.settings import FILTERED_COUNTS
 from ..kernels.pipeline.queues import has_overflowed
 from .state.structs import Step
 
@@ -55,6 +57,9 @@ _WIDENING = wp.constant(wp.float64(1.25))
 """Factor by which the separation of new constraints grows with each iteration, so that jams are resolved."""
 _WIDEST = wp.constant(wp.float64(5.0))
 """Largest factor on the separation."""
+_FIRST_FILTERED, _FILTERED_KINDS = wp.constant(FILTERED_COUNTS.start), wp.constant(len(FILTERED_COUNTS))
+_FILTERED_STEP = wp.constant(FILTERED_COUNTS.step)
+_LARGEST_COUNT = wp.constant(wp.int64(2**31 - 1))
 
 
 class Loop(IntEnum):
@@ -77,6 +82,7 @@ class Detection(IntEnum):
     EXCLUDED = 1  # contacts of elements that crossed or touched at the start
     OF_BODIES = 2  # contacts between bodies, which are left to the inner solver
     TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
+    FILTERED = 4  # contacts of shapes that do not collide by Newton's filters, and with planes that are filtered
 
 
 class Result(IntEnum):
@@ -94,6 +100,7 @@ class Result(IntEnum):
     FROZEN = 9  # 1 if a vertex or a body was frozen
     NOT_FINITE = 10  # particles whose predicted position or velocity was not finite
     CROSSINGS = 11  # edges that cross faces at the start
+    FILTERED = 12  # pairs of the predicted motion that filters left out
 
 
 @wp.struct
@@ -249,6 +256,15 @@ def decide_worlds(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], ca
     of_worlds.remaining[world] = found
 
 
+@wp.func
+def _count_filtered(counts: wp.array[wp.int64], contacts: int) -> int:
+    """Returns the pairs that filters left out of a detection, by its counts, and contacts that were left out later."""
+    filtered = wp.int64(contacts)
+    for kind in range(_FILTERED_KINDS):
+        filtered += counts[_FIRST_FILTERED + kind * _FILTERED_STEP]
+    return int(wp.min(filtered, _LARGEST_COUNT))
+
+
 @wp.kernel
 def decide(
     step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus
@@ -274,6 +290,8 @@ def decide(
     results[Result.REMAINING] = hits
     results[Result.EXCLUDED] = detection[Detection.EXCLUDED]
     results[Result.BODY_CONTACTS] = detection[Detection.OF_BODIES]
+    if results[Result.COUNTED] == 0:
+        results[Result.FILTERED] = _count_filtered(counts, detection[Detection.FILTERED])
     _clear_detection(status)
     loop[Loop.NEWLY_FROZEN] = 0
     if results[Result.COUNTED] == 0:

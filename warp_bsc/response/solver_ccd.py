@@ -22,6 +22,7 @@ from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, Loop
 from .stage import CollisionStage
+from .state.collision_filter import CollisionFilter
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
@@ -103,8 +104,9 @@ class SolverCCD(CollisionStage):
         restitution: float | wp.array[float] | None = None,
         substeps: int | Literal["auto"] | None = "auto",
         bodies: Literal["pushed", "separated", "left"] = "pushed",
-        min_distance: float | None = None,
+        min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
+        collision_filter: CollisionFilter | None = None,
         contact_layer: bool = True,
         lift_speed_limit: bool = True,
         max_iterations: int = MAX_ITERATIONS,
@@ -147,10 +149,15 @@ class SolverCCD(CollisionStage):
                 infinite planes: a pair that started farther apart stays so, and one that started closer comes no
                 closer. Neighbours, elements that an edge of the mesh joins, only do not touch. The stage moves pairs
                 apart to this distance and ``separation``. Springs and particles without faces take part. None or 0:
-                pairs do not touch.
-            particle_radius: Radius of each particle [m], shape [particle_count], or one for all, such as
-                ``model.particle_radius``: pairs keep the sum of their radii beside ``min_distance``. That of an edge or
-                a face is the largest one of its vertices, that of a shape 0.
+                pairs do not touch. ``"model"``: pairs keep the thickness that the model has, the radii of particles, or
+                ``particle_radius`` where that is given, and the margins of shapes (``model.shape_margin``).
+            particle_radius: Radius of each particle [m], shape [particle_count], or one for all: pairs keep the sum of
+                their radii beside ``min_distance``. That of an edge or a face is the largest one of its vertices, that
+                of a shape 0, or its margin with ``min_distance="model"``.
+            collision_filter: Groups and masks of particles and shapes: pairs that they leave out are left to the inner
+                solver, also if ``contacts`` are passed to :meth:`step`, see
+                :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
+                particles by their flags are left out in any case, pairs of shapes as ``bodies`` says.
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
@@ -181,6 +188,7 @@ class SolverCCD(CollisionStage):
             bodies=bodies,
             min_distance=min_distance,
             particle_radius=particle_radius,
+            collision_filter=collision_filter,
             contact_layer=contact_layer,
             lift_speed_limit=lift_speed_limit,
             max_iterations=max_iterations,
@@ -190,13 +198,15 @@ class SolverCCD(CollisionStage):
         self._reads_friction = options.reads_friction
         self.friction, self.restitution = options.friction, options.restitution
         self.substeps, self.max_iterations = options.substeps, options.max_iterations
-        mesh = ModelMesh(self.model, strands=options.keeps_distances)
+        separates, keeps_distances = options.bodies == "separated", options.distances.any
+        filters = {"collision_filter": collision_filter, "separates_bodies": separates}
+        mesh = ModelMesh(self.model, strands=keeps_distances, **filters)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
-        if options.keeps_distances:
-            mesh.distances = mesh.min_distances(options.min_distance, options.radii, reach=self.separation)
+        if keeps_distances:
+            mesh.distances = mesh.min_distances(options.distances, reach=self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         integrator = innermost(solver)
-        moves, separates = options.moves_bodies(mesh, integrator), options.bodies == "separated"
+        moves = options.moves_bodies(mesh, integrator)
         coefficients = friction_of(mesh, self.friction)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
@@ -207,6 +217,7 @@ class SolverCCD(CollisionStage):
                 restitution=self.restitution,
                 min_distance=min_distance,
                 particle_radius=particle_radius,
+                collision_filter=collision_filter,
                 bodies=options.bodies,
             )
         if isinstance(self.solver, ContactLayer):

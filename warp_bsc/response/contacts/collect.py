@@ -8,7 +8,7 @@ from ...kernels.pipeline.queues import has_overflowed, is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, is_dividing, widened
-from ..state.planes import MovingPlanes, signed_distance, time_of_entry
+from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
@@ -100,7 +100,7 @@ def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: i
     if not motion.distances.radius:
         return ZERO, ZERO
     before, error = signed_distance(planes.start[i], motion.x0[vertex])
-    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes, _KEPT * (before - error))
+    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (before - error))
     return wp.max(kept, ZERO), motion.distances.reach
 
 
@@ -127,6 +127,9 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         if near and not ahead:
             continue
         if kept < ZERO and after >= kept - PLANE_DEPTH * separation:
+            continue
+        if is_filtered_by_plane(motion, planes, i, vertex):
+            wp.atomic_add(status.detection, int(Detection.FILTERED), wp.where(ahead, 0, 1))
             continue
         if not _stops(motion, planes, i, vertex):
             continue
@@ -195,6 +198,9 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
     corners = vertices_of(contacts, i)
     owner = rules.owner_of(motion, corners)
     if owner == ContactClass.NONE or (near and owner != ContactClass.OURS):
+        return
+    if owner == ContactClass.FILTERED:
+        wp.atomic_add(status.detection, int(Detection.FILTERED), 1)
         return
     added = constraints.Constraint()
     bound = toi

@@ -7,6 +7,7 @@ from newton import ShapeFlags
 
 from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
+from ...kernels.pipeline.pairs import is_filtered
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
 from ..state.structs import Bodies, Motion, Step, body_of, can_move
@@ -23,6 +24,7 @@ class ContactClass(IntEnum):
     CROSSED = 1  # excludes it, because its elements crossed or touched at the start: the inner solver parts them
     OF_BODIES = 2  # counts it, and leaves it to the inner solver, because it is between bodies
     NONE = 3  # ignores it: nothing can be moved, or bodies that touched at the start
+    FILTERED = 4  # counts it: of two shapes that Newton's flags, groups or filters keep from colliding
 
 
 @wp.func
@@ -61,7 +63,7 @@ def collides(bodies: Bodies, shape: int, other: int) -> bool:
 
 @wp.func
 def crosses_face(step: Step, edge: int, face: int) -> bool:
-    """Returns whether an edge certainly crosses a face at the start."""
+    """Returns whether an edge certainly crosses a face at the start; not if a filter leaves the pair out."""
     mesh = step.mesh
     for end in range(2):
         for corner in range(3):
@@ -70,6 +72,9 @@ def crosses_face(step: Step, edge: int, face: int) -> bool:
     x = step.motion.x0
     p = mesh.edges[edge, 0]
     q = mesh.edges[edge, 1]
+    corners = wp.vec3i(mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2])
+    if is_filtered(step.motion.pair_filter, wp.vec3i(p, q, q), corners):
+        return False
     a = x[mesh.faces[face, 0]]
     b = x[mesh.faces[face, 1]]
     c = x[mesh.faces[face, 2]]
@@ -101,7 +106,7 @@ def crossed_at_start(step: Step, kind: int, pair: wp.vec2i) -> bool:
 
 @wp.func
 def owner_of(motion: Motion, corners: wp.vec4i) -> int:
-    """Returns the ContactClass of two elements as far as it follows from their vertices: OURS, OF_BODIES or NONE.
+    """Returns the ContactClass of two elements as far as it follows from their vertices, not CROSSED.
 
     Those of two bodies, or of a body and a static shape, are of bodies unless the response keeps these apart.
     """
@@ -117,7 +122,7 @@ def owner_of(motion: Motion, corners: wp.vec4i) -> int:
     if body_of(motion, corners[0]) == body_of(motion, corners[3]):
         return ContactClass.NONE
     if not collides(motion.bodies, motion.bodies.shape[a], motion.bodies.shape[b]):
-        return ContactClass.NONE
+        return ContactClass.FILTERED
     return wp.where(motion.bodies.responds == 1, int(ContactClass.OURS), int(ContactClass.OF_BODIES))
 
 

@@ -53,6 +53,9 @@ def _resolve(
     min_distance: wp.float64,
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
+    if owner == ContactClass.FILTERED:
+        wp.atomic_add(arguments.status.detection, int(Detection.FILTERED), 1)
+        return
     found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:
         wp.atomic_add(arguments.status.detection, int(Detection.EXCLUDED), 1)
@@ -109,9 +112,9 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
 @wp.func
 def _pairs_of_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
     """Returns the pairs of elements that two faces represent and whose boxes overlap, as bits."""
-    left = overlapping_vertices(mesh, place, other, False) >> 3
-    left = left | ((overlapping_vertices(mesh, other, place, False) >> 3) << 3)
-    return left | ((overlapping_edges(mesh, place, other, False) >> 9) << 6)
+    left = (overlapping_vertices(mesh, place, other, False) >> 3) & 7
+    left = left | (overlapping_vertices(mesh, other, place, False) & 56)
+    return left | (((overlapping_edges(mesh, place, other, False) >> 9) & 511) << 6)
 
 
 @wp.func

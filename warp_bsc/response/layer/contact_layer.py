@@ -16,6 +16,8 @@ A body takes part with its inverse mass at the contact, 1/m + (r x n) I^-1 (r x 
 the same way. Its pushes act where it was predicted to be.
 """
 
+from typing import Literal
+
 import newton
 import numpy as np
 import warp as wp
@@ -34,6 +36,7 @@ from ..adjoint.structs import StateGradients
 from ..contacts.queue import queues_of
 from ..integration.wrapped_solver import WrappedSolver, innermost
 from ..options import Bodies, StageOptions, friction_of, in_eight_bits, particle_edge_lengths
+from ..state.collision_filter import CollisionFilter
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, arrays_of
 from ..state.structs import add_zeros
@@ -80,8 +83,9 @@ class ContactLayer(WrappedSolver):
         thickness: float | None = None,
         friction: float | wp.array[float] | None = None,
         restitution: float | wp.array[float] | None = None,
-        min_distance: float | None = None,
+        min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
+        collision_filter: CollisionFilter | None = None,
         bodies: Bodies = "pushed",
     ):
         """Puts the layer around a solver.
@@ -95,8 +99,10 @@ class ContactLayer(WrappedSolver):
                 :mod:`.layer.thickness`.
             friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``.
             restitution: Share of the approaching velocity that comes back, in [0, 1].
-            min_distance: Distance of pairs at the bottom of the layer [m]; None or 0: they touch.
+            min_distance: Distance of pairs at the bottom of the layer [m], or ``"model"``; None or 0: they touch.
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all.
+            collision_filter: Groups and masks of particles and shapes, as for :class:`.solver_ccd.SolverCCD`. A stage
+                around the layer has its own: give it the same.
             bodies: Whether particles push dynamic bodies, as for :class:`.solver_ccd.SolverCCD`; ``"separated"`` is as
                 ``"pushed"`` here.
 
@@ -112,13 +118,14 @@ class ContactLayer(WrappedSolver):
             restitution=restitution,
             min_distance=min_distance,
             particle_radius=particle_radius,
+            collision_filter=collision_filter,
             bodies=bodies,
         )
-        self.mesh = mesh = ModelMesh(self.model, strands=options.keeps_distances)
+        strands = options.distances.any
+        self.mesh = mesh = ModelMesh(self.model, strands=strands, collision_filter=options.collision_filter)
         self.friction, self.restitution = options.friction, options.restitution
         self._reads_friction = options.reads_friction
-        of_pairs = options.min_distance + 2.0 * float(options.radii.max(initial=0.0))
-        thin, thick = default_thicknesses(mesh, of_pairs)
+        thin, thick = default_thicknesses(mesh, options.distances.largest)
         if thickness is not None:
             thin = thick = checked_distance(thickness, "thickness", zero=False)
         moves_bodies = options.moves_bodies(mesh, innermost(solver))
@@ -128,7 +135,7 @@ class ContactLayer(WrappedSolver):
         layer.thickness = self.thickness_values = wp.full(1, thin, dtype=wp.float64, device=device)
         layer.restitution = self.restitution
         layer.motion, layer.planes = self._motion.vertices, self._motion.planes
-        layer.distances = mesh.min_distances(options.min_distance, options.radii, reach=thick)
+        layer.distances = mesh.min_distances(options.distances, reach=thick)
         self._rule = rule = ThicknessRule()
         rule.thin, rule.thick = thin, thick
         add_zeros(rule, ["is_chosen"], 1, device)

@@ -10,7 +10,7 @@ from ...kernels.polynomials import EDGE_EDGE
 from ..contacts.closest import closest_vector
 from ..contacts.constraints import contact_friction
 from ..contacts.rules import ContactClass, owner_of
-from ..state.planes import MovingPlanes, signed_distance
+from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ..state.structs import Motion, MovedBodies, body_of, can_move
 from ..state.vectors import ONE, ZERO, to_double
 from ..tuning import PARALLEL_IN_LAYER
@@ -97,9 +97,11 @@ def contact_with_plane(layer: Layer, plane: int, vertex: int):
     normal = wp.vec3d(end[0], end[1], end[2])
     if planes.world[plane] >= 0 and planes.world[plane] != motion.world[vertex]:
         return normal, ZERO
+    if is_filtered_by_plane(motion, planes, plane, vertex):
+        return normal, ZERO
     before, error = signed_distance(planes.start[plane], motion.x0[vertex])
     after, _error = signed_distance(end, motion.x1[vertex])
-    min_distance = layer.distances.radius[vertex] + layer.distances.of_planes
+    min_distance = layer.distances.radius[vertex] + layer.distances.of_planes[plane]
     depth = layer.thickness[0] + min_distance - after - theta * (before - after)
     if not (depth > ZERO and before >= -error):
         return normal, ZERO

@@ -9,7 +9,10 @@ from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 from ..._arguments import checked_integer
 from ...detection.approach_phase import MinDistances, make_min_distances
 from ...detection.mesh import CollisionMesh
+from ...kernels.pipeline.pairs import PairFilter
 from ..tuning import SEGMENTS
+from .collision_filter import CollisionFilter, bits_of_model
+from .kept_distances import KeptDistances
 from .structs import Connectivity, Incidence
 
 MAX_SEGMENTS = 1024
@@ -62,8 +65,9 @@ class ModelMesh(CollisionMesh):
     vertices on the surface, so that the mesh of a convex shape lies within it. A shape that is in all worlds has
     vertices in each. Infinite planes have no triangles and are listed separately.
 
-    Later changes of the model do not change the mesh, except for positions and inverse masses. Margins of shapes and
-    radii of particles are ignored.
+    Later changes of the model do not change the mesh, except for positions and inverse masses. Shapes that do not
+    collide with particles by their flags (``newton.ShapeFlags``) are not part of it. Particles that are not active are,
+    and are held where the program puts them.
 
     Attributes:
         model: The model.
@@ -76,9 +80,18 @@ class ModelMesh(CollisionMesh):
         device_planes: ``planes`` as Warp arrays.
         connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
+        shape_filter: Groups and masks of the shapes on the device, for infinite planes; empty without a filter.
     """
 
-    def __init__(self, model: Model, *, strands: bool = False, segments: int = SEGMENTS):
+    def __init__(
+        self,
+        model: Model,
+        *,
+        strands: bool = False,
+        segments: int = SEGMENTS,
+        collision_filter: CollisionFilter | None = None,
+        separates_bodies: bool = False,
+    ):
         """Tessellates the shapes and puts the mesh on the model's device.
 
         Args:
@@ -88,10 +101,13 @@ class ModelMesh(CollisionMesh):
                 bending, takes no part.
             segments: Triangles around a round shape, a multiple of four, 4 to 1024. The mesh of a sphere of radius r
                 lies up to 10 r / segments^2 below the sphere.
+            collision_filter: Groups and masks of particles and shapes; None to leave out no pairs.
+            separates_bodies: Whether shapes of a model with bodies take part that collide with shapes, but not with
+                particles; a filter leaves out their pairs with particles.
 
         Raises:
             TypeError: If ``segments`` is no integer.
-            ValueError: If ``segments`` is out of range or no multiple of four.
+            ValueError: If ``segments`` is out of range or no multiple of four, or the filter does not fit the model.
             NotImplementedError: If a shape that collides with particles is neither a plane, box, sphere, capsule,
                 cylinder, cone or ellipsoid nor a mesh, or a particle is in all of several worlds.
         """
@@ -107,7 +123,11 @@ class ModelMesh(CollisionMesh):
             )
         shape_body, shape_world = host_array(model.shape_body), host_array(model.shape_world)
         transform = host_array(model.shape_transform).astype(np.float64)
-        collides = (host_array(model.shape_flags) & ShapeFlags.COLLIDE_PARTICLES) != 0
+        flags = host_array(model.shape_flags)
+        apart = np.zeros(len(flags), dtype=bool)
+        if separates_bodies and model.body_count:
+            apart = (flags & (ShapeFlags.COLLIDE_SHAPES | ShapeFlags.COLLIDE_PARTICLES)) == ShapeFlags.COLLIDE_SHAPES
+        collides = apart | ((flags & ShapeFlags.COLLIDE_PARTICLES) != 0)
         shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
         infinite = are_infinite_planes(model)
         tessellations = {}
@@ -129,9 +149,17 @@ class ModelMesh(CollisionMesh):
         world, faces = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)]), np.concatenate(faces)
         edges, points = _strands(model, faces) if strands else (None, None)
         worlds = world if model.world_count > 1 else None
-        super().__init__(faces, vertex_count, edges=edges, points=points, world=worlds, device=model.device)
+        shapes, group, mask = np.array(shapes, dtype=np.int32), None, None
+        bits, self.shape_filter = bits_of_model(model, collision_filter, apart), PairFilter()
+        if bits is not None:
+            of_particles, of_shapes = bits
+            group, mask = np.concatenate([of_particles, of_shapes[:, shapes]], axis=1)
+            on_device = [wp.array(b.view(np.int32), dtype=int, device=model.device) for b in of_shapes]
+            self.shape_filter.group, self.shape_filter.mask = on_device
+        options = {"edges": edges, "points": points, "world": worlds, "group": group, "mask": mask}
+        super().__init__(faces, vertex_count, **options, device=model.device)
         self.model = model
-        shapes, planes = np.array(shapes, dtype=np.int32), np.flatnonzero(collides & infinite).astype(np.int32)
+        planes = np.flatnonzero(collides & infinite).astype(np.int32)
         normals = _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0]))
         self.shape_vertices = ShapeVertices(np.concatenate(positions).astype(np.float32), shape_body[shapes], shapes)
         of_planes = shape_body[planes], planes, shape_world[planes]
@@ -147,19 +175,20 @@ class ModelMesh(CollisionMesh):
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
 
-    def min_distances(self, min_distance: float, radii: np.ndarray, *, reach: float) -> MinDistances:
+    def min_distances(self, kept: KeptDistances, *, reach: float) -> MinDistances:
         """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.approach_phase`.
 
         Args:
-            min_distance: Minimum distance of all pairs [m], 0 or at least 2^-1021.
-            radii: Radius of each particle [m], shape [particle_count], or one for all.
+            kept: The distances that pairs keep.
             reach: How much farther apart than their minimum distance the pairs of a proximity are at most [m].
         """
         count, group = self.model.particle_count, np.full(self.vertex_count, -1)
-        every = np.full(self.vertex_count, 0.5 * min_distance)
-        every[:count] += radii
+        half = 0.5 * kept.minimum
+        every = half + np.concatenate([kept.radii, kept.margins[self.shape_vertices.shape]])
         group[count:] = self.shape_vertices.body + 1
-        return make_min_distances(self, every, of_planes=0.5 * min_distance, reach=reach, group=group)
+        return make_min_distances(
+            self, every, of_planes=half + kept.margins[self.planes.shape], reach=reach, group=group
+        )
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""

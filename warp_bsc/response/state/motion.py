@@ -206,13 +206,13 @@ class ModelMotion:
         add_zeros(vertices, ["interrupted"], max(1, model.world_count) + 1, device)
         self._last: wp.array[wp.vec3] | None = None
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
-        vertices.friction = friction.vertices
+        vertices.friction, vertices.pair_filter = friction.vertices, mesh.pair_filter
         if mesh.distances is not None:
             vertices.distances = mesh.distances
         self.planes = planes = MovingPlanes()
         of_planes = mesh.device_planes
         planes.friction, planes.world = friction.planes, of_planes.world
-        planes.shape, planes.body = of_planes.shape, of_planes.body
+        planes.shape, planes.body, planes.shape_filter = of_planes.shape, of_planes.body, mesh.shape_filter
         add_zeros(planes, ("start", "end"), len(friction.planes), device)
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from ...kernels.pipeline.pairs import PairFilter, groups_meet
+from .structs import Motion
 from .vectors import ONE, ZERO, to_double
 
 _ROUNDOFF = wp.constant(wp.float64(2.0**-50))
@@ -23,6 +25,7 @@ class MovingPlanes:
     world: wp.array[int]  # -1 for all
     shape: wp.array[int]
     body: wp.array[int]  # that the plane moves with, -1 for none
+    shape_filter: PairFilter  # groups and masks of shapes; empty if no pair is left out
 
 
 @wp.func
@@ -55,3 +58,16 @@ def signed_distance(plane: wp.vec4d, x: wp.vec3):
 def time_of_entry(before: wp.float64, after: wp.float64) -> wp.float64:
     """Returns when a vertex enters a solid, in [0, 1], from its signed distances at the start and end of a step."""
     return wp.min(wp.max(before, ZERO) / wp.max(before - after, _TINY), ONE)
+
+
+@wp.func
+def is_filtered_by_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
+    """Returns whether groups and masks leave out a vertex and an infinite plane."""
+    of_vertices = motion.pair_filter
+    if not of_vertices.group:
+        return False
+    of_shapes = planes.shape_filter
+    shape = planes.shape[i]
+    return not groups_meet(
+        of_vertices.group[vertex], of_vertices.mask[vertex], of_shapes.group[shape], of_shapes.mask[shape]
+    )

@@ -7,6 +7,7 @@ import warp as wp
 
 from ..._private_names.of_warp import struct_type
 from ...detection.approach_phase import MinDistances
+from ...kernels.pipeline.pairs import PairFilter
 
 
 class ContactKind(IntEnum):
@@ -115,6 +116,7 @@ class Motion:
     world: wp.array[int]
     bodies: Bodies
     distances: MinDistances  # of pairs; empty if pairs only must not touch
+    pair_filter: PairFilter  # groups and masks of vertices; empty if no pair is left out
     interrupted: wp.array[int]  # by world, then of any: 1 where the program moved a movable particle between steps
 
 

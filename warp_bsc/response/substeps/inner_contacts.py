@@ -14,6 +14,7 @@ from newton import BodyFlags, GeoType
 
 from ..._private_names.of_newton import contacts_with, soft_contact_arrays, soft_contact_counters
 from ..._private_names.of_warp import struct_fields
+from ...kernels.pipeline.pairs import PairFilter, groups_meet
 from ..state.mesh import ModelMesh, are_infinite_planes
 from ..tuning import SEGMENTS, SHAPE_SAGITTA
 
@@ -42,6 +43,8 @@ class _Stage:
     depth: wp.array[float]  # below the surface of each shape [m]; a particle below that has entered it
     is_plane: wp.array[bool]  # of each shape, whether it is an infinite plane, which all particles meet
     takes_part: wp.array[bool]  # whether a particle meets other shapes
+    of_particles: PairFilter  # groups and masks; empty if no pair is left out
+    of_shapes: PairFilter
     shape_body: wp.array[int]
     body_world: wp.array[int]
     body_flags: wp.array[int]
@@ -65,6 +68,11 @@ def _resolves(
             if not stage.is_plane[shape] and not stage.takes_part[particle]:
                 return False
             x += contacts.barycentric[i][corner] * particle_q[particle]
+            if stage.of_particles.group:
+                group = stage.of_particles.group[particle]
+                mask = stage.of_particles.mask[particle]
+                if not groups_meet(group, mask, stage.of_shapes.group[shape], stage.of_shapes.mask[shape]):
+                    return False
     point = contacts.body_pos[i]
     if body >= 0:
         point = wp.transform_point(body_q[body], point)
@@ -127,8 +135,8 @@ class InnerContacts:
 
     The stage resolves a contact of particles with a shape if the particles take part in its detection, and start the
     step outside the shape. It excludes particles that have entered a shape: Newton's contacts push them out. The inner
-    solver keeps a contact with a body that it moves, unless the stage pushes that body as well. Contacts of bodies with
-    each other remain.
+    solver keeps a contact with a body that it moves, unless the stage pushes that body as well, and a contact that a
+    filter of the stage leaves out. Contacts of bodies with each other remain.
     """
 
     def __init__(self, mesh: ModelMesh, *, moves_bodies: bool):
@@ -139,6 +147,7 @@ class InnerContacts:
         stage.depth = wp.array(_depths(model, mesh.segments), dtype=float, device=mesh.device)
         stage.is_plane = wp.array(are_infinite_planes(model), dtype=bool, device=mesh.device)
         stage.takes_part = wp.array(_takes_part(mesh), dtype=bool, device=mesh.device)
+        stage.of_particles, stage.of_shapes = mesh.pair_filter, mesh.shape_filter
         stage.shape_body = model.shape_body
         if model.body_count:
             stage.body_world, stage.body_flags = model.body_world, model.body_flags

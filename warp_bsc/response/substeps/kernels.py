@@ -142,12 +142,13 @@ def use_predicted_substeps(
 
 @wp.kernel
 def keep_detection(step: Step, status: SolveStatus, detected: wp.array[int], is_fast: wp.array[int]):
-    """Keeps the numbers of constraints and contacts, and which worlds have fast or pushing contacts."""
+    """Keeps the numbers of constraints, contacts and filtered pairs, and which worlds have fast or pushing contacts."""
     world = wp.tid()
     is_fast[world] = status.is_fast[world]
     if world == 0:
         detected[0] = step.constraints.count[0]
         detected[1] = status.results[Result.FIRST_HITS]
+        detected[2] = status.results[Result.FILTERED]
         status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
 
 
@@ -194,7 +195,7 @@ def keep_constraints(step: Step, detected: wp.array[int], number: wp.array[int])
 
 @wp.kernel
 def restore_detection(step: Step, detected: wp.array[int], is_fast: wp.array[int], status: SolveStatus):
-    """Counts the contacts of the step as it was predicted, and its worlds with fast or pushing contacts.
+    """Counts the contacts and filtered pairs of the step as it was predicted, and its worlds with fast or pushing ones.
 
     Where something immovable pushes, substeps that follow it may end in contacts that do not look fast; but to divide
     them could leave vertices in its way. Constraints of the substeps leave nothing to do.
@@ -202,6 +203,7 @@ def restore_detection(step: Step, detected: wp.array[int], is_fast: wp.array[int
     world = wp.tid()
     status.is_fast[world] = wp.max(status.is_fast[world], is_fast[world])
     status.results[Result.FIRST_HITS] = detected[1]
+    status.results[Result.FILTERED] = detected[2]
     if world == 0 and status.loop[Loop.ACTIVE] == 0 and step.constraints.count[0] <= detected[0]:
         status.loop[Loop.UNFINISHED] = status.results[Result.UNDETECTED]
 

@@ -122,7 +122,7 @@ class Substeps:
         self._is_pending = wp.zeros(worlds, dtype=int, device=device)  # 1 while a world has substeps to take
         self._takes_substeps = wp.zeros(worlds, dtype=int, device=device)
         self._is_fast = wp.zeros(worlds, dtype=int, device=device)  # as in SolveStatus, of the predicted motion
-        self._detected = wp.zeros(2, dtype=int, device=device)  # constraints and contacts
+        self._detected = wp.zeros(3, dtype=int, device=device)  # constraints, contacts and filtered pairs
         self._remaining = wp.zeros(1, dtype=int, device=device)  # substeps
         if self._chooses:
             self._strain, self._final_strain = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
