@@ -109,9 +109,9 @@ class CollisionMesh:
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: If the faces, edges, points, tetrahedra, radii, worlds, groups or masks have another shape or type
-                or are out of range, an index is not in [0, vertex_count), that is not in [0, 2^31), an edge has one
-                vertex twice, entries are masked, the worlds differ within a face or an edge, or the device does not
+            ValueError: If the faces, edges, points, tetrahedra, radii, worlds, groups or masks have another shape or
+                type or are out of range, an index is not in [0, vertex_count), that is not in [0, 2^31), an edge has
+                one vertex twice, entries are masked, the worlds differ within a face or an edge, or the device does not
                 exist.
         """
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
