@@ -322,7 +322,8 @@ class Substeps:
         if self._moves_bodies:
             wp.copy(substep.vertices.bodies.start, start.body_q)  # now: some solvers overwrite it
         self._step(start, end, step.control, step.contacts, substep_dt)
-        work.motion = substep
+        if work.motion is not substep:  # which copies structs, and takes longer than the launch of a kernel
+            work.motion = substep
         if self._moves_bodies:
             substep.set_body_ends(arrays_of(end))
             work.launch_over_bodies(begin_bodies)
