@@ -18,7 +18,7 @@ import trimesh
 from matplotlib.colors import to_rgb
 from rich.progress import track
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]  # for the other figures and the examples
+sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1])]  # for the other figures and the examples
 from scenes import View, shade
 
 _FIRST, _FOUND, _RIGID = "#e07a2f", "#2f6fb3", "#b9b4ae"
@@ -45,13 +45,13 @@ class Strip(NamedTuple):
 
 _STRIPS = {
     "identify": Strip(
-        "how stiff a cloth is", 1, (0, 10, 20, 30, 120), 0.75, View(0, "", 14.0, -72.0, (0.02, 0.62, -0.2), 1.05, 1.3)
+        "how stiff a cloth is", 1, (0, 10, 20, 30, 120), 0.75, View(0, "", 14.0, -72.0, (0.02, 0.62, -0.2), 0.86, 1.3)
     ),
     "towel": Strip(
-        "a throw over a bar", 2, (0, 12, 22, 30, 48), 0.7, View(0, "", 12.0, -80.0, (-0.28, 0.35, 0.0), 1.2, 1.3)
+        "a throw over a bar", 2, (0, 12, 22, 30, 48), 0.7, View(0, "", 12.0, -80.0, (-0.28, 0.35, 0.02), 1.08, 1.3)
     ),
     "fold": Strip(
-        "a path that folds a cloth", 0, (0, 10, 18, 25, 40), 0.6, View(0, "", 28.0, -76.0, (0.0, 0.3, 0.06), 1.05, 1.3)
+        "a path that folds a cloth", 0, (0, 10, 18, 25, 40), 0.6, View(0, "", 28.0, -76.0, (0.0, 0.3, 0.06), 0.84, 1.3)
     ),
 }
 
@@ -83,7 +83,7 @@ def rigid_parts(name, behind):
     if name == "identify":
         return []
     if name == "fold":
-        ground = trimesh.creation.box((1.0, 0.55 + behind, 0.01)).apply_translation([0.0, 0.5 * behind, -0.005])
+        ground = trimesh.creation.box((0.9, 0.5 + behind, 0.01)).apply_translation([0.0, 0.5 * behind, -0.005])
         return [ground.subdivide().subdivide().subdivide()]
     bar = trimesh.creation.cylinder(0.03, 0.56).apply_transform(
         trimesh.transformations.rotation_matrix(0.5 * np.pi, [1.0, 0.0, 0.0])
@@ -118,7 +118,7 @@ def draw(learnt):
         row[-1].set_yscale("log")
         row[-1].set_title("least distance from the target [m]", fontsize=8)
         row[-1].tick_params(labelsize=7, which="both")
-    rows[-1, -1].set_xlabel("evaluations of loss and gradient, from three starts", fontsize=8)
+    rows[-1, -1].set_xlabel("evaluations, from three starts", fontsize=8)
     figure.tight_layout(pad=0.4, w_pad=0.3)
     figure.text(0.34, 0.985, "front, blue: what gradients found", color=_FOUND, fontsize=10, va="top")
     figure.text(0.56, 0.985, "behind, orange: the first guess", color=_FIRST, fontsize=10, va="top")
