@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 from common import main
 from diffsim import build_worlds
-from diffsim_vbd import TargetExample
+from diffsim_targets import TargetExample
 
 import warp_bsc as bsc
 
@@ -56,8 +56,8 @@ def move_gripper(
         world = particle_world[particle]
         s = share * share * (3.0 - 2.0 * share)
         path = 3.0 * (1.0 - s) * s * ((1.0 - s) * points_1[world] + s * points_2[world]) + s * s * s * points_3[world]
-        path[2] = wp.max(path[2], 0.0)  # not into the ground
-        moved[particle] = rest[particle] + path
+        up = wp.max(path[2], 0.0)  # not into the ground
+        moved[particle] = rest[particle] + wp.vec3(path[0], path[1], up)
 
 
 class GripperSolver(bsc.SolverImplicitAdjoint):
@@ -82,7 +82,7 @@ class GripperSolver(bsc.SolverImplicitAdjoint):
 class Example(TargetExample):
     """The scene, in the format of Newton's examples; a frame is an iteration of the optimisation."""
 
-    num_frames = 12
+    num_frames = 20
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)

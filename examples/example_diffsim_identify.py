@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from common import main
 from diffsim import build_worlds
-from diffsim_vbd import TargetExample
+from diffsim_targets import TargetExample
 from newton.solvers import SolverVBD
 
 import warp_bsc as bsc

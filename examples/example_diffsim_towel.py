@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from common import main
 from diffsim import build_worlds
-from diffsim_vbd import TargetExample
+from diffsim_targets import TargetExample
 
 import warp_bsc as bsc
 

@@ -45,7 +45,7 @@ class Strip(NamedTuple):
 
 _STRIPS = {
     "identify": Strip(
-        "how stiff a cloth is", 1, (0, 10, 20, 30, 120), 0.75, View(0, "", 14.0, -72.0, (0.02, 0.62, -0.2), 0.86, 1.3)
+        "how stiff a cloth is", 1, (0, 10, 20, 30, 120), 0.75, View(0, "", 14.0, -72.0, (0.12, 0.62, -0.17), 0.92, 1.3)
     ),
     "towel": Strip(
         "a throw over a bar", 2, (0, 12, 22, 30, 48), 0.7, View(0, "", 12.0, -80.0, (-0.28, 0.35, 0.02), 1.08, 1.3)
