@@ -82,7 +82,7 @@ class GripperSolver(bsc.SolverImplicitAdjoint):
 class Example(TargetExample):
     """The scene, in the format of Newton's examples; a frame is an iteration of the optimisation."""
 
-    num_frames = 12
+    num_frames = 8
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)

@@ -54,7 +54,7 @@ class Example(TargetExample):
         errors: Relative errors of these after each evaluation, shape [worlds, 2] each.
     """
 
-    num_frames = 10
+    num_frames = 9
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)

@@ -54,7 +54,7 @@ def main():
     """Prints the counts for each guess."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--triangles", type=int, default=128, help="Triangles of the cloth, about.")
-    parser.add_argument("--gradients", type=int, default=12, help="Most evaluations with gradients.")
+    parser.add_argument("--gradients", type=int, default=9, help="Most evaluations with gradients.")
     parser.add_argument("--samples", type=int, default=90, help="Most evaluations of CMA-ES.")
     parser.add_argument("--seed", type=int, default=1, help="Seed of CMA-ES.")
     args = parser.parse_args()
