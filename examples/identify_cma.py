@@ -55,7 +55,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--triangles", type=int, default=128, help="Triangles of the cloth, about.")
     parser.add_argument("--gradients", type=int, default=9, help="Most evaluations with gradients.")
-    parser.add_argument("--samples", type=int, default=90, help="Most evaluations of CMA-ES.")
+    parser.add_argument("--samples", type=int, default=126, help="Most evaluations of CMA-ES.")
     parser.add_argument("--seed", type=int, default=1, help="Seed of CMA-ES.")
     args = parser.parse_args()
     example = make_example(len(STARTS), args.triangles)
