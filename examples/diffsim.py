@@ -1,4 +1,4 @@
-"""Base of the examples with gradients: cloth that is to end on a mark, and gradient descent from several starts."""
+"""Bases of the examples with gradients: gradient descent from several starts; cloth that is to end on a mark."""
 
 import itertools
 
@@ -44,6 +44,7 @@ def build_worlds(world, count):
     """Returns a model of this many copies of a world, with gradients."""
     builder = newton.ModelBuilder()
     builder.replicate(world, count)
+    builder.color()  # for VBD
     model = builder.finalize(requires_grad=True)
     # the solver's own contacts between particles are penalties, and not needed here
     model.particle_ke = model.particle_kd = model.particle_kf = 0.0
@@ -55,54 +56,43 @@ class DiffsimExample(ExampleBase):
     """Gradient descent in several worlds at once, in the format of Newton's examples; a frame is an iteration.
 
     A derived class calls :meth:`start` and :meth:`prepare_descent` at the end of its ``__init__``, and makes its
-    ``forward`` depend on the parameters.
+    ``forward`` depend on the parameters. It adds the losses of all worlds in ``add_losses``, and says in ``distances``
+    how far from their marks they ended.
 
     Attributes:
         loss_history: The losses of all worlds in each iteration so far.
-        distance: Least distance from the mark so far, at which the cloth of each world ended [m].
-        path: Path of the centre of the cloth in that iteration [m], shape [steps + 1, worlds, 3].
+        distance: Least distance from the mark so far, at which each world ended [m].
+        motion: Positions of particles in that iteration [m], shape [steps + 1, worlds, particles, 3].
     """
 
-    def __init__(self, viewer, args):
-        super().__init__(viewer, args)
-        self.sim_dt = 1.0 / 600.0
-
-    def prepare_descent(self, parameters, rate, cloth_count, mark, steps):
+    def prepare_descent(self, parameters, rate, steps):
         """Prepares gradient descent.
 
         Args:
             parameters: The arrays to improve, an element for each world.
-            rate: Learning rate of the first iteration.
-            cloth_count: Particles of the cloth that is to end on the mark, the first ones of each world.
-            mark: Where its centre is to end [m].
+            rate: Learning rate of the first iteration; None if ``improve`` is not that of Adam.
             steps: How many steps a simulation has.
         """
         model, device = self.model, self.model.device
-        self.parameters, self.rate, self.cloth_count, self.mark = parameters, rate, cloth_count, mark
+        self.parameters, self.rate = parameters, rate
         self.states = [self.state_0, *(model.state() for _ in range(steps - 1)), self.state_1]
         self.worlds = model.world_count
-        is_cloth = np.arange(model.particle_count) % (model.particle_count // self.worlds) < cloth_count
-        # of each particle in the centre of the cloth of its world
-        self.shares = wp.array(is_cloth / cloth_count, dtype=float, device=device)
-        self.centres = wp.zeros(self.worlds, dtype=wp.vec3, device=device, requires_grad=True)
         self.losses = wp.zeros(self.worlds, dtype=float, device=device, requires_grad=True)
         self.loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
-        self.optimizer = warp.optim.Adam(parameters, lr=rate)
+        if rate is not None:
+            self.optimizer = warp.optim.Adam(parameters, lr=rate)
         self.tape = None
         self.loss_history = []
         self.distance = np.full(self.worlds, np.inf)
-        self.path = np.zeros((steps + 1, self.worlds, 3))
+        self.motion = self.positions()
 
     def forward(self):
         """Simulates all worlds, and computes their losses."""
         for start, end in itertools.pairwise(self.states):
             start.clear_forces()
             self.solver.step(start, end, self.control, None, self.sim_dt)
-        self.centres.zero_()
         self.loss.zero_()
-        inputs = [self.states[-1].particle_q, self.shares, self.model.particle_world]
-        wp.launch(add_to_centre, self.model.particle_count, inputs=inputs, outputs=[self.centres])
-        wp.launch(add_loss, self.worlds, inputs=[self.centres, self.mark, RADIUS], outputs=[self.losses, self.loss])
+        self.add_losses()
 
     def simulate(self):
         """Simulates all worlds, and computes the gradient of their loss."""
@@ -114,24 +104,75 @@ class DiffsimExample(ExampleBase):
         self.tape.backward(self.loss)
 
     def step(self):
-        """Improves the parameters by the gradient, computed on a GPU from a CUDA graph."""
-        self.optimizer.lr = self.rate * RATE_DECAY**self.frame
+        """Computes the gradient, on a GPU from a CUDA graph, and improves the parameters."""
         super().step()
         self.loss_history.append(self.losses.numpy().copy())
-        distance = np.linalg.norm(self.centres.numpy() - np.array(self.mark), axis=1)
+        distance = self.distances()
         nearer = distance < self.distance
         self.distance[nearer] = distance[nearer]
-        self.path[:, nearer] = self.centre_paths()[:, nearer]
+        self.motion[:, nearer] = self.positions()[:, nearer]
+        self.improve()
+
+    def improve(self):
+        """Improves the parameters by their gradients, in a step of Adam."""
+        self.optimizer.lr = self.rate * RATE_DECAY ** (self.frame - 1)
         self.optimizer.step([array.grad for array in self.parameters])
 
-    def centre_paths(self):
-        """Returns the paths of the centres of the cloths in the last simulation [m], shape [steps + 1, worlds, 3]."""
+    def positions(self):
+        """Returns all positions of the last simulation [m], shape [steps + 1, worlds, particles, 3]."""
         positions = np.array([state.particle_q.numpy() for state in self.states])
-        return positions.reshape(len(positions), self.worlds, -1, 3)[:, :, : self.cloth_count].mean(axis=2)
+        return positions.reshape(len(positions), self.worlds, -1, 3)
+
+    def test_final(self):
+        """Checks that the stage certified all steps, and that all have gradients."""
+        if self.ccd:
+            report = self.solver.report
+            assert report.totals.uncertified_steps + report.gradients.lost_steps == 0, report
+
+
+class MarkExample(DiffsimExample):
+    """Cloths that are to end on a mark, behind the semi-implicit solver."""
+
+    def __init__(self, viewer, args):
+        super().__init__(viewer, args)
+        self.sim_dt = 1.0 / 600.0
+
+    def prepare_descent(self, parameters, rate, steps, *, cloth_count, mark):
+        """Prepares gradient descent.
+
+        Args:
+            parameters: The arrays to improve, an element for each world.
+            rate: Learning rate of the first iteration.
+            steps: How many steps a simulation has.
+            cloth_count: Particles of the cloth that is to end on the mark, the first ones of each world.
+            mark: Where its centre is to end [m].
+        """
+        super().prepare_descent(parameters, rate, steps)
+        model, device = self.model, self.model.device
+        self.cloth_count, self.mark = cloth_count, mark
+        is_cloth = np.arange(model.particle_count) % (model.particle_count // self.worlds) < cloth_count
+        # of each particle in the centre of the cloth of its world
+        self.shares = wp.array(is_cloth / cloth_count, dtype=float, device=device)
+        self.centres = wp.zeros(self.worlds, dtype=wp.vec3, device=device, requires_grad=True)
+
+    def add_losses(self):
+        """Computes the losses of all worlds, and their sum."""
+        self.centres.zero_()
+        inputs = [self.states[-1].particle_q, self.shares, self.model.particle_world]
+        wp.launch(add_to_centre, self.model.particle_count, inputs=inputs, outputs=[self.centres])
+        wp.launch(add_loss, self.worlds, inputs=[self.centres, self.mark, RADIUS], outputs=[self.losses, self.loss])
+
+    def distances(self):
+        """Returns how far from the mark the cloth of each world ended [m]."""
+        return np.linalg.norm(self.centres.numpy() - np.array(self.mark), axis=1)
+
+    def path(self):
+        """Returns the path of the centre of each cloth in its best iteration [m], shape [steps + 1, worlds, 3]."""
+        return self.motion[:, :, : self.cloth_count].mean(axis=2)
 
     def render(self):
         """Shows where the cloths end, and their paths."""
-        paths = self.centre_paths()[::8]
+        paths = self.positions()[::8, :, : self.cloth_count].mean(axis=2)
         starts, ends = (wp.array(part.reshape(-1, 3), dtype=wp.vec3) for part in (paths[:-1], paths[1:]))
         self.viewer.begin_frame(float(self.frame))
         self.viewer.log_state(self.states[-1])
@@ -141,10 +182,9 @@ class DiffsimExample(ExampleBase):
 
     def test_final(self):
         """Checks that all cloths end within two centimetres of the mark, if there is a stage."""
+        super().test_final()
         if self.ccd:
             assert self.distance.max() < 0.02, self.distance
-            report = self.solver.report
-            assert report.totals.uncertified_steps + report.gradients.lost_steps == 0, report
 
     def print_report(self):
         """Prints what the stage did, and how far from the mark the cloths end."""

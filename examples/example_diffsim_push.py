@@ -12,7 +12,7 @@ import newton
 import numpy as np
 import warp as wp
 from common import main
-from diffsim import DiffsimExample, add_cloth, build_worlds
+from diffsim import MarkExample, add_cloth, build_worlds
 from newton.solvers import SolverSemiImplicit
 
 MARK = wp.vec3(0.15, 0.08, 0.25)  # [m]
@@ -57,7 +57,7 @@ class PaddleSolver(SolverSemiImplicit):
         wp.launch(swing, len(self.shifts), inputs=inputs, outputs=outputs, device=self.model.device)
 
 
-class Example(DiffsimExample):
+class Example(MarkExample):
     """The scene, in the format of Newton's examples; a frame is an iteration of the optimisation."""
 
     num_frames = 40
@@ -75,7 +75,7 @@ class Example(DiffsimExample):
         paths = [wp.array(start, dtype=wp.vec3, device=model.device, requires_grad=True) for start in starts]
         self.paddles = PaddleSolver(model, *paths, STEPS * self.sim_dt)
         self.start(model, self.paddles, (wp.vec3(0.2, -1.8, 0.4), -5.0, 90.0))
-        self.prepare_descent(paths, FIRST_RATE, world.particle_count, MARK, STEPS)
+        self.prepare_descent(paths, FIRST_RATE, STEPS, cloth_count=world.particle_count, mark=MARK)
 
     def forward(self):
         """Simulates the pushes, and computes their losses."""

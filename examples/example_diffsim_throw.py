@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 from common import main
-from diffsim import DiffsimExample, add_cloth, build_worlds
+from diffsim import MarkExample, add_cloth, build_worlds
 
 MARK = wp.vec3(-0.55, 0.1, 0.75)  # [m]
 STARTS = [(13.5, 0.0, -1.0), (9.5, 1.6, 1.0), (12.5, -1.2, 1.6)]  # first throws [m/s]
@@ -34,7 +34,7 @@ def throw(
     particle_qd[particle] = velocity
 
 
-class Example(DiffsimExample):
+class Example(MarkExample):
     """The scene, in the format of Newton's examples; a frame is an iteration of the optimisation."""
 
     num_frames = 60
@@ -54,7 +54,7 @@ class Example(DiffsimExample):
         # no layer: the cloth flies farther in a step than a layer may be thick
         self.start(model, solver, (wp.vec3(-0.3, -3.2, 0.5), -5.0, 90.0), contact_layer=False)
         self.throws = wp.array(STARTS, dtype=wp.vec3, device=model.device, requires_grad=True)
-        self.prepare_descent([self.throws], FIRST_RATE, patch, MARK, STEPS)
+        self.prepare_descent([self.throws], FIRST_RATE, STEPS, cloth_count=patch, mark=MARK)
 
     def forward(self):
         """Simulates the throws, and computes their losses."""

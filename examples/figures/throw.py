@@ -28,7 +28,7 @@ def learn(ccd):
     for iteration in track(range(_ITERATIONS), "with the stage" if ccd else "without"):
         example.step()
         if iteration == 0:
-            first = example.path.copy()
+            first = example.path()
     return example, first
 
 
@@ -38,10 +38,11 @@ def draw_paths(axes, example, first):
     sheet = rest[example.shares.numpy() == 0]
     low, high = sheet[sheet[:, 2].argmin()], sheet[sheet[:, 2].argmax()]
     axes.plot([low[0], high[0]], [low[2], high[2]], color="#555555", linewidth=3.0, label="sheet")
+    found = example.path()
     for world, color in enumerate(_COLORS):
         axes.plot(first[:, world, 0], first[:, world, 2], color=color, linestyle=":", linewidth=1.3)
-        axes.plot(example.path[:, world, 0], example.path[:, world, 2], color=color, linewidth=1.8)
-        axes.plot(*example.path[-1, world, [0, 2]], "o", color=color, markersize=4)
+        axes.plot(found[:, world, 0], found[:, world, 2], color=color, linewidth=1.8)
+        axes.plot(*found[-1, world, [0, 2]], "o", color=color, markersize=4)
     axes.plot(MARK[0], MARK[2], "*", color="#c22f3d", markersize=15, label="mark", zorder=5)
     axes.set(xlabel="x [m]", ylabel="z [m]", xlim=(-1.1, 0.8 if example.ccd else 2.6), ylim=(-0.7, 1.3))
     axes.set_aspect("equal")

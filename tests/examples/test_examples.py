@@ -23,6 +23,12 @@ BULLET = FOLDER / "example_cloth_bullet.py"
 THROW = FOLDER / "example_diffsim_throw.py"
 GRIPPER = FOLDER / "example_gripper.py"
 PUSH = FOLDER / "example_diffsim_push.py"
+BEHIND_VBD = {
+    "identify": ({"STEPS": 12, "NOISE": 0.0}, ["--triangles", "18", "--starts", "1"], 0.6),
+    "towel": ({"STEPS": 10, "LAST": 2, "START": wp.vec3(-0.1, 0.0, 0.07), "STARTS": [(0.5, 0.3, -0.5)]}, [], 0.8),
+    "fold": ({"CELLS": 4, "CELL": 0.1, "STEPS": 8, "MOVES": 7, "STARTS": [((0.0, 0.05, 0.1),) * 3]}, [], 0.8),
+}
+"""Short versions of examples: constants, options, and the share of the first loss that a step leaves at most."""
 PAPER_SCENES = {
     "twisting": "degrees",
     "funnel": "from the axis",
@@ -36,6 +42,7 @@ PRINTED.append("paper/example_twisting")
 FIGURES = sorted((FOLDER / "figures").glob("*.py"))
 FRAMES = 2
 RUN_LONGER = ["example_diffsim_push", "example_diffsim_throw", "example_gripper"]
+RUN_LONGER += [f"example_diffsim_{name}" for name in BEHIND_VBD]
 """Examples that other tests run with the same options, and for more frames."""
 COMPARED = ["particle_q", "particle_qd", "particle_mass", "tri_indices", "tri_materials"]
 COMPARED += ["tet_indices", "tet_poses", "tet_materials"]
@@ -59,7 +66,11 @@ def load(path):
 
 def run(path, frames, *options):
     """Runs an example for some frames, as its script would."""
-    example_class = load(path)
+    return run_class(load(path), frames, *options)
+
+
+def run_class(example_class, frames, *options):
+    """Runs the class of an example."""
     args = example_class.create_parser().parse_args(["--viewer", "null", "--num-frames", str(frames), *options])
     viewer = ViewerNull(num_frames=frames)
     example = example_class(viewer, args)
@@ -216,6 +227,20 @@ def test_push_is_learnt_through_the_stage():
     first, *_, last = run(PUSH, 3).loss_history
     assert (last < 0.5 * first).all()
     run(PUSH, 2, "--no-ccd").test_final()
+
+
+@pytest.mark.filterwarnings("ignore:.*of the weight")
+@pytest.mark.parametrize("name", BEHIND_VBD)
+def test_gradients_behind_vbd_lead_to_the_target(name, monkeypatch):
+    constants, options, share = BEHIND_VBD[name]
+    program = load_module(FOLDER / f"example_diffsim_{name}.py")
+    for constant, value in constants.items():
+        monkeypatch.setattr(program, constant, value)
+    example = run_class(program.Example, 2, *options)
+    first, second = example.loss_history
+    assert second < share * first
+    assert example.adjoint.report.failed_solves == 0
+    assert len(example.solver.report.intersections) == 0
 
 
 @pytest.mark.parametrize("robot", ["featherstone", "mujoco"])
