@@ -185,9 +185,10 @@ def calls() -> dict[str, Call]:
     mesh = bsc.CollisionMesh(FACES, 6, device="cpu")
     detector = bsc.CollisionDetector(mesh)
     found: dict[str, Call] = {}
-    arrays = {"edges": np.array([[0, 3]]), "points": np.array([1]), "faces": FACES}
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 5]])
+    arrays = {"edges": np.array([[0, 3]]), "points": np.array([1]), "tets": tets, "faces": FACES}
     indices = {name: bad_arrays(good, index=True) for name, good in arrays.items()}
-    for name in ("edges", "points"):
+    for name in ("edges", "points", "tets"):
         indices[name] = without(indices[name], "None")
     world = without(bad_arrays(np.zeros(6, int), index=True), "None", "huge")
     found["CollisionMesh"] = Call(
@@ -230,6 +231,11 @@ def calls() -> dict[str, Call]:
         capture, {"x0": on_device, "x1": on_device}, {"x0": COORDINATES, "x1": COORDINATES}, raises=detector.capture
     )
     found["CollisionDetector.find_intersections"] = Call(detector.find_intersections, {"x": X}, {"x": COORDINATES})
+    of_tets = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, tets=tets, device="cpu"))
+    found["CollisionDetector.inversions"] = Call(
+        of_tets.inversions, {"x0": X, "x1": X}, {"x0": COORDINATES, "x1": COORDINATES}
+    )
+    found["CollisionDetector.find_inversions"] = Call(of_tets.find_inversions, {"x": X}, {"x": COORDINATES})
     found["CollisionDetector.find_proximities"] = Call(
         detector.find_proximities,
         {"x": X, "distance": 0.1},
@@ -275,6 +281,10 @@ def calls() -> dict[str, Call]:
         names = list(inspect.signature(getattr(bsc.checker, name)).parameters)
         good = {argument: pair[argument] for argument in names}
         found[f"checker.{name}"] = Call(getattr(bsc.checker, name), good, {a: bad[a] for a in names})
+    moving = np.zeros((2, 8, 3))
+    for name in ("tetrahedron", "tetrahedron_toi"):
+        bad_points = {**bad_arrays(moving), **not_finite(moving)}
+        found[f"checker.{name}"] = Call(getattr(bsc.checker, name), {"points": moving}, {"points": bad_points})
     points = np.zeros((2, 3))
     found["checker.rays_pass_faces"] = Call(
         bsc.checker.rays_pass_faces,

@@ -139,7 +139,7 @@ def find_inversions(mesh: CollisionMesh, x0: wp.array, x1: wp.array, *, method: 
 
     certified = classify(ROUNDOFF)
     if (certified == UNSURE).any():
-        for name, x in (("x0", x0), ("x1", x1)):
+        for name, x in [("x", x0)] if x0 is x1 else [("x0", x0), ("x1", x1)]:
             check_finite(x.numpy(), name, np.unique(mesh.tets))
     inverts = certified != FREE
     if method == "float":
