@@ -2,14 +2,18 @@
 
 import numpy as np
 
-from .elastic import Springs
+from .contacts import Contacts, projected
+from .elastic import Springs, near
 from .motion import move_freely
 from .surface import Surface
 
 __all__ = ["approach"]
 
 _ROUNDS = 24
-_SWEEPS = 40
+_SWEEPS, _MORE_SWEEPS = 40, 160
+"""Sweeps of a round in which strains are below the limit at its start, and above it."""
+_RINGS = 10
+"""Edges around vertices in contact within which springs move others."""
 _SETTLED = 2.0**-10
 """Move, in edges, below which the approach ends."""
 _PROGRESS = 0.98
@@ -24,7 +28,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """Returns positions near the input that can be reached from a start without a collision.
 
     What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
-    below the limit. Of the positions passed, the result has the least strain above the limit, then the least moves.
+    below the limit; contacts that are known keep their elements apart meanwhile, so that each motion meets few others. Of the positions passed, the result has the least strain above the limit, then the least moves.
 
     Args:
         surface: The surface.
@@ -34,13 +38,17 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """
     best, score = x, _score(surface, x, max_strain)
     best_score = score
-    held, stalled = np.zeros(len(x), dtype=bool), 0
+    held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         if held.any():
-            goal = springs.relax(goal, _SWEEPS, _SOUGHT * max_strain)
-        moved, stopped = move_freely(surface, x, surface.rounded(goal))
-        held |= stopped
+            around = near(surface, held, _RINGS)
+            sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
+            goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
+            goal = projected(surface.fixed, goal, known)
+        moved, contacts = move_freely(surface, x, surface.rounded(goal))
+        known = Contacts.joined([known, contacts]).latest()
+        held[contacts.vertices] = True
         change = np.abs(moved - x).max(initial=0.0)
         x = moved
         before, score = score, _score(surface, x, max_strain)

@@ -4,7 +4,8 @@ import numpy as np
 import warp as wp
 
 from ..detection.launch import launch_in_turn
-from .kernels import relax_springs, spread_moves
+from .contacts import Contacts
+from .kernels import Planes, relax_springs, spread_moves
 from .surface import Surface
 
 __all__ = ["Springs", "near", "within"]
@@ -45,7 +46,7 @@ class Springs:
             movable: Vertices that they may move, bool, shape [n].
         """
         self._surface, self.movable = surface, movable
-        vertices = np.flatnonzero(movable)
+        vertices = self._vertices = np.flatnonzero(movable)
         first, second = surface.ends
         edges = np.flatnonzero(movable[first] | movable[second])
         across = _vertices_across(surface, movable)
@@ -72,22 +73,50 @@ class Springs:
             sweeps: Number of sweeps, about as many edges as moves spread over.
         """
         is_given = self._surface.array(given, bool)
-        return self._sweep(spread_moves, [*self._springs, is_given], moves, sweeps)
+        return self._sweep(spread_moves, len(self._vertices), [*self._springs, is_given], moves, sweeps)
 
-    def relax(self, x: np.ndarray, sweeps: int, slack: float = 0.0) -> np.ndarray:
+    def relax(
+        self,
+        x: np.ndarray,
+        sweeps: int,
+        slack: float = 0.0,
+        *,
+        contacts: Contacts | None = None,
+        around: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Returns positions with strains that are smaller, or at most ``slack`` if there are enough sweeps.
 
         Args:
             x: Positions, in units, shape [n, 3].
             sweeps: Number of Jacobi sweeps.
             slack: Strain that needs no change.
+            contacts: Contacts that are kept apart meanwhile, nearly; default: none.
+            around: The movable vertices that move, bool, shape [n]; default: all.
         """
-        return self._sweep(relax_springs, [*self._springs, *self._rest, wp.float64(slack)], x, sweeps)
+        contacts = Contacts.none() if contacts is None else contacts
+        rows = np.arange(len(self._vertices)) if around is None else np.flatnonzero(around[self._vertices])
+        inputs = [self._surface.array(rows, int), *self._springs, *self._rest, self._planes(contacts)]
+        return self._sweep(relax_springs, len(rows), [*inputs, wp.float64(slack)], x, sweeps)
 
-    def _sweep(self, kernel: wp.Kernel, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
-        """Returns values after some launches of a kernel that writes those of all movable vertices."""
+    def _planes(self, contacts: Contacts) -> Planes:
+        """Returns contacts as planes, by the rows of the vertices."""
+        row = np.full(len(self.movable), -1)
+        row[self._vertices] = np.arange(len(self._vertices))
+        rows = row[contacts.vertices.ravel()]
+        order = np.argsort(rows, kind="stable")
+        order = order[np.count_nonzero(rows < 0) :]
+        planes, array = Planes(), self._surface.array
+        planes.starts = array(np.searchsorted(rows[order], np.arange(len(self._vertices) + 1)), int)
+        planes.places = array(order, int)
+        planes.vertices, planes.weights = array(contacts.vertices, wp.vec4i), array(contacts.weights, wp.vec4d)
+        planes.normals, planes.gaps = array(contacts.normals), array(contacts.gap, wp.float64)
+        planes.mobilities = array(contacts.mobilities(self._surface.fixed), wp.float64)
+        return planes
+
+    def _sweep(self, kernel: wp.Kernel, dim: int, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
+        """Returns values after some launches of a kernel that writes those of movable vertices."""
         arrays = [self._surface.array(values), self._surface.array(values)]
-        return launch_in_turn(kernel, len(self._springs[0]), sweeps, inputs=inputs, values=arrays).numpy()
+        return launch_in_turn(kernel, dim, sweeps, inputs=inputs, values=arrays).numpy()
 
 
 def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:
