@@ -3,7 +3,7 @@
 import numpy as np
 
 from .contacts import Contacts, projected
-from .elastic import Springs, near
+from .elastic import Springs
 from .motion import move_freely
 from .surface import Surface
 
@@ -28,7 +28,8 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """Returns positions near the input that can be reached from a start without a collision.
 
     What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
-    below the limit; contacts that are known keep their elements apart meanwhile, so that each motion meets few others. Of the positions passed, the result has the least strain above the limit, then the least moves.
+    below the limit. Meanwhile known contacts keep their elements apart, so that a motion meets few others. Of the
+    positions passed, the result has the least strain above the limit, then the least moves.
 
     Args:
         surface: The surface.
@@ -42,22 +43,28 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         if held.any():
-            around = near(surface, held, _RINGS)
+            around = springs.around(held, _RINGS)
             sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
             goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
             goal = projected(surface.fixed, goal, known)
-        moved, contacts = move_freely(surface, x, surface.rounded(goal))
+        goal = surface.rounded(goal)
+        if _are_near(x, goal, surface.edge):
+            break
+        start, (x, contacts) = x, move_freely(surface, x, goal)
         known = Contacts.joined([known, contacts]).latest()
         held[contacts.vertices] = True
-        change = np.abs(moved - x).max(initial=0.0)
-        x = moved
         before, score = score, _score(surface, x, max_strain)
         stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
-        if change < _SETTLED * surface.edge or stalled >= (_PATIENCE if score[0] else 1):
+        if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1):
             break
     return best
+
+
+def _are_near(start: np.ndarray, end: np.ndarray, edge: float) -> bool:
+    """Returns whether no vertex moves by more than a small share of an edge."""
+    return bool(np.abs(end - start).max(initial=0.0) < _SETTLED * edge)
 
 
 def _score(surface: Surface, x: np.ndarray, max_strain: float) -> tuple[float, float]:

@@ -23,7 +23,12 @@ def within(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
     """Returns which vertices are within some edges of given ones, a mask or indices, bool, shape [n]."""
     reached = np.zeros(len(surface.home), dtype=bool)
     reached[vertices] = True
-    first, second = surface.ends
+    return _grown(reached, surface.ends, rings)
+
+
+def _grown(reached: np.ndarray, ends: np.ndarray, rings: int) -> np.ndarray:
+    """Returns which vertices are within some edges, whose two ends are given, of those that are reached."""
+    first, second = ends
     for _ in range(rings if reached.any() else 0):
         from_first, from_second = reached[first], reached[second]
         reached[second[from_first]] = True
@@ -49,6 +54,7 @@ class Springs:
         vertices = self._vertices = np.flatnonzero(movable)
         first, second = surface.ends
         edges = np.flatnonzero(movable[first] | movable[second])
+        self._ends = surface.ends[:, edges]
         across = _vertices_across(surface, movable)
         ends = np.concatenate([surface.edges[edges], across])
         stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
@@ -63,6 +69,10 @@ class Springs:
             array(both[order, 1], int),
         ]
         self._rest = [array(np.tile(values, 2)[order], wp.float64) for values in (lengths, stiffness)]
+
+    def around(self, vertices: np.ndarray, rings: int) -> np.ndarray:
+        """Returns the movable vertices within some edges, that springs follow, of given ones, bool, shape [n]."""
+        return _grown(vertices.copy(), self._ends, rings) & self.movable
 
     def spread(self, moves: np.ndarray, given: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns moves of all vertices, which join those of given vertices smoothly; Jacobi sweeps.
