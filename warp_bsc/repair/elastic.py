@@ -103,10 +103,13 @@ class Springs:
             contacts: Contacts that are kept apart meanwhile, nearly; default: none.
             around: The movable vertices that move, bool, shape [n]; default: all.
         """
-        contacts = Contacts.none() if contacts is None else contacts
-        rows = np.arange(len(self._vertices)) if around is None else np.flatnonzero(around[self._vertices])
-        inputs = [self._surface.array(rows, int), *self._springs, *self._rest, self._planes(contacts)]
-        return self._sweep(relax_springs, len(rows), [*inputs, wp.float64(slack)], x, sweeps)
+        planes = Planes() if contacts is None or not len(contacts.toi) else self._planes(contacts)
+        rows, count = None, len(self._vertices)
+        if around is not None:
+            (moving,) = np.nonzero(around[self._vertices])
+            rows, count = self._surface.array(moving, int), len(moving)
+        inputs = [rows, *self._springs, *self._rest, planes, wp.float64(slack)]
+        return self._sweep(relax_springs, count, inputs, x, sweeps)
 
     def _planes(self, contacts: Contacts) -> Planes:
         """Returns contacts as planes, by the rows of the vertices."""

@@ -78,7 +78,8 @@ class Planes:
     """Planes that keep the elements of contacts apart, by vertex.
 
     Attributes:
-        starts: Where the places of each row of vertices begin, and their number at last, array of int.
+        starts: Where the places of each row of vertices begin, and their number at last, array of int; None if there
+            are no planes.
         places: Contacts of the vertices, each as 4 times its number plus that of the corner, array of int.
         vertices: Corners of each contact, those of the second element last, array of vec4i.
         weights: Coordinates of the contact in the elements, those of the second one negative, array of vec4d.
@@ -101,7 +102,12 @@ def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
     """Returns the mean move of a vertex that puts its contacts at their distances, shared with the other corners."""
     total = wp.vec3d()
     count = _ZERO
-    for k in range(planes.starts[i], planes.starts[i + 1]):
+    first = int(0)
+    last = int(0)
+    if planes.starts:
+        first = planes.starts[i]
+        last = planes.starts[i + 1]
+    for k in range(first, last):
         contact = planes.places[k] / 4
         corners = planes.vertices[contact]
         weights = planes.weights[contact]
@@ -134,10 +140,12 @@ def relax_springs(
 ):
     """Moves each vertex towards the lengths of its springs, and out of planes: one Jacobi sweep.
 
-    The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``, for each i of ``rows``. Lengths
-    within ``slack``, a share, of their rest length are left.
+    The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``, for each i of ``rows``, or each
+    i. Lengths within ``slack``, a share, of their rest length are left.
     """
-    i = rows[wp.tid()]
+    i = wp.tid()
+    if rows:
+        i = rows[i]
     vertex = vertices[i]
     p = x[vertex]
     total = wp.vec3d()
