@@ -20,10 +20,8 @@ from .surface import Surface
 
 __all__ = ["Untangled", "untangle"]
 
-_STEP, _LARGEST_STEP = 0.25, 0.75
-"""Distance by which an edge and a face move apart in the first iteration, and in one without fewer crossings than the
-best, in edges; and the largest one, as it grows otherwise."""
-_GROWTH = 1.5
+_STEP = 0.25
+"""Distance by which an edge and a face move apart in an iteration, in edges."""
 _RINGS = 10
 """Edges around contours within which vertices may move, and how many more when these grow."""
 _MORE_RINGS = 4
@@ -67,7 +65,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     """
     inner = np.zeros(len(x), dtype=bool)
     springs = Springs(surface, inner)
-    best, since, iteration, step = Untangled(x, crossings, springs), 0, 0, _STEP
+    best, since, iteration = Untangled(x, crossings, springs), 0, 0
     while not surface.are_fixed(crossings).all() and since < _PATIENCE:
         vertices = _vertices_of(surface, crossings)
         if not inner[vertices].all():
@@ -76,14 +74,13 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
         if since >= _STUCK and since % 2 == 0:
             x = springs.spread(x, ~within(surface, vertices, 1), _SMOOTHING_SWEEPS)
         else:
-            moves, given = _contour_moves(surface, x, crossings, step * surface.edge, whole=iteration % 2 == 1)
+            moves, given = _contour_moves(surface, x, crossings, whole=iteration % 2 == 1)
             x = springs.relax(x + springs.spread(moves, given, _SPREAD_SWEEPS), _RELAX_SWEEPS)
         x = surface.rounded(x)
         crossings = surface.crossings(x)
         iteration, since = iteration + 1, since + 1
         if len(crossings) < len(best.crossings):
             best, since = Untangled(x, crossings, springs), 0
-        step = _STEP if since else min(_GROWTH * step, _LARGEST_STEP)
     return best
 
 
@@ -93,7 +90,7 @@ def _vertices_of(surface: Surface, crossings: np.ndarray) -> np.ndarray:
 
 
 def _contour_moves(
-    surface: Surface, x: np.ndarray, crossings: np.ndarray, step: float, *, whole: bool
+    surface: Surface, x: np.ndarray, crossings: np.ndarray, *, whole: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the moves of vertices that shorten contours, and which vertices they are for.
 
@@ -101,7 +98,6 @@ def _contour_moves(
         surface: The surface.
         x: Positions, in units, shape [n, 3].
         crossings: (edge, face), shape [m, 2].
-        step: Distance by which an edge and a face move apart, in units; less for small ones.
         whole: Whether all edges of a contour move alike.
     """
     mesh = surface.mesh
@@ -118,12 +114,12 @@ def _contour_moves(
     # small elements take small steps, or their strain would be large
     sides = np.linalg.norm(x[corners] - x[np.roll(corners, 1, axis=1)], axis=2).mean(axis=1)
     size = 0.5 * (np.linalg.norm(x[ends[:, 1]] - x[ends[:, 0]], axis=1) + sides)
-    steps = (step * np.minimum(size / surface.edge, 1.0))[:, None] * direction
+    step = _STEP * np.minimum(size, surface.edge)[:, None] * direction
     vertices = np.concatenate([ends, corners], axis=1)
     weights = np.concatenate([1.0 - along[:, None], along[:, None], coordinates], axis=1) * ~surface.fixed[vertices]
     # edge and face share the step, unless one of them is fixed
     shares = np.where(weights[:, :2].any(axis=1) & weights[:, 2:].any(axis=1), 0.5, 1.0)[:, None]
-    moves = (np.array([1.0, 1.0, -1.0, -1.0, -1.0]) * weights * shares)[:, :, None] * steps[:, None, :]
+    moves = (np.array([1.0, 1.0, -1.0, -1.0, -1.0]) * weights * shares)[:, :, None] * step[:, None, :]
     involved, rows = np.unique(vertices, return_inverse=True)
     rows = rows.reshape(-1)
     total = _sums(rows, moves.reshape(-1, 3), len(involved))
