@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from .contacts import Contacts, projected
 from .elastic import Springs
 from .motion import move_freely
 from .surface import Surface
@@ -9,7 +10,10 @@ from .surface import Surface
 __all__ = ["approach"]
 
 _ROUNDS = 24
-_SWEEPS = 40
+_SWEEPS, _MORE_SWEEPS = 40, 160
+"""Sweeps of a round in which strains are below the limit at its start, and above it."""
+_RINGS = 10
+"""Edges around vertices in contact within which springs move others."""
 _SETTLED = 2.0**-10
 """Move, in edges, below which the approach ends."""
 _PROGRESS = 0.98
@@ -24,7 +28,8 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """Returns positions near the input that can be reached from a start without a collision.
 
     What is free to go returns to its input. What contact keeps from it takes its neighbours along until strains are
-    below the limit. Of the positions passed, the result has the least strain above the limit, then the least moves.
+    below the limit. Meanwhile known contacts keep their elements apart, so that a motion meets few others. Of the
+    positions passed, the result has the least strain above the limit, then the least moves.
 
     Args:
         surface: The surface.
@@ -34,22 +39,32 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """
     best, score = x, _score(surface, x, max_strain)
     best_score = score
-    held, stalled = np.zeros(len(x), dtype=bool), 0
+    held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         if held.any():
-            goal = springs.relax(goal, _SWEEPS, _SOUGHT * max_strain)
-        moved, stopped = move_freely(surface, x, surface.rounded(goal))
-        held |= stopped
-        change = np.abs(moved - x).max(initial=0.0)
-        x = moved
+            around = springs.around(held, _RINGS)
+            sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
+            goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
+            goal = projected(surface.fixed, goal, known)
+        goal = surface.rounded(goal)
+        if _are_near(x, goal, surface.edge):
+            break
+        start, (x, contacts) = x, move_freely(surface, x, goal)
+        known = Contacts.joined([known, contacts]).latest()
+        held[contacts.vertices] = True
         before, score = score, _score(surface, x, max_strain)
         stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
-        if change < _SETTLED * surface.edge or stalled >= (_PATIENCE if score[0] else 1):
+        if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1):
             break
     return best
+
+
+def _are_near(start: np.ndarray, end: np.ndarray, edge: float) -> bool:
+    """Returns whether no vertex moves by more than a small share of an edge."""
+    return bool(np.abs(end - start).max(initial=0.0) < _SETTLED * edge)
 
 
 def _score(surface: Surface, x: np.ndarray, max_strain: float) -> tuple[float, float]:

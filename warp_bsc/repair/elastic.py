@@ -4,7 +4,8 @@ import numpy as np
 import warp as wp
 
 from ..detection.launch import launch_in_turn
-from .kernels import relax_springs, spread_moves
+from .contacts import Contacts
+from .kernels import Planes, relax_springs, spread_moves
 from .surface import Surface
 
 __all__ = ["Springs", "near", "within"]
@@ -22,7 +23,12 @@ def within(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
     """Returns which vertices are within some edges of given ones, a mask or indices, bool, shape [n]."""
     reached = np.zeros(len(surface.home), dtype=bool)
     reached[vertices] = True
-    first, second = surface.ends
+    return _grown(reached, surface.ends, rings)
+
+
+def _grown(reached: np.ndarray, ends: np.ndarray, rings: int) -> np.ndarray:
+    """Returns which vertices are within some edges, whose two ends are given, of those that are reached."""
+    first, second = ends
     for _ in range(rings if reached.any() else 0):
         from_first, from_second = reached[first], reached[second]
         reached[second[from_first]] = True
@@ -45,9 +51,10 @@ class Springs:
             movable: Vertices that they may move, bool, shape [n].
         """
         self._surface, self.movable = surface, movable
-        vertices = np.flatnonzero(movable)
+        vertices = self._vertices = np.flatnonzero(movable)
         first, second = surface.ends
         edges = np.flatnonzero(movable[first] | movable[second])
+        self._ends = surface.ends[:, edges]
         across = _vertices_across(surface, movable)
         ends = np.concatenate([surface.edges[edges], across])
         stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
@@ -63,6 +70,10 @@ class Springs:
         ]
         self._rest = [array(np.tile(values, 2)[order], wp.float64) for values in (lengths, stiffness)]
 
+    def around(self, vertices: np.ndarray, rings: int) -> np.ndarray:
+        """Returns the movable vertices within some edges, that springs follow, of given ones, bool, shape [n]."""
+        return _grown(vertices.copy(), self._ends, rings) & self.movable
+
     def spread(self, moves: np.ndarray, given: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns moves of all vertices, which join those of given vertices smoothly; Jacobi sweeps.
 
@@ -72,22 +83,53 @@ class Springs:
             sweeps: Number of sweeps, about as many edges as moves spread over.
         """
         is_given = self._surface.array(given, bool)
-        return self._sweep(spread_moves, [*self._springs, is_given], moves, sweeps)
+        return self._sweep(spread_moves, len(self._vertices), [*self._springs, is_given], moves, sweeps)
 
-    def relax(self, x: np.ndarray, sweeps: int, slack: float = 0.0) -> np.ndarray:
+    def relax(
+        self,
+        x: np.ndarray,
+        sweeps: int,
+        slack: float = 0.0,
+        *,
+        contacts: Contacts | None = None,
+        around: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Returns positions with strains that are smaller, or at most ``slack`` if there are enough sweeps.
 
         Args:
             x: Positions, in units, shape [n, 3].
             sweeps: Number of Jacobi sweeps.
             slack: Strain that needs no change.
+            contacts: Contacts that are kept apart meanwhile, nearly; default: none.
+            around: The movable vertices that move, bool, shape [n]; default: all.
         """
-        return self._sweep(relax_springs, [*self._springs, *self._rest, wp.float64(slack)], x, sweeps)
+        planes = Planes() if contacts is None or not len(contacts.toi) else self._planes(contacts)
+        rows, count = None, len(self._vertices)
+        if around is not None:
+            (moving,) = np.nonzero(around[self._vertices])
+            rows, count = self._surface.array(moving, int), len(moving)
+        inputs = [rows, *self._springs, *self._rest, planes, wp.float64(slack)]
+        return self._sweep(relax_springs, count, inputs, x, sweeps)
 
-    def _sweep(self, kernel: wp.Kernel, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
-        """Returns values after some launches of a kernel that writes those of all movable vertices."""
+    def _planes(self, contacts: Contacts) -> Planes:
+        """Returns contacts as planes, by the rows of the vertices."""
+        row = np.full(len(self.movable), -1)
+        row[self._vertices] = np.arange(len(self._vertices))
+        rows = row[contacts.vertices.ravel()]
+        order = np.argsort(rows, kind="stable")
+        order = order[np.count_nonzero(rows < 0) :]
+        planes, array = Planes(), self._surface.array
+        planes.starts = array(np.searchsorted(rows[order], np.arange(len(self._vertices) + 1)), int)
+        planes.places = array(order, int)
+        planes.vertices, planes.weights = array(contacts.vertices, wp.vec4i), array(contacts.weights, wp.vec4d)
+        planes.normals, planes.gaps = array(contacts.normals), array(contacts.gap, wp.float64)
+        planes.mobilities = array(contacts.mobilities(self._surface.fixed), wp.float64)
+        return planes
+
+    def _sweep(self, kernel: wp.Kernel, dim: int, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
+        """Returns values after some launches of a kernel that writes those of movable vertices."""
         arrays = [self._surface.array(values), self._surface.array(values)]
-        return launch_in_turn(kernel, len(self._springs[0]), sweeps, inputs=inputs, values=arrays).numpy()
+        return launch_in_turn(kernel, dim, sweeps, inputs=inputs, values=arrays).numpy()
 
 
 def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:

@@ -73,26 +73,79 @@ def contour_gradients(
     gradient[i] = total / wp.max(wp.length(total), _ONE)
 
 
+@wp.struct
+class Planes:
+    """Planes that keep the elements of contacts apart, by vertex.
+
+    Attributes:
+        starts: Where the places of each row of vertices begin, and their number at last, array of int; None if there
+            are no planes.
+        places: Contacts of the vertices, each as 4 times its number plus that of the corner, array of int.
+        vertices: Corners of each contact, those of the second element last, array of vec4i.
+        weights: Coordinates of the contact in the elements, those of the second one negative, array of vec4d.
+        normals: Normals, array of vec3d.
+        gaps: Distances along the normal, array of float64.
+        mobilities: Reciprocal sums of the squared weights of corners that may move, array of float64.
+    """
+
+    starts: wp.array[int]
+    places: wp.array[int]
+    vertices: wp.array[wp.vec4i]
+    weights: wp.array[wp.vec4d]
+    normals: wp.array[wp.vec3d]
+    gaps: wp.array[wp.float64]
+    mobilities: wp.array[wp.float64]
+
+
+@wp.func
+def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
+    """Returns the mean move of a vertex that puts its contacts at their distances, shared with the other corners."""
+    total = wp.vec3d()
+    count = _ZERO
+    first = int(0)
+    last = int(0)
+    if planes.starts:
+        first = planes.starts[i]
+        last = planes.starts[i + 1]
+    for k in range(first, last):
+        contact = planes.places[k] / 4
+        corners = planes.vertices[contact]
+        weights = planes.weights[contact]
+        between = wp.vec3d()
+        for corner in range(4):
+            between += weights[corner] * x[corners[corner]]
+        short = planes.gaps[contact] - wp.dot(between, planes.normals[contact])
+        if short > _ZERO:
+            weight = weights[planes.places[k] % 4]
+            total += weight * short * planes.mobilities[contact] * planes.normals[contact]
+            count += _ONE
+    return total / wp.max(count, _ONE)
+
+
 @wp.kernel
 def relax_springs(
     # springs
+    rows: wp.array[int],
     vertices: wp.array[int],
     starts: wp.array[int],
     ends: wp.array[int],
     lengths: wp.array[wp.float64],
     weights: wp.array[wp.float64],
+    planes: Planes,
     # in
     slack: wp.float64,
     x: wp.array[wp.vec3d],
     # out
     relaxed: wp.array[wp.vec3d],
 ):
-    """Moves each vertex towards the lengths of its springs: one Jacobi sweep.
+    """Moves each vertex towards the lengths of its springs, and out of planes: one Jacobi sweep.
 
-    The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``. Lengths within ``slack``, a share,
-    of their rest length are left.
+    The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``, for each i of ``rows``, or each
+    i. Lengths within ``slack``, a share, of their rest length are left.
     """
     i = wp.tid()
+    if rows:
+        i = rows[i]
     vertex = vertices[i]
     p = x[vertex]
     total = wp.vec3d()
@@ -103,7 +156,7 @@ def relax_springs(
         wanted = wp.clamp(length, lengths[k] * (_ONE - slack), lengths[k] * (_ONE + slack))
         total += weights[k] * (length - wanted) * _direction(along)
         weight += weights[k]
-    relaxed[vertex] = p + _HALF * total / wp.max(weight, _TINY)
+    relaxed[vertex] = p + _HALF * total / wp.max(weight, _TINY) + _push(i, x, planes)
 
 
 @wp.kernel

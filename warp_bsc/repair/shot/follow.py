@@ -10,7 +10,7 @@ import warp as wp
 from ...detection.detector import CollisionDetector
 from ...detection.launch import launch, launch_in_turn
 from ...detection.mesh import CollisionMesh
-from ..motion import Contacts, as_contacts, projected
+from ..contacts import Contacts, as_contacts, projected
 from .follow_kernels import normalize, smooth
 
 if TYPE_CHECKING:
