@@ -12,7 +12,7 @@ from .differentiable import CollisionArrays
 from .distance_phase import decide_distances_on_host
 from .host_function import run_on_host
 from .intersections import IntersectionFinder, find_intersections
-from .inversions import Inversions, find_inversions
+from .inversions import Inversions, inversions_of_motion
 from .launch import retry_until_fits
 from .mesh import CollisionMesh
 from .narrow_phase import decide_on_host
@@ -199,7 +199,7 @@ class CollisionDetector:
         if self.mesh.device.is_capturing:
             raise RuntimeError(f"{self.mesh.device} captures a graph: find inversions outside of it")
         x0, x1 = self._checked_positions(x0, x1)
-        return find_inversions(self.mesh, x0, x1, method=self.method, tolerance=self.tolerance)
+        return inversions_of_motion(self.mesh, x0, x1, method=self.method, tolerance=self.tolerance)
 
     def find_inversions(self, x: np.ndarray | wp.array) -> np.ndarray:
         """Returns the tetrahedra of the mesh whose volume is 0 or negative in one configuration, exactly.
@@ -218,7 +218,7 @@ class CollisionDetector:
         if self.mesh.device.is_capturing:
             raise RuntimeError(f"{self.mesh.device} captures a graph: find inversions outside of it")
         x = self.mesh.device_positions(x, "x")
-        return find_inversions(self.mesh, x, x, method="exact", tolerance=self.tolerance).tets
+        return inversions_of_motion(self.mesh, x, x, method="exact", tolerance=self.tolerance).tets
 
     def find_proximities(self, x: np.ndarray | wp.array, distance: float, *, rings: int = 1) -> Proximities:
         """Returns the pairs of elements that are near each other in one configuration, exactly.

@@ -16,7 +16,7 @@ from .launch import launch_over, made_once
 from .mesh import CollisionMesh
 from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Method
 
-__all__ = ["Inversions", "find_inversions"]
+__all__ = ["Inversions", "inversions_of_motion"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,9 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
     return decide_exactly
 
 
-def find_inversions(mesh: CollisionMesh, x0: wp.array, x1: wp.array, *, method: Method, tolerance: float) -> Inversions:
+def inversions_of_motion(
+    mesh: CollisionMesh, x0: wp.array, x1: wp.array, *, method: Method, tolerance: float
+) -> Inversions:
     """Returns the tetrahedra of a mesh that invert in a motion.
 
     Args:
@@ -147,7 +149,7 @@ def find_inversions(mesh: CollisionMesh, x0: wp.array, x1: wp.array, *, method: 
     elif method == "exact":
         inverts = _decided(mesh, x0, x1, status) == HIT
     (found,) = np.nonzero(inverts)
-    return Inversions(found.astype(np.int32), certified[found], np.minimum(toi.numpy()[found], 1.0))
+    return Inversions(found.astype(np.int32), certified[found], toi.numpy()[found])
 
 
 def _decided(mesh: CollisionMesh, x0: wp.array, x1: wp.array, status: wp.array) -> np.ndarray:

@@ -163,8 +163,10 @@ class Workspace:
         masses = motion.inverse_mass, motion.bodies.inverse_mass
         if self.unmasked is not None:
             motion.inverse_mass, motion.bodies.inverse_mass = self.unmasked
-        yield
-        motion.inverse_mass, motion.bodies.inverse_mass = masses
+        try:
+            yield
+        finally:
+            motion.inverse_mass, motion.bodies.inverse_mass = masses
 
     @property
     def motion(self) -> ModelMotion:
