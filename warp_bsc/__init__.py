@@ -54,6 +54,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .response.report import SolverReport
     from .response.solver_ccd import SolverCCD
     from .response.state.collision_filter import CollisionFilter
+    from .response.state.friction_table import FrictionTable
     from .usd.frames import FrameRange
     from .usd.scene import Scene
     from .usd.selection import Selection
@@ -70,6 +71,7 @@ _MODULES = {
     "ContactLayer": "response.layer.contact_layer",
     "DetectionStats": "detection.collisions",
     "FrameRange": "usd.frames",
+    "FrictionTable": "response.state.friction_table",
     "IntervalResult": "replay.results",
     "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",
@@ -106,6 +108,7 @@ __all__ = [
     "ContactLayer",
     "DetectionStats",
     "FrameRange",
+    "FrictionTable",
     "IntervalResult",
     "IntervalSummary",
     "QueryResult",

@@ -25,6 +25,7 @@ __all__ = [
     "checked_distances",
     "checked_flag",
     "checked_integer",
+    "checked_integers",
     "checked_number",
     "checked_shape",
     "checked_strings",
@@ -245,6 +246,22 @@ def checked_distance(distance: Any, name: str, *, zero: bool = True) -> float:
     return float(checked)
 
 
+def checked_integers(integers: Any, name: str, count: int, end: int) -> np.ndarray:
+    """Returns an integer for each of some things, int32, shape (count,).
+
+    Args:
+        integers: Integers in [0, end); one, or an array of shape (count,).
+        name: Name of the argument in errors.
+        count: Number of things.
+        end: The first integer that is too large.
+
+    Raises:
+        TypeError: If they are no integers.
+        ValueError: If they have another shape, are masked, or are out of range.
+    """
+    return _checked_integers(integers, name, count, 0, end, f"in [0, {end})").astype(np.int32)
+
+
 def checked_bits(bits: Any, name: str, count: int) -> np.ndarray:
     """Returns 32 bits for each of some things, uint32, shape (count,).
 
@@ -257,18 +274,23 @@ def checked_bits(bits: Any, name: str, count: int) -> np.ndarray:
         TypeError: If they are no integers.
         ValueError: If they have another shape, are masked, or are out of range.
     """
+    return _checked_integers(bits, name, count, -1, 2**32, "in [0, 2^32), or -1 for all bits").astype(np.uint32)
+
+
+def _checked_integers(integers, name, count, first, end, range_):
+    """Returns integers in [first, end) for each of some things, which errors describe as a range."""
     what = "one integer or an array of integers"
-    values = as_numpy(bits, name, what)
+    values = as_numpy(integers, name, what)
     if values.dtype.kind not in "iu":
-        raise TypeError(f"{name} must be {what}, not {given(bits)}")
+        raise TypeError(f"{name} must be {what}, not {given(integers)}")
     if values.shape not in ((), (count,)):
         raise ValueError(f"{name} must be one integer or have shape ({count},), not {values.shape}")
-    bad = (values < -1) | (values >= 2**32)
+    bad = (values < first) | (values >= end)
     if bad.any():
         which = np.flatnonzero(bad)[0]
         where = f"{name}[{which}]" if values.ndim else name
-        raise ValueError(f"{where} must be in [0, 2^32), or -1 for all bits, not {values.reshape(-1)[which]}")
-    return np.broadcast_to(values, count).astype(np.uint32)
+        raise ValueError(f"{where} must be {range_}, not {values.reshape(-1)[which]}")
+    return np.broadcast_to(values, count)
 
 
 def _as_double(values: np.ndarray) -> np.ndarray:

@@ -404,6 +404,22 @@ def calls_of_solvers() -> dict[str, Call]:
         "too few": bsc.CollisionFilter(particle_mask=np.ones(count - 1, dtype=int)),
         "shapes": bsc.CollisionFilter(shape_group=[1]),
     }
+    tables = without(OBJECTS, "None") | {
+        "list": [[0.1]],
+        "too few": bsc.FrictionTable([[0.1]], particle_material=np.zeros(count - 1, dtype=int)),
+        "shapes": bsc.FrictionTable([[0.1]], shape_material=[0]),
+    }
+    coefficients = without(bad_arrays(np.zeros((2, 2))), "integers", "half precision") | {
+        "not square": np.zeros((2, 1)),
+        "empty": np.zeros((0, 0)),
+        "not symmetric": [[0.1, 0.2], [0.3, 0.1]],
+        "nan": [[math.nan]],
+        "inf": [[math.inf]],
+        "huge": [[1e39]],
+        "doubles": wp.zeros((1, 1), dtype=wp.float64, device="cpu"),
+        "one dimension": wp.zeros(2, dtype=float, device="cpu"),
+    }
+    materials = without(bad_bits(count), "rows") | {"too large": 1, "two-dimensional": np.zeros((2, 2), dtype=int)}
     bits = without(bad_bits(count), "rows") | {"two-dimensional": np.ones((2, 2), dtype=int)}
     found = {
         "CollisionFilter": Call(
@@ -412,6 +428,12 @@ def calls_of_solvers() -> dict[str, Call]:
             dict.fromkeys(["particle_group", "particle_mask", "shape_group", "shape_mask"], bits),
             raises=bsc.CollisionFilter,
         ),
+        "FrictionTable": Call(
+            bsc.FrictionTable,
+            {"coefficients": [[0.1]]},
+            {"coefficients": coefficients} | dict.fromkeys(["particle_material", "shape_material"], materials),
+            raises=bsc.FrictionTable,
+        ),
         "SolverCCD": Call(
             bsc.SolverCCD,
             {"solver": inner},
@@ -419,6 +441,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "solver": solvers,
                 "separation": without(POSITIVE, "None"),
                 "friction": coefficient | {"huge": 1e39},
+                "friction_table": tables,
                 "restitution": coefficient | {"above 1": 1.5},
                 "substeps": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
@@ -452,6 +475,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "solver": solvers,
                 "thickness": without(POSITIVE, "None"),
                 "friction": coefficient | {"huge": 1e39},
+                "friction_table": tables,
                 "restitution": coefficient | {"above 1": 1.5},
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
@@ -546,6 +570,8 @@ INTERNAL = {
     "CollisionMesh.device_elements",
     "FrameRange.bounds",
     "FrameRange.times",
+    "FrictionTable.materials",
+    "FrictionTable.on_device",
     "Scene.note",
     "Scene.prim_of",
     "Scene.segment",

@@ -21,6 +21,7 @@ from .._private_names.of_newton import has_external_rigid_solver
 from .schedule import MAX_ITERATIONS
 from .state.collision_filter import CollisionFilter, checked_filter
 from .state.friction import Friction
+from .state.friction_table import FrictionTable, checked_table
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
@@ -41,6 +42,7 @@ class StageOptions:
 
     separation: float | None
     friction: wp.array
+    friction_table: FrictionTable | None
     reads_friction: bool
     restitution: wp.array
     substeps: int | Literal["auto"] | None
@@ -60,6 +62,7 @@ class StageOptions:
         *,
         separation=None,
         friction=None,
+        friction_table=None,
         restitution=None,
         substeps: int | Literal["auto"] | None = "auto",
         bodies="pushed",
@@ -80,6 +83,7 @@ class StageOptions:
         return cls(
             separation=separation,
             friction=checked_friction(friction, model),
+            friction_table=checked_table(friction_table, model),
             reads_friction=model.requires_grad or isinstance(friction, wp.array),
             restitution=checked_restitution(restitution, model),
             substeps=substeps,
@@ -177,8 +181,10 @@ def _checked_coefficients(value, name, lengths, most, limits, model):
     return value if isinstance(value, wp.array) else wp.array(values, dtype=float, device=model.device)
 
 
-def friction_of(mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | None = None) -> Friction:
-    """Returns the coefficients of vertices and of infinite planes; by default those of shapes are of their materials.
+def friction_of(
+    mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | None = None, table: FrictionTable | None = None
+) -> Friction:
+    """Returns the coefficients of vertices and of infinite planes, by default those of the model, and of pairs.
 
     Raises:
         ValueError: If the friction of a shape is negative or no number.
@@ -193,4 +199,4 @@ def friction_of(mesh: ModelMesh, of_particles: wp.array, of_shapes: wp.array | N
     for shape in np.union1d(mesh.shape_vertices.shape, mesh.planes.shape):
         if not values[shape] >= 0.0:
             raise ValueError(f"shape {shape} ({model.shape_label[shape]!r}) has friction {values[shape]}")
-    return Friction(mesh, of_particles, of_shapes)
+    return Friction(mesh, of_particles, of_shapes, table)

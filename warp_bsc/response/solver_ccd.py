@@ -23,6 +23,7 @@ from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, Loop
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter
+from .state.friction_table import FrictionTable
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
@@ -101,6 +102,7 @@ class SolverCCD(CollisionStage):
         *,
         separation: float | None = None,
         friction: float | wp.array[float] | None = None,
+        friction_table: FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
         substeps: int | Literal["auto"] | None = "auto",
         bodies: Literal["pushed", "separated", "left"] = "pushed",
@@ -122,6 +124,8 @@ class SolverCCD(CollisionStage):
                 their material, contacts the geometric mean. May be an array of float32, of length 1 or of one for each
                 particle, which each step reads again, and which may require gradients; so are then the coefficients of
                 shapes, as with ``requires_grad``. Negative values count as 0.
+            friction_table: Coefficients by pair of materials, where they are another than the geometric mean, see
+                :class:`.state.friction_table.FrictionTable`. None for none.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             substeps: Substeps of the inner solver in a step that collides, so that it reacts to the contacts, see
@@ -183,6 +187,7 @@ class SolverCCD(CollisionStage):
             self.model,
             separation=separation,
             friction=friction,
+            friction_table=friction_table,
             restitution=restitution,
             substeps=substeps,
             bodies=bodies,
@@ -207,13 +212,14 @@ class SolverCCD(CollisionStage):
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         integrator = innermost(solver)
         moves = options.moves_bodies(mesh, integrator)
-        coefficients = friction_of(mesh, self.friction)
+        coefficients = friction_of(mesh, self.friction, table=friction_table)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         if options.contact_layer and self.model.requires_grad and inner is solver:
             self.solver = ContactLayer(
                 solver,
                 friction=self.friction,
+                friction_table=friction_table,
                 restitution=self.restitution,
                 min_distance=min_distance,
                 particle_radius=particle_radius,
@@ -372,7 +378,7 @@ class SolverCCD(CollisionStage):
         arrays = [start.particle_q, end.particle_q, end.particle_qd]
         if model.body_count:
             arrays += [start.body_q, end.body_q, end.body_qd]
-        read = [friction.of_particles, friction.of_shapes, self.restitution, model.particle_inv_mass]
+        read = [*friction.inputs, self.restitution, model.particle_inv_mass]
         read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
         recorded: RecordedStep | None = None

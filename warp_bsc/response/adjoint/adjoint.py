@@ -15,7 +15,7 @@ from ..state.record import GROWING, OFFSETS, RecordCounts, check_complete
 from ..state.structs import SUMS, Constraints, add_zeros, allocate
 from ..state.workspace import Workspace
 from . import kernels, pose_kernels, restore, structs
-from .arrays import copied, filled, launch_adjoint, with_gradients
+from .arrays import copied, copied_materials, filled, launch_adjoint, materials_with_gradients, with_gradients
 from .structs import Move, Projection, RestoredStep
 
 _UNUSED_OF_CONSTRAINTS = {"count", "min_distance", "last_sweep", "active_set", "active_count"}
@@ -45,6 +45,7 @@ class RecordedStep:
         restored.planes = copied(motion.planes, ("start", "end", "friction"))
         step = restored.step
         step.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
+        step.motion.materials = copied_materials(motion.vertices.materials)
         names = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
         step.vertices = copied(work.vertices, names)
         if motion.keeps_poses:
@@ -84,6 +85,8 @@ class StepAdjoint:
         self._step = step = restored.step
         names = "x0", "x1", "velocity", "inverse_mass", "friction"
         step.motion, self._of_motion = with_gradients(given.motion, names)
+        materials = materials_with_gradients(given.motion.materials, recorded.friction.materials.friction)
+        step.motion.materials, self._of_motion.materials = materials
         if model.body_count:
             names = _MOTION_OF_BODIES if recorded.moves_bodies else ("start", "end")
             step.motion.bodies, self._of_motion.bodies = with_gradients(given.motion.bodies, names)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ..._private_names.of_warp import empty_struct, struct_type
+from ..state.structs import Materials
 
 
 def filled(array: wp.array, counts: wp.array, place: int = 0) -> int:
@@ -40,6 +41,19 @@ def with_gradients(struct, names=(), **gradients):
             alias.grad, alias.retain_grad = gradient, True  # which a store would clear
             setattr(into, name, alias)
     return into, of_struct
+
+
+def copied_materials(materials: Materials) -> Materials:
+    """Returns materials with a copy of the friction of their pairs, which a program may change."""
+    return copied(materials, [] if materials.friction is None else ["friction"])
+
+
+def materials_with_gradients(materials: Materials, table: wp.array | None):
+    """Returns materials whose friction adds to the gradient of a table, and gradients as :func:`with_gradients`."""
+    if table is None:
+        return with_gradients(materials)
+    gradient = wp.zeros_like(table, requires_grad=False) if table.grad is None else table.grad
+    return with_gradients(materials, friction=gradient)
 
 
 def launch_adjoint(kernel, dim, inputs, of_outputs, device):

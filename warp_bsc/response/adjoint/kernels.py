@@ -9,10 +9,11 @@ from ...kernels.closest import contact_weights, weights_across
 from ..contacts.collect import distances_from_plane, offset_from
 from ..contacts.constraints import (
     approach_of,
-    contact_friction,
     feasible,
+    friction_on_plane,
     has_pushed,
     kind_of_pair,
+    pair_friction,
     sagitta,
 )
 from ..contacts.first_contact import truncated_path
@@ -197,9 +198,9 @@ def make_constraints(restored: RestoredStep, found: Constraints):
         if motion.distances.radius:
             of_plane, _reach = distances_from_plane(motion, restored.planes, found.plane[i], corners[0])
             separation += wp.max(of_plane, ZERO)
-        friction = contact_friction(motion.friction[corners[0]], restored.planes.friction[found.plane[i]])
+        friction = friction_on_plane(motion, restored.planes, found.plane[i], corners[0])
     else:
-        friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+        friction = pair_friction(motion, corners)
     kept, reach = kept_distance(motion, corners, kind)
     if kind < ContactKind.PLANE and motion.distances.radius:
         at_distance, towards = contact_within_reach(step, corners, kind, weight, normal, kept, iteration <= 0, reach)

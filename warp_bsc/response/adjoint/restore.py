@@ -206,6 +206,10 @@ def finish_gradients(
     x1 = gradients.x1[particle] + gradients.more_x1[particle] + of_motion.x1[particle]
     velocity = gradients.velocity[particle] + gradients.more_velocity[particle] + of_motion.velocity[particle]
     of_motion.friction[particle] += missing
+    if particle == 0 and of_motion.materials.friction and restored.record.counts.complete[0] == 0:
+        for i in range(of_motion.materials.friction.shape[0]):
+            for j in range(of_motion.materials.friction.shape[1]):
+                of_motion.materials.friction[i, j] = wp.nan
     if particle == 0 and of_model.restitution:
         of_model.restitution[0] += missing
     if particle >= of_state.particle_q.shape[0]:

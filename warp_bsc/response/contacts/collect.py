@@ -169,7 +169,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         added.weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
         added.min_distance = wp.max(kept, ZERO)
         added.separation = offset_from(step, planes, i, vertex, status) + added.min_distance
-        added.friction = constraints.contact_friction(motion.friction[vertex], planes.friction[i])
+        added.friction = constraints.friction_on_plane(motion, planes, i, vertex)
         added.kind = ContactKind.PLANE
         added.plane = i
         added.within_tolerance = True
@@ -259,7 +259,7 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
         status.loop[Loop.PROJECTING] = 1
         status.contact_iteration[world] = iteration
     added.separation = target
-    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    added.friction = constraints.pair_friction(motion, corners)
     added.within_tolerance = contacts.within_tolerance[i]
     added.toi = toi
     constraints.add_constraint(step, added)

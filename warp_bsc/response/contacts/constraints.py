@@ -5,8 +5,9 @@ import warp as wp
 from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE, VERTEX_VERTEX
+from ..state.planes import MovingPlanes
 from ..state.poses import turn_between
-from ..state.structs import ContactKind, Motion, Pace, Step, body_of, can_move
+from ..state.structs import ContactKind, Materials, Motion, Pace, Step, body_of, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double
 from ..tuning import MAX_SAGITTA, RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
 from .rules import are_on_body, inverse_mass_of
@@ -141,12 +142,43 @@ def feasible(step: Step, corners: wp.vec4i, target: wp.float64, start: wp.float6
 
 
 @wp.func
-def contact_friction(a: float, b: float) -> float:
-    """Returns the coefficient of friction of a contact from those of its two sides: their geometric mean."""
+def _mean_friction(a: float, b: float) -> float:
+    """Returns the geometric mean of two coefficients of friction."""
     product = a * b
     if product > 0.0:  # at 0 there is no derivative
         return wp.sqrt(product)
     return 0.0
+
+
+@wp.func
+def _friction_of_materials(materials: Materials, a: int, b: int, mean: float) -> float:
+    """Returns the coefficient of friction of two materials; the mean of that of the two sides if they have none."""
+    of_pair = materials.friction[wp.min(a, b), wp.max(a, b)]
+    if of_pair >= 0.0:
+        return of_pair
+    return mean
+
+
+@wp.func
+def pair_friction(motion: Motion, corners: wp.vec4i) -> float:
+    """Returns the coefficient of friction of two elements."""
+    a = corners[0]
+    b = corners[3]
+    mean = _mean_friction(motion.friction[a], motion.friction[b])
+    if motion.materials.friction:
+        of_vertex = motion.materials.of_vertex
+        return _friction_of_materials(motion.materials, of_vertex[a], of_vertex[b], mean)
+    return mean
+
+
+@wp.func
+def friction_on_plane(motion: Motion, planes: MovingPlanes, plane: int, vertex: int) -> float:
+    """Returns the coefficient of friction of a vertex and an infinite plane."""
+    mean = _mean_friction(motion.friction[vertex], planes.friction[plane])
+    if motion.materials.friction:
+        of_vertex = motion.materials.of_vertex[vertex]
+        return _friction_of_materials(motion.materials, of_vertex, motion.materials.of_plane[plane], mean)
+    return mean
 
 
 @wp.func

@@ -96,7 +96,7 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     added.weights = weights
     added.normal = normal
     added.separation = added.min_distance + constraints.feasible(step, corners, separation, beyond)
-    added.friction = constraints.contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    added.friction = constraints.pair_friction(motion, corners)
     of_faces, of_edges = int(ContactKind.VERTEX_FACE_PROXIMITY), int(ContactKind.EDGE_EDGE_PROXIMITY)
     added.kind = wp.where(kind == EDGE_EDGE, of_edges, of_faces)
     added.within_tolerance = True

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import warp as wp
 
 from ..adjoint import pose_kernels
-from ..adjoint.arrays import copied, filled, launch_adjoint, with_gradients
+from ..adjoint.arrays import copied, copied_materials, filled, launch_adjoint, materials_with_gradients, with_gradients
 from ..adjoint.structs import StateGradients
 from ..contacts.queue import PairQueue
 from ..state.motion import ModelMotion
@@ -29,6 +29,7 @@ def record_pushes(layer: Layer, pairs: list[PairQueue], motion: ModelMotion) -> 
     pushes_bodies = motion.moves_bodies
     layer = copied(layer, ("shares", "changes") if pushes_bodies else ("shares",))
     layer.motion = copied(motion.vertices, ("x0", "x1", "is_not_finite", "friction"))
+    layer.motion.materials = copied_materials(motion.vertices.materials)
     layer.planes = copied(motion.planes, ("start", "end", "friction"))
     if motion.keeps_poses:
         names = ("start", "end", "velocity", "inverse_mass") if pushes_bodies else ("start", "end")
@@ -59,6 +60,8 @@ def go_back(recorded: RecordedPushes, motion: ModelMotion, of_state: StateGradie
     recorded_motion, recorded_bodies = layer.motion, layer.motion.bodies
     layer, of_layer = with_gradients(layer, ("shares", "changes") if pushes_bodies else ("shares",))
     layer.motion, of_motion = with_gradients(recorded_motion, names)
+    materials = materials_with_gradients(recorded_motion.materials, motion.friction.materials.friction)
+    layer.motion.materials, of_motion.materials = materials
     layer.planes, of_planes = with_gradients(recorded.layer.planes, ("start", "end", "friction"))
     if keeps_poses:
         names = ("start", "end", "velocity", "inverse_mass") if pushes_bodies else ("start", "end")

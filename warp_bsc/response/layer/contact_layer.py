@@ -37,6 +37,7 @@ from ..contacts.queue import queues_of
 from ..integration.wrapped_solver import WrappedSolver, innermost
 from ..options import Bodies, StageOptions, friction_of, in_eight_bits, particle_edge_lengths
 from ..state.collision_filter import CollisionFilter
+from ..state.friction_table import FrictionTable
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, arrays_of
 from ..state.structs import add_zeros
@@ -82,6 +83,7 @@ class ContactLayer(WrappedSolver):
         *,
         thickness: float | None = None,
         friction: float | wp.array[float] | None = None,
+        friction_table: FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
@@ -98,6 +100,8 @@ class ContactLayer(WrappedSolver):
                 less the minimum distance where the first step shows that motion is too fast for that, see
                 :mod:`.layer.thickness`.
             friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``.
+            friction_table: Coefficients by pair of materials, as for :class:`.solver_ccd.SolverCCD`. A stage around the
+                layer has its own: give it the same.
             restitution: Share of the approaching velocity that comes back, in [0, 1].
             min_distance: Distance of pairs at the bottom of the layer [m], or ``"model"``; None or 0: they touch.
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all.
@@ -115,6 +119,7 @@ class ContactLayer(WrappedSolver):
         options = StageOptions.of(
             self.model,
             friction=friction,
+            friction_table=friction_table,
             restitution=restitution,
             min_distance=min_distance,
             particle_radius=particle_radius,
@@ -129,7 +134,8 @@ class ContactLayer(WrappedSolver):
         if thickness is not None:
             thin = thick = checked_distance(thickness, "thickness", zero=False)
         moves_bodies = options.moves_bodies(mesh, innermost(solver))
-        self._motion = ModelMotion(mesh, friction_of(mesh, self.friction), moves_bodies=moves_bodies)
+        coefficients = friction_of(mesh, self.friction, table=friction_table)
+        self._motion = ModelMotion(mesh, coefficients, moves_bodies=moves_bodies)
         layer, device = Layer(), mesh.device
         n, body_count = mesh.vertex_count, self.model.body_count if moves_bodies else 0
         layer.thickness = self.thickness_values = wp.full(1, thin, dtype=wp.float64, device=device)
@@ -215,7 +221,7 @@ class ContactLayer(WrappedSolver):
         arrays = {"start_q": start.particle_q, "particle_q": end.particle_q, "particle_qd": end.particle_qd}
         if model.body_count:
             arrays |= {"start_body_q": start.body_q, "body_q": end.body_q, "body_qd": end.body_qd}
-        read = [motion.friction.of_particles, motion.friction.of_shapes, self.restitution, model.particle_inv_mass]
+        read = [*motion.friction.inputs, self.restitution, model.particle_inv_mass]
         if self._body_count:
             read += [model.body_inv_mass, model.body_inv_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]

@@ -4,7 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.queues import has_overflowed
 from ..adjoint.structs import StateGradients
-from ..contacts.constraints import contact_friction
+from ..contacts.constraints import pair_friction
 from ..contacts.queue import PairQueue, has_pair, vertices_of
 from ..state.fixed_sum import add_to_sum, from_units, sum_of, sums_of, to_units, with_delta
 from ..state.motion import StateArrays
@@ -128,7 +128,7 @@ def sum_pushes(
     for j in range(4):
         vertex = corners[j]
         path += weights[j] * (to_double(motion.x1[vertex]) - to_double(motion.x0[vertex]))
-    friction = contact_friction(motion.friction[corners[0]], motion.friction[corners[3]])
+    friction = pair_friction(motion, corners)
     push = push_of(layer, normal, depth, path, resistance, across_resistance, friction)
     for j in range(4):
         change = weights[j] * wp.float64(motion.inverse_mass[corners[j]]) * push

@@ -8,7 +8,7 @@ from ...kernels.closest import closest_weights
 from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE
 from ..contacts.closest import closest_vector
-from ..contacts.constraints import contact_friction
+from ..contacts.constraints import friction_on_plane
 from ..contacts.rules import ContactClass, owner_of
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ..state.structs import Motion, MovedBodies, body_of, can_move
@@ -150,7 +150,7 @@ def change_by_plane(layer: Layer, plane: int, vertex: int) -> wp.vec3d:
     if depth <= ZERO or resistance <= ZERO:
         return wp.vec3d()
     path = to_double(motion.x1[vertex]) - to_double(motion.x0[vertex])
-    friction = contact_friction(motion.friction[vertex], layer.planes.friction[plane])
+    friction = friction_on_plane(motion, layer.planes, plane, vertex)
     push = push_of(layer, normal, depth, path, resistance, resistance, friction)
     return wp.float64(motion.inverse_mass[vertex]) * push
 

@@ -206,7 +206,8 @@ class ModelMotion:
         add_zeros(vertices, ["interrupted"], max(1, model.world_count) + 1, device)
         self._last: wp.array[wp.vec3] | None = None
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
-        vertices.friction, vertices.pair_filter = friction.vertices, mesh.pair_filter
+        vertices.friction, vertices.materials = friction.vertices, friction.materials
+        vertices.pair_filter = mesh.pair_filter
         if mesh.distances is not None:
             vertices.distances = mesh.distances
         self.planes = planes = MovingPlanes()

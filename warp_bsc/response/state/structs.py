@@ -104,6 +104,15 @@ class MovedBodies:
 
 
 @wp.struct
+class Materials:
+    """Materials of vertices and infinite planes, and friction by pair of them; empty without a friction table."""
+
+    friction: wp.array2d[float]  # coefficient of two materials, the smaller first; negative if they have none
+    of_vertex: wp.array[int]
+    of_plane: wp.array[int]
+
+
+@wp.struct
 class Motion:
     """The predicted motion, and properties of its vertices. The response only reads it."""
 
@@ -113,6 +122,7 @@ class Motion:
     is_not_finite: wp.array[int]  # 1 where the prediction is not finite: the vertex stays at its start
     inverse_mass: wp.array[float]  # [1/kg], 0 where a vertex cannot be moved by itself
     friction: wp.array[float]  # coefficient
+    materials: Materials
     world: wp.array[int]
     bodies: Bodies
     distances: MinDistances  # of pairs; empty if pairs only must not touch

@@ -1,0 +1,95 @@
+"""Friction by pair of materials: a symmetric table of coefficients, and the materials of particles and shapes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from ..._arguments import as_numpy, check_instance, checked_integers
+from .collision_filter import on_host
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionTable:
+    """Coefficients of friction by pair of materials, in place of the geometric mean of those of the two sides.
+
+    Each particle and each shape has a material, a number. The entry of two materials is the coefficient of contacts
+    between them; where it is negative, they have none of their own, and the coefficients of the two sides count. So one
+    shape may be slippery for one cloth and rough for another. An edge or a face between particles of several materials
+    has that of one of its vertices.
+
+    Cloth that slides on the first shape and sticks to the second, and for which everything else is as without a table::
+
+        table = [[-1.0, 0.1, 0.9], [0.1, -1.0, -1.0], [0.9, -1.0, -1.0]]
+        SolverCCD(solver, friction_table=FrictionTable(table, particle_material=0, shape_material=[1, 2]))
+
+    Attributes:
+        coefficients: Coefficients, shape [n, n], symmetric. A Warp array of float32 on the device of the model is read
+            again in each step, in CUDA graphs too, and may require gradients. Only entries on and above the diagonal
+            are read, and have gradients; a NaN that a program writes counts as negative.
+        particle_material: Material of each particle, integers in [0, n), shape [particle_count], or one for all. A
+            stage reads the materials once, when it is made.
+        shape_material: Material of each shape, shape [shape_count], or one for all.
+
+    Raises:
+        TypeError: If coefficients are no numbers, or materials no integers.
+        ValueError: If coefficients are not finite, not symmetric or not square, or a material is out of range.
+    """
+
+    coefficients: wp.array | np.ndarray | list[list[float]]
+    particle_material: int | np.ndarray | wp.array = 0
+    shape_material: int | np.ndarray | wp.array = 0
+
+    def __post_init__(self):
+        values = self.coefficients
+        if isinstance(values, wp.array) and values.dtype is not wp.float32:
+            raise TypeError(f"coefficients must be an array of float32, not of {values.dtype.__name__}")
+        what = "an array of numbers"
+        values = as_numpy(on_host(values), "coefficients", what)
+        if values.dtype.kind not in "iuf":
+            raise TypeError(f"coefficients must be {what}, not {values.dtype}")
+        if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.size:
+            raise ValueError(f"coefficients must have shape (n, n), not {values.shape}")
+        with np.errstate(over="ignore"):
+            single = values.astype(np.float32)
+        bad = ~np.isfinite(single) | (single != single.T)
+        if bad.any():
+            i, j = np.argwhere(bad)[0]
+            raise ValueError(
+                f"coefficients[{i}][{j}] must be finite in single precision, and that of the pair in the other order, "
+                f"not {values[i, j]} and {values[j, i]}"
+            )
+        for name in ("particle_material", "shape_material"):
+            materials = as_numpy(on_host(getattr(self, name)), name, "one integer or an array of integers")
+            if materials.ndim > 1:
+                raise ValueError(f"{name} must be one integer or an array of one dimension, not {materials.shape}")
+            checked_integers(materials, name, materials.size, len(values))
+
+    def on_device(self, model: newton.Model) -> wp.array:
+        """Returns the coefficients on the device of a model, float32, shape [n, n]: those that a program may change."""
+        if isinstance(self.coefficients, wp.array):
+            return self.coefficients
+        return wp.array(np.asarray(self.coefficients), dtype=float, device=model.device)
+
+    def materials(self, model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the materials of the particles and shapes of a model, int32, with errors as of the class."""
+        counts, most = {"particle": model.particle_count, "shape": model.shape_count}, len(self.coefficients)
+        of_particles, of_shapes = (
+            checked_integers(on_host(getattr(self, f"{what}_material")), f"friction_table.{what}_material", n, most)
+            for what, n in counts.items()
+        )
+        return of_particles, of_shapes
+
+
+def checked_table(friction_table: Any, model: newton.Model) -> FrictionTable | None:
+    """Returns the argument ``friction_table``, a :class:`FrictionTable` that fits a model, or None."""
+    if friction_table is None:
+        return None
+    check_instance(friction_table, "friction_table", FrictionTable, "a FrictionTable")
+    friction_table.materials(model)
+    device = friction_table.on_device(model).device
+    if device != model.device:
+        raise ValueError(f"friction_table.coefficients must be on device {model.device}, not {device}")
+    return friction_table
