@@ -129,6 +129,9 @@ import warp as wp
                     left_out |= (unsigned)!meet(element + 8 + lane, other_element + 8 + other_lane) << other_lane;
                 }
                 filtered += __builtin_popcount(left_out);
+                if (filtered_of_worlds.data && left_out)
+                    __atomic_fetch_add(&filtered_of_worlds.data[element[32 + lane]],
+                                       (wp::int64)__builtin_popcount(left_out), __ATOMIC_RELAXED);
                 mask &= ~left_out;
                 if (!mask)
                     continue;
@@ -212,6 +215,7 @@ def pair_packet(
     at_end: int,
     # in and out
     counts: wp.array[wp.int64],
+    filtered_of_worlds: wp.array[wp.int64],
     # indices of counts
     candidate_count: int,
     queued_count: int,
@@ -226,7 +230,7 @@ def pair_packet(
     boxes at the end count instead of the swept ones, and all pairs that overlap are enqueued. Pairs without a changed
     element are excluded. With ``symmetric`` both are of one tree, and each pair is found once. With ``ordered`` the
     smaller number comes first, else that of the packet. With groups, the pairs that a :class:`.pairs.PairFilter` leaves
-    out are counted, and are no candidates.
+    out are counted, by world as well if there is an array for that, and are no candidates.
     """
     ...
 

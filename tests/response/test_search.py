@@ -24,11 +24,11 @@ def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_verti
     return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, padding=padding)
 
 
-def stage(model, monkeypatch, *, tiny, inner="vbd", **options):
+def stage(model, monkeypatch, *, tiny, inner="vbd", make=bsc.SolverCCD, **options):
     """A stage, with queues for four pairs that cannot grow if it is ``tiny``: those of a CUDA graph cannot."""
     with monkeypatch.context() as patch:
         patch.setattr(pipeline, "make_broad_phase", make_hierarchy)
-        solver = bsc.SolverCCD(SOLVERS[inner](model) if isinstance(inner, str) else inner, **options)
+        solver = make(SOLVERS[inner](model) if isinstance(inner, str) else inner, **options)
     if tiny:
         detector = solver._work.detector
         detector.broad_phase._face_pairs = wp.empty(CAPACITY, dtype=wp.vec2i, device=detector.mesh.device)

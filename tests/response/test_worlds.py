@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Changed, add_crossing_sheets, add_patch, add_plates, bullet
+from test_bodies import add_body, free
+from test_search import stage
 
 import warp_bsc as bsc
 
@@ -115,7 +117,7 @@ def test_each_world_is_stepped_as_if_it_were_alone(inner, substeps, device):
         for _ in range(steps):
             alone.step()
             report, results = alone.solver.report, alone.solver.report.worlds.numpy()
-            for name in ("certified", "hits", "remaining", "truncated", "frozen", "substeps", "crossings"):
+            for name in ("certified", "hits", "remaining", "filtered", "truncated", "frozen", "substeps", "crossings"):
                 assert results[name].tolist() == [getattr(report, name)], name
             listed = report.contacts.numpy()["normal_impulse"]
             assert results["max_impulse"][0] == max(listed, default=0.0)
@@ -252,10 +254,81 @@ def test_frozen_and_truncated_vertices_are_counted_by_world(device):
     assert cut > 0
 
 
+def filtered_worlds(seeds, device):
+    """A model with a world for each seed and its filter.
+
+    A cloth and a particle of the second group fly at a box, which stops them before a cloth and a particle of the first
+    group. Two bodies meet that are filtered by Newton. The box and the ground are in all worlds.
+    """
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    builder.add_shape_box(-1, xform=wp.transform((0.1, 0.0, 0.05), wp.quat_identity()), hx=0.05, hy=0.05, hz=0.05)
+    for seed in seeds:
+        random = np.random.default_rng(seed)
+        world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        world.add_shape_sphere(-1, xform=wp.transform((-0.1, 0.0, 0.05), wp.quat_identity()), radius=0.05)
+        for x in (-0.02, 0.02):
+            add_body(world, "box", (x, 0.3, random.uniform(0.1, 0.11)), hx=0.03, hy=0.03, hz=0.03)
+            world.body_qd[-1] = wp.spatial_vector(-20.0 * x, 0.0, 0.0, 0.0, 0.0, 0.0)
+        world.add_shape_collision_filter_pair(1, 2)
+        for height, speed in ((0.03, 0.0), (0.13, 30.0)):
+            at = *random.uniform(-0.02, 0.02, 2), height
+            add_patch(world, 4, 0.05, at, velocity=(0.0, 0.0, -speed))
+            world.add_particle(wp.vec3(*at) + wp.vec3(0.0, 0.0, 0.01), wp.vec3(0.0, 0.0, -1.5 * speed), 0.001)
+        builder.add_world(world)
+    builder.color()
+    model = builder.finalize(device=device)
+    group = np.tile(1 << np.repeat([0, 1], 26), len(seeds))
+    shapes = [1, 2, *([1, 2, 2] * len(seeds))]
+    return model, bsc.CollisionFilter(particle_group=group, particle_mask=2, shape_group=shapes, shape_mask=2)
+
+
+@pytest.mark.filterwarnings("ignore:contacts strained")
+@pytest.mark.parametrize(
+    "tree, options",
+    [
+        ("packets", {"substeps": None}),
+        ("packets", {"substeps": 2}),
+        ("packets", None),
+        ("faces", {"substeps": 2}),
+        ("faces", None),
+        ("faces without queues", {"substeps": None}),
+    ],
+)
+def test_filtered_pairs_by_world_are_those_of_each_world_alone(tree, options, monkeypatch, device):
+    """And add up to those of all, also without queues, where both are lower bounds; None is of a monitor."""
+    if tree == "packets" and wp.get_device(device).is_cuda:
+        pytest.skip("of the CPU")
+
+    def filtered(seeds):
+        model, collision_filter = filtered_worlds(seeds, device)
+        given = {"collision_filter": collision_filter, "min_distance": 0.002, "report_worlds": True}
+        make = bsc.CollisionMonitor
+        if options is not None:
+            make, given = bsc.SolverCCD, given | {"bodies": "separated", **options}
+        if tree == "packets":
+            solver = make(free(model), **given)
+        else:
+            solver = stage(model, monkeypatch, tiny=tree != "faces", inner=free(model), make=make, **given)
+        states, found = [model.state(), model.state()], []
+        for _ in range(4):
+            solver.step(*states, None, None, DT)
+            states.reverse()
+            found.append(solver.report.worlds.filtered.numpy().tolist())
+            assert sum(found[-1]) == solver.report.filtered
+        return np.array(found)
+
+    together = filtered(range(3))
+    assert together.any()
+    if "without" not in tree:
+        assert (together.max(axis=0) > 100).all() and len(np.unique(together, axis=1).T) == 3
+        np.testing.assert_array_equal(together, np.concatenate([filtered([seed]) for seed in range(3)], axis=1))
+
+
 def test_a_graph_reads_the_mask_of_each_replay(device):
     """And its report is that of the same steps outside a graph; a world starts anew between two replays."""
-    model = finalize(range(3), device)
-    solvers = [new_stage(model, "vbd") for _ in range(2)]
+    model, alone = finalize(range(3), device), bsc.CollisionFilter(particle_group=2, particle_mask=1)
+    solvers = [new_stage(model, "vbd", collision_filter=alone) for _ in range(2)]
     mask = wp.array([True, True, True, True], dtype=bool, device=device)
     states, control = [[model.state(), model.state()] for _ in range(2)], model.control()
 
@@ -265,12 +338,12 @@ def test_a_graph_reads_the_mask_of_each_replay(device):
 
     with pytest.raises(RuntimeError, match="before capturing"), wp.ScopedCapture(device):
         take_pair(0)
-    solvers[0] = new_stage(model, "vbd")
+    solvers[0] = new_stage(model, "vbd", collision_filter=alone)
     for i in range(2):
         take_pair(i)
     with wp.ScopedCapture(device) as capture:
         take_pair(1)
-    random, moved = np.random.default_rng(3), 0
+    random, moved, filtered = np.random.default_rng(3), 0, 0
     for replay in range(6):
         mask.assign([*(random.random(3) < 0.6), True])
         before = states[0][0].particle_q.numpy().copy()
@@ -284,12 +357,13 @@ def test_a_graph_reads_the_mask_of_each_replay(device):
             assert np.array_equal(*(getattr(report, f"{kind}_impulse").numpy() for report in reports))
         for one, other in zip(*(report.worlds.numpy().values() for report in reports), strict=True):
             assert np.array_equal(one, other)
+        filtered += reports[1].worlds.filtered.numpy()
         for one, other in zip(*(report.contacts.numpy().values() for report in reports), strict=True):
             assert np.array_equal(one, other)
         if replay == 2:
             for i in range(2):
                 solvers[i].reset(states[i][0], wp.array([False, True, False, False], dtype=bool, device=device))
-    assert moved > 3
+    assert moved > 3 and (filtered > 100).all()
 
 
 def cloth_on_a_sphere(turn, height):

@@ -40,6 +40,10 @@ class BroadPhase(Protocol):
         """Enlarges the queue of pairs of faces if it is too small for the count."""
         ...
 
+    def count_filtered_by_world(self, counts: wp.array) -> None:
+        """Makes runs add the pairs of elements that groups and masks leave out to counts by world, array of int64."""
+        ...
+
     def pair_elements(
         self,
         x0: wp.array,

@@ -99,6 +99,10 @@ class BroadPhaseHierarchy:
         if count > self.capacity:
             self._face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
 
+    def count_filtered_by_world(self, counts: wp.array) -> None:
+        """Makes runs count the pairs that groups and masks leave out by world as well."""
+        self.hierarchy.filtered_of_worlds = counts
+
     def pair_elements(
         self,
         x0: wp.array,

@@ -33,6 +33,7 @@ class BroadPhaseSimd:
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
         self.lock = threading.RLock()
+        self._filtered_of_worlds: wp.array | None = None
         shared = mesh.world, padding, mesh.pair_filter
 
         def of_vertices(vertices: np.ndarray) -> WideTree:
@@ -56,6 +57,10 @@ class BroadPhaseSimd:
 
     def grow(self, count: int) -> None:
         """Does nothing, as there is no queue."""
+
+    def count_filtered_by_world(self, counts: wp.array) -> None:
+        """Makes runs count the pairs that groups and masks leave out by world as well."""
+        self._filtered_of_worlds = counts
 
     def pair_elements(
         self,
@@ -94,10 +99,9 @@ class BroadPhaseSimd:
         if self._points is None or self._free_edges is None:
             return
         self._build([self._points, self._free_edges], x0, x1, refit, changed)
-        self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, keep_separated=keep_separated)
-        self._points.pair(
-            self._points, vertex_vertex_counts, vertex_vertex, ordered=True, keep_separated=keep_separated
-        )
+        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
+        self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, **options)
+        self._points.pair(self._points, vertex_vertex_counts, vertex_vertex, ordered=True, **options)
 
     def pair_overlapping_elements(
         self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
@@ -122,7 +126,7 @@ class BroadPhaseSimd:
         keep_separated: bool,
     ) -> None:
         """Enqueues the candidates of the trees, with arguments as of :meth:`pair_elements`."""
-        options = {"keep_separated": keep_separated}
+        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, **options)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, ordered=True, **options)
         if self._edges_of_faces:

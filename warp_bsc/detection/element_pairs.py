@@ -68,6 +68,16 @@ def _is_face(mesh: FaceHierarchy, place: int) -> bool:
 
 
 @wp.func
+def _count_filtered(mesh: FaceHierarchy, place: int, count: int):
+    """Counts pairs of elements of the cell at a place that a filter leaves out by world, if that is to be known."""
+    if mesh.filtered_of_worlds and count > 0:
+        world = int(0)
+        if mesh.places.first_world:
+            world = mesh.places.first_world[place]
+        wp.atomic_add(mesh.filtered_of_worlds, world, wp.int64(count))
+
+
+@wp.func
 def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
@@ -169,8 +179,11 @@ def pair_elements(
             edges = overlapping_edges(mesh, face, other, keep_separated)
             candidates[0] += count_set_bits(wp.uint32(vertices & 0o7007))
             candidates[1] += count_set_bits(wp.uint32(edges & 511))
-            filtered[0] += count_set_bits(wp.uint32(vertices & 0o700700))
-            filtered[1] += count_set_bits(wp.uint32(edges >> 18))
+            filtered_vertices = count_set_bits(wp.uint32(vertices & 0o700700))
+            filtered_edges = count_set_bits(wp.uint32(edges >> 18))
+            filtered[0] += filtered_vertices
+            filtered[1] += filtered_edges
+            _count_filtered(mesh, face, filtered_vertices + filtered_edges)
             # of the rest only what no axis separates
             vertices = ((vertices >> 3) & 7) | ((vertices >> 9) & 56)
             edges = (edges >> 9) & 511
@@ -271,6 +284,7 @@ def _pair_point(
             point = mesh.faces[place, 0]
             if is_filtered(mesh.pair_filter, wp.vec3i(point), _corners(mesh.faces, other)):
                 take_slot(vertex_edge_counts, _FILTERED)
+                _count_filtered(mesh, place, 1)
                 return
             take_slot(vertex_edge_counts, _CANDIDATES)
             if keep_separated or not _apart(box, other_box):
@@ -306,6 +320,7 @@ def pair_points(
             q = mesh.faces[other, 0]
             if is_filtered(mesh.pair_filter, wp.vec3i(p), wp.vec3i(q)):
                 take_slot(vertex_vertex_counts, _FILTERED)
+                _count_filtered(mesh, place, 1)
                 return
             take_slot(vertex_vertex_counts, _CANDIDATES)
             if keep_separated or not _apart(box, other_box):

@@ -49,6 +49,7 @@ class FaceHierarchy:
         all_faces: Whether all cells are faces.
         only_free: Whether pairs of two faces are left out.
         pair_filter: Pairs of elements that are left out.
+        filtered_of_worlds: How many of them each world has; without an array they are not counted by world.
         face_count: Number of faces; greater cells are edges.
         point_start: First cell that is a point.
         order: Cell at each place, -1 for none.
@@ -69,6 +70,7 @@ class FaceHierarchy:
     all_faces: wp.bool
     only_free: wp.bool
     pair_filter: PairFilter
+    filtered_of_worlds: wp.array[wp.int64]
     face_count: int
     point_start: int
     order: wp.array[int]

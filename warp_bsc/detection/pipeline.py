@@ -145,6 +145,7 @@ class DetectionPipeline:
         self._captured = False
         self._retired: list = []  # buffers that a CUDA graph may still write to
         self.counters = Counters(mesh.device)
+        self._filtered_of_worlds: wp.array | None = None
         self.counts = self.counters.read()
         vertices, edges, faces = mesh.vertex_count, len(mesh.edges), len(mesh.faces)
         self._min_distances = min_distances
@@ -185,6 +186,15 @@ class DetectionPipeline:
             )
         self.capacities = self._device_capacities()
 
+    def count_filtered_by_world(self, counts: wp.array) -> None:
+        """Makes each run write how many pairs groups and masks leave out in each world, beside those of all.
+
+        Args:
+            counts: Pairs by world, Warp array of int64, shape [number of worlds].
+        """
+        self._filtered_of_worlds = counts
+        self._broad_phase.count_filtered_by_world(counts)
+
     @property
     def narrow_phases(self) -> tuple[NarrowPhase, ...]:
         """The narrow phases of vertex-face and of edge-edge pairs, and those of points."""
@@ -220,6 +230,8 @@ class DetectionPipeline:
         """
         self._captured |= bool(self.mesh.device.is_capturing)
         self.counters.array.zero_()
+        if self._filtered_of_worlds is not None:
+            self._filtered_of_worlds.zero_()
         with timer.stage("broad phase"):
             self._broad_phase.pair_elements(
                 x0, x1, *_queues(self.vertex_face, self.edge_edge), refit=refit, changed=changed

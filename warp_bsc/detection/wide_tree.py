@@ -160,6 +160,7 @@ def _pair_packets(
     at_end: int,
     # out
     counts: wp.array[wp.int64],
+    filtered_of_worlds: wp.array[wp.int64],
     pairs: wp.array[wp.vec2i],
 ):
     """Enqueues the pairs of a packet's elements with those of a tree, a packet a thread."""
@@ -181,6 +182,7 @@ def _pair_packets(
         keep_separated,
         at_end,
         counts,
+        filtered_of_worlds,
         _CANDIDATES,
         _QUEUED,
         _FILTERED,
@@ -323,6 +325,7 @@ class WideTree:
         ordered: bool = False,
         keep_separated: bool = False,
         at_end: bool = False,
+        filtered_of_worlds: wp.array | None = None,
     ) -> None:
         """Enqueues the candidates between this tree and another, or within this tree.
 
@@ -335,6 +338,7 @@ class WideTree:
             ordered: Whether the smaller number comes first; else that of this tree does.
             keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
+            filtered_of_worlds: Counts of the pairs that are left out, by world, array of int64; None for none.
         """
         if not len(other._boxes):
             return
@@ -354,6 +358,7 @@ class WideTree:
             keep_separated,
             at_end,
             counts,
+            filtered_of_worlds,
         ]
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
 

@@ -105,11 +105,14 @@ class Result(IntEnum):
 
 @wp.struct
 class WorldCounts:
-    """Contacts of each world, shape [worlds]; empty if the report is not asked for worlds."""
+    """Contacts and filtered pairs of each world, shape [worlds]; empty if the report is not asked for worlds."""
 
     found: wp.array[int]  # by the detection in progress
     hits: wp.array[int]  # of the predicted motion
     remaining: wp.array[int]  # that the last detection found
+    left_out: wp.array[int]  # by the detection in progress, see Detection.FILTERED
+    left_out_pairs: wp.array[wp.int64]  # pairs of elements that groups and masks left out of the last detection
+    filtered: wp.array[int]  # pairs of the predicted motion that filters left out, both of these
 
 
 @wp.struct
@@ -242,17 +245,33 @@ def count_contact(status: SolveStatus, world: int):
         wp.atomic_add(status.of_worlds.found, world, 1)
 
 
+@wp.func
+def count_filtered(status: SolveStatus, world: int):
+    """Counts a contact that a detection found, but that a filter leaves out."""
+    wp.atomic_add(status.detection, int(Detection.FILTERED), 1)
+    if status.of_worlds.left_out:
+        wp.atomic_add(status.of_worlds.left_out, world, 1)
+
+
+@wp.func
+def _count_in_32_bits(count: wp.int64) -> int:
+    return int(wp.min(count, _LARGEST_COUNT))
+
+
 @wp.kernel
 def decide_worlds(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus):
-    """Takes over the contacts that a detection found in each world, before :func:`decide` does so for all."""
+    """Takes over what a detection found and left out in each world, before :func:`decide` does so for all."""
     world = wp.tid()
     of_worlds = status.of_worlds
     found = of_worlds.found[world]
+    left_out = of_worlds.left_out[world]
     of_worlds.found[world] = 0
+    of_worlds.left_out[world] = 0
     if can_search and status.results[Result.UNDETECTED] == 0 and has_overflowed(counts, capacities):
         return  # a search finds them again
     if status.results[Result.COUNTED] == 0:
         of_worlds.hits[world] += found
+        of_worlds.filtered[world] = _count_in_32_bits(of_worlds.left_out_pairs[world] + wp.int64(left_out))
     of_worlds.remaining[world] = found
 
 
@@ -262,7 +281,7 @@ def _count_filtered(counts: wp.array[wp.int64], contacts: int) -> int:
     filtered = wp.int64(contacts)
     for kind in range(_FILTERED_KINDS):
         filtered += counts[_FIRST_FILTERED + kind * _FILTERED_STEP]
-    return int(wp.min(filtered, _LARGEST_COUNT))
+    return _count_in_32_bits(filtered)
 
 
 @wp.kernel

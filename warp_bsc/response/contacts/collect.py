@@ -7,7 +7,7 @@ from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import has_overflowed, is_filled
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
-from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, is_dividing, widened
+from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, count_filtered, is_dividing, widened
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
@@ -129,7 +129,8 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         if kept < ZERO and after >= kept - PLANE_DEPTH * separation:
             continue
         if is_filtered_by_plane(motion, planes, i, vertex):
-            wp.atomic_add(status.detection, int(Detection.FILTERED), wp.where(ahead, 0, 1))
+            if not ahead:
+                count_filtered(status, world)
             continue
         if not _stops(motion, planes, i, vertex):
             continue
@@ -200,7 +201,7 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
     if owner == ContactClass.NONE or (near and owner != ContactClass.OURS):
         return
     if owner == ContactClass.FILTERED:
-        wp.atomic_add(status.detection, int(Detection.FILTERED), 1)
+        count_filtered(status, motion.world[corners[0]])
         return
     added = constraints.Constraint()
     bound = toi

@@ -17,7 +17,7 @@ from ...kernels.pipeline.pairs import distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import impact
-from ..schedule import Detection, SolveStatus, count_contact
+from ..schedule import Detection, SolveStatus, count_contact, count_filtered
 from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed
@@ -54,7 +54,7 @@ def _resolve(
 ):
     """Counts a pair that is in contact, adds its dividing planes, and finds the first contact of its vertices."""
     if owner == ContactClass.FILTERED:
-        wp.atomic_add(arguments.status.detection, int(Detection.FILTERED), 1)
+        count_filtered(arguments.status, arguments.step.motion.world[corners[0]])
         return
     found = classify_contact(arguments.step, kind, pair, corners, owner, bound, True)
     if found == ContactClass.CROSSED:

@@ -57,6 +57,8 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
             status.of_worlds.found[i] = 0
             status.of_worlds.hits[i] = 0
             status.of_worlds.remaining[i] = 0
+            status.of_worlds.left_out[i] = 0
+            status.of_worlds.filtered[i] = 0
     if i <= worlds:
         motion.interrupted[i] = 0
     if i >= vertices.x1.shape[0]:
@@ -152,8 +154,9 @@ class Workspace:
         self._max_blocks = BLOCKS * device.sm_count
 
     def count_worlds(self) -> WorldCounts:
-        """Counts contacts of each world from now on, and returns the counts."""
+        """Counts contacts and filtered pairs of each world from now on, and returns the counts."""
         self.status.of_worlds = allocate(WorldCounts, self.worlds, self.device)
+        self.detector.count_filtered_by_world(self.status.of_worlds.left_out_pairs)
         return self.status.of_worlds
 
     @contextlib.contextmanager

@@ -138,7 +138,7 @@ class Substeps:
         self._extrapolates = self._chooses and moves_alone
         self.forces: ContactForces | None = None
         self.taken: wp.array[int] | None = None
-        self._hits = wp.zeros(worlds, dtype=int, device=device)  # of the predicted motion, by world
+        self._hits, self._filtered = (wp.zeros(worlds, dtype=int, device=device) for _ in range(2))  # as predicted
         self._arrays_of_solver()
 
     @property
@@ -243,6 +243,7 @@ class Substeps:
         work.launch(kernels.keep_detection, work.worlds, inputs)
         if self.taken is not None:
             wp.copy(self._hits, work.status.of_worlds.hits)
+            wp.copy(self._filtered, work.status.of_worlds.filtered)
         for array, saved in step.arrays:
             wp.copy(saved, array)
         self._is_pending.fill_(1)
@@ -260,10 +261,11 @@ class Substeps:
             self._meter.measure(self._motion.vertices, self.strain)
 
     def _report_worlds(self):
-        """Reports the substeps of each world, and the contacts of the motion that the inner solver predicted."""
+        """Reports the substeps of each world, and contacts and filtered pairs of the motion as it was predicted."""
         if self.taken is not None:
             wp.copy(self.taken, self._number)
             wp.copy(self._work.status.of_worlds.hits, self._hits)
+            wp.copy(self._work.status.of_worlds.filtered, self._filtered)
 
     def _take_chosen_numbers(self, step):
         """Takes the substeps of all worlds that have still to, and decides which worlds repeat theirs."""

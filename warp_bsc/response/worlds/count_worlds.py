@@ -87,7 +87,8 @@ class WorldCounter:
         found = work.count_worlds()
         self._out = allocate(_Arrays, work.worlds, work.device)
         arrays = {name: getattr(self._out, name) for name in _Arrays.vars}
-        counts = {"hits": found.hits, "remaining": found.remaining, "crossings": work.status.crossings}
+        counts = {name: getattr(found, name) for name in ("hits", "remaining", "filtered")}
+        counts["crossings"] = work.status.crossings
         self.worlds = Worlds(**arrays, **counts, _max_impulse=max_impulse)
 
     def count(self, taken: wp.array[int] | None = None) -> None:

@@ -20,6 +20,7 @@ class Worlds:
         certified: Whether the motion is certified, bool.
         hits: Contacts of the predicted motion, int.
         remaining: Contacts of the motion as it is stored, int.
+        filtered: Pairs that filters left out, int. Shapes that are in all worlds have their elements in each of them.
         truncated: Vertices and bodies whose paths were truncated, int.
         frozen: Vertices and bodies that were frozen, int.
         substeps: Substeps of the step, 0 if it was not taken in substeps, int.
@@ -29,6 +30,7 @@ class Worlds:
     certified: wp.array[wp.bool]
     hits: wp.array[int]
     remaining: wp.array[int]
+    filtered: wp.array[int]
     truncated: wp.array[int]
     frozen: wp.array[int]
     substeps: wp.array[int]

@@ -1,0 +1,38 @@
+"""The program that measures steps a second by the number of worlds, on one and two worlds."""
+
+import sys
+
+import pytest
+from worlds_throughput import SOLVERS, build, main
+
+
+def test_a_row_for_each_solver_and_number_of_worlds(device, monkeypatch, capsys):
+    """Behind the stage all steps are certified, and the exact detector finds no crossing; behind VBD alone it does."""
+    arguments = ["worlds_throughput.py", "--worlds", "1", "2", "--steps", "20", "--device", str(device)]
+    monkeypatch.setattr(sys, "argv", arguments)
+    main()
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header.split() == ["solver", "worlds", "steps/s", "by", "processor", "crossings", "uncertified"]
+    rows = [(line[:30].strip(), *line[30:].split()) for line in lines]
+    assert [row[:2] for row in rows] == [(name, worlds) for worlds in "12" for name in SOLVERS]
+    for name, _, by_clock, by_processor, crossings, uncertified in rows:
+        assert float(by_clock) > 0.0 and float(by_processor) > 0.0
+        if "SolverCCD" in name:
+            assert (crossings, uncertified) == ("0", "0")
+        else:
+            assert uncertified == "-"
+    without = [int(row[4]) for row in rows if row[0] == "VBD"]
+    assert 0 < without[0] < without[1]
+
+
+def test_worlds_are_those_asked_for(device):
+    model = build(2)
+    assert model.world_count == 2 and model.tri_count == 400
+    assert model.particle_world.numpy().tolist() == [0] * 121 + [1] * 121
+
+
+def test_steps_must_be_a_multiple_of_twenty(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["worlds_throughput.py", "--steps", "30"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "--steps must be a multiple of 20, not 30" in capsys.readouterr().err
