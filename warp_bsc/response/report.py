@@ -200,7 +200,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         solver predicted, near each other or not, and particles in solids of infinite planes that it leaves out. With
         ``bodies="separated"`` particles count with shapes that collide with shapes alone. If the response moves bodies,
         so do contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from colliding. In a
-        CUDA graph the number is a lower bound if its queues are too small.
+        CUDA graph the number is a lower bound if its queues are too small. :attr:`worlds` has the numbers by world.
         """
         return _read(self._work.results[Result.FILTERED])
 

@@ -71,9 +71,10 @@ class SolverCCD(CollisionStage):
     inner solver is differentiable: from positions and velocities of particles and poses and velocities of bodies at its
     end to the predicted ones, to positions and poses at its start, to ``particle_inv_mass``, ``body_inv_mass``,
     ``body_inv_inertia``, ``body_mass``, ``body_inertia`` and ``shape_material_mu`` of the model, and to coefficients of
-    friction and restitution that are arrays. The set of contacts is constant; everything else is differentiated as it
-    was computed, see :mod:`.adjoint.adjoint`. With ``requires_grad`` all sweeps are made, so that results do not jump,
-    and the stage puts a :class:`.layer.contact_layer.ContactLayer` around the inner solver, see ``contact_layer``.
+    friction, also of pairs, and restitution that are arrays. The set of contacts is constant; everything else is
+    differentiated as it was computed, see :mod:`.adjoint.adjoint`. With ``requires_grad`` all sweeps are made, so that
+    results do not jump, and the stage puts a :class:`.layer.contact_layer.ContactLayer` around the inner solver, see
+    ``contact_layer``.
 
     A step builds on the one before. A second thread that calls the stage while one is in it gets a RuntimeError: use
     one stage for each thread. Warp and Newton load their kernels in the first steps that need them, which two threads

@@ -71,7 +71,7 @@ class FrictionTable:
         """Returns the coefficients on the device of a model, float32, shape [n, n]: those that a program may change."""
         if isinstance(self.coefficients, wp.array):
             return self.coefficients
-        return wp.array(np.asarray(self.coefficients), dtype=float, device=model.device)
+        return wp.array(np.asarray(self.coefficients, dtype=np.float32), dtype=float, device=model.device)
 
     def materials(self, model: newton.Model) -> tuple[np.ndarray, np.ndarray]:
         """Returns the materials of the particles and shapes of a model, int32, with errors as of the class."""
@@ -89,7 +89,7 @@ def checked_table(friction_table: Any, model: newton.Model) -> FrictionTable | N
         return None
     check_instance(friction_table, "friction_table", FrictionTable, "a FrictionTable")
     friction_table.materials(model)
-    device = friction_table.on_device(model).device
-    if device != model.device:
-        raise ValueError(f"friction_table.coefficients must be on device {model.device}, not {device}")
+    values = friction_table.coefficients
+    if isinstance(values, wp.array) and values.device != model.device:
+        raise ValueError(f"friction_table.coefficients must be on device {model.device}, not {values.device}")
     return friction_table
