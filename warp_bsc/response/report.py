@@ -20,6 +20,11 @@ _CROSSINGS_WARNING = (
     "edges pass through faces at the start of a step, and their contacts are left to the solver: "
     "warp_bsc.repair_state(model, state) moves them apart before the first step"
 )
+_INVERSIONS_WARNING = (
+    "a step inverted tetrahedra, report.inversions counts those of the last one: take shorter steps, or pass "
+    "inversions='prevented'"
+)
+_NOT_WATCHED = "a stage counts inversions only if it is asked to: pass inversions='reported' or 'prevented'"
 _LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it; shorten steps"
 
 
@@ -38,6 +43,7 @@ class StepTotals:
     excluded: wp.array[wp.int64]
     strained_steps: wp.array[wp.int64]
     crossing_steps: wp.array[wp.int64]
+    inverting_steps: wp.array[wp.int64]
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
     outrun_steps: wp.array[wp.int64]
@@ -60,6 +66,8 @@ class Totals:
         excluded: Sum of :attr:`SolverReport.excluded`; a pair counts in each step in which it has a contact.
         strained_steps: Steps in which :attr:`SolverReport.strain` was more than 0.2.
         crossing_steps: Steps at whose start :attr:`SolverReport.crossings` was more than 0.
+        inverting_steps: Steps in which :attr:`SolverReport.inversions` was more than 0; 0 if the stage was not asked to
+            count them.
     """
 
     steps: int
@@ -73,6 +81,7 @@ class Totals:
     excluded: int
     strained_steps: int
     crossing_steps: int
+    inverting_steps: int
 
 
 @dataclass(frozen=True)
@@ -130,7 +139,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once each of a step that is not certified, a :attr:`strain` above 0.2, crossings, and a layer passed.
+        """Warns once each of a step that is not certified, strain above 0.2, crossings, inversions, and a layer passed.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
@@ -141,6 +150,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             self._warn_once("strain", self._strain_warning)
         if known["crossing_steps"] and self._responds:
             self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
+        if known["inverting_steps"] and self._work.ends is None:
+            self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
             self._warn_once("layer", lambda: _LAYER_WARNING)
 
@@ -166,7 +177,8 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         Contacts that :attr:`excluded` counts, pairs that filters leave out (:attr:`filtered`), and contacts of which no
         vertex can be moved, are not part of this. A step with a start position that is not finite is not certified;
-        without a response, neither is one with such an end. :attr:`uncertified_vertices` lists the particles concerned.
+        without a response, neither is one with such an end. With ``inversions="prevented"``, :attr:`inversions` is 0 in
+        a certified step. :attr:`uncertified_vertices` lists the particles concerned.
         """
         self.warn()
         return bool(_read(self._work.results[Result.CERTIFIED]))
@@ -224,6 +236,35 @@ class SolverReport(ReportViews, WorldsOfReport):
         return _read(self._work.results[Result.CROSSINGS])
 
     @property
+    def inversions(self) -> int:
+        """Tetrahedra that the motion of the last step as it is stored inverts, or may invert.
+
+        Counted are those whose volume certainly was positive at the start, and is not certainly positive in the whole
+        step. Those of which no vertex can be moved are left out.
+
+        Raises:
+            RuntimeError: If the stage was not asked to count them.
+        """
+        return self._read_inversions(Result.INVERTING)
+
+    @property
+    def inverted(self) -> int:
+        """Tetrahedra whose volume at the start of the last step was 0 or negative, or not certainly positive.
+
+        No cut of a path changes that, and they are left to the inner solver. Those of which no vertex can be moved are
+        left out.
+
+        Raises:
+            RuntimeError: If the stage was not asked to count them.
+        """
+        return self._read_inversions(Result.INVERTED)
+
+    def _read_inversions(self, result):
+        if self._work.tetrahedra is None:
+            raise RuntimeError(_NOT_WATCHED)
+        return _read(self._work.results[result])
+
+    @property
     def not_finite(self) -> int:
         """Particles whose position or velocity was not finite after the inner solver in the last step.
 
@@ -235,7 +276,8 @@ class SolverReport(ReportViews, WorldsOfReport):
     def uncertified_vertices(self) -> np.ndarray:
         """Particles that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
 
-        They are the particles of contacts that remain, and those of elements with a start position that is not finite.
+        They are the particles of contacts that remain, of tetrahedra that invert where that is prevented, and of
+        elements with a start position that is not finite.
         Without a response, a position or velocity that is not finite at the end counts as well. If :attr:`undetected`
         is true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
         nothing but the position of a body is not finite. Gathered on the host, on each access.
@@ -395,6 +437,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
         if self.filtered:
             line += f"; {self.filtered} filtered pairs in the last step, which are not certified"
+        if totals.inverting_steps:
+            line += f", {totals.inverting_steps} steps that inverted tetrahedra"
         if totals.not_finite_steps:
             line += f", {totals.not_finite_steps} steps with positions that are not finite"
         if gradients.grazing or gradients.lost_steps:

@@ -20,12 +20,17 @@ queues cannot grow in a CUDA graph. :mod:`.contacts.search` then finds contacts 
 third row. Recorded steps cannot be searched, and freeze at once.
 
 What makes a step uncertified? Contacts that are left, a last detection that was incomplete, or positions that are not
-finite, see :func:`decide`.
+finite, see :func:`decide`. Where inversions are prevented, tetrahedra that still invert as well.
+
+Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration cuts the
+paths of tetrahedra that would invert, and divides what collides for that; in the last row it freezes the vertices of
+both. This ends as well: what stands still does not invert.
 
 What is excluded? Contacts of elements that crossed or touched at the start, and vertices that were in the solid of a
-plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for contacts of
-bodies that are left to the inner solver, see :class:`.contacts.rules.ContactClass`, and for pairs that filters leave
-out, see :class:`.state.collision_filter.CollisionFilter`.
+plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for tetrahedra
+that were inverted at the start, for contacts of bodies that are left to the inner solver, see
+:class:`.contacts.rules.ContactClass`, and for pairs that filters leave out, see
+:class:`.state.collision_filter.CollisionFilter`.
 """
 
 from enum import IntEnum
@@ -83,6 +88,8 @@ class Detection(IntEnum):
     OF_BODIES = 2  # contacts between bodies, which are left to the inner solver
     TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
     FILTERED = 4  # contacts of shapes that do not collide by Newton's filters, and with planes that are filtered
+    INVERTING = 5  # tetrahedra that the motion inverts or may invert, if they are looked at
+    INVERTED = 6  # those that were or may have been inverted at the start
 
 
 class Result(IntEnum):
@@ -101,11 +108,13 @@ class Result(IntEnum):
     NOT_FINITE = 10  # particles whose predicted position or velocity was not finite
     CROSSINGS = 11  # edges that cross faces at the start
     FILTERED = 12  # pairs of the predicted motion that filters left out
+    INVERTING = 13  # tetrahedra that the motion inverts or may invert, if they are looked at
+    INVERTED = 14  # those that were or may have been inverted at the start
 
 
 @wp.struct
 class WorldCounts:
-    """Contacts and filtered pairs of each world, shape [worlds]; empty if the report is not asked for worlds."""
+    """Contacts, filtered pairs and tetrahedra by world, shape [worlds]; empty if the report is not asked for worlds."""
 
     found: wp.array[int]  # by the detection in progress
     hits: wp.array[int]  # of the predicted motion
@@ -113,6 +122,8 @@ class WorldCounts:
     left_out: wp.array[int]  # by the detection in progress, see Detection.FILTERED
     left_out_pairs: wp.array[wp.int64]  # pairs of elements that groups and masks left out of the last detection
     filtered: wp.array[int]  # pairs of the predicted motion that filters left out, both of these
+    inverting: wp.array[int]  # tetrahedra, see Detection.INVERTING
+    inverted: wp.array[int]  # see Detection.INVERTED
 
 
 @wp.struct
@@ -254,6 +265,26 @@ def count_filtered(status: SolveStatus, world: int):
 
 
 @wp.func
+def count_inversion(status: SolveStatus, world: int, at_start: bool):
+    """Counts a tetrahedron that the motion inverts, or one that was inverted ``at_start``."""
+    wp.atomic_add(status.detection, wp.where(at_start, int(Detection.INVERTED), int(Detection.INVERTING)), 1)
+    if status.of_worlds.inverting:
+        if at_start:
+            wp.atomic_add(status.of_worlds.inverted, world, 1)
+        else:
+            wp.atomic_add(status.of_worlds.inverting, world, 1)
+
+
+@wp.func
+def _take_inversions(status: SolveStatus) -> int:
+    """Makes the tetrahedra that a detection counted a result; returns how many the motion inverts."""
+    inverting = status.detection[Detection.INVERTING]
+    status.results[Result.INVERTING] = inverting
+    status.results[Result.INVERTED] = status.detection[Detection.INVERTED]
+    return inverting
+
+
+@wp.func
 def _count_in_32_bits(count: wp.int64) -> int:
     return int(wp.min(count, _LARGEST_COUNT))
 
@@ -304,7 +335,8 @@ def decide(
         return
     overflowed = overflowed and not can_search
     hits = detection[Detection.HITS]
-    finished = hits == 0 and detection[Detection.TOO_NEAR] == 0
+    inverting = _take_inversions(status)
+    finished = hits == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
     stuck = is_freezing(status) and loop[Loop.NEWLY_FROZEN] == 0
     results[Result.REMAINING] = hits
     results[Result.EXCLUDED] = detection[Detection.EXCLUDED]
@@ -316,12 +348,30 @@ def decide(
     if results[Result.COUNTED] == 0:
         results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
         results[Result.COUNTED] = 1
-    results[Result.CERTIFIED] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
+    certified = hits == 0 and inverting == 0 and not overflowed and counts[0] == wp.int64(0)
+    results[Result.CERTIFIED] = wp.where(certified, 1, 0)
     results[Result.UNDETECTED] = wp.where(overflowed, 1, 0)
     loop[Loop.ACTIVE] = wp.where(finished or overflowed or stuck, 0, 1)
     loop[Loop.ITERATION] = loop[Loop.ITERATION] + loop[Loop.ACTIVE]
     results[Result.ITERATIONS] = results[Result.ITERATIONS] + loop[Loop.ACTIVE]
     loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
+
+
+@wp.kernel
+def decide_inversions(prevents: bool, status: SolveStatus):
+    """Takes over how many tetrahedra the resolved motion inverts; if they are prevented, begins to cut paths for them.
+
+    Where contacts are left, it begins with the iterations that freeze. It leaves a step whose detection was incomplete
+    as it is, with all vertices at their start.
+    """
+    results, loop = status.results, status.loop
+    inverting = _take_inversions(status)
+    _clear_detection(status)
+    if prevents and inverting > 0 and results[Result.UNDETECTED] == 0:
+        after = wp.where(results[Result.REMAINING] > 0, status.max_truncations, 0)
+        loop[Loop.ITERATION] = status.max_iterations + after + 1
+        loop[Loop.ACTIVE] = 1
+        results[Result.ITERATIONS] = results[Result.ITERATIONS] + 1
 
 
 @wp.func

@@ -27,7 +27,7 @@ from .state.friction_table import FrictionTable
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
-from .step import resolve
+from .step import resolve, resolve_inversions
 from .substeps.inner_contacts import InnerContacts
 from .substeps.small_steps import SmallSteps
 from .substeps.strain import StrainMeter
@@ -110,6 +110,7 @@ class SolverCCD(CollisionStage):
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
+        inversions: Literal["left", "reported", "prevented"] = "left",
         contact_layer: bool = True,
         lift_speed_limit: bool = True,
         max_iterations: int = MAX_ITERATIONS,
@@ -163,6 +164,11 @@ class SolverCCD(CollisionStage):
                 solver, also if ``contacts`` are passed to :meth:`step`, see
                 :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
                 particles by their flags are left out in any case, pairs of shapes as ``bodies`` says.
+            inversions: Tetrahedra of soft bodies whose volume is, or may be, 0 or negative at a time of the step.
+                ``"left"``: they are the inner solver's. ``"reported"``: ``report.inversions`` counts those of each step
+                as it is stored. ``"prevented"``: paths of their vertices are also cut, as they are for collisions, and
+                a step with one left is not certified, see :func:`.step.resolve_inversions`. Those that were inverted at
+                the start are counted apart (``report.inverted``), and left.
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
@@ -195,6 +201,7 @@ class SolverCCD(CollisionStage):
             min_distance=min_distance,
             particle_radius=particle_radius,
             collision_filter=collision_filter,
+            inversions=inversions,
             contact_layer=contact_layer,
             lift_speed_limit=lift_speed_limit,
             max_iterations=max_iterations,
@@ -216,6 +223,8 @@ class SolverCCD(CollisionStage):
         coefficients = friction_of(mesh, self.friction, table=friction_table)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
+        if options.inversions != "left":
+            self._work.watch_inversions(prevents=options.inversions == "prevented")
         if options.contact_layer and self.model.requires_grad and inner is solver:
             self.solver = ContactLayer(
                 solver,
@@ -314,6 +323,8 @@ class SolverCCD(CollisionStage):
                 "on a tape, particles without faces and springs that keep a distance carry no gradients: "
                 "omit min_distance and particle_radius"
             )
+        if self._work.ends is not None:
+            raise NotImplementedError("inversions: a step on a tape prevents none, pass 'reported'")
 
     def _begin_step(self, state, contacts):
         self._in_substeps, self._inner_contacts = None, None
@@ -423,6 +434,7 @@ class SolverCCD(CollisionStage):
                     self.report.last_strain.zero_()
                     measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
                     wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
+                resolve_inversions(self._work, dt)
                 self._write_end(end)
 
     def _write_end(self, end):

@@ -12,7 +12,8 @@ minimum distances, a contact is a pair that comes nearer than it may.
 import warp as wp
 
 from .contacts import detect, proximities
-from .schedule import Loop
+from .contacts.inversions import find_inversions
+from .schedule import Loop, decide_inversions
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
@@ -70,6 +71,33 @@ def _iterate(work, dt):
     positions.project(work)
     division.divide(work, dt)
     detect.detect(work, only_changed=True)
+
+
+def resolve_inversions(work: Workspace, dt: float) -> None:
+    """Counts the tetrahedra that the resolved motion inverts, and cuts paths until none is left, if that is asked for.
+
+    Does nothing unless :meth:`.Workspace.watch_inversions` asks for it. The motion stays free of contacts.
+    """
+    if work.tetrahedra is None:
+        return
+    find_inversions(work)
+    work.launch(decide_inversions, 1, [work.ends is not None, work.status])
+    if work.ends is not None:
+        wp.capture_if(work.loop[Loop.ACTIVE], _prevent_inversions, work=work, dt=dt)
+
+
+def _prevent_inversions(work, dt):
+    wp.copy(work.ends, work.vertices.x1, count=work.particle_count)
+    wp.capture_while(work.loop[Loop.ACTIVE], _cut_paths, work=work, dt=dt)
+    division.freeze_if_undetected(work)
+    work.launch_over_particles(division.take_velocities_of_paths, work.ends, dt)
+
+
+def _cut_paths(work, dt):
+    """Cuts paths before inversions, and divides what collides for that; then detects what has changed."""
+    division.divide(work, dt)
+    work.launch_over_particles(division.truncate_before_inversions, work.tetrahedra, work.status)
+    detect.detect(work, only_changed=True, inversions=True)
 
 
 def add_proximities(work: Workspace) -> None:
