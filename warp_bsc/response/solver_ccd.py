@@ -34,7 +34,7 @@ from .substeps.strain import StrainMeter
 from .substeps.style3d_contacts import Style3DContacts
 from .substeps.substeps import Substeps, reason_to_omit_substeps
 from .tuning import SUBSTEPS
-from .write_back import count_outrun, count_record, write_back
+from .write_back import count_record, write_back
 
 _COUPLED = "a coupled solver steps the stage"
 
@@ -164,11 +164,11 @@ class SolverCCD(CollisionStage):
                 solver, also if ``contacts`` are passed to :meth:`step`, see
                 :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
                 particles by their flags are left out in any case, pairs of shapes as ``bodies`` says.
-            inversions: Tetrahedra of soft bodies whose volume is, or may be, 0 or negative at a time of the step.
-                ``"left"``: they are the inner solver's. ``"reported"``: ``report.inversions`` counts those of each step
-                as it is stored. ``"prevented"``: paths of their vertices are also cut, as they are for collisions, and
-                a step with one left is not certified, see :func:`.step.resolve_inversions`. Those that were inverted at
-                the start are counted apart (``report.inverted``), and left.
+            inversions: What happens to tetrahedra whose volume becomes, or may become, 0 or negative at a time of the
+                step. ``"left"``: nothing. ``"reported"``: ``report.inversions`` counts those of the step as it is
+                stored. ``"prevented"``: the paths of their vertices are cut as well, as they are for collisions, and a
+                step with one that is left is not certified. Tetrahedra that were inverted at the start are left, and
+                counted apart (``report.inverted``).
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
@@ -223,8 +223,7 @@ class SolverCCD(CollisionStage):
         coefficients = friction_of(mesh, self.friction, table=friction_table)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
-        if options.inversions != "left":
-            self._work.watch_inversions(prevents=options.inversions == "prevented")
+        self._work.watch_inversions(options.inversions)
         if options.contact_layer and self.model.requires_grad and inner is solver:
             self.solver = ContactLayer(
                 solver,
@@ -307,11 +306,6 @@ class SolverCCD(CollisionStage):
 
         on_tape = tape is not None and self.model.requires_grad
         self._small_steps.take(step, state_in, state_out, dt, on_tape=on_tape)
-
-    def _count_step(self):
-        if self.report.thickness is not None:
-            self._work.launch(count_outrun, 1, [self._work.status], [self.report.device_totals])
-        super()._count_step()
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
@@ -399,7 +393,7 @@ class SolverCCD(CollisionStage):
             nonlocal recorded
             self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder))
             recorded = None
-            if device.is_capturing or self._has_changed():
+            if device.is_capturing or self._work.has_changed():
                 recorded = RecordedStep(self._work, dt)
                 self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
@@ -410,12 +404,6 @@ class SolverCCD(CollisionStage):
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
-
-    def _has_changed(self):
-        """Returns whether the response changed a particle or a body. Synchronizes with the device."""
-        vertices = self._work.vertices
-        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._motion.moves_bodies else [vertices.outcome]
-        return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
     def _resolve(self, end, dt, solve, mask=None):

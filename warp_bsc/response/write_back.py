@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .report import StepTotals
+from .report_totals import StepTotals
 from .schedule import Loop, Result, SolveStatus
 from .state.motion import StateArrays
 from .state.record import RecordCounts

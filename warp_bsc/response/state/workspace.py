@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -164,14 +165,21 @@ class Workspace:
         self.detector.count_filtered_by_world(self.status.of_worlds.left_out_pairs)
         return self.status.of_worlds
 
-    def watch_inversions(self, *, prevents: bool) -> None:
-        """Looks for the tetrahedra that a step inverts from now on, and ``prevents`` that if it can."""
+    def watch_inversions(self, inversions: Literal["left", "reported", "prevented"]) -> None:
+        """Allocates what it takes to count the tetrahedra that a step inverts, or also to prevent that."""
+        if inversions == "left":
+            return
         self.tetrahedra = tetrahedra = Tetrahedra()
         tetrahedra.corners = self.mesh.device_tets
-        if prevents:
+        if inversions == "prevented":
             n = self.particle_count
             tetrahedra.first_inversion = wp.full(n, NEVER, dtype=wp.int64, device=self.device)
             self.ends = wp.zeros(n, dtype=wp.vec3, device=self.device)
+
+    def has_changed(self) -> bool:
+        """Returns whether the response changed a particle or a body. Synchronizes with the device."""
+        outcomes = [self.vertices.outcome, self.vertices.bodies.outcome]
+        return any(outcome.numpy().any() for outcome in outcomes if outcome is not None)
 
     @contextlib.contextmanager
     def all_worlds(self) -> Iterator[None]:
