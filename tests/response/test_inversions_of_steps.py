@@ -76,7 +76,9 @@ def test_random_steps_are_counted_and_made_free_of_inversions(size, held, device
     """At 0.04 m some tetrahedra invert; at 0.1 m, two cells, nearly all, and the blocks collide all over as well."""
     model = shaken_model(device, held=held)
     for seed in range(3):
-        solver = bsc.SolverCCD(Changed(model, shaken(seed, size, 9 * held)), inversions="prevented", report_contacts=True)
+        solver = bsc.SolverCCD(
+            Changed(model, shaken(seed, size, 9 * held)), inversions="prevented", report_contacts=True
+        )
         rollout, cut = Inverting(model, solver), 0
         for _ in range(3):
             rollout.step()

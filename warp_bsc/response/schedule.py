@@ -49,6 +49,8 @@ MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
+MAX_CUTS = wp.constant(64)
+"""Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
 MAX_TRUNCATIONS = wp.constant(8)
 """Iterations of detect and truncate of a recorded step, after which vertices that still collide are frozen."""
 MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
@@ -78,6 +80,7 @@ class Loop(IntEnum):
     NEWLY_FROZEN = 5  # vertices and bodies that this iteration froze
     MORE_SWEEPS = 6  # 1 while another batch of sweeps is needed
     SWEEP = 7  # sweeps so far
+    CUTTING = 8  # 1 while tetrahedra invert, and paths are to be cut again
 
 
 class Detection(IntEnum):
@@ -88,8 +91,6 @@ class Detection(IntEnum):
     OF_BODIES = 2  # contacts between bodies, which are left to the inner solver
     TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
     FILTERED = 4  # contacts of shapes that do not collide by Newton's filters, and with planes that are filtered
-    INVERTING = 5  # tetrahedra that the motion inverts or may invert, if they are looked at
-    INVERTED = 6  # those that were or may have been inverted at the start
 
 
 class Result(IntEnum):
@@ -122,8 +123,8 @@ class WorldCounts:
     left_out: wp.array[int]  # by the detection in progress, see Detection.FILTERED
     left_out_pairs: wp.array[wp.int64]  # pairs of elements that groups and masks left out of the last detection
     filtered: wp.array[int]  # pairs of the predicted motion that filters left out, both of these
-    inverting: wp.array[int]  # tetrahedra, see Detection.INVERTING
-    inverted: wp.array[int]  # see Detection.INVERTED
+    inverting: wp.array[int]  # tetrahedra, see Result.INVERTING
+    inverted: wp.array[int]  # see Result.INVERTED
 
 
 @wp.struct
@@ -267,21 +268,12 @@ def count_filtered(status: SolveStatus, world: int):
 @wp.func
 def count_inversion(status: SolveStatus, world: int, at_start: bool):
     """Counts a tetrahedron that the motion inverts, or one that was inverted ``at_start``."""
-    wp.atomic_add(status.detection, wp.where(at_start, int(Detection.INVERTED), int(Detection.INVERTING)), 1)
+    wp.atomic_add(status.results, wp.where(at_start, int(Result.INVERTED), int(Result.INVERTING)), 1)
     if status.of_worlds.inverting:
         if at_start:
             wp.atomic_add(status.of_worlds.inverted, world, 1)
         else:
             wp.atomic_add(status.of_worlds.inverting, world, 1)
-
-
-@wp.func
-def _take_inversions(status: SolveStatus) -> int:
-    """Makes the tetrahedra that a detection counted a result; returns how many the motion inverts."""
-    inverting = status.detection[Detection.INVERTING]
-    status.results[Result.INVERTING] = inverting
-    status.results[Result.INVERTED] = status.detection[Detection.INVERTED]
-    return inverting
 
 
 @wp.func
@@ -335,7 +327,7 @@ def decide(
         return
     overflowed = overflowed and not can_search
     hits = detection[Detection.HITS]
-    inverting = _take_inversions(status)
+    inverting = results[Result.INVERTING]
     finished = hits == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
     stuck = is_freezing(status) and loop[Loop.NEWLY_FROZEN] == 0
     results[Result.REMAINING] = hits
@@ -358,20 +350,26 @@ def decide(
 
 
 @wp.kernel
-def decide_inversions(prevents: bool, status: SolveStatus):
-    """Takes over how many tetrahedra the resolved motion inverts; if they are prevented, begins to cut paths for them.
+def begin_prevention(status: SolveStatus):
+    """Begins to cut paths if the resolved motion inverts tetrahedra.
 
     Where contacts are left, it begins with the iterations that freeze. It leaves a step whose detection was incomplete
     as it is, with all vertices at their start.
     """
     results, loop = status.results, status.loop
-    inverting = _take_inversions(status)
-    _clear_detection(status)
-    if prevents and inverting > 0 and results[Result.UNDETECTED] == 0:
+    if results[Result.INVERTING] > 0 and results[Result.UNDETECTED] == 0:
         after = wp.where(results[Result.REMAINING] > 0, status.max_truncations, 0)
         loop[Loop.ITERATION] = status.max_iterations + after + 1
         loop[Loop.ACTIVE] = 1
         results[Result.ITERATIONS] = results[Result.ITERATIONS] + 1
+
+
+@wp.kernel
+def decide_cut(first: bool, status: SolveStatus):
+    """Decides whether another sweep cuts paths, ``first`` before the first one."""
+    loop = status.loop
+    loop[Loop.SWEEP] = wp.where(first, 0, loop[Loop.SWEEP] + 1)
+    loop[Loop.CUTTING] = wp.where(status.results[Result.INVERTING] > 0 and loop[Loop.SWEEP] < MAX_CUTS, 1, 0)
 
 
 @wp.func

@@ -13,7 +13,7 @@ import warp as wp
 
 from .contacts import detect, proximities
 from .contacts.inversions import find_inversions
-from .schedule import Loop, decide_inversions
+from .schedule import Loop, begin_prevention, decide_cut
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
@@ -81,23 +81,32 @@ def resolve_inversions(work: Workspace, dt: float) -> None:
     if work.tetrahedra is None:
         return
     find_inversions(work)
-    work.launch(decide_inversions, 1, [work.ends is not None, work.status])
     if work.ends is not None:
+        work.launch(begin_prevention, 1, [work.status])
         wp.capture_if(work.loop[Loop.ACTIVE], _prevent_inversions, work=work, dt=dt)
 
 
 def _prevent_inversions(work, dt):
     wp.copy(work.ends, work.vertices.x1, count=work.particle_count)
-    wp.capture_while(work.loop[Loop.ACTIVE], _cut_paths, work=work, dt=dt)
+    wp.capture_while(work.loop[Loop.ACTIVE], _iterate_cuts, work=work, dt=dt)
     division.freeze_if_undetected(work)
     work.launch_over_particles(division.take_velocities_of_paths, work.ends, dt)
+    find_inversions(work)  # those that are left
 
 
-def _cut_paths(work, dt):
-    """Cuts paths before inversions, and divides what collides for that; then detects what has changed."""
+def _iterate_cuts(work, dt):
+    """Divides what collides, and cuts paths until no tetrahedron inverts; then detects what has changed."""
     division.divide(work, dt)
+    find_inversions(work)
+    work.launch(decide_cut, 1, [True, work.status])
+    wp.capture_while(work.loop[Loop.CUTTING], _cut_paths, work=work)
+    detect.detect(work, only_changed=True, keeps_constraints=True)
+
+
+def _cut_paths(work):
     work.launch_over_particles(division.truncate_before_inversions, work.tetrahedra, work.status)
-    detect.detect(work, only_changed=True, inversions=True)
+    find_inversions(work)
+    work.launch(decide_cut, 1, [False, work.status])
 
 
 def add_proximities(work: Workspace) -> None:

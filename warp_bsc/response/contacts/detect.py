@@ -9,7 +9,6 @@ from ..schedule import Loop, Result, decide, decide_worlds
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
 from .impacts import count_grazing
-from .inversions import find_inversions
 from .queue import counted, queues_of
 from .search import find_contacts_without_queues
 
@@ -35,11 +34,11 @@ def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
     work.launch(collect_penetrations, work.vertices_at_planes, inputs)
 
 
-def detect(work: Workspace, *, only_changed: bool = False, inversions: bool = False) -> None:
+def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bool = False) -> None:
     """Detects the motion as it is now, adds constraints for its contacts, and decides whether to iterate again.
 
-    With ``only_changed``, only vertices that changed since the last detection are looked at. With ``inversions``, all
-    tetrahedra are as well, and constraints are only kept, as velocities were solved.
+    With ``only_changed``, only vertices that changed since the last detection are looked at. Those of earlier
+    detections are dropped where there might be too many, unless ``keeps_constraints``: then new ones may be missing.
     """
     detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else work.active
@@ -53,7 +52,7 @@ def detect(work: Workspace, *, only_changed: bool = False, inversions: bool = Fa
     work.reserve(work.max_contacts)
     if only_changed:  # before, nothing has changed, and there is always enough
         vertices.changed.zero_()
-        if not inversions:
+        if not keeps_constraints:
             work.launch(drop_if_full, 1, [work.step, work.record, work.max_contacts])
     queues = queues_of(detector)
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
@@ -63,24 +62,22 @@ def detect(work: Workspace, *, only_changed: bool = False, inversions: bool = Fa
         work.launch_over(collect_contacts, counted(pair), inputs)
     if work.recorder is not None:
         work.launch_over(count_grazing, counted(queues[:2]), [work.step, *queues[:2], work.record])
-    _decide(work, overflow, inversions)
+    _decide(work, overflow)
     if can_search:
-        wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow, inversions=inversions)
+        wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow)
 
 
-def _search(work, overflow, inversions):
+def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
     broad_phase = work.detector.broad_phase
     broad_phase.fit(work.step.motion.x0, work.vertices.x1)
     find_contacts_without_queues(broad_phase, work.step, work.dividing, work.status)
-    _decide(work, overflow, inversions)
+    _decide(work, overflow)
 
 
-def _decide(work, overflow, inversions):
+def _decide(work, overflow):
     if work.max_penetrations:
         detect_penetrations(work, ahead=False)
-    if inversions:
-        find_inversions(work)
     if work.status.of_worlds.found is not None:
         work.launch(decide_worlds, work.worlds, [*overflow, work.status])
     work.launch(decide, 1, [work.step, *overflow], [work.status])

@@ -30,7 +30,7 @@ from ..state.structs import (
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
-from ..tuning import SHARE_OF_PATH
+from ..tuning import CUT, SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -265,14 +265,13 @@ def truncate_vertices(
 def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, status: SolveStatus):
     """Truncates the path of each particle before the first inversion of a tetrahedron of its, or freezes it.
 
-    If all four vertices of a tetrahedron go the same share of their paths, it ends as it was at that time.
+    In one sweep no path becomes shorter than by CUT: others are cut as well, and may then leave enough space.
     """
     particle = wp.tid()
     motion, vertices = step.motion, step.vertices
     packed = tetrahedra.first_inversion[particle]
     if packed == NEVER:
         return
-    tetrahedra.first_inversion[particle] = NEVER
     outcome = vertices.outcome[particle]
     if motion.inverse_mass[particle] == 0.0 or outcome & FROZEN != 0:
         return
@@ -282,8 +281,8 @@ def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, status: Solve
         wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     x0 = to_double(motion.x0[particle])
-    path = first_contact.truncated_path(x0, to_double(vertices.x1[particle]), first_contact.contact_time(packed))
-    vertices.x1[particle] = to_single(x0 + path)
+    share = wp.max(SHARE_OF_PATH * first_contact.contact_time(packed), CUT)
+    vertices.x1[particle] = to_single(x0 + share * (to_double(vertices.x1[particle]) - x0))
     vertices.outcome[particle] = outcome | TRUNCATED
 
 
