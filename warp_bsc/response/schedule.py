@@ -22,9 +22,9 @@ third row. Recorded steps cannot be searched, and freeze at once.
 What makes a step uncertified? Contacts that are left, a last detection that was incomplete, or positions that are not
 finite, see :func:`decide`. Where inversions are prevented, tetrahedra that still invert as well.
 
-Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration cuts the
-paths of tetrahedra that would invert, and divides what collides for that; in the last row it freezes the vertices of
-both. This ends as well: what stands still does not invert.
+Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration divides
+what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the
+vertices of both. This ends as well: what stands still does not invert.
 
 What is excluded? Contacts of elements that crossed or touched at the start, and vertices that were in the solid of a
 plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for tetrahedra

@@ -318,7 +318,7 @@ class SolverCCD(CollisionStage):
                 "omit min_distance and particle_radius"
             )
         if self._work.ends is not None:
-            raise NotImplementedError("inversions: a step on a tape prevents none, pass 'reported'")
+            raise NotImplementedError("inversions='prevented' has no gradients: on a tape, pass 'reported' or 'left'")
 
     def _begin_step(self, state, contacts):
         self._in_substeps, self._inner_contacts = None, None

@@ -74,9 +74,10 @@ def _iterate(work, dt):
 
 
 def resolve_inversions(work: Workspace, dt: float) -> None:
-    """Counts the tetrahedra that the resolved motion inverts, and cuts paths until none is left, if that is asked for.
+    """Counts the tetrahedra that the resolved motion inverts, and cuts paths until there is none, if that is asked for.
 
-    Does nothing unless :meth:`.Workspace.watch_inversions` asks for it. The motion stays free of contacts.
+    Does nothing unless :meth:`.Workspace.watch_inversions` asks for it. The motion stays free of contacts. It is the
+    last change of a step, after velocities: what it moves has the velocity of its path.
     """
     if work.tetrahedra is None:
         return
