@@ -75,12 +75,12 @@ def shaken(seed, size, held=0):
 def test_random_steps_are_counted_and_made_free_of_inversions(size, held, device):
     """At 0.04 m some tetrahedra invert; at 0.1 m, two cells, nearly all, and the blocks collide all over as well."""
     model = shaken_model(device, held=held)
-    for seed in range(3):
+    for seed in range(2):
         solver = bsc.SolverCCD(
             Changed(model, shaken(seed, size, 9 * held)), inversions="prevented", report_contacts=True
         )
         rollout, cut = Inverting(model, solver), 0
-        for _ in range(3):
+        for _ in range(2):
             rollout.step()
             report = solver.report
             assert (rollout.inverting, rollout.inverted) == (0, 0) == (report.inversions, report.inverted)
@@ -92,13 +92,13 @@ def test_random_steps_are_counted_and_made_free_of_inversions(size, held, device
     with pytest.warns(UserWarning, match="inversions='prevented'"):
         solver = bsc.SolverCCD(Changed(model, shaken(3, size, 9 * held)), inversions="reported")
         rollout, counts = Inverting(model, solver), []
-        for _ in range(4):
+        for _ in range(3):
             rollout.step()
             counts.append((solver.report.inversions, solver.report.inverted))
             assert counts[-1] == (rollout.inverting, rollout.inverted)
     assert counts[0][0] > 5 and counts[-1][1] > 5
     assert solver.report.totals.inverting_steps == sum(count > 0 for count, _ in counts)
-    assert f"{solver.report.totals.inverting_steps} steps that inverted tetrahedra" in str(solver.report)
+    assert f"{solver.report.totals.inverting_steps} that inverted tetrahedra" in str(solver.report)
 
 
 def wall(device):
@@ -119,8 +119,7 @@ def press(device):
     return finalized(builder, device)
 
 
-@pytest.mark.parametrize("scene", [wall, press])
-@pytest.mark.parametrize("substeps", [None, 3, "auto"])
+@pytest.mark.parametrize(("scene", "substeps"), [(wall, None), (wall, 3), (press, None), (press, "auto")])
 def test_a_block_that_is_thrown_or_pressed_inverts_nowhere(scene, substeps, device):
     """Without prevention it does, except where many substeps help it."""
     seen = {}
@@ -129,7 +128,7 @@ def test_a_block_that_is_thrown_or_pressed_inverts_nowhere(scene, substeps, devi
         inner = newton.solvers.SolverVBD(model, iterations=2, integrate_with_external_rigid_solver=True)
         solver = bsc.SolverCCD(inner, substeps=substeps, inversions=inversions)
         rollout, seen[inversions], substepped = Inverting(model, solver), 0, 0
-        for i in range(6):
+        for i in range(5):
             if scene is press:
                 state, step = rollout.states[1], 0.012 * min(i, 4)  # where VBD leaves them
                 heights = np.float32([[0.0, 0.0, -0.011 + step], [0.0, 0.0, 2 * CELL + 0.011 - step]])
@@ -229,7 +228,7 @@ def test_held_particles_that_invert_are_not_certified(device):
     start = rollout.positions
     start[:9] += (start[18:27] - start[:9]).mean(axis=0)  # by two layers
     rollout.states[0].particle_q.assign(start)
-    with pytest.warns(UserWarning, match="not certified"):
+    with pytest.warns(UserWarning, match="not certified.* or invert a tetrahedron: particle"):
         rollout.step()
     report = solver.report
     tets, before = model.tet_indices.numpy().reshape(-1, 4), model.particle_q.numpy()  # the program moves in the step

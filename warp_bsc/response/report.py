@@ -73,7 +73,7 @@ class SolverReport(ReportViews, WorldsOfReport):
             self._warn_once("strain", self._strain_warning)
         if known["crossing_steps"] and self._responds:
             self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
-        if known["inverting_steps"] and self._work.ends is None:
+        if known["inverting_steps"] and not self._prevents_inversions:
             self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
             self._warn_once("layer", lambda: _LAYER_WARNING)
@@ -354,14 +354,14 @@ class SolverReport(ReportViews, WorldsOfReport):
             line += f", {totals.strained_steps} in which contacts strained an edge by more than {float(MAX_STRAIN):.0%}"
         if self.speed_limit_lifted:
             line += ", without VBD's speed limit"
+        if totals.inverting_steps:
+            line += f", {totals.inverting_steps} that inverted tetrahedra"
         if self.crossings:
             line += f", {self.crossings} crossings at the start (warp_bsc.repair_state removes them)"
         if totals.remaining or totals.excluded:
             line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
         if self.filtered:
             line += f"; {self.filtered} filtered pairs in the last step, which are not certified"
-        if totals.inverting_steps:
-            line += f", {totals.inverting_steps} steps that inverted tetrahedra"
         if totals.not_finite_steps:
             line += f", {totals.not_finite_steps} steps with positions that are not finite"
         if gradients.grazing or gradients.lost_steps:
@@ -377,6 +377,10 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def _mesh(self):
         return self._work.mesh
+
+    @property
+    def _prevents_inversions(self):
+        return self._work.ends is not None
 
     def _find_positions(self):
         return self._work.vertices.x1.numpy()
