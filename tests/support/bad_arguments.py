@@ -445,6 +445,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "restitution": coefficient | {"above 1": 1.5},
                 "substeps": without(NOT_COUNT, "None", "string") | {"one": 1, "zero": 0, "unknown": "always"},
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
+                "inversions": {"unknown": "counted", "flag": True, "None": None},
                 "max_iterations": NOT_COUNT | {"too many": 41},
                 "report_contacts": without(NOT_COUNT, "bool") | {"zero": 0},
                 "report_worlds": FLAGS,

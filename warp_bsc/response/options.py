@@ -29,6 +29,7 @@ from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
 MAX_SUBSTEPS, MAX_CONTACTS = 1024, 2**28
 MAX_FLOAT = float(np.finfo(np.float32).max)
 Bodies = Literal["pushed", "separated", "left"]
+Inversions = Literal["left", "reported", "prevented"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,7 @@ class StageOptions:
     bodies: Bodies
     distances: KeptDistances
     collision_filter: CollisionFilter | None
+    inversions: Inversions
     contact_layer: bool
     lift_speed_limit: bool
     max_iterations: int
@@ -69,6 +71,7 @@ class StageOptions:
         min_distance=None,
         particle_radius=None,
         collision_filter=None,
+        inversions="left",
         contact_layer=True,
         lift_speed_limit=True,
         max_iterations=MAX_ITERATIONS,
@@ -90,6 +93,7 @@ class StageOptions:
             bodies=cast(Bodies, checked_choice(bodies, "bodies", get_args(Bodies))),
             distances=KeptDistances.of(model, min_distance, particle_radius),
             collision_filter=checked_filter(collision_filter, model),
+            inversions=cast(Inversions, checked_choice(inversions, "inversions", get_args(Inversions))),
             contact_layer=checked_flag(contact_layer, "contact_layer"),
             lift_speed_limit=checked_flag(lift_speed_limit, "lift_speed_limit"),
             max_iterations=checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS),

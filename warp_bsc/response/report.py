@@ -2,13 +2,13 @@
 
 import functools
 import warnings
-from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
 from .inside import Inside, InsideFinder
+from .report_totals import GradientTotals, StepTotals, Totals
 from .report_views import ReportViews
 from .schedule import Result, views_of
 from .state.structs import FROZEN, TRUNCATED
@@ -20,80 +20,12 @@ _CROSSINGS_WARNING = (
     "edges pass through faces at the start of a step, and their contacts are left to the solver: "
     "warp_bsc.repair_state(model, state) moves them apart before the first step"
 )
+_INVERSIONS_WARNING = (
+    "a step inverted tetrahedra, report.inversions counts those of the last one: take shorter steps, or pass "
+    "inversions='prevented'"
+)
+_NOT_WATCHED = "a stage counts inversions only if it is asked to: pass inversions='reported' or 'prevented'"
 _LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it; shorten steps"
-
-
-@wp.struct
-class StepTotals:
-    """Totals over all steps so far on the device, see :class:`Totals`; each field is an array of one element."""
-
-    steps: wp.array[wp.int64]
-    substepped_steps: wp.array[wp.int64]
-    uncertified_steps: wp.array[wp.int64]
-    undetected_steps: wp.array[wp.int64]
-    truncated_steps: wp.array[wp.int64]
-    frozen_steps: wp.array[wp.int64]
-    not_finite_steps: wp.array[wp.int64]
-    remaining: wp.array[wp.int64]
-    excluded: wp.array[wp.int64]
-    strained_steps: wp.array[wp.int64]
-    crossing_steps: wp.array[wp.int64]
-    grazing: wp.array[wp.int64]
-    lost_gradients: wp.array[wp.int64]
-    outrun_steps: wp.array[wp.int64]
-
-
-@dataclass(frozen=True)
-class Totals:
-    """Totals over all steps so far.
-
-    Attributes:
-        steps: Steps.
-        substepped_steps: Steps that were taken in substeps, see :mod:`.substeps.substeps`.
-        uncertified_steps: Steps that were not certified.
-        undetected_steps: Steps that froze all vertices because their detection was incomplete, see
-            :attr:`SolverReport.undetected`.
-        truncated_steps: Steps in which a path was truncated.
-        frozen_steps: Steps in which a vertex or a body was frozen.
-        not_finite_steps: Steps with positions or velocities of particles that were not finite.
-        remaining: Sum of :attr:`SolverReport.remaining`: contacts that were passed, in steps not certified.
-        excluded: Sum of :attr:`SolverReport.excluded`; a pair counts in each step in which it has a contact.
-        strained_steps: Steps in which :attr:`SolverReport.strain` was more than 0.2.
-        crossing_steps: Steps at whose start :attr:`SolverReport.crossings` was more than 0.
-    """
-
-    steps: int
-    substepped_steps: int
-    uncertified_steps: int
-    undetected_steps: int
-    truncated_steps: int
-    frozen_steps: int
-    not_finite_steps: int
-    remaining: int
-    excluded: int
-    strained_steps: int
-    crossing_steps: int
-
-
-@dataclass(frozen=True)
-class GradientTotals:
-    """Totals over all steps on a tape so far.
-
-    Attributes:
-        grazing: Contacts whose gradients are clamped. The derivatives of features that slide along each other, or have
-            no plane, are unbounded; finite ones replace them, see :mod:`warp_bsc.kernels.gradients`.
-        lost_steps: Steps in a CUDA graph whose record did not fit in its buffers. Gradients through such a step are
-            NaN, see :class:`.captured_steps.CapturedSteps`.
-        layerless_steps: Steps whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
-            Contacts then act where they hit, and results are not continuous.
-        outrun_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or are
-            between bodies. Results are not continuous there.
-    """
-
-    grazing: int
-    lost_steps: int
-    layerless_steps: int
-    outrun_steps: int
 
 
 class SolverReport(ReportViews, WorldsOfReport):
@@ -130,7 +62,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once each of a step that is not certified, a :attr:`strain` above 0.2, crossings, and a layer passed.
+        """Warns once each of a step that is not certified, strain above 0.2, crossings, inversions, and a layer passed.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
@@ -141,6 +73,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             self._warn_once("strain", self._strain_warning)
         if known["crossing_steps"] and self._responds:
             self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
+        if known["inverting_steps"] and not self._prevents_inversions:
+            self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
             self._warn_once("layer", lambda: _LAYER_WARNING)
 
@@ -166,7 +100,8 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         Contacts that :attr:`excluded` counts, pairs that filters leave out (:attr:`filtered`), and contacts of which no
         vertex can be moved, are not part of this. A step with a start position that is not finite is not certified;
-        without a response, neither is one with such an end. :attr:`uncertified_vertices` lists the particles concerned.
+        without a response, neither is one with such an end. With ``inversions="prevented"``, :attr:`inversions` is 0 in
+        a certified step. :attr:`uncertified_vertices` lists the particles concerned.
         """
         self.warn()
         return bool(_read(self._work.results[Result.CERTIFIED]))
@@ -224,6 +159,35 @@ class SolverReport(ReportViews, WorldsOfReport):
         return _read(self._work.results[Result.CROSSINGS])
 
     @property
+    def inversions(self) -> int:
+        """Tetrahedra that the motion of the last step as it is stored inverts, or may invert.
+
+        Counted are those whose volume certainly was positive at the start, and is not certainly positive in the whole
+        step. Those of which no vertex can be moved are left out.
+
+        Raises:
+            RuntimeError: If the stage was not asked to count them.
+        """
+        return self._read_inversions(Result.INVERTING)
+
+    @property
+    def inverted(self) -> int:
+        """Tetrahedra whose volume at the start of the last step was 0 or negative, or not certainly positive.
+
+        No cut of a path changes that, and they are left to the inner solver. Those of which no vertex can be moved are
+        left out.
+
+        Raises:
+            RuntimeError: If the stage was not asked to count them.
+        """
+        return self._read_inversions(Result.INVERTED)
+
+    def _read_inversions(self, result):
+        if self._work.tetrahedra is None:
+            raise RuntimeError(_NOT_WATCHED)
+        return _read(self._work.results[result])
+
+    @property
     def not_finite(self) -> int:
         """Particles whose position or velocity was not finite after the inner solver in the last step.
 
@@ -235,7 +199,8 @@ class SolverReport(ReportViews, WorldsOfReport):
     def uncertified_vertices(self) -> np.ndarray:
         """Particles that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
 
-        They are the particles of contacts that remain, and those of elements with a start position that is not finite.
+        They are the particles of contacts that remain, of tetrahedra that invert where that is prevented, and of
+        elements with a start position that is not finite.
         Without a response, a position or velocity that is not finite at the end counts as well. If :attr:`undetected`
         is true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
         nothing but the position of a body is not finite. Gathered on the host, on each access.
@@ -389,6 +354,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             line += f", {totals.strained_steps} in which contacts strained an edge by more than {float(MAX_STRAIN):.0%}"
         if self.speed_limit_lifted:
             line += ", without VBD's speed limit"
+        if totals.inverting_steps:
+            line += f", {totals.inverting_steps} that inverted tetrahedra"
         if self.crossings:
             line += f", {self.crossings} crossings at the start (warp_bsc.repair_state removes them)"
         if totals.remaining or totals.excluded:
@@ -410,6 +377,10 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def _mesh(self):
         return self._work.mesh
+
+    @property
+    def _prevents_inversions(self):
+        return self._work.ends is not None
 
     def _find_positions(self):
         return self._work.vertices.x1.numpy()

@@ -52,8 +52,13 @@ def table_by_shape(model: newton.Model, contacts: dict[str, np.ndarray], dt: flo
     return "\n".join(lines)
 
 
-def uncertified_warning(model: newton.Model, particles: np.ndarray, shapes: np.ndarray) -> str:
-    """Returns what to say of a step that is not certified, given the particles and shapes concerned."""
+def uncertified_warning(
+    model: newton.Model, particles: np.ndarray, shapes: np.ndarray, *, may_invert: bool = False
+) -> str:
+    """Returns what to say of a step that is not certified, given the particles and shapes concerned.
+
+    With ``may_invert`` it may also lack the certificate because a tetrahedron inverts.
+    """
     if not len(particles) and not len(shapes):
         return (
             "a step was not certified, and a later one is: read report.certified after each step, "
@@ -67,8 +72,9 @@ def uncertified_warning(model: newton.Model, particles: np.ndarray, shapes: np.n
     named += [shape_name(model, shape) for shape in shapes[:_NAMED]]
     if len(shapes) > _NAMED:
         named.append(f"{len(shapes) - _NAMED} more shapes")
+    or_invert = ", or invert a tetrahedron" if may_invert else ""
     return (
-        f"a step is not certified, its motion may pass through something: {', '.join(named)}. To look closer: "
-        "report.uncertified_vertices and report.uncertified_bodies list all of that step, and report.draw(viewer) "
-        "shows them in red"
+        f"a step is not certified, its motion may pass through something{or_invert}: {', '.join(named)}. "
+        "To look closer: report.uncertified_vertices and report.uncertified_bodies list all of that step, and "
+        "report.draw(viewer) shows them in red"
     )

@@ -77,10 +77,15 @@ class ReportViews(ContactReport):
         mesh, listed = self._mesh, self._find_uncertified()
         first = mesh.model.particle_count
         particles, shapes = np.flatnonzero(listed[:first]), np.unique(mesh.shape_vertices.shape[listed[first:]])
-        return uncertified_warning(mesh.model, particles, shapes)
+        return uncertified_warning(mesh.model, particles, shapes, may_invert=self._prevents_inversions)
 
     @property
     def _mesh(self) -> ModelMesh:
+        raise NotImplementedError
+
+    @property
+    def _prevents_inversions(self) -> bool:
+        """Whether the stage keeps tetrahedra from inverting, so that its certificate covers that."""
         raise NotImplementedError
 
     def _find_positions(self) -> np.ndarray:

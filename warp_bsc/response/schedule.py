@@ -20,12 +20,17 @@ queues cannot grow in a CUDA graph. :mod:`.contacts.search` then finds contacts 
 third row. Recorded steps cannot be searched, and freeze at once.
 
 What makes a step uncertified? Contacts that are left, a last detection that was incomplete, or positions that are not
-finite, see :func:`decide`.
+finite, see :func:`decide`. Where inversions are prevented, tetrahedra that still invert as well.
+
+Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration divides
+what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the
+vertices of both. This ends as well: what stands still does not invert.
 
 What is excluded? Contacts of elements that crossed or touched at the start, and vertices that were in the solid of a
-plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for contacts of
-bodies that are left to the inner solver, see :class:`.contacts.rules.ContactClass`, and for pairs that filters leave
-out, see :class:`.state.collision_filter.CollisionFilter`.
+plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for tetrahedra
+that were inverted at the start, for contacts of bodies that are left to the inner solver, see
+:class:`.contacts.rules.ContactClass`, and for pairs that filters leave out, see
+:class:`.state.collision_filter.CollisionFilter`.
 """
 
 from enum import IntEnum
@@ -44,6 +49,8 @@ MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
+MAX_CUTS = wp.constant(64)
+"""Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
 MAX_TRUNCATIONS = wp.constant(8)
 """Iterations of detect and truncate of a recorded step, after which vertices that still collide are frozen."""
 MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
@@ -77,6 +84,7 @@ class Loop(IntEnum):
     NEWLY_FROZEN = 5  # vertices and bodies that this iteration froze
     MORE_SWEEPS = 6  # 1 while another batch of sweeps is needed
     SWEEP = 7  # sweeps so far
+    CUTTING = 8  # 1 while tetrahedra invert, and paths are to be cut again
 
 
 class Detection(IntEnum):
@@ -105,11 +113,13 @@ class Result(IntEnum):
     NOT_FINITE = 10  # particles whose predicted position or velocity was not finite
     CROSSINGS = 11  # edges that cross faces at the start
     FILTERED = 12  # pairs of the predicted motion that filters left out
+    INVERTING = 13  # tetrahedra that the motion inverts or may invert, if they are looked at
+    INVERTED = 14  # those that were or may have been inverted at the start
 
 
 @wp.struct
 class WorldCounts:
-    """Contacts and filtered pairs of each world, shape [worlds]; empty if the report is not asked for worlds."""
+    """Contacts, filtered pairs and tetrahedra by world, shape [worlds]; empty if the report is not asked for worlds."""
 
     found: wp.array[int]  # by the detection in progress
     hits: wp.array[int]  # of the predicted motion
@@ -117,6 +127,8 @@ class WorldCounts:
     left_out: wp.array[int]  # by the detection in progress, see Detection.FILTERED
     left_out_pairs: wp.array[wp.int64]  # pairs of elements that groups and masks left out of the last detection
     filtered: wp.array[int]  # pairs of the predicted motion that filters left out, both of these
+    inverting: wp.array[int]  # tetrahedra, see Result.INVERTING
+    inverted: wp.array[int]  # see Result.INVERTED
 
 
 @wp.struct
@@ -258,6 +270,17 @@ def count_filtered(status: SolveStatus, world: int):
 
 
 @wp.func
+def count_inversion(status: SolveStatus, world: int, at_start: bool):
+    """Counts a tetrahedron that the motion inverts, or one that was inverted ``at_start``."""
+    wp.atomic_add(status.results, wp.where(at_start, int(Result.INVERTED), int(Result.INVERTING)), 1)
+    if status.of_worlds.inverting:
+        if at_start:
+            wp.atomic_add(status.of_worlds.inverted, world, 1)
+        else:
+            wp.atomic_add(status.of_worlds.inverting, world, 1)
+
+
+@wp.func
 def _count_in_32_bits(count: wp.int64) -> int:
     return int(wp.min(count, _LARGEST_COUNT))
 
@@ -308,7 +331,8 @@ def decide(
         return
     overflowed = overflowed and not can_search
     hits = detection[Detection.HITS]
-    finished = hits == 0 and detection[Detection.TOO_NEAR] == 0
+    inverting = results[Result.INVERTING]
+    finished = hits == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
     stuck = is_freezing(status) and loop[Loop.NEWLY_FROZEN] == 0
     results[Result.REMAINING] = hits
     results[Result.EXCLUDED] = detection[Detection.EXCLUDED]
@@ -320,12 +344,36 @@ def decide(
     if results[Result.COUNTED] == 0:
         results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
         results[Result.COUNTED] = 1
-    results[Result.CERTIFIED] = wp.where(hits == 0 and not overflowed and counts[0] == wp.int64(0), 1, 0)
+    certified = hits == 0 and inverting == 0 and not overflowed and counts[0] == wp.int64(0)
+    results[Result.CERTIFIED] = wp.where(certified, 1, 0)
     results[Result.UNDETECTED] = wp.where(overflowed, 1, 0)
     loop[Loop.ACTIVE] = wp.where(finished or overflowed or stuck, 0, 1)
     loop[Loop.ITERATION] = loop[Loop.ITERATION] + loop[Loop.ACTIVE]
     results[Result.ITERATIONS] = results[Result.ITERATIONS] + loop[Loop.ACTIVE]
     loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
+
+
+@wp.kernel
+def begin_prevention(status: SolveStatus):
+    """Begins to cut paths if the resolved motion inverts tetrahedra.
+
+    Where contacts are left, it begins with the iterations that freeze. It leaves a step whose detection was incomplete
+    as it is, with all vertices at their start.
+    """
+    results, loop = status.results, status.loop
+    if results[Result.INVERTING] > 0 and results[Result.UNDETECTED] == 0:
+        after = wp.where(results[Result.REMAINING] > 0, status.max_truncations, 0)
+        loop[Loop.ITERATION] = status.max_iterations + after + 1
+        loop[Loop.ACTIVE] = 1
+        results[Result.ITERATIONS] = results[Result.ITERATIONS] + 1
+
+
+@wp.kernel
+def decide_cut(first: bool, status: SolveStatus):
+    """Decides whether another sweep cuts paths, ``first`` before the first one."""
+    loop = status.loop
+    loop[Loop.SWEEP] = wp.where(first, 0, loop[Loop.SWEEP] + 1)
+    loop[Loop.CUTTING] = wp.where(status.results[Result.INVERTING] > 0 and loop[Loop.SWEEP] < MAX_CUTS, 1, 0)
 
 
 @wp.func

@@ -27,14 +27,14 @@ from .state.friction_table import FrictionTable
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
-from .step import resolve
+from .step import resolve, resolve_inversions
 from .substeps.inner_contacts import InnerContacts
 from .substeps.small_steps import SmallSteps
 from .substeps.strain import StrainMeter
 from .substeps.style3d_contacts import Style3DContacts
 from .substeps.substeps import Substeps, reason_to_omit_substeps
 from .tuning import SUBSTEPS
-from .write_back import count_outrun, count_record, write_back
+from .write_back import count_record, write_back
 
 _COUPLED = "a coupled solver steps the stage"
 
@@ -110,6 +110,7 @@ class SolverCCD(CollisionStage):
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
+        inversions: Literal["left", "reported", "prevented"] = "left",
         contact_layer: bool = True,
         lift_speed_limit: bool = True,
         max_iterations: int = MAX_ITERATIONS,
@@ -163,6 +164,11 @@ class SolverCCD(CollisionStage):
                 solver, also if ``contacts`` are passed to :meth:`step`, see
                 :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
                 particles by their flags are left out in any case, pairs of shapes as ``bodies`` says.
+            inversions: What happens to tetrahedra whose volume becomes, or may become, 0 or negative at a time of the
+                step. ``"left"``: nothing. ``"reported"``: ``report.inversions`` counts those of the step as it is
+                stored. ``"prevented"``: the paths of their vertices are cut as well, as they are for collisions, and a
+                step with one that is left is not certified. Tetrahedra that were inverted at the start are left, and
+                counted apart (``report.inverted``).
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
@@ -195,6 +201,7 @@ class SolverCCD(CollisionStage):
             min_distance=min_distance,
             particle_radius=particle_radius,
             collision_filter=collision_filter,
+            inversions=inversions,
             contact_layer=contact_layer,
             lift_speed_limit=lift_speed_limit,
             max_iterations=max_iterations,
@@ -216,6 +223,7 @@ class SolverCCD(CollisionStage):
         coefficients = friction_of(mesh, self.friction, table=friction_table)
         motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
+        self._work.watch_inversions(options.inversions)
         if options.contact_layer and self.model.requires_grad and inner is solver:
             self.solver = ContactLayer(
                 solver,
@@ -299,11 +307,6 @@ class SolverCCD(CollisionStage):
         on_tape = tape is not None and self.model.requires_grad
         self._small_steps.take(step, state_in, state_out, dt, on_tape=on_tape)
 
-    def _count_step(self):
-        if self.report.thickness is not None:
-            self._work.launch(count_outrun, 1, [self._work.status], [self.report.device_totals])
-        super()._count_step()
-
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
             return
@@ -314,6 +317,8 @@ class SolverCCD(CollisionStage):
                 "on a tape, particles without faces and springs that keep a distance carry no gradients: "
                 "omit min_distance and particle_radius"
             )
+        if self._work.ends is not None:
+            raise NotImplementedError("inversions='prevented' has no gradients: on a tape, pass 'reported' or 'left'")
 
     def _begin_step(self, state, contacts):
         self._in_substeps, self._inner_contacts = None, None
@@ -388,7 +393,7 @@ class SolverCCD(CollisionStage):
             nonlocal recorded
             self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder))
             recorded = None
-            if device.is_capturing or self._has_changed():
+            if device.is_capturing or self._work.has_changed():
                 recorded = RecordedStep(self._work, dt)
                 self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
@@ -399,12 +404,6 @@ class SolverCCD(CollisionStage):
 
         run_on_host(forward, device)
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
-
-    def _has_changed(self):
-        """Returns whether the response changed a particle or a body. Synchronizes with the device."""
-        vertices = self._work.vertices
-        outcomes = [vertices.outcome, vertices.bodies.outcome] if self._motion.moves_bodies else [vertices.outcome]
-        return any(outcome.numpy().any() for outcome in outcomes)
 
     @one_at_a_time
     def _resolve(self, end, dt, solve, mask=None):
@@ -423,6 +422,7 @@ class SolverCCD(CollisionStage):
                     self.report.last_strain.zero_()
                     measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
                     wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
+                resolve_inversions(self._work, dt)
                 self._write_end(end)
 
     def _write_end(self, end):

@@ -19,7 +19,7 @@ from .state.workspace import Workspace
 from .step import prepare
 from .worlds.count_worlds import WorldCounter
 from .worlds.world_mask import WorldMask, checked_mask
-from .write_back import count_step
+from .write_back import count_outrun, count_step
 
 
 class CollisionStage(CouplingHooks):
@@ -155,6 +155,8 @@ class CollisionStage(CouplingHooks):
 
     def _count_step(self):
         work, report = self._work, self.report
+        if report.thickness is not None:
+            work.launch(count_outrun, 1, [work.status], [report.device_totals])
         work.launch(count_step, 1, [work.status, report.last_substeps, report.last_strain], [report.device_totals])
         report.copy_totals()
 

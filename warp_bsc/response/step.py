@@ -12,7 +12,8 @@ minimum distances, a contact is a pair that comes nearer than it may.
 import warp as wp
 
 from .contacts import detect, proximities
-from .schedule import Loop
+from .contacts.inversions import find_inversions
+from .schedule import Loop, begin_prevention, decide_cut
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
@@ -70,6 +71,43 @@ def _iterate(work, dt):
     positions.project(work)
     division.divide(work, dt)
     detect.detect(work, only_changed=True)
+
+
+def resolve_inversions(work: Workspace, dt: float) -> None:
+    """Counts the tetrahedra that the resolved motion inverts, and cuts paths until there is none, if that is asked for.
+
+    Does nothing unless :meth:`.Workspace.watch_inversions` asks for it. The motion stays free of contacts. It is the
+    last change of a step, after velocities: what it moves has the velocity of its path.
+    """
+    if work.tetrahedra is None:
+        return
+    find_inversions(work)
+    if work.ends is not None:
+        work.launch(begin_prevention, 1, [work.status])
+        wp.capture_if(work.loop[Loop.ACTIVE], _prevent_inversions, work=work, dt=dt)
+
+
+def _prevent_inversions(work, dt):
+    wp.copy(work.ends, work.vertices.x1, count=work.particle_count)
+    wp.capture_while(work.loop[Loop.ACTIVE], _iterate_cuts, work=work, dt=dt)
+    division.freeze_if_undetected(work)
+    work.launch_over_particles(division.take_velocities_of_paths, work.ends, dt)
+    find_inversions(work)  # those that are left
+
+
+def _iterate_cuts(work, dt):
+    """Divides what collides, and cuts paths until no tetrahedron inverts; then detects what has changed."""
+    division.divide(work, dt)
+    find_inversions(work)
+    work.launch(decide_cut, 1, [True, work.status])
+    wp.capture_while(work.loop[Loop.CUTTING], _cut_paths, work=work)
+    detect.detect(work, only_changed=True, keeps_constraints=True)
+
+
+def _cut_paths(work):
+    work.launch_over_particles(division.truncate_before_inversions, work.tetrahedra, work.status)
+    find_inversions(work)
+    work.launch(decide_cut, 1, [False, work.status])
 
 
 def add_proximities(work: Workspace) -> None:

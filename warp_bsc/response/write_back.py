@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .report import StepTotals
+from .report_totals import StepTotals
 from .schedule import Loop, Result, SolveStatus
 from .state.motion import StateArrays
 from .state.record import RecordCounts
@@ -84,6 +84,8 @@ def count_step(status: SolveStatus, substeps: wp.array[int], strain: wp.array[fl
     totals.excluded[0] += wp.int64(results[Result.EXCLUDED])
     if strain[0] > MAX_STRAIN:
         totals.strained_steps[0] += wp.int64(1)
+    if results[Result.INVERTING] > 0:
+        totals.inverting_steps[0] += wp.int64(1)
     if results[Result.CROSSINGS] > 0:
         totals.crossing_steps[0] += wp.int64(1)
 

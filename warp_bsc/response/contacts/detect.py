@@ -34,10 +34,11 @@ def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
     work.launch(collect_penetrations, work.vertices_at_planes, inputs)
 
 
-def detect(work: Workspace, *, only_changed: bool = False) -> None:
+def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bool = False) -> None:
     """Detects the motion as it is now, adds constraints for its contacts, and decides whether to iterate again.
 
-    With ``only_changed``, only vertices that changed since the last detection are looked at.
+    With ``only_changed``, only vertices that changed since the last detection are looked at. Those of earlier
+    detections are dropped where there might be too many, unless ``keeps_constraints``: then new ones may be missing.
     """
     detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else work.active
@@ -51,7 +52,8 @@ def detect(work: Workspace, *, only_changed: bool = False) -> None:
     work.reserve(work.max_contacts)
     if only_changed:  # before, nothing has changed, and there is always enough
         vertices.changed.zero_()
-        work.launch(drop_if_full, 1, [work.step, work.record, work.max_contacts])
+        if not keeps_constraints:
+            work.launch(drop_if_full, 1, [work.step, work.record, work.max_contacts])
     queues = queues_of(detector)
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]

@@ -2,7 +2,7 @@
 
 A vertex is moved onto its sides of dividing planes, and a body back along its path until its vertices are. Where a
 contact has no plane, and in recorded steps, the path is cut before the first contact. Frozen vertices end at their
-start.
+start. Paths of vertices are also cut before a tetrahedron of theirs inverts, where that is prevented.
 """
 
 import warp as wp
@@ -26,10 +26,11 @@ from ..state.structs import (
     DividingPlanes,
     Pace,
     Step,
+    Tetrahedra,
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
-from ..tuning import SHARE_OF_PATH
+from ..tuning import CUT, SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
 from .sides import position_on_sides, share_of_path
 
@@ -258,6 +259,44 @@ def truncate_vertices(
         outcome = outcome | UNCONSTRAINED
     vertices.x1[vertex] = end
     vertices.outcome[vertex] = outcome
+
+
+@wp.kernel
+def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, status: SolveStatus):
+    """Truncates the path of each particle before the first inversion of a tetrahedron of its, or freezes it.
+
+    In one sweep no path becomes shorter than by CUT: others are cut as well, and may then leave enough space.
+    """
+    particle = wp.tid()
+    motion, vertices = step.motion, step.vertices
+    packed = tetrahedra.first_inversion[particle]
+    if packed == NEVER:
+        return
+    outcome = vertices.outcome[particle]
+    if motion.inverse_mass[particle] == 0.0 or outcome & FROZEN != 0:
+        return
+    vertices.changed[particle] = 1
+    if is_freezing(status):
+        _freeze_vertex(step, particle)
+        wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
+        return
+    x0 = to_double(motion.x0[particle])
+    share = wp.max(SHARE_OF_PATH * first_contact.contact_time(packed), CUT)
+    vertices.x1[particle] = to_single(x0 + share * (to_double(vertices.x1[particle]) - x0))
+    vertices.outcome[particle] = outcome | TRUNCATED
+
+
+@wp.kernel
+def take_velocities_of_paths(step: Step, ends: wp.array[wp.vec3], dt: wp.float64):
+    """Gives each particle that was moved from an end, but not frozen, the velocity of its path."""
+    particle = wp.tid()
+    vertices = step.vertices
+    end = vertices.x1[particle]
+    before = ends[particle]
+    moved = end[0] != before[0] or end[1] != before[1] or end[2] != before[2]
+    if moved and vertices.outcome[particle] & FROZEN == 0:
+        vertices.velocity[particle] = (end - step.motion.x0[particle]) / float(dt)
+        vertices.outcome[particle] = vertices.outcome[particle] | UNCONSTRAINED
 
 
 @wp.kernel

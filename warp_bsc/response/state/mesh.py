@@ -132,7 +132,8 @@ class ModelMesh(CollisionMesh):
         infinite = are_infinite_planes(model)
         tessellations = {}
         triangles, vertex_count = elements_of(model.tri_indices, 3), model.particle_count
-        faces = [triangles, outer_sides(elements_of(model.tet_indices, 4), triangles)]
+        tetrahedra = elements_of(model.tet_indices, 4)
+        faces = [triangles, outer_sides(tetrahedra, triangles)]
         shapes, worlds, positions = [], [], [np.empty((0, 3))]
         for shape in np.flatnonzero(collides & ~infinite):
             key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
@@ -157,7 +158,7 @@ class ModelMesh(CollisionMesh):
             on_device = [wp.array(b.view(np.int32), dtype=int, device=model.device) for b in of_shapes]
             self.shape_filter.group, self.shape_filter.mask = on_device
         options = {"edges": edges, "points": points, "world": worlds, "group": group, "mask": mask}
-        super().__init__(faces, vertex_count, **options, device=model.device)
+        super().__init__(faces, vertex_count, **options, tets=tetrahedra, device=model.device)
         self.model = model
         planes = np.flatnonzero(collides & infinite).astype(np.int32)
         normals = _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0]))

@@ -31,8 +31,8 @@ class Pace(IntEnum):
 
 PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
 """Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity; dividing planes moved it;
-its path was cut; it was frozen at its start; it was left there because its prediction was not finite; it was divided
-from contacts without constraints."""
+its path was cut; it was frozen at its start; it was left there because its prediction was not finite; its velocity is
+that of its path, as it was divided from contacts without constraints, or moved to prevent inversions."""
 NEVER = wp.constant(wp.int64(2**62))
 """In place of the packed contact of a vertex without one, see :attr:`Vertices.first_contact`."""
 SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))
@@ -183,6 +183,14 @@ class Step:
     constraints: Constraints
     separation: wp.float64  # distance that projection moves contacts apart [m]
     restitution: wp.array[float]  # share of the approaching velocity that comes back, one number
+
+
+@wp.struct
+class Tetrahedra:
+    """The tetrahedra of soft bodies whose inversions are looked for."""
+
+    corners: wp.array2d[int]  # particles, shape [n, 4]
+    first_inversion: wp.array[wp.int64]  # of particles, see first_contact.packed_contact; empty if none is prevented
 
 
 @wp.func

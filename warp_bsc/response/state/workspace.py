@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -33,6 +34,7 @@ from .structs import (
     DividingPlanes,
     MovedBodies,
     Step,
+    Tetrahedra,
     Vertices,
     allocate,
 )
@@ -94,6 +96,8 @@ class Workspace:
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
         active: 1 of each vertex that takes part in the step, None if all do.
+        tetrahedra: The tetrahedra whose inversions are looked for, None if nobody asks.
+        ends: Where particles ended before inversions were prevented; None if they are not.
         unmasked: Inverse masses of vertices and bodies while those that take no part have none.
         sweeping_threads: Threads that make all sweeps in one launch; 0 if each is launched, as those of bodies and of
             steps that may be recorded are.
@@ -122,6 +126,8 @@ class Workspace:
         step.mesh = mesh.connectivity
         self.motion = motion
         self.active: wp.array[int] | None = None
+        self.tetrahedra: Tetrahedra | None = None
+        self.ends: wp.array[wp.vec3] | None = None
         self.unmasked: tuple[wp.array, wp.array] | None = None
         step.separation, step.restitution = separation, restitution
         size = vertices, 3
@@ -158,6 +164,22 @@ class Workspace:
         self.status.of_worlds = allocate(WorldCounts, self.worlds, self.device)
         self.detector.count_filtered_by_world(self.status.of_worlds.left_out_pairs)
         return self.status.of_worlds
+
+    def watch_inversions(self, inversions: Literal["left", "reported", "prevented"]) -> None:
+        """Allocates what it takes to count the tetrahedra that a step inverts, or also to prevent that."""
+        if inversions == "left":
+            return
+        self.tetrahedra = tetrahedra = Tetrahedra()
+        tetrahedra.corners = self.mesh.device_tets
+        if inversions == "prevented":
+            n = self.particle_count
+            tetrahedra.first_inversion = wp.full(n, NEVER, dtype=wp.int64, device=self.device)
+            self.ends = wp.zeros(n, dtype=wp.vec3, device=self.device)
+
+    def has_changed(self) -> bool:
+        """Returns whether the response changed a particle or a body. Synchronizes with the device."""
+        outcomes = [self.vertices.outcome, self.vertices.bodies.outcome]
+        return any(outcome.numpy().any() for outcome in outcomes if outcome is not None)
 
     @contextlib.contextmanager
     def all_worlds(self) -> Iterator[None]:

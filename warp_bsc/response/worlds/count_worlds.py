@@ -21,11 +21,13 @@ class _Arrays:
 
 
 @wp.kernel
-def _begin(status: SolveStatus, taken: wp.array[int], out: _Arrays):
+def _begin(status: SolveStatus, prevents_inversions: bool, taken: wp.array[int], out: _Arrays):
     """Writes what follows from the contacts of each world, and clears the counts of vertices."""
     world = wp.tid()
     detected = status.results[Result.UNDETECTED] == 0
     out.certified[world] = detected and status.of_worlds.remaining[world] == 0
+    if prevents_inversions and status.of_worlds.inverting[world] > 0:
+        out.certified[world] = False
     out.truncated[world] = 0
     out.frozen[world] = 0
     out.substeps[world] = 0
@@ -89,11 +91,13 @@ class WorldCounter:
         arrays = {name: getattr(self._out, name) for name in _Arrays.vars}
         counts = {name: getattr(found, name) for name in ("hits", "remaining", "filtered")}
         counts["crossings"] = work.status.crossings
+        if work.tetrahedra is not None:
+            counts |= {"inversions": found.inverting, "inverted": found.inverted}
         self.worlds = Worlds(**arrays, **counts, _max_impulse=max_impulse)
 
     def count(self, taken: wp.array[int] | None = None) -> None:
         """Writes the results of a step, given the substeps that each world took, None for none."""
         work = self._work
-        work.launch(_begin, work.worlds, [work.status, taken], [self._out])
+        work.launch(_begin, work.worlds, [work.status, work.ends is not None, taken], [self._out])
         inputs = [work.step, work.particle_count, self._responds, work.detector.counters.array]
         work.launch(_count_vertices, max(work.mesh.vertex_count, work.body_count), inputs, [self._out])

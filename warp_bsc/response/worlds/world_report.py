@@ -25,6 +25,8 @@ class Worlds:
         frozen: Vertices and bodies that were frozen, int.
         substeps: Substeps of the step, 0 if it was not taken in substeps, int.
         crossings: Edges that cross faces at the start, int.
+        inversions: Tetrahedra that the motion inverts, int; None if the stage was not asked to count them.
+        inverted: Tetrahedra that were inverted at the start, int; None if the stage was not asked to count them.
     """
 
     certified: wp.array[wp.bool]
@@ -35,6 +37,8 @@ class Worlds:
     frozen: wp.array[int]
     substeps: wp.array[int]
     crossings: wp.array[int]
+    inversions: wp.array[int] | None = None
+    inverted: wp.array[int] | None = None
     _max_impulse: wp.array[float] | None = None
 
     @property
