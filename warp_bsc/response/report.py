@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
+from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
 from .report_views import ReportViews
 from .schedule import Result, views_of
@@ -41,6 +42,7 @@ class StepTotals:
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
     outrun_steps: wp.array[wp.int64]
+    ambiguous_moves: wp.array[wp.int64]
 
 
 @dataclass(frozen=True)
@@ -88,12 +90,15 @@ class GradientTotals:
             Contacts then act where they hit, and results are not continuous.
         outrun_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or are
             between bodies. Results are not continuous there.
+        ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps on a tape, and
+            that are NaN, as it cannot be known what they are of, see :mod:`.adjoint.between_steps`.
     """
 
     grazing: int
     lost_steps: int
     layerless_steps: int
     outrun_steps: int
+    ambiguous_moves: int
 
 
 class SolverReport(ReportViews, WorldsOfReport):
@@ -130,7 +135,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once each of a step that is not certified, a :attr:`strain` above 0.2, crossings, and a layer passed.
+        """Warns once each of steps not certified, a :attr:`strain` above 0.2, crossings, and gradients that are wrong.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
@@ -143,6 +148,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
             self._warn_once("layer", lambda: _LAYER_WARNING)
+        if known["ambiguous_moves"]:
+            self._warn_once("moves", lambda: f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)")
 
     def _warn_once(self, subject, message):
         if subject not in self._said:
@@ -357,14 +364,14 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        return Totals(*self._read_totals()[:-3])
+        return Totals(*self._read_totals()[:-4])
 
     @property
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
         layerless = 0 if self.layerless_steps is None else _read(self.layerless_steps)
-        grazing, lost_steps, outrun = self._read_totals()[-3:]
-        return GradientTotals(grazing, lost_steps, layerless, outrun)
+        grazing, lost_steps, outrun, ambiguous = self._read_totals()[-4:]
+        return GradientTotals(grazing, lost_steps, layerless, outrun, ambiguous)
 
     @property
     def layer_thickness(self) -> float | None:

@@ -10,6 +10,7 @@ import warp as wp
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .._private_names.of_warp import paused_tape
+from .adjoint.between_steps import BetweenSteps
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS, Loop
@@ -22,11 +23,18 @@ from .worlds.world_mask import WorldMask, checked_mask
 from .write_back import count_step
 
 
+def is_recorded(tape: wp.Tape | None, state_out: newton.State) -> bool:
+    """Returns whether a tape, if there is one, records the gradients of a step."""
+    end = state_out.particle_q
+    return tape is not None and end is not None and end.requires_grad
+
+
 class CollisionStage(CouplingHooks):
     """A stage behind another solver: a :class:`.solver_ccd.SolverCCD` or a :class:`.monitor.CollisionMonitor`."""
 
     mesh: ModelMesh
     report: SolverReport
+    _between_steps: BetweenSteps | None = None  # of a stage whose steps carry gradients
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _mask: wp.array | None = None  # of the step in progress, if worlds take no part in it
 
@@ -49,6 +57,11 @@ class CollisionStage(CouplingHooks):
         if not model.requires_grad:
             motion.remember(self._work.vertices.x1)
         self.report = SolverReport(self._work, responds=responds)
+
+    def _watch_between_steps(self, *, bodies: bool):
+        """Keeps gradients apart of what a program moves between steps; ``bodies`` as of :class:`BetweenSteps`."""
+        if self.model.requires_grad:
+            self._between_steps = BetweenSteps(self.model, self.report.device_totals.ambiguous_moves, bodies=bodies)
 
     def _count_worlds(self, max_impulse: wp.array | None = None, *, responds: bool = True):
         """Makes the report have results by world."""
@@ -102,6 +115,9 @@ class CollisionStage(CouplingHooks):
             self._check_tape(tape, state_in, state_out)
             if mask is not None and tape is not None and self.model.requires_grad:
                 raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
+            between_steps = self._between_steps if is_recorded(tape, state_out) else None
+            if between_steps is not None:
+                between_steps.begin(tape, state_in, state_out)
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
             self._mask = mask
@@ -113,6 +129,8 @@ class CollisionStage(CouplingHooks):
             if mask is not None:
                 self._world_mask.restore(mask, state_out)
             self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
+            if between_steps is not None:
+                between_steps.end(tape)
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
         if not self.mesh.device.is_capturing:
@@ -184,6 +202,8 @@ class CollisionStage(CouplingHooks):
         """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
+        if self._between_steps is not None:
+            self._between_steps.refresh()
         self._recount_crossings()
 
     @one_at_a_time
