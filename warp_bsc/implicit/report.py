@@ -76,7 +76,8 @@ class ImplicitReport:
     def ambiguous_moves(self) -> int:
         """Gradients of kinematic particles and bodies that a program moved between steps on a tape, which are NaN.
 
-        It cannot be known what they are of, see :mod:`.response.adjoint.between_steps`.
+        It cannot be known what they are of, see :mod:`.response.adjoint.between_steps`. Behind the collision stage, its
+        report counts them, ``gradients.ambiguous_moves``.
         """
         return self._count(5)
 

@@ -174,13 +174,12 @@ class SolverImplicitAdjoint(WrappedSolver):
             if state_in is state_out:
                 raise ValueError("on a tape, state_out must not be state_in")
             self._check_detections(tape, contacts)
-            self._between_steps.begin(tape, state_in, state_out)
-            poses = self._poses.read(state_in, state_out, tape)
-            x0 = wp.clone(state_in.particle_q, requires_grad=False)
-            self.solver.step(state_in, state_out, control, contacts, dt, **options)
-            wp.copy(state_in.particle_q, x0)
-            self._record(tape, state_in, state_out, x0, contacts, poses, dt)
-            self._between_steps.end(tape)
+            with self._between_steps.watched(tape, state_in, state_out):
+                poses = self._poses.read(state_in, state_out, tape)
+                x0 = wp.clone(state_in.particle_q, requires_grad=False)
+                self.solver.step(state_in, state_out, control, contacts, dt, **options)
+                wp.copy(state_in.particle_q, x0)
+                self._record(tape, state_in, state_out, x0, contacts, poses, dt)
         if not self.model.device.is_capturing:
             self.report.warn()
 

@@ -115,26 +115,29 @@ class CollisionStage(CouplingHooks):
             self._check_tape(tape, state_in, state_out)
             if mask is not None and tape is not None and self.model.requires_grad:
                 raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
-            between_steps = self._between_steps if is_recorded(tape, state_out) else None
-            if between_steps is not None:
-                between_steps.begin(tape, state_in, state_out)
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
             self._mask = mask
             if mask is not None:
                 self._world_mask.begin(start)
             passed = self._begin_step(state_in, contacts)
-        self._step_inner(state_in, state_out, control, passed, dt, **options)
-        with paused_tape() as tape:
-            if mask is not None:
-                self._world_mask.restore(mask, state_out)
-            self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
-            if between_steps is not None:
-                between_steps.end(tape)
+        with self._watched(tape, state_in, state_out):
+            self._step_inner(state_in, state_out, control, passed, dt, **options)
+            with paused_tape():
+                if mask is not None:
+                    self._world_mask.restore(mask, state_out)
+                self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
+        with paused_tape():
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
         if not self.mesh.device.is_capturing:
             self.report.warn()
+
+    def _watched(self, tape, state_in, state_out):
+        """Keeps the gradients of a step on a tape apart from those of what a program moves before it, and after it."""
+        if tape is None or self._between_steps is None or not is_recorded(tape, state_out):
+            return contextlib.nullcontext()
+        return self._between_steps.watched(tape, state_in, state_out)
 
     @functools.cached_property
     def _world_mask(self):

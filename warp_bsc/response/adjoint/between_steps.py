@@ -19,8 +19,9 @@ What cannot be known is NaN:
 What the tape itself writes between two steps, it differentiates.
 """
 
+import contextlib
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import newton
@@ -28,6 +29,7 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags, ParticleFlags
 
+from ..._private_names.of_warp import paused_tape
 from ..._private_names.tape_access import Access, access_to, arrays_of_launch
 
 wp.set_module_options({"enable_backward": False})
@@ -38,6 +40,9 @@ AMBIGUOUS_MOVES = (
     "next step"
 )
 """What to say of gradients that are NaN."""
+
+_WATCHED: weakref.WeakSet[wp.Tape] = weakref.WeakSet()
+"""Tapes that are recording a step that is watched."""
 
 GOES_ON, RESTS, STAYS, LOST, UNKNOWN = (wp.constant(i) for i in range(5))
 """What becomes of a gradient: it goes on to the start of the step; it goes on, and is NaN in the array between the
@@ -261,10 +266,26 @@ class BetweenSteps:
         if kinematic.any():
             self._kinematic[name] = wp.array(np.flatnonzero(kinematic), dtype=int, device=self._model.device)
 
-    def begin(self, tape: wp.Tape, state_in: newton.State, state_out: newton.State) -> None:
-        """Begins a step, before anything of it is on the tape."""
-        if not self._kinematic:
+    @contextlib.contextmanager
+    def watched(self, tape: wp.Tape, state_in: newton.State, state_out: newton.State) -> Iterator[None]:
+        """Watches a step, all of which the tape records within the context.
+
+        Does nothing if it is a part of a step that is watched: of an inner solver, whose end the stage changes.
+        """
+        if not self._kinematic or tape in _WATCHED:
+            yield
             return
+        _WATCHED.add(tape)
+        try:
+            with paused_tape():
+                self._begin(tape, state_in, state_out)
+            yield
+            with paused_tape():
+                self._end(tape)
+        finally:
+            _WATCHED.discard(tape)
+
+    def _begin(self, tape, state_in, state_out):
         if self._tape() is not tape or self._has_lost(tape):
             self._tape, self._seen, self._used, self._ends = weakref.ref(tape), 0, set(), {}
         launches, followed = tape.launches, []
@@ -290,10 +311,7 @@ class BetweenSteps:
 
         self._record(tape, backward)
 
-    def end(self, tape: wp.Tape) -> None:
-        """Ends the step, after all of it is on the tape."""
-        if not self._kinematic:
-            return
+    def _end(self, tape):
         begun, counts = self._begun, self._counts
         for end in begun:
             end.finish()
