@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 
 from warp_bsc._private_names import of_newton, of_warp, versions
+from warp_bsc._private_names.tape_access import Access, access_to
 from warp_bsc.detection.host_function import run_on_host
 
 
@@ -89,3 +90,46 @@ def test_names_are_replaced_and_one_that_is_gone_is_an_error():
     assert module.run is print
     with pytest.raises(RuntimeError, match=r"has no newton.examples.main, which warp-bsc replaces"):
         of_newton.replace_name(module, "main", print)
+
+
+@wp.struct
+class Values:
+    x: wp.array[wp.vec3]
+
+
+@wp.func
+def first_of(x: wp.array[wp.vec3]):
+    return x[0]
+
+
+@wp.kernel(module="unique")
+def access_in_many_ways(
+    read: wp.array[wp.vec3],
+    passed_on: wp.array[wp.vec3],
+    set_part: wp.array[wp.vec3],
+    added: wp.array[wp.vec3],
+    added_atomically: wp.array[wp.vec3],
+    values: Values,
+):
+    i = wp.tid()
+    x = wp.vec3()
+    if read:
+        x = read[i] + first_of(passed_on) + values.x[i]
+    set_part[i][0] = x[0]
+    added[i] += x
+    wp.atomic_add(added_atomically, i, x)
+
+
+def test_a_tape_says_how_an_array_is_accessed():
+    arrays = [wp.zeros(2, dtype=wp.vec3, device="cpu", requires_grad=True) for _ in range(8)]
+    values = Values()
+    values.x = arrays[5]
+    with wp.Tape() as tape:
+        inputs = [arrays[0][:1], *arrays[1:5], values]
+        wp.launch(access_in_many_ways, 1, inputs=inputs, device="cpu")
+        wp.copy(arrays[6], arrays[7])
+    found = [access_to(array, tape.launches) for array in arrays]
+    assert found[:6] == [Access.READ, Access.UNKNOWN, *[Access.WRITTEN] * 3, Access.UNKNOWN]
+    assert found[6:] == [Access.WRITTEN, Access.READ]
+    kernel = types.SimpleNamespace(adj=None)  # of another version of Warp
+    assert access_to(arrays[0], [[kernel, 1, 0, [arrays[0]], []]]) is Access.UNKNOWN

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import warp as wp
 
+from ..response.adjoint.between_steps import AMBIGUOUS_MOVES
 from .worlds import Worlds
 
 RESIDUAL_LIMIT = 0.01
@@ -24,8 +25,8 @@ class ImplicitReport:
         self._worlds = worlds
         device, count = worlds.of_particles.device, worlds.count
         self.device_residuals = wp.zeros((2, count), dtype=wp.float64, device=device)  # last, largest
-        self.device_counts = wp.zeros(5, dtype=wp.int64, device=device)
-        self._host = wp.zeros(5, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
+        self.device_counts = wp.zeros(6, dtype=wp.int64, device=device)
+        self._host = wp.zeros(6, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
         self._said = set()
 
     @property
@@ -71,6 +72,15 @@ class ImplicitReport:
         """
         return self._count(4)
 
+    @property
+    def ambiguous_moves(self) -> int:
+        """Gradients of kinematic particles and bodies that a program moved between steps on a tape, which are NaN.
+
+        It cannot be known what they are of, see :mod:`.response.adjoint.between_steps`. Behind the collision stage, its
+        report counts them, ``gradients.ambiguous_moves``.
+        """
+        return self._count(5)
+
     def _count(self, i):
         return int(self.device_counts.numpy()[i])
 
@@ -79,8 +89,8 @@ class ImplicitReport:
         wp.copy(self._host, self.device_counts)
 
     def warn(self) -> None:
-        """Warns once each of steps not converged, solves that failed and pairs dropped, as far as the host knows."""
-        _, unconverged, _, failed, overflowed = self._host.numpy()
+        """Warns once each of steps not converged and of gradients that are NaN, as far as the host knows."""
+        _, unconverged, _, failed, overflowed, ambiguous = self._host.numpy()
         if unconverged:
             self._warn_once(
                 "residual",
@@ -97,6 +107,8 @@ class ImplicitReport:
                 "report.overflowed_steps); raise particle_vertex_contact_buffer_size or "
                 "particle_edge_contact_buffer_size of SolverVBD",
             )
+        if ambiguous:
+            self._warn_once("moves", f"{AMBIGUOUS_MOVES} (see report.ambiguous_moves)")
 
     def _warn_once(self, subject, message):
         if subject not in self._said:

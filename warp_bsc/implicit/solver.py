@@ -14,6 +14,7 @@ from .._one_thread import one_at_a_time
 from .._private_names.of_newton import displacements_since_detection, soft_contact_arrays
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
+from ..response.adjoint.between_steps import BetweenSteps
 from ..response.integration.wrapped_solver import WrappedSolver
 from . import kernels, matrix_kernels
 from .attachments import check_attachments
@@ -68,9 +69,13 @@ class SolverImplicitAdjoint(WrappedSolver):
         On a tape, or with ``polish``, a step raises NotImplementedError with dynamic bodies that VBD integrates,
         self-contact between particles of a world and of none, contacts of a collision pipeline of VBD's own, truncation
         before shapes (``rigid_soft_enable_dat``), contacts with features of meshes, and penalties of contacts that grow
-        (``rigid_avbd_linear_beta``). Velocities of bodies at the end carry no gradients. A program that moves bodies
-        between steps has to do so on the tape, as by :func:`warp.copy`: otherwise the gradients of their new poses go
-        to those that the step before was given.
+        (``rigid_avbd_linear_beta``). Velocities of bodies at the end carry no gradients.
+
+        Kinematic particles and bodies that a program moves between steps, on the tape or not, have their gradient in
+        the array that it writes: that of a state of its own for each step. Positions and poses that are those that the
+        step left have theirs at its start, and NaN between the steps: a program that writes the same does so on the
+        tape, as by :func:`warp.copy`. Where it cannot be known what a gradient is of, it is NaN as well, and
+        ``report.ambiguous_moves`` counts it, see :mod:`.response.adjoint.between_steps`.
 
     References:
         A. H. Chen, Z. Liu, Y. Yang and C. Yuksel, Vertex Block Descent, ACM Transactions on Graphics 43(4), 2024,
@@ -119,6 +124,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._poses = BodyPoses(solver)
         self._has_dynamic_bodies = self._poses.has_dynamic()
         self.report = ImplicitReport(worlds)
+        moves_bodies, counts = not solver.integrate_with_external_rigid_solver, self.report.device_counts[5:]
+        self._between_steps = BetweenSteps(model, counts, bodies=moves_bodies)
         self._sums = wp.zeros((2, worlds.count), dtype=wp.float64, device=model.device)
         self._tape, self._first, self._launches, self._detected = _no_tape, None, 0, []
         self._of_end, self._free = equations.zeros(), equations.zeros()
@@ -167,11 +174,12 @@ class SolverImplicitAdjoint(WrappedSolver):
             if state_in is state_out:
                 raise ValueError("on a tape, state_out must not be state_in")
             self._check_detections(tape, contacts)
-            poses = self._poses.read(state_in, state_out, tape)
-            x0 = wp.clone(state_in.particle_q, requires_grad=False)
-            self.solver.step(state_in, state_out, control, contacts, dt, **options)
-            wp.copy(state_in.particle_q, x0)
-            self._record(tape, state_in, state_out, x0, contacts, poses, dt)
+            with self._between_steps.watched(tape, state_in, state_out):
+                poses = self._poses.read(state_in, state_out, tape)
+                x0 = wp.clone(state_in.particle_q, requires_grad=False)
+                self.solver.step(state_in, state_out, control, contacts, dt, **options)
+                wp.copy(state_in.particle_q, x0)
+                self._record(tape, state_in, state_out, x0, contacts, poses, dt)
         if not self.model.device.is_capturing:
             self.report.warn()
 
@@ -332,11 +340,12 @@ class SolverImplicitAdjoint(WrappedSolver):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies VBD, reads again which bodies it moves, and checks attachments again.
+        """Notifies VBD, reads again what is kinematic and which bodies it moves, and checks attachments again.
 
         Raises:
             NotImplementedError: If several attachments of infinite stiffness hold one particle.
         """
         super().notify_model_changed(flags)
         self._has_dynamic_bodies = self._poses.has_dynamic()
+        self._between_steps.refresh()
         check_attachments(self.model)

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from ..detection.intersections import find_intersections
+from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
 from .report_totals import GradientTotals, StepTotals, Totals
 from .report_views import ReportViews
@@ -62,7 +63,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once each of a step that is not certified, strain above 0.2, crossings, inversions, and a layer passed.
+        """Warns once each of steps not certified, strain above 0.2, crossings, inversions, and gradients that are wrong.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
@@ -77,6 +78,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
             self._warn_once("layer", lambda: _LAYER_WARNING)
+        if known["ambiguous_moves"]:
+            self._warn_once("moves", lambda: f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)")
 
     def _warn_once(self, subject, message):
         if subject not in self._said:
@@ -322,14 +325,14 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        return Totals(*self._read_totals()[:-3])
+        return Totals(*self._read_totals()[:-4])
 
     @property
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
         layerless = 0 if self.layerless_steps is None else _read(self.layerless_steps)
-        grazing, lost_steps, outrun = self._read_totals()[-3:]
-        return GradientTotals(grazing, lost_steps, layerless, outrun)
+        grazing, lost_steps, outrun, ambiguous = self._read_totals()[-4:]
+        return GradientTotals(grazing, lost_steps, layerless, outrun, ambiguous)
 
     @property
     def layer_thickness(self) -> float | None:

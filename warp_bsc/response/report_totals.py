@@ -24,6 +24,7 @@ class StepTotals:
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
     outrun_steps: wp.array[wp.int64]
+    ambiguous_moves: wp.array[wp.int64]
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,12 @@ class GradientTotals:
             Contacts then act where they hit, and results are not continuous.
         outrun_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or are
             between bodies. Results are not continuous there.
+        ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps on a tape, and
+            that are NaN, as it cannot be known what they are of, see :mod:`.adjoint.between_steps`.
     """
 
     grazing: int
     lost_steps: int
     layerless_steps: int
     outrun_steps: int
+    ambiguous_moves: int

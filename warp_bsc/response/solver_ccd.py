@@ -21,7 +21,7 @@ from .integration.wrapped_solver import innermost
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, Loop
-from .stage import CollisionStage
+from .stage import CollisionStage, is_recorded
 from .state.collision_filter import CollisionFilter
 from .state.friction_table import FrictionTable
 from .state.mesh import ModelMesh
@@ -74,7 +74,8 @@ class SolverCCD(CollisionStage):
     friction, also of pairs, and restitution that are arrays. The set of contacts is constant; everything else is
     differentiated as it was computed, see :mod:`.adjoint.adjoint`. With ``requires_grad`` all sweeps are made, so that
     results do not jump, and the stage puts a :class:`.layer.contact_layer.ContactLayer` around the inner solver, see
-    ``contact_layer``.
+    ``contact_layer``. :mod:`.adjoint.between_steps` says where gradients of kinematic particles and bodies are that a
+    program moves between steps.
 
     A step builds on the one before. A second thread that calls the stage while one is in it gets a RuntimeError: use
     one stage for each thread. Warp and Newton load their kernels in the first steps that need them, which two threads
@@ -239,6 +240,7 @@ class SolverCCD(CollisionStage):
             self.report.layerless_steps, self.report.thickness = self.solver.skipped, self.solver.thickness_values
         self._limited = integrator if options.lift_speed_limit and has_speed_limit(integrator) else None
         self.report.speed_limit_lifted = self._limited is not None
+        self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
         self._substepping: tuple[Substeps, InnerContacts] | None = None
@@ -372,7 +374,7 @@ class SolverCCD(CollisionStage):
             self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
             solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
             run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
-        elif tape is not None and end.particle_q is not None and end.particle_q.requires_grad:
+        elif is_recorded(tape, state_out):
             self._record(arrays_of(state_in), end, dt, tape)
         else:
             solve = functools.partial(resolve, self._work, dt)

@@ -10,6 +10,7 @@ import warp as wp
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .._private_names.of_warp import paused_tape
+from .adjoint.between_steps import BetweenSteps
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS, Loop
@@ -22,11 +23,18 @@ from .worlds.world_mask import WorldMask, checked_mask
 from .write_back import count_outrun, count_step
 
 
+def is_recorded(tape: wp.Tape | None, state_out: newton.State) -> bool:
+    """Returns whether a tape, if there is one, records the gradients of a step."""
+    end = state_out.particle_q
+    return tape is not None and end is not None and end.requires_grad
+
+
 class CollisionStage(CouplingHooks):
     """A stage behind another solver: a :class:`.solver_ccd.SolverCCD` or a :class:`.monitor.CollisionMonitor`."""
 
     mesh: ModelMesh
     report: SolverReport
+    _between_steps: BetweenSteps | None = None  # of a stage whose steps carry gradients
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _mask: wp.array | None = None  # of the step in progress, if worlds take no part in it
 
@@ -49,6 +57,11 @@ class CollisionStage(CouplingHooks):
         if not model.requires_grad:
             motion.remember(self._work.vertices.x1)
         self.report = SolverReport(self._work, responds=responds)
+
+    def _watch_between_steps(self, *, bodies: bool):
+        """Keeps gradients apart of what a program moves between steps; ``bodies`` as of :class:`BetweenSteps`."""
+        if self.model.requires_grad:
+            self._between_steps = BetweenSteps(self.model, self.report.device_totals.ambiguous_moves, bodies=bodies)
 
     def _count_worlds(self, max_impulse: wp.array | None = None, *, responds: bool = True):
         """Makes the report have results by world."""
@@ -108,15 +121,23 @@ class CollisionStage(CouplingHooks):
             if mask is not None:
                 self._world_mask.begin(start)
             passed = self._begin_step(state_in, contacts)
-        self._step_inner(state_in, state_out, control, passed, dt, **options)
-        with paused_tape() as tape:
-            if mask is not None:
-                self._world_mask.restore(mask, state_out)
-            self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
+        with self._watched(tape, state_in, state_out):
+            self._step_inner(state_in, state_out, control, passed, dt, **options)
+            with paused_tape():
+                if mask is not None:
+                    self._world_mask.restore(mask, state_out)
+                self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
+        with paused_tape():
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
         if not self.mesh.device.is_capturing:
             self.report.warn()
+
+    def _watched(self, tape, state_in, state_out):
+        """Keeps the gradients of a step on a tape apart from those of what a program moves before it, and after it."""
+        if tape is None or self._between_steps is None or not is_recorded(tape, state_out):
+            return contextlib.nullcontext()
+        return self._between_steps.watched(tape, state_in, state_out)
 
     @functools.cached_property
     def _world_mask(self):
@@ -186,6 +207,8 @@ class CollisionStage(CouplingHooks):
         """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
+        if self._between_steps is not None:
+            self._between_steps.refresh()
         self._recount_crossings()
 
     @one_at_a_time

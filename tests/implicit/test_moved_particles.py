@@ -1,0 +1,236 @@
+"""Gradients of kinematic particles and bodies that a program moves between the steps of a tape."""
+
+import itertools
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from implicit_scenes import attached_cloth, hanging_cloth
+from newton.solvers import SolverSemiImplicit, SolverVBD
+
+import warp_bsc as bsc
+from warp_bsc._private_names.of_warp import paused_tape
+
+WAY = np.array([0.004, 0.002, 0.003])  # of what is held, from a step to the next [m]
+STEPS = 3
+
+
+def implicit(model):
+    return bsc.SolverImplicitAdjoint(SolverVBD(model, iterations=10), polish=4)
+
+
+SOLVERS = {
+    "implicit": implicit,
+    "stage, implicit": lambda model: bsc.SolverCCD(implicit(model)),
+    "layer, implicit": lambda model: bsc.SolverCCD(bsc.ContactLayer(implicit(model), thickness=0.02)),
+    "stage, semi-implicit": lambda model: bsc.SolverCCD(SolverSemiImplicit(model)),
+}
+
+
+def falling_cloth(device):
+    """A cloth that falls on a sheet that is held at its corners."""
+    builder = newton.ModelBuilder()
+    material = {"tri_ke": 80.0, "tri_ka": 60.0, "tri_kd": 5e-3, "edge_ke": 5e-2, "edge_kd": 1e-3}
+    tilt, flat = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.7, 0.2)), 0.2), wp.quat_identity()
+    size = {"dim_x": 2, "dim_y": 2, "cell_x": 0.05, "cell_y": 0.05}
+    at, velocity = wp.vec3(-0.05, -0.04, 0.03), wp.vec3(0.3, 0.1, -0.6)
+    builder.add_cloth_grid(pos=at, rot=tilt, vel=velocity, mass=0.002, particle_radius=0.01, **size, **material)
+    held = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
+    size = {"dim_x": 1, "dim_y": 1, "cell_x": 0.6, "cell_y": 0.6}
+    at = wp.vec3(-0.3, -0.3, 0.0)
+    builder.add_cloth_grid(pos=at, rot=flat, vel=wp.vec3(), mass=0.002, **held, **size, **material)
+    builder.color()
+    return builder.finalize(device=device, requires_grad=True)
+
+
+@wp.kernel
+def place(held: wp.array[int], first: wp.array[wp.vec3], way: wp.array[wp.vec3], k: float, x: wp.array[wp.vec3]):
+    i = wp.tid()
+    x[held[i]] = first[held[i]] + k * way[0]
+
+
+@wp.kernel
+def shift(held: wp.array[int], way: wp.array[wp.vec3], x: wp.array[wp.vec3]):
+    x[held[wp.tid()]] += way[0]
+
+
+@wp.kernel
+def add_heights(x: wp.array[wp.vec3], first: int, total: wp.array[float]):
+    wp.atomic_add(total, 0, x[first + wp.tid()][2])
+
+
+def write_outside(scene, state, k):
+    """Places what is held where it is after k steps; no tape sees it."""
+    name = scene.name
+    array, first = getattr(state, name), getattr(scene.model, name).numpy()
+    values = array.numpy().copy()
+    values[scene.held, :3] = first[scene.held, :3] + np.float32(k * scene.way.numpy()[0])
+    with paused_tape():
+        array.assign(values)
+
+
+def write_on_tape(scene, state, k):
+    inputs = [scene.index, scene.model.particle_q, scene.way, float(k)]
+    wp.launch(place, len(scene.held), inputs=inputs, outputs=[state.particle_q], device=scene.model.device)
+
+
+def shift_on_tape(scene, state, k):
+    inputs = [scene.index, scene.way, state.particle_q]
+    wp.launch(shift, len(scene.held), inputs=inputs, device=scene.model.device)
+
+
+def copy_on_tape(scene, state, k):
+    """Writes to another array, and copies that."""
+    moved = wp.empty_like(state.particle_q, requires_grad=True)
+    wp.copy(moved, state.particle_q)
+    inputs = [scene.index, scene.model.particle_q, scene.way, float(k)]
+    wp.launch(place, len(scene.held), inputs=inputs, outputs=[moved], device=scene.model.device)
+    wp.copy(state.particle_q, moved)
+
+
+class Scene:
+    """Steps of a cloth; a function moves what holds it before each step but the first."""
+
+    def __init__(self, solver, device, move=write_outside, *, scene=hanging_cloth):
+        self.model, has_body = scene(device), scene is attached_cloth
+        model = self.model
+        self.solver, self.move = SOLVERS[solver](model), move
+        self.dt = 2e-3 if "semi" in solver else 1.0 / 60.0
+        n = model.particle_count
+        self.name = "body_q" if has_body else "particle_q"
+        self.held = np.array([0]) if has_body else np.flatnonzero(model.particle_inv_mass.numpy() == 0.0)
+        self.index = wp.array(self.held, dtype=int, device=device)
+        self.way = wp.array([WAY], dtype=wp.vec3, device=device, requires_grad=True)
+        self.weights = np.random.default_rng(3).normal(size=(n, 3)) / n
+        self.weights[model.particle_inv_mass.numpy() == 0.0] = 0.0
+
+    def run(self, way=WAY, start=0.0):
+        first = getattr(self.model, self.name).numpy().copy()
+        first[self.held, :3] += np.float32(start)
+        with paused_tape():
+            self.way.assign(np.float32([way]))
+            self.states = [self.model.state() for _ in range(STEPS + 1)]
+            self.solver.reset(self.states[0])
+            getattr(self.states[0], self.name).assign(first)
+        self.take_steps(self.states)
+
+    def take_steps(self, states):
+        for k, (begin, end) in enumerate(itertools.pairwise(states)):
+            if k:
+                self.move(self, begin, k)
+            self.solver.step(begin, end, None, None, self.dt)
+
+    def backward(self):
+        with wp.Tape() as tape:
+            self.run()
+        seed = wp.array(self.weights, dtype=wp.vec3, device=self.model.device)
+        tape.backward(grads={self.states[-1].particle_q: seed})
+        gradients = [getattr(state, self.name).grad.numpy()[self.held, :3].sum(axis=0) for state in self.states]
+        return gradients
+
+    def assert_gradient(self, gradient, name, value):
+        """The gradient by a vector that is an argument of :meth:`run` is that of central differences, along a line."""
+        direction, h, losses = np.array([0.6, 0.7, -0.4]), 1e-4, []
+        for change in (h * direction, -h * direction):
+            self.run(**{name: value + change})
+            losses.append((self.weights * self.states[-1].particle_q.numpy().astype(float)).sum())
+        assert gradient @ direction == pytest.approx((losses[0] - losses[1]) / (2.0 * h), rel=0.01)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_what_a_program_writes_gets_the_gradient_in_its_array(solver, device):
+    scene = Scene(solver, device, scene=falling_cloth if solver == "layer, implicit" else hanging_cloth)
+    of_states = scene.backward()
+    scene.assert_gradient(sum(k * of_states[k] for k in range(1, STEPS)), "way", WAY)
+    scene.assert_gradient(of_states[0], "start", 0.0)
+
+
+def test_poses_that_a_program_writes_get_the_gradient_in_their_array(device):
+    scene = Scene("implicit", device, scene=attached_cloth)
+    of_states = scene.backward()
+    scene.assert_gradient(sum(k * of_states[k] for k in range(1, STEPS)), "way", WAY)
+    scene.assert_gradient(of_states[0], "start", 0.0)
+
+
+@pytest.mark.parametrize("move", [write_on_tape, shift_on_tape, copy_on_tape])
+def test_what_the_tape_moves_it_differentiates(move, device):
+    scene = Scene("stage, implicit", device, move)
+    of_states = scene.backward()
+    scene.assert_gradient(scene.way.grad.numpy()[0], "way", WAY)
+    scene.assert_gradient(of_states[0], "start", 0.0)
+
+
+def stay(scene, state, k):
+    """Moves nothing."""
+
+
+def test_at_rest_gradients_go_on_and_are_not_known_between_steps(device):
+    scene = Scene("implicit", device, stay)
+    of_states = scene.backward()
+    scene.assert_gradient(of_states[0], "start", 0.0)
+    assert np.isnan(of_states[1:STEPS]).all()  # a program may have written the same positions
+    assert scene.solver.report.ambiguous_moves == 0
+
+
+def test_a_loss_between_steps_may_be_of_either_position(device):
+    """It reads what the program moves before the next step, or has moved already."""
+    scene, total = Scene("implicit", device), wp.zeros(1, dtype=float, device=device, requires_grad=True)
+
+    def move(scene, state, k):
+        inputs = [state.particle_q, int(scene.held[0]), total]
+        wp.launch(add_heights, 1, inputs=inputs, device=device)
+        write_outside(scene, state, k)
+
+    scene.move = move
+    with wp.Tape() as tape:
+        scene.run()
+    free = np.setdiff1d(np.arange(scene.model.particle_count), scene.held)
+    tape.backward(total)
+    first, second = (scene.states[k].particle_q.grad.numpy() for k in (0, 1))
+    for gradient in (first, second):
+        assert np.isnan(gradient[scene.held[0]]).all()
+        assert np.isfinite(gradient[scene.held[1:]]).all()
+        assert np.isfinite(gradient[free]).all()
+    assert scene.solver.report.ambiguous_moves == 1  # the second step passes it on to the first
+    with pytest.warns(UserWarning, match="kinematic particles or bodies were moved between steps on a tape"):
+        scene.run()
+        with wp.Tape():
+            scene.run()
+
+
+def test_two_states_that_take_turns_have_no_array_for_each_gradient(device):
+    scene = Scene("stage, implicit", device)
+    states = [scene.model.state() for _ in range(2)]
+    with wp.Tape() as tape:
+        for k in range(STEPS):
+            begin, end = states[k % 2], states[(k + 1) % 2]
+            if k:
+                write_outside(scene, begin, k)
+            scene.solver.step(begin, end, None, None, scene.dt)
+    seed = wp.array(scene.weights, dtype=wp.vec3, device=device)
+    tape.backward(grads={states[STEPS % 2].particle_q: seed})
+    assert np.isnan(states[0].particle_q.grad.numpy()[scene.held]).all()
+    assert scene.solver.report.gradients.ambiguous_moves == len(scene.held)
+
+
+def test_in_a_graph_as_without(device):
+    def move(scene, state, k):
+        with paused_tape():
+            write_on_tape(scene, state, k)
+
+    scene = Scene("stage, implicit", device, move)
+    expected, states = scene.backward(), [scene.model.state() for _ in range(STEPS + 1)]
+    scene.solver.reset(states[0])
+    seed = wp.array(scene.weights, dtype=wp.vec3, device=device)
+    with wp.ScopedCapture(device) as capture:
+        with wp.Tape() as tape:
+            scene.take_steps(states)
+        tape.backward(grads={states[-1].particle_q: seed})
+    for _ in range(2):
+        states[0].assign(scene.model.state())
+        tape.zero()
+        states[-1].particle_q.grad.assign(seed)
+        wp.capture_launch(capture.graph)
+        for state, gradient in zip(states, expected, strict=True):
+            np.testing.assert_array_equal(state.particle_q.grad.numpy()[scene.held].sum(axis=0), gradient)
