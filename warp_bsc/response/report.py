@@ -63,7 +63,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         wp.copy(self._host_totals, self.total_values)
 
     def warn(self) -> None:
-        """Warns once each of steps not certified, strain above 0.2, crossings, inversions, and gradients that are wrong.
+        """Warns once each of steps not certified, strain above 0.2, crossings, inversions, and wrong gradients.
 
         Known is what the host knows already; the device is only waited for to warn.
         """
