@@ -36,6 +36,11 @@ class Contacts:
     toi: np.ndarray
     gap: np.ndarray
 
+    @property
+    def are_of_edges(self) -> np.ndarray:
+        """Whether both elements are edges, bool, shape [n]."""
+        return self.keys < 0
+
     def rows(self, which: np.ndarray) -> "Contacts":
         """Returns some of the contacts."""
         return Contacts(*(values[which] for values in vars(self).values()))
@@ -89,18 +94,21 @@ def projected(fixed: np.ndarray, x: np.ndarray, contacts: Contacts, sweeps: int 
         contacts: The contacts.
         sweeps: Number of sweeps.
     """
-    weights, normals = contacts.weights, contacts.normals
     involved, rows = np.unique(contacts.vertices, return_inverse=True)
     rows, at = rows.reshape(contacts.vertices.shape), x[involved]
-    movable = np.where(fixed[contacts.vertices], 0.0, weights)
-    inverse = contacts.mobilities(fixed)
+    # one row of twelve numbers a contact, for its four vertices
+    gradients = (contacts.weights[:, :, None] * contacts.normals[:, None, :]).reshape(-1, 12)
+    movable = np.where(fixed[contacts.vertices], 0.0, contacts.weights) * contacts.mobilities(fixed)[:, None]
+    moves = (movable[:, :, None] * contacts.normals[:, None, :]).reshape(-1, 12)
     for _ in range(sweeps):
-        short = contacts.gap - np.einsum("ik,ikj,ij->i", weights, at[rows], normals)
-        push = np.where(short > 0.0, short * inverse, 0.0)
-        moves = (movable * push[:, None])[:, :, None] * normals[:, None, :]
-        total = np.stack([np.bincount(rows.ravel(), moves[:, :, i].ravel(), len(at)) for i in range(3)], axis=1)
-        count = np.bincount(rows.ravel(), np.repeat(push > 0.0, 4), len(at))
-        at = at + total / np.maximum(count, 1.0)[:, None]
+        short = contacts.gap - np.einsum("ij,ij->i", gradients, at[rows].reshape(-1, 12))
+        (active,) = np.nonzero(short > 0.0)
+        if not len(active):
+            break
+        pushed = rows[active].ravel()
+        pushes = (moves[active] * short[active, None]).reshape(-1, 3)
+        total = np.stack([np.bincount(pushed, pushes[:, i], len(at)) for i in range(3)], axis=1)
+        at = at + total / np.maximum(np.bincount(pushed, minlength=len(at)), 1)[:, None]
     result = x.copy()
     result[involved] = at
     return result
