@@ -27,7 +27,7 @@ _PROJECTIONS = 20
 _GAP = 0.005
 """Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes layers that lie on
 each other into the next ones."""
-_REACH = 0.1
+_REACH = 0.07
 """Distance, as a share of that length, from which a contact of the frame before is none."""
 _LEAST_SPREAD = 0.2
 """Share of the largest displacement by contacts from which spread ones are used: pushes of the two sides of a fold
@@ -185,7 +185,7 @@ class Follower:
         """Returns a target at which contacts are moved apart, float64 unless there are none."""
         if not len(known.toi):
             return target
-        return projected(~self._is_movable, target.astype(np.float64), known, _PROJECTIONS)
+        return projected(~self._is_movable, target.astype(np.float64), known, _PROJECTIONS, device=self._device)
 
     def _contacts(self, start: wp.array, target, changed) -> tuple[Contacts, np.ndarray]:
         """Returns the contacts of a motion that can be moved apart, and which vertices collide or come too near.
