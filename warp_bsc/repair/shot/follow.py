@@ -114,7 +114,14 @@ class Follower:
         self._spread = wp.empty(len(x), dtype=wp.vec3, device=self._device)
 
     def follow(
-        self, start: np.ndarray, given: np.ndarray, displacement: np.ndarray, *, tolerance: float, known: Contacts
+        self,
+        start: np.ndarray,
+        given: np.ndarray,
+        displacement: np.ndarray,
+        *,
+        tolerance: float,
+        known: Contacts,
+        free_start: np.ndarray | None = None,
     ) -> FollowedFrame:
         """Returns positions near given ones that a straight motion reaches without a collision.
 
@@ -126,6 +133,8 @@ class Follower:
             tolerance: Displacement by contacts, as a share of the median edge length, that is not spread: the
                 neighbourhood need not follow.
             known: Contacts to keep apart from the first detection on.
+            free_start: Positions from which the straight motion to the given ones is known to be free, so that only
+                vertices that move otherwise are looked at; None if it is not known.
         """
         tolerance *= self.length
         device_start = self._mesh.device_positions(start, "start")
@@ -133,6 +142,8 @@ class Follower:
         sweeps = list(_SWEEPS)
         target = _displaced(given, displacement)
         x, changed = self._moved_apart(target, known), self._is_movable
+        if free_start is not None:
+            changed = (start != free_start).any(axis=1) | (x.astype(np.float32) != given).any(axis=1)
         for number in range(_DETECTIONS):
             x = x.astype(np.float32)
             contacts, touched = self._contacts(device_start, x, changed)

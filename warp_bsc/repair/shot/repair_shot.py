@@ -202,7 +202,8 @@ class _Shot:
             # The same for all stretches of the segment, wherever a run begins.
             x = segment.start_positions
             # The stage works in single precision: near the origin it is finer.
-            self._origin = np.zeros(3) if x.dtype == np.float32 else x.mean(axis=0)
+            self._is_single = x.dtype == np.float32
+            self._origin = np.zeros(3) if self._is_single else x.mean(axis=0)
             self._follower = Follower(
                 segment.faces,
                 self._single(x),
@@ -215,7 +216,7 @@ class _Shot:
 
     def _single(self, x) -> np.ndarray:
         """Returns positions of the scene in single precision, relative to the origin."""
-        return x if x.dtype == np.float32 else (x - self._origin).astype(np.float32)
+        return x if self._is_single else (x - self._origin).astype(np.float32)
 
     def _start(self, first, interval, left) -> ShotFrame:
         """Returns the first frame, repaired if it crosses; adds to ``left`` what still does."""
@@ -272,7 +273,14 @@ class _Shot:
                     known, tolerance = self._follower.near(known, frame.x), _SOUGHT
                 else:
                     known, tolerance = contacts.get(index, Contacts.none()), _ACCEPTED
-                found = self._follower.follow(frame.x, given, displacement, tolerance=tolerance, known=known)
+                found = self._follower.follow(
+                    frame.x,
+                    given,
+                    displacement,
+                    tolerance=tolerance,
+                    known=known,
+                    free_start=frame.given if self._findings[index].is_free and self._is_single else None,
+                )
                 if displacements is None:
                     known = contacts[index] = found.contacts
                 added = found.displacement if displacements is None else found.x - given
