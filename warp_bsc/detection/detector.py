@@ -103,8 +103,8 @@ class CollisionDetector:
                 array. They are taken as exact; those of vertices that no face uses may be anything. If it requires
                 gradients, a Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
-            only: Finds the collisions alone that have one of these vertices, at less cost; of others the result says
-                nothing. Bool, shape [vertex_count]; None for all.
+            only: Vertices of interest, bool, shape [vertex_count]: collisions that have none of them may be missing, at
+                less cost. None for all.
 
         Raises:
             TypeError: If the positions are no arrays of numbers.
