@@ -47,7 +47,7 @@ PACKAGES = {
     "torch": {"response", "_arguments"},
     "jax": {"response", "_arguments"},
     "implicit": {"detection", "response", "_arguments", "_one_thread", "_private_names"},
-    "repair": {"detection", "response", "usd", "replay", "_arguments", "_atomic_file"},
+    "repair": {"detection", "response", "kernels", "usd", "replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_version"},
     "bench": {"detection", "kernels", "usd", "checker", "response", "repair", "_arguments", "_private_names"},

@@ -8,7 +8,8 @@ side, so that one box is compared with eight at once.
 - ``elements``, int32, 41 a packet: the numbers of the elements, three corners each, their worlds, and which of them
   have changed, as bits.
 - ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
-- ``node_worlds``, int32, 16 a node: the first and the last world of the children.
+- ``node_marks``, int32, 24 a node: the first and the last world of the children, and whether elements below them have
+  changed.
 
 Missing elements and children have empty boxes, which overlap none.
 """
@@ -164,8 +165,10 @@ import warp as wp
     while (height > 0) {
         const int level = stack[--height].level, node = stack[height].node;
         const float* child = other_nodes.data + 48 * (size_t)(level_starts.data[level] + node);
-        const int* child_worlds = other_node_worlds.data + 16 * (size_t)(level_starts.data[level] + node);
-        Ints overlap = (ints(child_worlds) <= last_world) & (ints(child_worlds + 8) >= first_world);
+        const int* child_marks = other_node_marks.data + 24 * (size_t)(level_starts.data[level] + node);
+        Ints overlap = (ints(child_marks) <= last_world) & (ints(child_marks + 8) >= first_world);
+        if (!changed)
+            overlap &= ints(child_marks + 16) != 0;
         for (int axis = 0; axis < 3; ++axis)
             overlap &= (floats(child + 16 * axis) <= high[axis]) & (floats(child + 16 * axis + 8) >= low[axis]);
         for (unsigned mask = bits(overlap); mask; mask &= mask - 1) {
@@ -203,7 +206,7 @@ def pair_packet(
     other_elements: wp.array[wp.int32],
     other_corners: int,
     other_nodes: wp.array[wp.float32],
-    other_node_worlds: wp.array[wp.int32],
+    other_node_marks: wp.array[wp.int32],
     level_starts: wp.array[wp.int32],
     # filter
     group: wp.array[wp.int32],
@@ -244,6 +247,7 @@ _FIT_SNIPPET = """
     const int* element = elements.data + 41 * (size_t)packet;
     float* box = boxes.data + 96 * (size_t)packet;
     float* node = nodes.data + 48 * (size_t)(packet / 8) + packet % 8;
+    int* marks = node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
 
     // positions may be a view, with any stride; a fourth number is read with them where there is one
     auto load = [&](const auto& x, int corner) -> Four {{
@@ -306,6 +310,7 @@ _FIT_SNIPPET = """
     }}
     __builtin_memcpy(box, rows, sizeof(rows));
     elements.data[41 * (size_t)packet + 40] = changed_lanes;
+    marks[16] = changed_lanes != 0;
 """
 
 
@@ -340,6 +345,7 @@ def fit_packet_of(dtype: type) -> wp.Function:
         # out
         boxes: wp.array[wp.float32],
         nodes: wp.array[wp.float32],
+        node_marks: wp.array[int],
     ): ...
 
     return fit_packet

@@ -313,6 +313,26 @@ def test_of_what_has_changed_all_contacts_are_found_again(broad_phase, device):
             assert share < 0.3 or len(part) > 10
 
 
+def test_collisions_of_the_vertices_of_interest_are_found(broad_phase):
+    x0, x1, faces = crumpled(1)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    detector = bsc.CollisionDetector(mesh)
+    full = detector.detect(x0, x1)
+    for share in (0.0, 0.02, 0.3, 1.0):
+        only = np.random.default_rng(0).random(len(x0)) < share
+        found = detector.detect(x0, x1, only=only)
+        for name, corners in (
+            ("vertex_face", lambda pairs: np.column_stack([pairs[:, 0], mesh.faces[pairs[:, 1]]])),
+            ("edge_edge", lambda pairs: mesh.edges[pairs].reshape(-1, 4)),
+        ):
+            everything, part = getattr(full, name), getattr(found, name)
+            of_interest = everything[only[corners(everything)].any(axis=1)]
+            pairs, all_pairs, sought = ({*map(tuple, rows)} for rows in (part, everything, of_interest))
+            assert sought <= pairs <= all_pairs
+            assert share < 0.3 or len(sought) > 10
+    assert_same(detector.detect(x0, x1), full)
+
+
 def test_all_overlapping_pairs_can_be_had(broad_phase, device):
     """Those as well that an axis separates, and as many as were counted."""
     x0, x1, faces = crumpled(2)

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from .._arguments import check_finite, check_instance, checked_distance
+from .._arguments import as_numpy, check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
 from .collisions import CapturedCollisions, Collisions
@@ -93,7 +93,9 @@ class CollisionDetector:
         self._has_run = False
 
     @one_at_a_time
-    def detect(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Collisions:
+    def detect(
+        self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, *, only: np.ndarray | None = None
+    ) -> Collisions:
         """Returns all collisions of a motion.
 
         Args:
@@ -101,19 +103,23 @@ class CollisionDetector:
                 array. They are taken as exact; those of vertices that no face uses may be anything. If it requires
                 gradients, a Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
+            only: Vertices of interest, bool, shape [vertex_count]: collisions that have none of them may be missing, at
+                less cost. None for all.
 
         Raises:
             TypeError: If the positions are no arrays of numbers.
-            ValueError: If they have another shape or type, differ in type, or are not finite.
+            ValueError: If they or ``only`` have another shape or type, if the positions differ in type, or if they are
+                not finite.
             RuntimeError: If the device captures a graph, see :meth:`capture`.
         """
         if self.mesh.device.is_capturing:
             raise RuntimeError(f"{self.mesh.device} captures a graph: call capture(x0, x1) there instead of detect")
         x0, x1 = self._checked_positions(x0, x1)
+        changed = None if only is None else self._checked_vertices(only)
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
-            self._pipeline.find_contacts(x0, x1, refit=self._has_run, sort=True, timer=timer)
+            self._pipeline.find_contacts(x0, x1, refit=self._has_run, changed=changed, sort=True, timer=timer)
             return timer
 
         timer = retry_until_fits(launch, self._pipeline, self.mesh.device)
@@ -242,6 +248,13 @@ class CollisionDetector:
     def intersection_finder(self) -> IntersectionFinder:
         """Returns a finder of intersections that shares trees with this detector on a CPU, and its lock."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
+
+    def _checked_vertices(self, only: np.ndarray) -> wp.array:
+        """Returns which vertices are given, on the device, array of int."""
+        mask = as_numpy(only, "only", "an array of bool")
+        if mask.dtype != bool or mask.shape != (self.mesh.vertex_count,):
+            raise ValueError(f"only must be bool of shape ({self.mesh.vertex_count},), not {mask.dtype} {mask.shape}")
+        return wp.array(mask, dtype=int, device=self.mesh.device)
 
     def _checked_positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> tuple[wp.array, wp.array]:
         """Returns the positions of a motion on the device, of one type."""

@@ -261,7 +261,8 @@ class IntersectionFinder:
         Args:
             x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array. Those of
                 vertices that no face uses may be anything.
-            is_end: Whether they are those at the end of the motion that the given broad phase has boxed last.
+            is_end: Whether they are those at the end of the motion that the given broad phase has boxed last, with all
+                vertices of interest.
 
         Raises:
             TypeError: If the positions are no array of numbers.

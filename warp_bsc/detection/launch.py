@@ -10,7 +10,7 @@ import functools
 import os
 import threading
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, Protocol, TypeVar
 
@@ -99,6 +99,29 @@ def launch_in_turn(kernel: wp.Kernel, dim: int, times: int, *, inputs: list, val
         for number in range(times):
             commands[number % 2].launch()
     return values[times % 2]
+
+
+def launch_repeatedly(
+    kernels: Sequence[tuple[wp.Kernel, int, list, list]], times: int, *, device: wp.DeviceLike
+) -> None:
+    """Launches kernels one after the other, several times.
+
+    Args:
+        kernels: Kernels with their numbers of threads, their inputs and their outputs.
+        times: How often to launch all.
+        device: The device of their arrays.
+    """
+    device = wp.get_device(device)
+    commands = []
+    for kernel, dim, inputs, outputs in kernels:
+        if dim:
+            with _loading(kernel, device, 0):
+                commands.append(
+                    wp.launch(kernel, dim, inputs, outputs, device=device, record_tape=False, record_cmd=True)
+                )
+    for _ in range(times):
+        for command in commands:
+            command.launch()
 
 
 @contextlib.contextmanager

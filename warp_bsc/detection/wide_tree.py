@@ -104,11 +104,12 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         # out
         boxes: wp.array[wp.float32],
         nodes: wp.array[wp.float32],
+        node_marks: wp.array[int],
     ):
         """Writes the boxes of each packet, and its entry in its node."""
         packet = first + wp.tid()
         lanes = wp.min(8, count - 8 * packet)
-        fit_packet(packet, lanes, x0, x1, corners, changed, padding, elements, boxes, nodes)
+        fit_packet(packet, lanes, x0, x1, corners, changed, padding, elements, boxes, nodes, node_marks)
 
     return encode, fit_packets
 
@@ -123,7 +124,7 @@ def _fill_packets(
     order: wp.array[int],
     # out
     elements: wp.array2d[int],
-    node_worlds: wp.array3d[int],
+    node_marks: wp.array3d[int],
 ):
     """Writes the elements of each packet in their order, and its worlds in its node."""
     packet = first + wp.tid()
@@ -134,8 +135,8 @@ def _fill_packets(
         elements[packet, 32 + lane] = worlds[i]
         for corner in range(corners.shape[1]):
             elements[packet, 8 + 8 * corner + lane] = corners[i, corner]
-    node_worlds[packet / 8, 0, packet % 8] = elements[packet, 32]
-    node_worlds[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
+    node_marks[packet / 8, 0, packet % 8] = elements[packet, 32]
+    node_marks[packet / 8, 1, packet % 8] = elements[packet, 32 + count - 1]
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -150,7 +151,7 @@ def _pair_packets(
     other_elements: wp.array[int],
     other_corners: int,
     other_nodes: wp.array[wp.float32],
-    other_node_worlds: wp.array[int],
+    other_node_marks: wp.array[int],
     level_starts: wp.array[int],
     # options
     pair_filter: PairFilter,
@@ -173,7 +174,7 @@ def _pair_packets(
         other_elements,
         other_corners,
         other_nodes,
-        other_node_worlds,
+        other_node_marks,
         level_starts,
         pair_filter.group,
         pair_filter.mask,
@@ -198,9 +199,9 @@ def _join_nodes(
     above: int,
     # in and out
     nodes: wp.array3d[wp.float32],
-    node_worlds: wp.array3d[int],
+    node_marks: wp.array3d[int],
 ):
-    """Writes the box and the worlds of each node of a level to the level above, given where both levels start."""
+    """Writes the box and the marks of each node of a level to the level above, given where both levels start."""
     i = first + wp.tid()
     node = start + i
     parent = above + i / 8
@@ -214,10 +215,13 @@ def _join_nodes(
         nodes[parent, 2 * axis, lane] = low
         nodes[parent, 2 * axis + 1, lane] = high
     last = int(-1)
+    changed = int(0)
     for child in range(8):
-        last = wp.max(last, node_worlds[node, 1, child])
-    node_worlds[parent, 0, lane] = node_worlds[node, 0, 0]
-    node_worlds[parent, 1, lane] = last
+        last = wp.max(last, node_marks[node, 1, child])
+        changed = wp.max(changed, node_marks[node, 2, child])
+    node_marks[parent, 0, lane] = node_marks[node, 0, 0]
+    node_marks[parent, 1, lane] = last
+    node_marks[parent, 2, lane] = changed
 
 
 class WideTree:
@@ -265,7 +269,7 @@ class WideTree:
         self._boxes = wp.array(np.tile(empty, (packets, 6, 8)), dtype=wp.float32, device=device)
         self._elements = wp.full((packets, 41), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
-        self._node_worlds = wp.full((starts[-1], 2, 8), -1, dtype=int, device=device)
+        self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
         self._size = self._sorted_size = 0.0  # of all packets, when fitted and when sorted
 
     @property
@@ -290,7 +294,7 @@ class WideTree:
             self._order.numpy()[:n] = np.argsort(self._codes.numpy()[:n], kind="stable")
         else:
             wp.utils.radix_sort_pairs(self._codes, self._order, n)
-        inputs, outputs = [self._corners, self._numbers, self._worlds, self._order], [self._elements, self._node_worlds]
+        inputs, outputs = [self._corners, self._numbers, self._worlds, self._order], [self._elements, self._node_marks]
         launch_over(_fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         self._sorted_size = 0.0
 
@@ -304,7 +308,8 @@ class WideTree:
         """
         _, fit_packets = _kernels(x0.dtype)
         inputs = [x0, x1, self._corners.shape[1], len(self._corners), changed, self._padding]
-        outputs = [self._elements.flatten(), self._boxes.flatten(), self._nodes.flatten()]
+        outputs = [self._elements, self._boxes, self._nodes, self._node_marks]
+        outputs = [array.flatten() for array in outputs]
         device = self._corners.device
         launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
         nodes, starts = self._nodes.numpy(), self._level_starts.numpy().tolist()
@@ -313,7 +318,7 @@ class WideTree:
         self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
         self._sorted_size = self._sorted_size or self._size
         for start, above in itertools.pairwise(starts[:-1]):
-            inputs, outputs = [start, above], [self._nodes, self._node_worlds]
+            inputs, outputs = [start, above], [self._nodes, self._node_marks]
             launch_over(_join_nodes, above - start, inputs=inputs, outputs=outputs, device=device, chunk=2048)
 
     def pair(
@@ -350,7 +355,7 @@ class WideTree:
             other._elements.flatten(),
             other._corners.shape[1],
             other._nodes.flatten(),
-            other._node_worlds.flatten(),
+            other._node_marks.flatten(),
             other._level_starts,
             self._filter,
             other is self,

@@ -46,7 +46,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
             around = springs.around(held, _RINGS)
             sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
             goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
-            goal = projected(surface.fixed, goal, known)
+            goal = projected(surface.fixed, goal, known, device=surface.device)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
             break

@@ -1,13 +1,16 @@
 """Contacts of a motion, as planes that keep their elements apart."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import warp as wp
 
 from ..detection.collisions import Collisions
+from ..detection.launch import launch_repeatedly
 from ..detection.mesh import CollisionMesh
+from .kernels import Planes, find_shortfalls, move_apart
 
-__all__ = ["Contacts", "as_contacts", "projected"]
+__all__ = ["Contacts", "as_contacts", "as_planes", "projected"]
 
 _SWEEPS = 4
 _LEAST_MOBILITY = 0.05
@@ -35,6 +38,11 @@ class Contacts:
     normals: np.ndarray
     toi: np.ndarray
     gap: np.ndarray
+
+    @property
+    def are_of_edges(self) -> np.ndarray:
+        """Whether both elements are edges, bool, shape [n]."""
+        return self.keys < 0
 
     def rows(self, which: np.ndarray) -> "Contacts":
         """Returns some of the contacts."""
@@ -80,7 +88,32 @@ def as_contacts(mesh: CollisionMesh, found: Collisions, gap: float) -> Contacts:
     )
 
 
-def projected(fixed: np.ndarray, x: np.ndarray, contacts: Contacts, sweeps: int = _SWEEPS) -> np.ndarray:
+def as_planes(contacts: Contacts, rows: np.ndarray, fixed: np.ndarray, device: wp.DeviceLike) -> Planes:
+    """Returns contacts as planes on a device.
+
+    Args:
+        contacts: The contacts.
+        rows: Row of each vertex among those that move, ascending; -1 for the others, int, shape [n].
+        fixed: Vertices that stay, bool, shape [n].
+        device: Warp device.
+    """
+    of_places = rows[contacts.vertices.ravel()]
+    order = np.argsort(of_places, kind="stable")
+    order = order[np.count_nonzero(of_places < 0) :]
+    starts = np.searchsorted(of_places[order], np.arange(rows.max(initial=-1) + 2))
+    planes = Planes()
+    planes.starts, planes.places = (wp.array(values, dtype=int, device=device) for values in (starts, order))
+    planes.vertices = wp.array(contacts.vertices, dtype=wp.vec4i, device=device)
+    planes.weights = wp.array(contacts.weights, dtype=wp.vec4d, device=device)
+    planes.normals = wp.array(contacts.normals, dtype=wp.vec3d, device=device)
+    planes.gaps = wp.array(contacts.gap, dtype=wp.float64, device=device)
+    planes.mobilities = wp.array(contacts.mobilities(fixed), dtype=wp.float64, device=device)
+    return planes
+
+
+def projected(
+    fixed: np.ndarray, x: np.ndarray, contacts: Contacts, sweeps: int = _SWEEPS, *, device: wp.DeviceLike
+) -> np.ndarray:
     """Returns positions at which contacts have their gaps along their normals: Jacobi sweeps, averaged by vertex.
 
     Args:
@@ -88,19 +121,25 @@ def projected(fixed: np.ndarray, x: np.ndarray, contacts: Contacts, sweeps: int 
         x: Positions, float64, shape [n, 3].
         contacts: The contacts.
         sweeps: Number of sweeps.
+        device: Warp device.
     """
-    weights, normals = contacts.weights, contacts.normals
-    involved, rows = np.unique(contacts.vertices, return_inverse=True)
-    rows, at = rows.reshape(contacts.vertices.shape), x[involved]
-    movable = np.where(fixed[contacts.vertices], 0.0, weights)
-    inverse = contacts.mobilities(fixed)
-    for _ in range(sweeps):
-        short = contacts.gap - np.einsum("ik,ikj,ij->i", weights, at[rows], normals)
-        push = np.where(short > 0.0, short * inverse, 0.0)
-        moves = (movable * push[:, None])[:, :, None] * normals[:, None, :]
-        total = np.stack([np.bincount(rows.ravel(), moves[:, :, i].ravel(), len(at)) for i in range(3)], axis=1)
-        count = np.bincount(rows.ravel(), np.repeat(push > 0.0, 4), len(at))
-        at = at + total / np.maximum(count, 1.0)[:, None]
+    count = len(contacts.toi)
+    is_involved = np.zeros(len(x), dtype=bool)
+    is_involved[contacts.vertices] = True
+    involved = np.flatnonzero(is_involved)
+    own = replace(contacts, vertices=(np.cumsum(is_involved) - 1)[contacts.vertices])
+    (moving,) = np.nonzero(~fixed[involved])
+    rows = np.full(len(involved), -1)
+    rows[moving] = np.arange(len(moving))
+    planes = as_planes(own, rows, fixed[involved], device)
+    at = wp.array(x[involved], dtype=wp.vec3d, device=device)
+    shortfalls = wp.empty(count, dtype=wp.float64, device=device)
+    vertices = wp.array(moving, dtype=int, device=device)
+    kernels = [
+        (find_shortfalls, count, [at, planes], [shortfalls]),
+        (move_apart, len(moving), [vertices, planes, shortfalls], [at]),
+    ]
+    launch_repeatedly(kernels, sweeps, device=device)
     result = x.copy()
-    result[involved] = at
+    result[involved] = at.numpy()
     return result

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..detection.launch import launch_in_turn
-from .contacts import Contacts
+from .contacts import Contacts, as_planes
 from .kernels import Planes, relax_springs, spread_moves
 from .surface import Surface
 
@@ -115,16 +115,7 @@ class Springs:
         """Returns contacts as planes, by the rows of the vertices."""
         row = np.full(len(self.movable), -1)
         row[self._vertices] = np.arange(len(self._vertices))
-        rows = row[contacts.vertices.ravel()]
-        order = np.argsort(rows, kind="stable")
-        order = order[np.count_nonzero(rows < 0) :]
-        planes, array = Planes(), self._surface.array
-        planes.starts = array(np.searchsorted(rows[order], np.arange(len(self._vertices) + 1)), int)
-        planes.places = array(order, int)
-        planes.vertices, planes.weights = array(contacts.vertices, wp.vec4i), array(contacts.weights, wp.vec4d)
-        planes.normals, planes.gaps = array(contacts.normals), array(contacts.gap, wp.float64)
-        planes.mobilities = array(contacts.mobilities(self._surface.fixed), wp.float64)
-        return planes
+        return as_planes(contacts, row, self._surface.fixed, self._surface.device)
 
     def _sweep(self, kernel: wp.Kernel, dim: int, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns values after some launches of a kernel that writes those of movable vertices."""

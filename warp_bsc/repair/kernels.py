@@ -123,6 +123,47 @@ def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
 
 
 @wp.kernel
+def find_shortfalls(
+    # in
+    x: wp.array[wp.vec3d],
+    planes: Planes,
+    # out
+    shortfalls: wp.array[wp.float64],
+):
+    """Writes how much each contact lacks of its distance, negative where nothing is lacking."""
+    i = wp.tid()
+    corners = planes.vertices[i]
+    weights = planes.weights[i]
+    between = wp.vec3d()
+    for corner in range(4):
+        between += weights[corner] * x[corners[corner]]
+    shortfalls[i] = planes.gaps[i] - wp.dot(between, planes.normals[i])
+
+
+@wp.kernel
+def move_apart(
+    # in
+    vertices: wp.array[int],
+    planes: Planes,
+    shortfalls: wp.array[wp.float64],
+    # in and out
+    x: wp.array[wp.vec3d],
+):
+    """Moves vertices by the mean of the moves that put their contacts at their distances."""
+    i = wp.tid()
+    total = wp.vec3d()
+    count = _ZERO
+    for k in range(planes.starts[i], planes.starts[i + 1]):
+        contact = planes.places[k] / 4
+        short = shortfalls[contact]
+        if short > _ZERO:
+            weight = planes.weights[contact][planes.places[k] % 4]
+            total += weight * short * planes.mobilities[contact] * planes.normals[contact]
+            count += _ONE
+    x[vertices[i]] += total / wp.max(count, _ONE)
+
+
+@wp.kernel
 def relax_springs(
     # springs
     rows: wp.array[int],

@@ -42,7 +42,7 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
             return goal, Contacts.joined(known)
         known.append(contacts)
         if detection < _PROJECTIONS:
-            goal = projected(surface.fixed, goal, Contacts.joined(known))
+            goal = projected(surface.fixed, goal, Contacts.joined(known), device=surface.device)
         else:
             kept = np.ones(len(start))
             np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
@@ -62,7 +62,7 @@ def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
             best, fewest, since = x, len(near.keys), 0
         if not len(near.keys):
             break
-        x, _ = move_freely(surface, x, surface.rounded(projected(surface.fixed, x, near)))
+        x, _ = move_freely(surface, x, surface.rounded(projected(surface.fixed, x, near, device=surface.device)))
     return best
 
 

@@ -1,7 +1,7 @@
 """Positions of a mesh at one time from those at the time before: near given ones, and reached without a collision."""
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,21 +11,27 @@ from ...detection.detector import CollisionDetector
 from ...detection.launch import launch, launch_in_turn
 from ...detection.mesh import CollisionMesh
 from ..contacts import Contacts, as_contacts, projected
-from .follow_kernels import normalize, smooth
+from .follow_kernels import find_directions, normalize, smooth
 
 if TYPE_CHECKING:
     from .playback import Playback
 
 __all__ = ["FollowedFrame", "Follower"]
 
-_SWEEPS = 64, 32, 16
-"""Sweeps that spread the displacements by the first contacts of a step over the mesh, by the second ones, and so on."""
-_DETECTIONS = 4
-"""Detections after which contacts are not moved apart anew before their displacements are spread."""
+_SWEEPS = 64, 16, 8
+"""Sweeps that spread the displacements by contacts over the mesh, one number after the other."""
+_DETECTIONS = 16
+"""Detections after which a step is left to the stage."""
 _PROJECTIONS = 20
 """Sweeps over the contacts after each detection."""
-_GAP = 0.02
-"""Distance that these contacts are moved apart, as a share of the median edge length, so that few are left."""
+_GAP = 0.005
+"""Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes layers that lie on
+each other into the next ones."""
+_REACH = 0.07
+"""Distance, as a share of that length, from which a contact of the frame before is none."""
+_LEAST_SPREAD = 0.2
+"""Share of the largest displacement by contacts from which spread ones are used: pushes of the two sides of a fold
+cancel where the sweeps reach from one to the other."""
 _SMALLEST = 1e-4
 """Displacement, as a share of that length, that is none: a contact does not reach all of a mesh."""
 _LARGEST_STEP = 1.0
@@ -41,11 +47,13 @@ class FollowedFrame:
         displacement: The displacements that were added to the given positions before the last contacts were moved
             apart, float64, shape [vertex_count, 3].
         certified: Whether the straight motion to these positions is free of collisions, and keeps the distance.
+        contacts: The contacts that are kept apart there.
     """
 
     x: np.ndarray
     displacement: np.ndarray
     certified: bool
+    contacts: Contacts
 
 
 class Follower:
@@ -53,7 +61,9 @@ class Follower:
 
     Contacts are moved apart, which would strain the edges around them. So their displacements are spread over the mesh,
     first widely, then less, and added to the given positions: the neighbourhood of a contact moves with it, and keeps
-    the shape that it has in the given positions. What then still collides is left to :class:`warp_bsc.SolverCCD`.
+    the shape that it has in the given positions. All contacts that are known stay apart meanwhile, so that few are new
+    in the next detection, which looks at the vertices alone whose motion has changed. What still collides after many
+    is left to :class:`warp_bsc.SolverCCD`.
 
     Attributes:
         edges: Vertices of the edges of the movable part, the smaller first, shape [n, 2].
@@ -104,7 +114,14 @@ class Follower:
         self._spread = wp.empty(len(x), dtype=wp.vec3, device=self._device)
 
     def follow(
-        self, start: np.ndarray, given: np.ndarray, displacement: np.ndarray, *, tolerance: float
+        self,
+        start: np.ndarray,
+        given: np.ndarray,
+        displacement: np.ndarray,
+        *,
+        tolerance: float,
+        known: Contacts,
+        free_start: np.ndarray | None = None,
     ) -> FollowedFrame:
         """Returns positions near given ones that a straight motion reaches without a collision.
 
@@ -115,52 +132,108 @@ class Follower:
             displacement: Displacements to begin with, float, shape [vertex_count, 3].
             tolerance: Displacement by contacts, as a share of the median edge length, that is not spread: the
                 neighbourhood need not follow.
+            known: Contacts to keep apart from the first detection on.
+            free_start: Positions from which the straight motion to the given ones is known to be free, so that only
+                vertices that move otherwise are looked at; None if it is not known.
         """
+        tolerance *= self.length
+        device_start = self._mesh.device_positions(start, "start")
         best: tuple[float, FollowedFrame] | None = None
-        for sweeps in _SWEEPS:
-            target = _displaced(given, displacement)
-            x, is_free = self._moved_apart(start, target)
-            residual = x.astype(np.float64) - target
-            size = np.linalg.norm(residual, axis=1, keepdims=True)
-            unspread = float(size.max(initial=0.0))
-            if is_free and (best is None or unspread < best[0]):
-                best = unspread, FollowedFrame(x, displacement, True)
-                if unspread < tolerance * self.length:
-                    return best[1]
-            largest = _LARGEST_STEP * self.length
-            residual *= np.minimum(1.0, largest / np.maximum(size, largest))
-            displacement = displacement + self._spread_out(residual, sweeps)
+        sweeps = list(_SWEEPS)
+        target = _displaced(given, displacement)
+        x, changed = self._moved_apart(target, known), self._is_movable
+        if free_start is not None:
+            changed = (start != free_start).any(axis=1) | (x.astype(np.float32) != given).any(axis=1)
+        for number in range(_DETECTIONS):
+            x = x.astype(np.float32)
+            contacts, touched = self._contacts(device_start, x, changed)
+            is_free = not touched.any()
+            unspread = float(np.linalg.norm(x.astype(np.float64) - target, axis=1).max(initial=0.0))
+            if is_free:
+                if best is None or unspread < best[0]:
+                    best = unspread, FollowedFrame(x, displacement, True, known)
+                if unspread < tolerance or not sweeps:
+                    break
+            elif not len(contacts.toi):
+                break
+            known = Contacts.joined([known, contacts])
+            last, x = x, self._moved_apart(target, known)
+            while sweeps and (is_free or number == 0):
+                residual = x - target
+                size = np.linalg.norm(residual, axis=1, keepdims=True)
+                if size.max(initial=0.0) < tolerance:
+                    break
+                largest = _LARGEST_STEP * self.length
+                residual *= np.minimum(1.0, largest / np.maximum(size, largest))
+                spread = self._spread_out(residual, sweeps.pop(0))
+                if np.linalg.norm(spread, axis=1).max() > _LEAST_SPREAD * size.max():
+                    displacement = displacement + spread
+                    target = _displaced(given, displacement)
+                    x = self._moved_apart(target, known)
+            changed = touched | (x.astype(np.float32) != last).any(axis=1)
         if best is not None:
             return best[1]
-        x, certified = self._playback.step(start, _displaced(given, displacement))
-        return FollowedFrame(x, displacement, certified)
+        x, certified = self._playback.step(start, x.astype(np.float32))
+        return FollowedFrame(x, displacement, certified, known)
 
-    def _moved_apart(self, start, target) -> tuple[np.ndarray, bool]:
-        """Returns a target at which contacts are moved apart, and whether the motion to it is free of others."""
-        known: list[Contacts] = []
-        x = target
-        for _ in range(_DETECTIONS):
-            contacts, is_free = self._contacts(start, x)
-            if is_free:
-                return x, True
-            known.append(contacts)
-            goal = target.astype(np.float64)
-            x = projected(~self._is_movable, goal, Contacts.joined(known), _PROJECTIONS).astype(np.float32)
-        return x, False
+    def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:
+        """Returns the contacts of which the elements are still near each other at positions, with directions there.
 
-    def _contacts(self, start, target) -> tuple[Contacts, bool]:
-        """Returns the contacts of a motion that can be moved apart, and whether nothing collides or comes too near.
+        Args:
+            contacts: Contacts of a frame.
+            x: The positions at its end, which are free, float32, shape [vertex_count, 3].
+        """
+        contacts = contacts.latest()
+        at = self._mesh.device_positions(x, "x")
+        contacts = self._directed(contacts, at, at)
+        distance = np.einsum(
+            "ik,ikj,ij->i", contacts.weights, x[contacts.vertices].astype(np.float64), contacts.normals
+        )
+        are_near = (distance > 0.0) & (distance < self._min_distance + _REACH * self.length)
+        return replace(contacts, gap=np.minimum(contacts.gap, distance)).rows(are_near)
+
+    def _moved_apart(self, target, known: Contacts) -> np.ndarray:
+        """Returns a target at which contacts are moved apart, float64 unless there are none."""
+        if not len(known.toi):
+            return target
+        return projected(~self._is_movable, target.astype(np.float64), known, _PROJECTIONS, device=self._device)
+
+    def _contacts(self, start: wp.array, target, changed) -> tuple[Contacts, np.ndarray]:
+        """Returns the contacts of a motion that can be moved apart, and which vertices collide or come too near.
 
         Pairs that start too near are left to the stage, which lets them come no nearer. Those of which no vertex is
-        movable do not count.
+        movable do not count, nor do those of which none is changed.
         """
-        found, is_free = [], True
+        end = self._mesh.device_positions(target, "target")
+        found, touched = [], np.zeros(len(target), dtype=bool)
         for detector, gap in self._gaps.items():
-            contacts = as_contacts(detector.mesh, detector.detect(start, target), gap)
+            contacts = as_contacts(detector.mesh, detector.detect(start, end, only=changed), gap)
             contacts = contacts.rows(np.asarray(self._is_movable[contacts.vertices].any(axis=1)))
-            is_free &= not len(contacts.toi)
+            touched[contacts.vertices] = True
             found.append(contacts.rows(contacts.toi > 0.0) if detector.min_distance else contacts)
-        return Contacts.joined(found), is_free
+        return self._directed(Contacts.joined(found), start, end), touched
+
+    def _directed(self, contacts: Contacts, x0: wp.array, x1: wp.array) -> Contacts:
+        """Returns contacts of a motion with the closest points, and the directions between them, a moment before.
+
+        At the time itself the normal of a contact at a border, as of an edge that passes a vertex, may be far from the
+        way that parts the two.
+        """
+        count = len(contacts.toi)
+        if not count:
+            return contacts
+        weights = wp.array(contacts.weights, dtype=wp.vec4d, device=self._device)
+        normals = wp.array(contacts.normals, dtype=wp.vec3d, device=self._device)
+        inputs = [
+            x0,
+            x1,
+            wp.array(contacts.vertices, dtype=wp.vec4i, device=self._device),
+            wp.array(contacts.are_of_edges, dtype=wp.bool, device=self._device),
+            wp.array(contacts.toi, dtype=wp.float64, device=self._device),
+            wp.array(contacts.gap, dtype=wp.float64, device=self._device),
+        ]
+        launch(find_directions, count, inputs=inputs, outputs=[weights, normals], device=self._device)
+        return replace(contacts, weights=weights.numpy(), normals=normals.numpy())
 
     @functools.cached_property
     def _playback(self) -> "Playback":

@@ -12,6 +12,7 @@ from ...usd.points_layer import MovedFrame
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.selection import Selection
+from ..contacts import Contacts
 from ..repair import repair
 from .blend import MARGIN, blend
 from .findings import Finding
@@ -93,7 +94,7 @@ def repair_shot(
         progress: Called with the number of intervals that are done.
 
     Yields:
-        RepairedStretch: The stretches, in order. The moved vertices of one are in memory.
+        RepairedStretch: The stretches, in order. The moved vertices and the contacts of one are in memory.
 
     Raises:
         TypeError: If an argument has another type.
@@ -154,14 +155,16 @@ class _Shot:
         left = []
         start = self._start(first, interval, left)
         sought = [_nonzero(start.displacement)]
-        for frame in self._follow(first, stop, last, start):
+        contacts: dict[int, Contacts] = {}
+        for frame in self._follow(first, stop, last, start, contacts):
             sought.append(_nonzero(frame.displacement))
         stop = min(last, max(stop, first + len(sought) - 1 + MARGIN))
         used, displacements = _joined(sought, stop - first + 1)
         recorder = StretchRecorder(self._mesh)
         frame, number = start, 0
         self._record(recorder, first, start, 0)
-        for number, frame in enumerate(self._follow(first, stop, last, start, used, blend(displacements)), 1):
+        frames = self._follow(first, stop, last, start, contacts, used, blend(displacements))
+        for number, frame in enumerate(frames, 1):
             self._record(recorder, first, frame, number)
         stop = first + number
         is_free = all(finding.is_free for finding in self._findings[max(first, stop - 2 * MARGIN) : stop])
@@ -199,7 +202,8 @@ class _Shot:
             # The same for all stretches of the segment, wherever a run begins.
             x = segment.start_positions
             # The stage works in single precision: near the origin it is finer.
-            self._origin = np.zeros(3) if x.dtype == np.float32 else x.mean(axis=0)
+            self._is_single = x.dtype == np.float32
+            self._origin = np.zeros(3) if self._is_single else x.mean(axis=0)
             self._follower = Follower(
                 segment.faces,
                 self._single(x),
@@ -212,7 +216,7 @@ class _Shot:
 
     def _single(self, x) -> np.ndarray:
         """Returns positions of the scene in single precision, relative to the origin."""
-        return x if x.dtype == np.float32 else (x - self._origin).astype(np.float32)
+        return x if self._is_single else (x - self._origin).astype(np.float32)
 
     def _start(self, first, interval, left) -> ShotFrame:
         """Returns the first frame, repaired if it crosses; adds to ``left`` what still does."""
@@ -236,7 +240,7 @@ class _Shot:
         x = np.asarray(result.x)
         return ShotFrame(given, x, x - given)
 
-    def _follow(self, first, stop, last, start, used=None, displacements=None) -> Iterator[ShotFrame]:
+    def _follow(self, first, stop, last, start, contacts, used=None, displacements=None) -> Iterator[ShotFrame]:
         """Yields the frames of a stretch after its first.
 
         Args:
@@ -244,11 +248,12 @@ class _Shot:
             stop: Number of the interval after the last; more are followed until the shot is reached.
             last: Number of the interval at which the segment ends, or its meshes jump.
             start: The first frame.
+            contacts: Contacts by interval: written while displacements are sought, and known from the start later.
             used: Vertices that are displaced.
             displacements: Their displacements at each frame, shape [frames, n, 3]; None where they are sought, and fade
                 from frame to frame.
         """
-        frame = start
+        frame, known = start, Contacts.none()
         for index in range(first, last):
             if index >= stop and not frame.differs:
                 return
@@ -262,10 +267,22 @@ class _Shot:
                 if index - first + 1 < len(displacements):
                     displacement[used] = displacements[index - first + 1]
             if self._findings[index].is_free and not frame.differs and not displacement.any():
-                frame = ShotFrame.of_shot(given)
+                frame, known = ShotFrame.of_shot(given), Contacts.none()
             else:
-                tolerance = _SOUGHT if displacements is None else _ACCEPTED
-                found = self._follower.follow(frame.x, given, displacement, tolerance=tolerance)
+                if displacements is None:
+                    known, tolerance = self._follower.near(known, frame.x), _SOUGHT
+                else:
+                    known, tolerance = contacts.get(index, Contacts.none()), _ACCEPTED
+                found = self._follower.follow(
+                    frame.x,
+                    given,
+                    displacement,
+                    tolerance=tolerance,
+                    known=known,
+                    free_start=frame.given if self._findings[index].is_free and self._is_single else None,
+                )
+                if displacements is None:
+                    known = contacts[index] = found.contacts
                 added = found.displacement if displacements is None else found.x - given
                 frame = ShotFrame(given, found.x, added.astype(np.float32), found.certified)
             yield frame
