@@ -98,6 +98,25 @@ class Planes:
 
 
 @wp.func
+def _shortfall(x: wp.array[wp.vec3d], planes: Planes, contact: int) -> wp.float64:
+    """Returns how much a contact lacks of its distance, negative where nothing is lacking."""
+    corners = planes.vertices[contact]
+    weights = planes.weights[contact]
+    between = wp.vec3d()
+    for corner in range(4):
+        between += weights[corner] * x[corners[corner]]
+    return planes.gaps[contact] - wp.dot(between, planes.normals[contact])
+
+
+@wp.func
+def _move(planes: Planes, place: int, short: wp.float64) -> wp.vec3d:
+    """Returns the move of a corner that makes up for what its contact lacks, shared with the other corners."""
+    contact = place / 4
+    weight = planes.weights[contact][place % 4]
+    return weight * short * planes.mobilities[contact] * planes.normals[contact]
+
+
+@wp.func
 def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
     """Returns the mean move of a vertex that puts its contacts at their distances, shared with the other corners."""
     total = wp.vec3d()
@@ -108,16 +127,9 @@ def _push(i: int, x: wp.array[wp.vec3d], planes: Planes):
         first = planes.starts[i]
         last = planes.starts[i + 1]
     for k in range(first, last):
-        contact = planes.places[k] / 4
-        corners = planes.vertices[contact]
-        weights = planes.weights[contact]
-        between = wp.vec3d()
-        for corner in range(4):
-            between += weights[corner] * x[corners[corner]]
-        short = planes.gaps[contact] - wp.dot(between, planes.normals[contact])
+        short = _shortfall(x, planes, planes.places[k] / 4)
         if short > _ZERO:
-            weight = weights[planes.places[k] % 4]
-            total += weight * short * planes.mobilities[contact] * planes.normals[contact]
+            total += _move(planes, planes.places[k], short)
             count += _ONE
     return total / wp.max(count, _ONE)
 
@@ -130,14 +142,9 @@ def find_shortfalls(
     # out
     shortfalls: wp.array[wp.float64],
 ):
-    """Writes how much each contact lacks of its distance, negative where nothing is lacking."""
+    """Writes how much each contact lacks of its distance."""
     i = wp.tid()
-    corners = planes.vertices[i]
-    weights = planes.weights[i]
-    between = wp.vec3d()
-    for corner in range(4):
-        between += weights[corner] * x[corners[corner]]
-    shortfalls[i] = planes.gaps[i] - wp.dot(between, planes.normals[i])
+    shortfalls[i] = _shortfall(x, planes, i)
 
 
 @wp.kernel
@@ -154,11 +161,9 @@ def move_apart(
     total = wp.vec3d()
     count = _ZERO
     for k in range(planes.starts[i], planes.starts[i + 1]):
-        contact = planes.places[k] / 4
-        short = shortfalls[contact]
+        short = shortfalls[planes.places[k] / 4]
         if short > _ZERO:
-            weight = planes.weights[contact][planes.places[k] % 4]
-            total += weight * short * planes.mobilities[contact] * planes.normals[contact]
+            total += _move(planes, planes.places[k], short)
             count += _ONE
     x[vertices[i]] += total / wp.max(count, _ONE)
 
