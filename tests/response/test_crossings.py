@@ -198,7 +198,7 @@ def test_cloth_on_a_roller_without_common_vertices(device):
     solver.step = step_and_turn
     rollout = Rollout(model, bsc.SolverCCD(solver, friction=0.8))
     touched = 0
-    for k in range(20):
+    for k in range(30):
         x, y, z = np.transpose(points)
         c, s = np.cos(0.02 * (k + 1)), np.sin(0.02 * (k + 1))
         turned = np.float32(np.stack([c * x + s * z, y, c * z - s * x], axis=1))

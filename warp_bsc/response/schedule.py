@@ -4,7 +4,7 @@ What a world does after the ``n``-th detection of a step, counted from 0, which 
 The first detection tells slow worlds from fast ones::
 
                      slow contacts only              a fast, pushing or body contact
-    n = 0            project                         project
+    n = 0            project, divide proximities     project
     n = 1 .. 39      divide (recorded: project)      project, target widened 1.25 times each n, at most 5 times
     n = 40 .. 71     divide                          divide (both recorded: truncate, n = 40 .. 47)
     then             freeze what still collides
@@ -49,6 +49,8 @@ MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
+MAX_PASSES = wp.constant(6)
+"""Passes over dividing planes in each division: layers that fall together by more than they are apart need several."""
 MAX_CUTS = wp.constant(64)
 """Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
 MAX_TRUNCATIONS = wp.constant(8)
@@ -56,12 +58,9 @@ MAX_TRUNCATIONS = wp.constant(8)
 MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
 """Sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one active
 set, after which the device checks whether a constraint is still active."""
-SLOW_POSITION_SWEEPS, SLOW_VELOCITY_SWEEPS = 4, 24
-"""Sweeps over constraints that move no body in worlds without fast contacts: division resolves what they leave.
-
-Few on positions, which know nothing of elasticity: in a pile they stretch layers, which then spring back. Many on
-velocities, as each passes an impulse on by a layer.
-"""
+SLOW_POSITION_SWEEPS = 4
+"""Sweeps on positions over constraints that move no body in worlds without fast contacts: division resolves what they
+leave. Velocities need more, as a sweep passes an impulse on by a layer."""
 MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
 """Sweeps of a step: one ahead of the detection, those of all iterations, and those on velocities."""
 _WIDENING = wp.constant(wp.float64(1.25))
@@ -84,7 +83,9 @@ class Loop(IntEnum):
     NEWLY_FROZEN = 5  # vertices and bodies that this iteration froze
     MORE_SWEEPS = 6  # 1 while another batch of sweeps is needed
     SWEEP = 7  # sweeps so far
-    CUTTING = 8  # 1 while tetrahedra invert, and paths are to be cut again
+    PASS = 8  # passes over dividing planes so far
+    MORE_PASSES = 9  # 1 while another is needed
+    CUTTING = 10  # 1 while tetrahedra invert, and paths are to be cut again
 
 
 class Detection(IntEnum):
@@ -146,7 +147,6 @@ class SolveStatus:
     max_slow_iterations: int
     max_truncations: int  # or divisions
     slow_position_sweeps: int
-    slow_velocity_sweeps: int
 
 
 def single_elements(values: wp.array) -> list[wp.array]:
@@ -176,7 +176,6 @@ def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, reco
     status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
     status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
     status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
-    status.slow_velocity_sweeps = int(MAX_SWEEPS) if recorded else SLOW_VELOCITY_SWEEPS
     return status
 
 
@@ -207,21 +206,12 @@ def is_dividing(status: SolveStatus, world: int, iteration: int) -> bool:
 
 
 @wp.func
-def divides_all_proximities(status: SolveStatus) -> bool:
-    """Returns whether all proximities are divided in this iteration, also where that stops what moves together."""
-    return status.loop[Loop.ITERATION] - 1 == status.max_slow_iterations
-
-
-@wp.func
 def divides_proximities(status: SolveStatus, world: int) -> bool:
-    """Returns whether proximities of a world without fast contacts are divided in this iteration, as contacts are.
-
-    Those at rest are divided after the last projection, and all of them in the next iteration, if contacts are left.
-    """
-    last = status.loop[Loop.ITERATION] - 1
-    if status.contact_iteration[world] != last or status.is_fast[world] == 1:
+    """Returns whether this iteration, after its projection, divides proximities of a world without fast contacts."""
+    iteration = status.loop[Loop.ITERATION]
+    if status.contact_iteration[world] != iteration - 1 or status.is_fast[world] == 1:
         return False
-    return last == status.max_slow_iterations - 1 or divides_all_proximities(status)
+    return iteration == status.max_slow_iterations
 
 
 @wp.func
@@ -229,6 +219,16 @@ def is_projecting(status: SolveStatus, world: int) -> bool:
     """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
     iteration = status.loop[Loop.ITERATION]
     return status.contact_iteration[world] == iteration - 1 and not is_dividing(status, world, iteration - 1)
+
+
+@wp.func
+def is_divided(status: SolveStatus, world: int) -> bool:
+    """Returns whether this iteration divides elements of a world, at first after its last projection.
+
+    A world without contacts stays as it is.
+    """
+    iteration = status.loop[Loop.ITERATION]
+    return status.contact_iteration[world] == iteration - 1 and is_dividing(status, world, iteration)
 
 
 @wp.func

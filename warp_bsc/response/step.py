@@ -105,14 +105,14 @@ def _iterate_cuts(work, dt):
 
 
 def _cut_paths(work):
-    work.launch_over_particles(division.truncate_before_inversions, work.tetrahedra, work.status)
+    work.launch_over_particles(division.truncate_before_inversions, work.tetrahedra, work.dividing, work.status)
     find_inversions(work)
     work.launch(decide_cut, 1, [False, work.status])
 
 
-def add_proximities(work: Workspace) -> None:
+def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
     """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
-    wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
+    wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work, in_substeps=in_substeps)
 
 
 def prepare(work: Workspace) -> None:

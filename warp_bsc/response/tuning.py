@@ -10,8 +10,8 @@ TOLERANCE = 0.1
 SLOW_PATH = wp.constant(wp.float64(0.5))
 """Longest path of slow elements, as a share of their shortest side."""
 RESTING_PATH = wp.constant(wp.float64(4.0))
-"""Longest path of proximities at rest, in separations. Dividing planes do not move: they would stop pairs that travel
-together and part pairs that slide."""
+"""Longest path of proximities at rest, in separations: they are projected, so that friction holds them in place, others
+are divided alone."""
 RECOVERY = wp.constant(wp.float64(0.25))
 """Most that the distance of slow elements grows in a step, as a share of their longest path: elements that are pushed
 apart further than they fall in a step hop, and slide meanwhile."""
@@ -64,6 +64,11 @@ MARGIN = wp.constant(wp.float64(0.2))
 """Least distance from a dividing plane after projection, as a share of the elements' distance at the start."""
 CLOSE_MARGIN = wp.constant(wp.float64(0.45))
 """The same of elements so close that they may hardly come nearer, step after step: positions are rounded."""
+CLOSE_TOGETHER = wp.constant(wp.float64(2.0))
+"""Their distance in separations at most. With less, a pile becomes so dense that many layers are near each other."""
+FAR_APART = wp.constant(wp.float64(4.0))
+"""Distance at the start, in separations, from which on margins are the same: elements that fall on each other come near
+in the first step, and contacts change only velocities of pairs that are."""
 SLACK = wp.constant(wp.float64(0.05))
 """How much farther than that both are from the plane at the start at least, as a share of their distance."""
 WEDGE = wp.constant(wp.float64(4.0))

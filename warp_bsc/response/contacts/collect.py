@@ -15,7 +15,7 @@ from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from . import constraints, rules
 from .constraints import TOUCH
-from .dividing_planes import add_dividing_plane, add_plane
+from .dividing_planes import add_dividing_plane, add_solid
 from .first_contact import update_first_contact
 from .queue import PairQueue, has_pair, vertices_of
 from .rules import ContactClass
@@ -162,7 +162,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             offset = plane[3] + kept + wp.min(wp.float64(2.0) * error_after, margin)
             if kept < ZERO:
                 offset = plane[3] + kept - PLANE_DEPTH * separation
-            add_plane(dividing, wp.vec4i(vertex, -1, -1, -1), 1, added.normal, offset, margin, ZERO)
+            add_solid(motion, dividing, vertex, added.normal, offset, float(margin))
             added.multiplier = TOUCH * added.normal
         else:
             status.loop[Loop.PROJECTING] = 1
@@ -229,7 +229,7 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
         count_contact(status, world)
         mark_changed(vertices, corners)
         if iteration == 0:
-            # dividing planes do not move: they would stop a body that takes along what it pushes
+            # dividing planes do not follow bodies: they would stop one that takes along what it pushes
             moves = added.pace == Pace.FAST or rules.are_on_body(motion, corners)
             if moves or constraints.is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
                 status.is_fast[world] = 1
@@ -240,7 +240,7 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
             update_first_contact(vertices, corners[j], toi, added.kind, i)
         if not dividing.first:
             return
-        add_dividing_plane(step, corners, kind, added.min_distance, dividing, True, True)
+        add_dividing_plane(step, corners, kind, added.min_distance, dividing, True)
         added.multiplier = TOUCH * added.normal
     else:
         if not near:

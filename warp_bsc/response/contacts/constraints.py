@@ -15,6 +15,8 @@ from .rules import are_on_body, inverse_mass_of
 TOUCH = wp.constant(wp.float64(1e-100))
 """Position multiplier of contacts that are divided [kg m]: it moves nothing, but lets them change velocities. It is the
 smallest push rather than a flag, because velocities and angular momentum treat these contacts as those that pushed."""
+NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
+"""Separation of a constraint that no motion violates, so that it never acts [m]."""
 NEVER_SWEPT = wp.constant(-2)
 """Last sweep of a constraint that was never active: no sweep comes right after it."""
 

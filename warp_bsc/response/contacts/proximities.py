@@ -7,12 +7,13 @@ from ...detection.launch import retry_until_fits
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ..schedule import SolveStatus, is_projecting
+from ..schedule import Loop, SolveStatus, is_dividing, is_projecting
 from ..state.structs import ContactKind, Pace, Step
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import BEHIND, REACH, RESTING_PATH
 from . import constraints
+from .closest import closest_vector
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
 from .rules import ContactClass, are_occluded, are_on_body, crossed_at_start, owner_of
 
@@ -122,6 +123,28 @@ def collect_proximities(
 
 
 @wp.kernel
+def disable_contacts_behind(step: Step, kept: wp.array[int], nearest: wp.array2d[float], status: SolveStatus):
+    """Disables constraints for slow contacts of elements with another face between them at the start.
+
+    What falls by more than the layers of a stack are apart would collide with many of them, but meets only the nearest.
+    If it still collides with others after the projection, planes divide them.
+    """
+    i = wp.tid()
+    added = step.constraints
+    if i >= kept[0] or added.pace[i] != Pace.SLOW or added.kind[i] >= ContactKind.PLANE:
+        return
+    corners = added.vertices[i]
+    world = step.motion.world[corners[0]]
+    if status.crossings[world] > 0 or not is_dividing(status, world, status.loop[Loop.ITERATION]):
+        return
+    kind = constraints.kind_of_pair(added.kind[i])
+    _weights, between = closest_vector(step.motion, corners, kind)
+    distance = wp.length(between)
+    if distance > ZERO and _is_behind(corners, kind, between / distance, distance, nearest):
+        added.separation[i] = constraints.NEVER_VIOLATED
+
+
+@wp.kernel
 def drop_proximities(
     step: Step, kept: wp.array[int], needed: int, counts: wp.array[wp.int64], capacities: wp.array[wp.int64]
 ):
@@ -134,8 +157,11 @@ def drop_proximities(
         count[0] = kept[0]
 
 
-def add_proximities(work: Workspace) -> None:
-    """Adds constraints for proximities, in worlds that have contacts; in a CUDA graph none if not all fit."""
+def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
+    """Adds constraints for proximities, in worlds that have contacts; in a CUDA graph none if not all fit.
+
+    Contacts behind other faces keep their constraints ``in_substeps``, which are not detected one by one.
+    """
     detector, nearest = work.detector, work.nearest
     retry_until_fits(detector.find_candidates, detector, work.device)
     wp.copy(work.kept, work.constraints.count)
@@ -145,6 +171,8 @@ def add_proximities(work: Workspace) -> None:
         if nearest is not None:
             nearest.fill_(np.inf)
             work.launch_over(find_nearest, counted(queues[:1]), [work.step, queues[0], nearest])
+            if not in_substeps:
+                work.launch_over_constraints(disable_contacts_behind, work.kept, nearest, work.status)
         inputs = [work.step, *queues, nearest, work.status]
         work.launch_over(collect_proximities, counted(queues), inputs)
 

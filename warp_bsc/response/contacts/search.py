@@ -65,7 +65,7 @@ def _resolve(
     if found != ContactClass.OURS:
         return
     count_contact(arguments.status, arguments.step.motion.world[corners[0]])
-    add_dividing_plane(arguments.step, corners, kind, min_distance, arguments.dividing, True, True)
+    add_dividing_plane(arguments.step, corners, kind, min_distance, arguments.dividing, True)
     mark_changed(arguments.step.vertices, corners)
     for j in range(4):
         update_first_contact(arguments.step.vertices, corners[j], toi, ContactKind.NONE, 0)

@@ -8,23 +8,24 @@ start. Paths of vertices are also cut before a tetrahedron of theirs inverts, wh
 import warp as wp
 
 from ..contacts import first_contact
-from ..contacts.constraints import TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
+from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
 from ..contacts.dividing_planes import add_dividing_plane, has_planes
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.queue import PairQueue, queues_of, vertices_of
-from ..schedule import Loop, Result, SolveStatus, divides_all_proximities, divides_proximities, is_freezing
+from ..schedule import Loop, Result, SolveStatus, divides_proximities, is_divided, is_freezing
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
 from ..state.structs import (
+    CUT_SHORT,
     DIVIDED,
     FROZEN,
     NEVER,
+    NOT_PLACED,
     PROJECTED,
     TRUNCATED,
     UNCONSTRAINED,
     ContactKind,
     DividingPlanes,
-    Pace,
     Step,
     Tetrahedra,
 )
@@ -32,17 +33,17 @@ from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
 from ..tuning import CUT, SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
-from .sides import position_on_sides, share_of_path
+from .moving_planes import begin_passes, move_to_sides, place_planes, want
+from .sides import share_of_path
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
 def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus):
-    """Adds dividing planes for proximities, see :func:`.schedule.divides_proximities`.
+    """Adds dividing planes for proximities, of which those of vertices and faces then may change velocities.
 
     In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
-    A constraint whose elements would meet changes velocities too.
     """
     i = wp.tid()
     constraints, outcome = step.constraints, step.vertices.outcome
@@ -54,12 +55,10 @@ def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus
     corners = constraints.vertices[i]
     if not divides_proximities(status, step.motion.world[corners[0]]) or moves_body(step, i):
         return
-    all_pairs = divides_all_proximities(status)
-    if not all_pairs and constraints.pace[i] != Pace.RESTING:
+    if constraints.separation[i] == NEVER_VIOLATED:
         return
-    kept = min_distance_of(step, i)
-    meets = add_dividing_plane(step, corners, kind_of_pair(kind), kept, dividing, False, all_pairs)
-    if meets and not has_pushed(step, i):
+    divided = add_dividing_plane(step, corners, kind_of_pair(kind), min_distance_of(step, i), dividing, False)
+    if divided and kind == ContactKind.VERTEX_FACE_PROXIMITY and not has_pushed(step, i):
         constraints.position_multiplier[i] = TOUCH * constraints.normal[i]
         for j in range(4):
             if step.motion.inverse_mass[corners[j]] > 0.0:
@@ -179,31 +178,35 @@ def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQue
 
 
 @wp.func
-def _keep_on_sides(step: Step, dividing: DividingPlanes, vertex: int):
-    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided.
-
-    One without a new plane is there, as no projection follows the first planes of its world.
-    """
-    vertices = step.vertices
-    first = dividing.first[vertex]
-    if step.motion.inverse_mass[vertex] == 0.0 or first < 0 or first == dividing.kept[vertex]:
-        return
-    dividing.kept[vertex] = first
-    x1 = vertices.x1[vertex]
-    end, truncated = position_on_sides(dividing, vertex, step.motion.x0[vertex], x1)
-    if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
-        vertices.x1[vertex] = end
-        vertices.changed[vertex] = 1
-        vertices.outcome[vertex] = vertices.outcome[vertex] | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+def _divided(dividing: DividingPlanes, vertex: int, outcome: int) -> int:
+    """Returns the outcome of a vertex that ends where it has reached."""
+    return outcome | wp.where(dividing.placed[vertex] == CUT_SHORT, DIVIDED | TRUNCATED, DIVIDED)
 
 
 @wp.func
-def _freeze_vertex(step: Step, vertex: int):
+def _keep_on_sides(step: Step, dividing: DividingPlanes, status: SolveStatus, vertex: int):
+    """Moves a vertex without a contact onto its sides, so that it comes into no element while others are divided."""
+    vertices = step.vertices
+    if dividing.first[vertex] < 0 or dividing.placed[vertex] == NOT_PLACED:
+        return
+    if step.motion.inverse_mass[vertex] == 0.0 or not is_divided(status, step.motion.world[vertex]):
+        return
+    x1 = vertices.x1[vertex]
+    end = dividing.reached[vertex]
+    if end[0] != x1[0] or end[1] != x1[1] or end[2] != x1[2]:
+        vertices.x1[vertex] = end
+        vertices.changed[vertex] = 1
+        vertices.outcome[vertex] = _divided(dividing, vertex, vertices.outcome[vertex])
+
+
+@wp.func
+def _freeze_vertex(step: Step, dividing: DividingPlanes, vertex: int):
     """Puts a vertex back to its start, without velocity."""
     vertices = step.vertices
     vertices.x1[vertex] = step.motion.x0[vertex]
     vertices.velocity[vertex] = wp.vec3()
     vertices.outcome[vertex] = vertices.outcome[vertex] | FROZEN
+    want(dividing, vertex, step.motion.x0[vertex])
 
 
 @wp.kernel
@@ -226,7 +229,7 @@ def truncate_vertices(
     packed = vertices.first_contact[vertex]
     if packed == NEVER:
         if dividing.first:
-            _keep_on_sides(step, dividing, vertex)
+            _keep_on_sides(step, dividing, status, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
@@ -239,19 +242,20 @@ def truncate_vertices(
         _record_truncation(step, vertex, -1, cuts, packed, vertex_face, edge_edge, record)
     vertices.changed[vertex] = 1
     if not cuts:
-        _freeze_vertex(step, vertex)
+        _freeze_vertex(step, dividing, vertex)
         wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     x0 = motion.x0[vertex]
     end = vertices.x1[vertex]
     divides, complete = has_planes(dividing, vertex)
     if divides:
-        end, truncated = position_on_sides(dividing, vertex, x0, end)
-        outcome = outcome | wp.where(truncated, DIVIDED | TRUNCATED, DIVIDED)
+        end = dividing.reached[vertex]
+        outcome = _divided(dividing, vertex, outcome)
     if not complete:
         path = first_contact.truncated_path(to_double(x0), to_double(end), first_contact.contact_time(packed))
         end = to_single(to_double(x0) + path)
         outcome = outcome | TRUNCATED
+        want(dividing, vertex, end)
         if not divides:
             vertices.velocity[vertex] = to_single(path / dt)
     if divides and first_contact.contact_kind(packed) == ContactKind.NONE:
@@ -262,7 +266,7 @@ def truncate_vertices(
 
 
 @wp.kernel
-def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, status: SolveStatus):
+def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, dividing: DividingPlanes, status: SolveStatus):
     """Truncates the path of each particle before the first inversion of a tetrahedron of its, or freezes it.
 
     In one sweep no path becomes shorter than by CUT: others are cut as well, and may then leave enough space.
@@ -277,12 +281,13 @@ def truncate_before_inversions(step: Step, tetrahedra: Tetrahedra, status: Solve
         return
     vertices.changed[particle] = 1
     if is_freezing(status):
-        _freeze_vertex(step, particle)
+        _freeze_vertex(step, dividing, particle)
         wp.atomic_add(status.loop, int(Loop.NEWLY_FROZEN), 1)
         return
     x0 = to_double(motion.x0[particle])
     share = wp.max(SHARE_OF_PATH * first_contact.contact_time(packed), CUT)
     vertices.x1[particle] = to_single(x0 + share * (to_double(vertices.x1[particle]) - x0))
+    want(dividing, particle, vertices.x1[particle])
     vertices.outcome[particle] = outcome | TRUNCATED
 
 
@@ -317,12 +322,12 @@ def record_body_truncations(step: Step, vertex_face: PairQueue, edge_edge: PairQ
 
 
 @wp.kernel
-def freeze_undetected(step: Step, particles: int, bodies: int, status: SolveStatus):
+def freeze_undetected(step: Step, dividing: DividingPlanes, particles: int, bodies: int, status: SolveStatus):
     """Freezes all particles and bodies if the last detection was incomplete; thread i has one of each."""
     i = wp.tid()
     undetected = status.results[Result.UNDETECTED] == 1
     if i < particles and undetected and step.motion.inverse_mass[i] > 0.0:
-        _freeze_vertex(step, i)
+        _freeze_vertex(step, dividing, i)
     if i < bodies:
         frozen = undetected and step.motion.bodies.inverse_mass[i] > 0.0
         step.vertices.bodies.moved[i] = wp.where(frozen, 1, 0)
@@ -336,6 +341,9 @@ def divide(work: Workspace, dt: float) -> None:
     contacts, changed = queues_of(work.detector)[:2], [work.dividing, work.status]
     if not work.differentiable:
         work.launch_over_constraints(divide_proximities, *changed)
+        particles, worlds = work.particle_count, work.worlds
+        work.launch(begin_passes, max(particles, worlds), [work.step, work.dividing, particles, worlds, work.status])
+        wp.capture_while(work.loop[Loop.MORE_PASSES], _pass_over_planes, work=work)
     work.launch_over_particles(truncate_vertices, *contacts, *changed, work.record, dt)
     work.launch_over_shape_vertices(find_body_shares, *changed, work.record)
     if work.recorder is not None:
@@ -344,8 +352,13 @@ def divide(work: Workspace, dt: float) -> None:
     work.launch_over_shape_vertices(place_vertices)
 
 
+def _pass_over_planes(work):
+    work.launch_over_planes(place_planes, work.dividing, work.status)
+    work.launch_over_particles(move_to_sides, work.dividing, work.tolerance, work.status)
+
+
 def freeze_if_undetected(work: Workspace) -> None:
     """Freezes everything if the last detection was incomplete: a recorded step whose CUDA graph is too small."""
     particles, bodies = work.particle_count, work.body_count
-    work.launch(freeze_undetected, max(particles, bodies), [work.step, particles, bodies, work.status])
+    work.launch(freeze_undetected, max(particles, bodies), [work.step, work.dividing, particles, bodies, work.status])
     work.launch_over_shape_vertices(place_vertices)

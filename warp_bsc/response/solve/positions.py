@@ -28,23 +28,29 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, i: int):
+def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, in_substep: bool, i: int):
     """Adds a constraint to the active set for positions, if it is violated, or may pull something back.
 
-    Constraints met within the tolerance cost nothing, and move nothing. Nor do edges at rest near each other where
-    planes divide them afterwards, unless they are too near: a stack has four times as many as of vertices and faces,
-    which hold it as well.
+    Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities that planes divide
+    afterwards, but for those at rest, which friction holds in place, and in substeps, which planes follow only at their
+    end: projection knows nothing of elasticity, and in a stack it stretches layers, which then spring back. Edges at
+    rest near each other are left to planes too, unless they are too near: a stack has four times as many as of vertices
+    and faces, which hold it as well.
     """
     motion, constraints = step.motion, step.constraints
     corners = constraints.vertices[i]
     world = motion.world[corners[0]]
-    resting_edges = constraints.kind[i] == ContactKind.EDGE_EDGE_PROXIMITY and constraints.pace[i] == Pace.RESTING
-    if resting_edges and is_dividing(status, world, status.loop[Loop.ITERATION]):
-        kept = min_distance_of(step, i)
-        start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
-        if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
-            return
-    past = status.loop[Loop.SWEEP] >= sweeps.max_sweeps(step, status, i, status.slow_position_sweeps)
+    kind = constraints.kind[i]
+    if kind > ContactKind.PLANE and is_dividing(status, world, status.loop[Loop.ITERATION]):
+        if constraints.pace[i] != Pace.RESTING:
+            if not in_substep:
+                return
+        elif kind == ContactKind.EDGE_EDGE_PROXIMITY:
+            kept = min_distance_of(step, i)
+            start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
+            if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
+                return
+    past = status.loop[Loop.SWEEP] >= sweeps.max_position_sweeps(step, status, i)
     if past or not is_projecting(status, world):
         return
     normal = constraints.normal[i]
@@ -71,11 +77,11 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
 
 
 @wp.kernel
-def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64):
+def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, in_substep: bool):
     """Fills the active set for positions."""
     i = wp.tid()
     if i < step.constraints.count[0]:
-        _activate_constraint(step, status, tolerance, i)
+        _activate_constraint(step, status, tolerance, in_substep, i)
 
 
 @wp.func
@@ -84,7 +90,7 @@ def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, pla
     vertices, constraints = step.vertices, step.constraints
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    momentum = sweeps.momentum_of(step, status, i, status.slow_position_sweeps)
+    momentum = sweeps.momentum_of(step, status, i, sweeps.max_position_sweeps(step, status, i))
     if pushes_only:
         violated = gap(step, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
@@ -134,17 +140,17 @@ def _sweep(
     record: StepRecord,
     particle_count: int,
     tolerance: wp.float64,
-    begins_moved: bool,
+    in_substep: bool,
     batches: int,
     sweeps_per_batch: int,
     threads: int,
 ):
     """Makes batches of sweeps in one launch, see :mod:`.cluster`.
 
-    With ``begins_moved``, multipliers have moved vertices before the first sweep.
+    With ``in_substep``, multipliers have moved vertices before the first sweep.
     """
     thread = wp.tid()
-    if begins_moved:
+    if in_substep:
         for vertex in range(thread, particle_count, threads):
             _update_vertex(step, status, record, True, vertex)
         wait_for_others()
@@ -156,7 +162,7 @@ def _sweep(
     batch = int(0)
     while more == 1 and batch < batches:
         for i in range(thread, count, threads):
-            _activate_constraint(step, status, tolerance, i)
+            _activate_constraint(step, status, tolerance, in_substep, i)
         wait_for_others()
         active_count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
@@ -170,21 +176,22 @@ def _sweep(
         batch += 1
 
 
-def project(work: Workspace, tolerance: float = 1.0, *, begins_moved: bool = False) -> None:
+def project(work: Workspace, tolerance: float = 1.0, *, in_substep: bool = False) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met.
 
     Args:
         work: The workspace.
         tolerance: Share of the tolerance of a whole step.
-        begins_moved: Whether the constraints begin with multipliers, whose sums have still to move vertices and bodies.
+        in_substep: Whether this is one of the substeps of a step, whose constraints begin with multipliers: their sums
+            have still to move vertices and bodies.
     """
     if work.sweeping_threads:
         batches = int(MAX_SWEEPS) // int(SWEEPS_PER_BATCH)
-        work.sweep_at_once(_sweep, [tolerance * work.tolerance, begins_moved, batches, int(SWEEPS_PER_BATCH)])
+        work.sweep_at_once(_sweep, [tolerance * work.tolerance, in_substep, batches, int(SWEEPS_PER_BATCH)])
         return
-    if begins_moved:
+    if in_substep:
         _update(work, last=True)
-    work.repeat_sweeps(lambda: _activate(work, tolerance), project_positions, _update)
+    work.repeat_sweeps(lambda: _activate(work, tolerance, in_substep), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -197,11 +204,12 @@ def _leave_planes(work):
         work.sweep_at_once(_sweep, [work.tolerance, False, 1, 1])
         return
     work.launch(start_sweeps, 1, [work.status])
-    work.sweep(1, lambda: _activate(work, 1.0), project_positions, _update)
+    work.sweep(1, lambda: _activate(work, 1.0, False), project_positions, _update)
 
 
-def _activate(work, tolerance):
-    work.launch_over_constraints(activate_position_constraints, work.status, tolerance * work.tolerance)
+def _activate(work, tolerance, in_substep):
+    inputs = [work.status, tolerance * work.tolerance, in_substep]
+    work.launch_over_constraints(activate_position_constraints, *inputs)
 
 
 def _update(work, last):

@@ -1,12 +1,4 @@
-"""Projects vertices onto their sides of dividing planes, which keep elements apart that sweeps left in contact.
-
-If one fixed direction separates two elements at the start of a step and at its end, on the same side, it separates them
-at all times of a linear motion. A plane lies across the shortest vector between two elements at the start, and each of
-their vertices is projected onto its side. The start of every vertex is on its sides, so that a solution exists for all
-pairs at once, and each vertex finds it by itself. Elements that slide along a plane go on sliding.
-
-After the last projection, proximities at rest get planes, but no pair that moves or turns together without meeting: a
-plane does not move, and would stop it. If contacts are left, they get planes, and so do all proximities.
+"""Projects a vertex onto its sides of dividing planes, which :mod:`.moving_planes` places.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
@@ -24,6 +16,8 @@ wp.set_module_options({"enable_backward": False})
 
 _PARALLEL = wp.constant(wp.float64(1.0e-14))
 """Squared sine up to which a normal counts as one within the span of others."""
+_ROUNDING = wp.constant(wp.float64(1.0e-6))
+"""Share by which a path to the nearest point may exceed the one to a point that is as near."""
 _SMALLEST = wp.constant(float(2.0**-149))
 """The smallest number in single precision."""
 
@@ -197,9 +191,9 @@ def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
 def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: wp.vec3d) -> wp.float64:
     """Returns how far from the end of its path planes may take a vertex [m]: as far as it is from the start.
 
-    The start is in the convex region above the planes, so that the nearest point of that region is no farther. Planes
-    that move, and cannot be moved, may have passed the start: then what lies between is added, and some more, as planes
-    that are nearly parallel meet far away.
+    The start is in the convex region above the planes, so that the nearest point of that region is no farther, except
+    for rounding. Planes that nothing can move may have passed the start: then what lies between is added, and some
+    more, as planes that are nearly parallel meet far away.
     """
     below = ZERO
     node = planes.first[vertex]
@@ -207,14 +201,14 @@ def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: 
         normal, least, margin = _half_space(planes, node)
         below = wp.max(below, least + margin - wp.dot(normal, start))
         node = planes.next[node]
-    return wp.length(end - start) + WEDGE * below
+    return (ONE + _ROUNDING) * wp.length(end - start) + WEDGE * below
 
 
 @wp.func
 def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.vec3):
     """Returns an end of a vertex's path above all of its planes, near to ``x1``, and whether the path was cut for that.
 
-    Where projection does not find one, the path is cut; where rounding leaves none, it ends at ``x0``.
+    Where projection does not find one, the way from ``x0`` is cut; where rounding leaves none, it ends there.
     """
     predicted = to_double(x1)
     if _is_above(planes, vertex, predicted):
@@ -229,8 +223,20 @@ def position_on_sides(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.v
     end = _rounded(planes, vertex, x)  # elements may be nearer to each other than their coordinates are precise
     if _is_above(planes, vertex, to_double(end)):
         return end, False
-    x = to_double(end)
-    end = to_single(start + share_of_path(planes, vertex, start, x) * (x - start))
+    return position_on_way(planes, vertex, x0, end), True
+
+
+@wp.func
+def position_on_way(planes: DividingPlanes, vertex: int, x0: wp.vec3, x1: wp.vec3) -> wp.vec3:
+    """Returns how far a way is above all planes of a vertex: an end of it, or ``x0`` where rounding leaves none."""
+    start = to_double(x0)
+    way = to_double(x1) - start
+    share = share_of_path(planes, vertex, start, start + way)
+    if share == ZERO:
+        return x0
+    if share == ONE:
+        return x1
+    end = to_single(start + share * way)
     if _is_above(planes, vertex, to_double(end)):
-        return end, True
-    return x0, True
+        return end
+    return x0

@@ -148,19 +148,22 @@ def activate(step: Step, i: int):
 
 
 @wp.func
-def max_sweeps(step: Step, status: SolveStatus, i: int, slow: int) -> int:
-    """Returns the most sweeps of a constraint: ``slow`` if it moves no body, and its world has no fast contacts."""
+def max_position_sweeps(step: Step, status: SolveStatus, i: int) -> int:
+    """Returns the most sweeps of a constraint on positions: few if it moves no body in a world without fast contact."""
     world = step.motion.world[step.constraints.vertices[i][0]]
-    return wp.where(status.is_fast[world] == 1 or moves_body(step, i), MAX_SWEEPS, slow)
+    return wp.where(status.is_fast[world] == 1 or moves_body(step, i), MAX_SWEEPS, status.slow_position_sweeps)
 
 
 @wp.func
-def momentum_of(step: Step, status: SolveStatus, i: int, slow: int) -> wp.float64:
-    """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep."""
+def momentum_of(step: Step, status: SolveStatus, i: int, most: int) -> wp.float64:
+    """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep.
+
+    That is the one after which there were the ``most`` sweeps.
+    """
     sweep = status.loop[Loop.SWEEP]
     last = step.constraints.last_sweep[i]
     step.constraints.last_sweep[i] = sweep
-    if last != sweep - 1 or sweep == max_sweeps(step, status, i, slow) - 1:
+    if last != sweep - 1 or sweep == most - 1:
         return ZERO
     return wp.float64(float(sweep) / float(sweep + 3))
 

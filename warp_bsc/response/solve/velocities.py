@@ -3,7 +3,7 @@
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
-from ..schedule import SWEEPS_PER_BATCH, Loop, SolveStatus, begin_sweeps
+from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, Loop, SolveStatus, begin_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
 from ..state.structs import Step, has_final_velocity
@@ -58,8 +58,6 @@ def initialize_velocity_multipliers(step: Step, dt: wp.float64):
 def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, dt: wp.float64, i: int):
     """Adds a constraint to the active set, if it pushed, and its contact points are still near each other."""
     constraints = step.constraints
-    if status.loop[Loop.SWEEP] >= sweeps.max_sweeps(step, status, i, status.slow_velocity_sweeps):
-        return
     multiplier = constraints.velocity_multiplier[i]
     if wp.length_sq(multiplier) == ZERO:
         if not has_pushed(step, i) or gap(step, i) > constraints.separation[i] - min_distance_of(step, i):
@@ -89,7 +87,7 @@ def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, pla
     """Updates the velocity multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
     i = constraints.active_set[place]
-    momentum = sweeps.momentum_of(step, status, i, status.slow_velocity_sweeps)
+    momentum = sweeps.momentum_of(step, status, i, MAX_SWEEPS)
     multiplier = sweeps.velocity_multiplier_after(step, i)
     old = constraints.velocity_multiplier[i]
     new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)

@@ -26,7 +26,7 @@ class Pace(IntEnum):
 
     FAST = 0
     SLOW = 1  # one direction holds for the whole step
-    RESTING = 2  # of slow proximities at rest, which are divided before the next detection
+    RESTING = 2  # of slow proximities at rest, which are projected before they are divided
 
 
 PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
@@ -218,24 +218,34 @@ def has_final_velocity(outcome: int) -> bool:
 
 NO_NODE = wp.constant(-1)
 """In place of a node: the end of a list."""
+NOT_PLACED, PLACED, CUT_SHORT = (wp.constant(i) for i in (0, 1, 2))
+"""Of a vertex: it has no wanted end; it has one; in the last pass rounding left it no position above its planes but on
+its way there."""
 
 
 @wp.struct
 class DividingPlanes:
     """Planes that vertices stay above or below, and a list for each vertex of those that concern it.
 
-    The nodes of lists are numbered ``4 plane + corner``, as the planes of two elements have four vertices.
+    The nodes of lists are numbered ``4 plane + corner``, as the planes of two elements have four vertices. These planes
+    move, see :mod:`.solve.moving_planes`.
     """
 
     count: wp.array[int]  # of planes, whether they fit or not
+    vertices: wp.array[wp.vec4i]  # of both elements, -1 for none
     normal: wp.array[wp.vec3d]
+    distance: wp.array[wp.float64]  # of both elements along the normal at the start, without that to keep [m]
     offset: wp.array[wp.float64]  # coordinate along the normal [m]
     half: wp.array[wp.float64]  # of the minimum distance of both elements [m]; empty without minimum distances
     margin: wp.array[float]  # by which projection exceeds it [m]
     split: wp.array[wp.int8]  # the first corner that stays below
     next: wp.array[int]  # the next node in the list of the same vertex, or the end
     first: wp.array[int]  # node of a vertex, or the end
-    kept: wp.array[int]  # the first node when the vertex was moved onto its sides last
+    placed: wp.array[int]  # of a vertex: NOT_PLACED, PLACED or CUT_SHORT
+    wanted: wp.array[wp.vec3]  # where a vertex is to end, as near as its planes let it come [m]
+    reached: wp.array[wp.vec3]  # an end of its path above its planes [m]
+    moved: wp.array[int]  # of a world, the pass after which a vertex had moved last
+    missed: wp.array[int]  # of a world, the pass after which a vertex was last not where it is wanted
 
 
 def add_zeros(struct, names: Iterable[str], size: int | tuple[int, ...], device: wp.Device) -> None:

@@ -29,6 +29,7 @@ from .structs import (
     NEVER,
     NO_NODE,
     NOT_FINITE,
+    NOT_PLACED,
     SUMS,
     Constraints,
     DividingPlanes,
@@ -78,7 +79,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
     if dividing.first:
         dividing.first[i] = NO_NODE
-        dividing.kept[i] = NO_NODE
+        dividing.placed[i] = NOT_PLACED
 
 
 class Workspace:
@@ -140,7 +141,8 @@ class Workspace:
         self.dividing = DividingPlanes()
         if not differentiable:
             capacity = DIVIDING_PLANES * self.particle_count
-            sizes = {"count": 1, "next": 4 * capacity, "first": vertices, "kept": vertices}
+            sizes = {"count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
+            sizes |= dict.fromkeys(("first", "placed", "wanted", "reached"), vertices)
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
         self.status = allocate_status(self.worlds, device, **limits)
@@ -299,6 +301,10 @@ class Workspace:
     def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the constraints, with the step as its first input, as in all that follow."""
         self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], [self.step, *inputs])
+
+    def launch_over_planes(self, kernel: wp.Kernel, *inputs) -> None:
+        """Launches a kernel over the dividing planes."""
+        self.launch_over(kernel, [(self.dividing.normal, self.dividing.count, 0)], [self.step, *inputs])
 
     def launch_over_active_set(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the active constraints."""

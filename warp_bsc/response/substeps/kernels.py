@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ..contacts.constraints import NEVER_SWEPT, approach_of
+from ..contacts.constraints import NEVER_SWEPT, NEVER_VIOLATED, approach_of
 from ..schedule import Loop, Result, SolveStatus
 from ..solve.sweeps import add_delta, count_active
 from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
@@ -15,8 +15,6 @@ wp.set_module_options({"enable_backward": False})
 
 _NOT_PROJECTED = wp.constant(-2)
 """Iteration of the last contact of a world that takes no substeps: no iteration projects its vertices."""
-_NEVER_VIOLATED = wp.constant(wp.float64(-1e30))
-"""Separation of a constraint that no motion violates, so that it never acts [m]."""
 
 
 @wp.kernel
@@ -160,7 +158,7 @@ def disable_constraints(step: Step, detected: wp.array[int], is_pending: wp.arra
     if i < detected[0] or i >= constraints.count[0]:
         return
     if is_pending[step.motion.world[constraints.vertices[i][0]]] == 0:
-        constraints.separation[i] = _NEVER_VIOLATED
+        constraints.separation[i] = NEVER_VIOLATED
 
 
 @wp.kernel
@@ -190,7 +188,7 @@ def keep_constraints(step: Step, detected: wp.array[int], number: wp.array[int])
     if i < detected[0]:
         _reset_constraint(step, i, wp.vec3d())
         if number[step.motion.world[step.constraints.vertices[i][0]]] == 0:
-            step.constraints.separation[i] = _NEVER_VIOLATED
+            step.constraints.separation[i] = NEVER_VIOLATED
 
 
 @wp.kernel
@@ -308,7 +306,7 @@ def reset_constraints(
         return
     multiplier = constraints.position_multiplier[i]
     if i < detected[0] and constraints.kind[i] == ContactKind.PLANE:
-        constraints.separation[i] = _NEVER_VIOLATED
+        constraints.separation[i] = NEVER_VIOLATED
         multiplier = wp.vec3d()
     if remaining[0] == substeps:
         multiplier = wp.vec3d()

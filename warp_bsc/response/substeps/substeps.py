@@ -238,7 +238,7 @@ class Substeps:
     def _take_substeps(self, step):
         """Repeats the step in substeps, and writes the end to the predicted motion and to the state."""
         work = self._work
-        add_proximities(work)
+        add_proximities(work, in_substeps=True)
         inputs = [work.step, work.status, self._detected, self._is_fast]
         work.launch(kernels.keep_detection, work.worlds, inputs)
         if self.taken is not None:
@@ -337,7 +337,7 @@ class Substeps:
             detect_penetrations(work, ahead=True)
         inputs = [work.status, self._detected, self._remaining, substeps]
         work.launch_over_constraints(kernels.reset_constraints, *inputs)
-        positions.project(work, 1.0 / substeps, begins_moved=True)  # creep adds up over substeps
+        positions.project(work, 1.0 / substeps, in_substep=True)  # creep adds up over substeps
         self._meter.measure(substep.vertices, self._strain)
         velocities.project(work, substep_dt)
         if self.forces is not None:
