@@ -61,16 +61,18 @@ def _is_behind(
 
 
 @wp.func
-def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus):
-    if not has_pair(candidates, i):
-        return
+def _add_proximity(
+    step: Step,
+    kind: int,
+    pair: wp.vec2i,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    distance: wp.float64,
+    status: SolveStatus,
+):
+    """Adds a constraint for a pair with given closest points, if it is a proximity."""
     motion, separation = step.motion, step.separation
-    kind = candidates.kind
-    corners = vertices_of(candidates, i)
-    a, b, c, d = corners_of(motion.x0, corners)
-    weights, normal, distance = weights_across(kind, a, b, c, d)
-    if distance == ZERO:
-        return
     added = constraints.Constraint()
     if motion.distances.radius:
         _start, kept = constraints.distances_at_start(motion, corners, kind)
@@ -85,11 +87,9 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
     if status.crossings[world] > 0:
-        if crossed_at_start(step, kind, candidates.pairs[i]):
+        if crossed_at_start(step, kind, pair):
             return
-    elif nearest and _is_behind(corners, kind, normal, distance, nearest):
-        return
-    if kind == EDGE_EDGE and are_occluded(step, candidates.pairs[i], corners, normal, ZERO):
+    if kind == EDGE_EDGE and are_occluded(step, pair, corners, normal, ZERO):
         return
     if are_on_body(motion, corners):
         status.is_fast[world] = 1  # as where bodies are in contact, see collect.collect_contacts
@@ -103,6 +103,23 @@ def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[fl
     added.within_tolerance = True
     added.pace = wp.where(path <= RESTING_PATH * separation, int(Pace.RESTING), int(Pace.SLOW))
     constraints.add_constraint(step, added)
+
+
+@wp.func
+def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus):
+    """Adds a constraint for a candidate if it is a proximity; most are not, and cost little."""
+    if not has_pair(candidates, i):
+        return
+    kind = candidates.kind
+    corners = vertices_of(candidates, i)
+    a, b, c, d = corners_of(step.motion.x0, corners)
+    weights, normal, distance = weights_across(kind, a, b, c, d)
+    if distance == ZERO:
+        return
+    if nearest and status.crossings[step.motion.world[corners[0]]] == 0:
+        if _is_behind(corners, kind, normal, distance, nearest):
+            return
+    _add_proximity(step, kind, candidates.pairs[i], corners, weights, normal, distance, status)
 
 
 @wp.kernel
