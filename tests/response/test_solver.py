@@ -7,6 +7,7 @@ import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
+from warp_bsc.response.contacts.constraints import NEVER_VIOLATED
 from warp_bsc.response.schedule import MAX_ITERATIONS
 from warp_bsc.response.state.structs import ContactKind
 
@@ -136,6 +137,10 @@ def test_proximities_are_of_neighbours_in_a_pile(device):
         found &= covered[np.minimum(corners, particles - 1)].all(axis=1)
         apart = np.abs(layer[found, 0] - layer[found, 3])
         assert len(apart) > 20 and (apart == 1).all(), (kind, np.bincount(apart))
+    # nor do contacts with the box act on what is behind the lowest layer
+    disabled = constraints.separation.numpy()[: len(kinds)] == NEVER_VIOLATED
+    apart = np.abs(layer[disabled, 0] - layer[disabled, 3])
+    assert len(apart) > 20 and (apart > 1).all(), np.bincount(apart)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])

@@ -32,7 +32,7 @@ def add_plane(
     normal: wp.vec3d,
     distance: wp.float64,
     half: wp.float64,
-):
+) -> int:
     """Adds a plane with a unit normal to the lists of those of up to four vertices, -1 for none, that can be moved.
 
     Vertices before ``split`` stay above the plane, the others below; see :class:`.DividingPlanes`. Where it does not
@@ -85,8 +85,8 @@ def _reach(step: Step, corners: wp.vec4i, begin: int, end: int, origin: wp.vec3d
     """Returns how far the vertices from ``begin`` to ``end`` reach against a normal, from an origin [m].
 
     They reach farther by ``half`` of the distance that they are to keep. The second is how far at the start, the first
-    wherever planes may take them, which is no farther than the ball around a path: this is what projection onto a
-    convex set does to the end of a path that starts in it.
+    wherever the first pass may take them, no farther than the ball around a path: this is what projection onto a convex
+    set does to the end of a path that starts in it. Where later passes take them farther, the next detection finds it.
     """
     start = FAR
     anywhere = FAR
@@ -106,7 +106,7 @@ def add_dividing_plane(
 ) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
-    It lies across the shortest vector between them at the start; :mod:`.solve.moving_planes` places it. Elements that
+    It lies across the shortest vector between them at the start; :mod:`.solve.dividing_passes` places it. Elements that
     touch at the start have none, nor do those without a contact that planes cannot bring together. Of the distance that
     the elements must keep, ``min_distance`` [m], half is on either side.
 

@@ -33,7 +33,7 @@ from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
 from ..tuning import CUT, SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
-from .moving_planes import begin_passes, move_to_sides, place_planes, want
+from .dividing_passes import begin_passes, move_to_sides, place_planes, want
 from .sides import share_of_path
 
 wp.set_module_options({"enable_backward": False})

@@ -1,4 +1,4 @@
-"""Projects a vertex onto its sides of dividing planes, which :mod:`.moving_planes` places.
+"""Projects a vertex onto its sides of dividing planes, which :mod:`.dividing_passes` places.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,

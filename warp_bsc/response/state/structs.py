@@ -219,8 +219,7 @@ def has_final_velocity(outcome: int) -> bool:
 NO_NODE = wp.constant(-1)
 """In place of a node: the end of a list."""
 NOT_PLACED, PLACED, CUT_SHORT = (wp.constant(i) for i in (0, 1, 2))
-"""Of a vertex: it has no wanted end; it has one; in the last pass rounding left it no position above its planes but on
-its way there."""
+"""Of a vertex: it has no wanted end; it has one; projection found it no position above its planes but on its way."""
 
 
 @wp.struct
@@ -228,7 +227,7 @@ class DividingPlanes:
     """Planes that vertices stay above or below, and a list for each vertex of those that concern it.
 
     The nodes of lists are numbered ``4 plane + corner``, as the planes of two elements have four vertices. These planes
-    move, see :mod:`.solve.moving_planes`.
+    move, see :mod:`.solve.dividing_passes`.
     """
 
     count: wp.array[int]  # of planes, whether they fit or not
