@@ -11,7 +11,6 @@ from numbers import Integral, Real
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 __all__ = [
     "SMALLEST_DISTANCE",
@@ -138,13 +137,17 @@ def check_instance(value: Any, name: str, types: type | tuple[type, ...], what: 
         raise TypeError(f"{name} must be {what}, not {given(value)}")
 
 
-def as_numpy(array: ArrayLike, name: str, what: str = "an array of numbers") -> np.ndarray:
+def as_numpy(array: Any, name: str, what: str = "an array of numbers") -> np.ndarray:
     """Returns an array of numbers, or ``what`` errors call it, as NumPy, in this machine's order of bytes.
+
+    A Warp array may be on any device.
 
     Raises:
         TypeError: If its entries are no numbers.
         ValueError: If its rows have different lengths, or entries are masked.
     """
+    if hasattr(array, "__cuda_array_interface__") and hasattr(array, "numpy"):  # on a GPU, which NumPy cannot read
+        array = array.numpy()
     if np.ma.is_masked(array):
         raise ValueError(f"{name} must have no masked entries, which have no value")
     try:
@@ -156,7 +159,7 @@ def as_numpy(array: ArrayLike, name: str, what: str = "an array of numbers") -> 
     return values if values.dtype.isnative else values.astype(values.dtype.newbyteorder("="))
 
 
-def checked_shape(array: ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+def checked_shape(array: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Returns an array of coordinates, as NumPy, finite or not.
 
     Args:
@@ -189,7 +192,7 @@ def check_finite(array: np.ndarray, name: str, rows: np.ndarray | None = None) -
         raise ValueError(f"{name}[{row if rows is None else rows[row]}] has a coordinate that is not finite")
 
 
-def checked_coordinates(array: ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
+def checked_coordinates(array: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Returns an array of coordinates, as NumPy, with arguments and errors of :func:`checked_shape`.
 
     Raises:

@@ -293,7 +293,7 @@ class CollisionMesh:
         if capturing or (isinstance(x, wp.array) and x.requires_grad):
             when = "in a graph" if capturing else "to have gradients"
             raise ValueError(f"{when} {name} must be a Warp array of vec3 or vec3d on {self.device}")
-        values = checked_shape(x.numpy() if isinstance(x, wp.array) else x, (3,), name)
+        values = checked_shape(x, (3,), name)
         if len(values) != self.vertex_count:
             raise ValueError(f"{name} must have {self.vertex_count} rows, one a vertex, got {len(values)}")
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
@@ -302,7 +302,7 @@ class CollisionMesh:
     def _checked_indices(self, given: np.ndarray | wp.array | Sequence, corners: int, name: str) -> np.ndarray:
         """Returns the vertex indices of elements, int32, shape [n, corners], or [n] for points."""
         shape = (0,) if corners == 1 else (0, corners)
-        elements = as_numpy(given.numpy() if isinstance(given, wp.array) else given, f"{name}s")
+        elements = as_numpy(given, f"{name}s")
         if elements.shape == (0,):
             elements = np.empty(shape, np.int32)
         if elements.ndim != len(shape) or elements.shape[1:] != shape[1:]:
@@ -325,17 +325,16 @@ class CollisionMesh:
 
     def _checked_radius(self, radius: float | np.ndarray | wp.array) -> np.ndarray | None:
         """Returns the radius of each vertex, float64, shape [vertex_count], or None if all are 0."""
-        given = radius.numpy() if isinstance(radius, wp.array) else radius
-        values = checked_distances(given, "radius", self.vertex_count)
+        values = checked_distances(radius, "radius", self.vertex_count)
         return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
 
     def _checked_bits(self, bits: int | np.ndarray | wp.array, name: str) -> np.ndarray:
         """Returns groups or masks of the vertices, uint32, shape [vertex_count]."""
-        return checked_bits(bits.numpy() if isinstance(bits, wp.array) else bits, name, self.vertex_count)
+        return checked_bits(bits, name, self.vertex_count)
 
     def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
         """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""
-        worlds = as_numpy(world.numpy() if isinstance(world, wp.array) else world, "world")
+        worlds = as_numpy(world, "world")
         if worlds.shape != (self.vertex_count,) or not np.issubdtype(worlds.dtype, np.integer):
             raise ValueError(
                 f"world must be {self.vertex_count} integers, one a vertex, got {worlds.dtype} {worlds.shape}"

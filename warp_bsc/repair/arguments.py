@@ -8,12 +8,7 @@ import warp as wp
 
 from .._arguments import as_numpy, given
 
-__all__ = ["checked_layers", "checked_mask", "host"]
-
-
-def host(array: Any) -> Any:
-    """Returns a Warp array as NumPy, and anything else as it is."""
-    return array.numpy() if isinstance(array, wp.array) else array
+__all__ = ["checked_layers", "checked_mask"]
 
 
 def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
@@ -28,7 +23,7 @@ def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
         TypeError: If they are no array of numbers.
         ValueError: If they have another shape or type, or an index is out of range.
     """
-    values = as_numpy(host(vertices), name, "an array of indices or a mask")
+    values = as_numpy(vertices, name, "an array of indices or a mask")
     if values.dtype == bool:
         if values.shape != (count,):
             raise ValueError(f"{name} as a mask must have shape ({count},), not {values.shape}")
@@ -57,7 +52,7 @@ def checked_layers(order: Any, count: int) -> np.ndarray:
         ValueError: If layers or groups have another shape or are out of range, or groups share a vertex.
     """
     if isinstance(order, np.ndarray | wp.array):
-        values = as_numpy(host(order), "order")
+        values = as_numpy(order, "order")
         if values.shape != (count,) or not np.issubdtype(values.dtype, np.integer):
             raise ValueError(
                 f"order as an array must be {count} integers, one a vertex, not {values.dtype} {values.shape}"

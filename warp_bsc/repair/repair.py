@@ -9,7 +9,7 @@ from .._arguments import check_finite, checked_distance, checked_number, checked
 from ..detection.mesh import CollisionMesh
 from ..detection.start import checked_device
 from .approach import approach
-from .arguments import checked_layers, checked_mask, host
+from .arguments import checked_layers, checked_mask
 from .elastic import Springs
 from .free import free, restore_parts
 from .layers import separate_layers
@@ -73,7 +73,7 @@ def repair(
         Pascal Volino and Nadia Magnenat-Thalmann. "Resolving Surface Collisions through Intersection Contour
         Minimization." ACM Transactions on Graphics 25, 3 (2006). https://doi.org/10.1145/1141911.1142007.
     """
-    given = checked_shape(host(x), (3,), "x")
+    given = checked_shape(x, (3,), "x")
     if not isinstance(mesh, CollisionMesh):
         chosen = checked_device(device)
         try:
@@ -123,7 +123,7 @@ def repair(
 
 def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: CollisionMesh) -> np.ndarray:
     """Returns the configuration before as NumPy."""
-    previous = checked_shape(host(x_previous), (3,), "x_previous")
+    previous = checked_shape(x_previous, (3,), "x_previous")
     if previous.dtype != x.dtype or len(previous) != len(x):
         raise ValueError(
             f"x_previous must have the type and the rows of x, {x.dtype} {x.shape}, not {previous.dtype} "

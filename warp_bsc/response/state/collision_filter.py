@@ -44,7 +44,7 @@ class CollisionFilter:
 
     def __post_init__(self):
         for name in _NAMES:
-            value = as_numpy(on_host(getattr(self, name)), name, "one integer or an array of integers")
+            value = as_numpy(getattr(self, name), name, "one integer or an array of integers")
             if value.ndim > 1:
                 raise ValueError(f"{name} must be one integer or an array of one dimension, not of shape {value.shape}")
             checked_bits(value, name, value.size)
@@ -59,7 +59,7 @@ class CollisionFilter:
 
     def _bits(self, what, count):
         names = f"{what}_group", f"{what}_mask"
-        group, mask = (checked_bits(on_host(getattr(self, n)), f"collision_filter.{n}", count) for n in names)
+        group, mask = (checked_bits(getattr(self, n), f"collision_filter.{n}", count) for n in names)
         return group, mask
 
 
@@ -108,8 +108,3 @@ def bits_of_model(
 
     particles, shapes = renumbered(particles), renumbered(shapes)
     return particles, np.where(apart, 0, shapes).astype(np.uint32) | (shapes << _MOST_GROUPS)
-
-
-def on_host(values: Any) -> Any:
-    """Returns an array of the device as NumPy, and anything else as it is."""
-    return values.numpy() if isinstance(values, wp.array) else values

@@ -8,7 +8,6 @@ import numpy as np
 import warp as wp
 
 from ..._arguments import as_numpy, check_instance, checked_integers
-from .collision_filter import on_host
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +46,7 @@ class FrictionTable:
         if isinstance(values, wp.array) and values.dtype is not wp.float32:
             raise TypeError(f"coefficients must be an array of float32, not of {values.dtype.__name__}")
         what = "an array of numbers"
-        values = as_numpy(on_host(values), "coefficients", what)
+        values = as_numpy(values, "coefficients", what)
         if values.dtype.kind not in "iuf":
             raise TypeError(f"coefficients must be {what}, not {values.dtype}")
         if values.ndim != 2 or values.shape[0] != values.shape[1] or not values.size:
@@ -62,7 +61,7 @@ class FrictionTable:
                 f"not {values[i, j]} and {values[j, i]}"
             )
         for name in ("particle_material", "shape_material"):
-            materials = as_numpy(on_host(getattr(self, name)), name, "one integer or an array of integers")
+            materials = as_numpy(getattr(self, name), name, "one integer or an array of integers")
             if materials.ndim > 1:
                 raise ValueError(f"{name} must be one integer or an array of one dimension, not {materials.shape}")
             checked_integers(materials, name, materials.size, len(values))
@@ -77,7 +76,7 @@ class FrictionTable:
         """Returns the materials of the particles and shapes of a model, int32, with errors as of the class."""
         counts, most = {"particle": model.particle_count, "shape": model.shape_count}, len(self.coefficients)
         of_particles, of_shapes = (
-            checked_integers(on_host(getattr(self, f"{what}_material")), f"friction_table.{what}_material", n, most)
+            checked_integers(getattr(self, f"{what}_material"), f"friction_table.{what}_material", n, most)
             for what, n in counts.items()
         )
         return of_particles, of_shapes

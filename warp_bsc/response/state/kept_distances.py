@@ -39,8 +39,8 @@ class KeptDistances:
                 particle_radius = _of_model(model.particle_radius, "particle_radius", model.particle_count)
             min_distance = None
         minimum = 0.0 if min_distance is None else checked_distance(min_distance, "min_distance")
-        radii = particle_radius.numpy() if isinstance(particle_radius, wp.array) else particle_radius
-        radii = checked_distances(0.0 if radii is None else radii, "particle_radius", model.particle_count)
+        radii = 0.0 if particle_radius is None else particle_radius
+        radii = checked_distances(radii, "particle_radius", model.particle_count)
         return cls(minimum, np.broadcast_to(radii, model.particle_count), margins)
 
     @property

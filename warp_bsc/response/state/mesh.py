@@ -1,6 +1,6 @@
 """The collision mesh of a Newton model: cloth, the surfaces of soft bodies, and rigid shapes cut into triangles."""
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
@@ -157,7 +157,7 @@ class ModelMesh(CollisionMesh):
             group, mask = np.concatenate([of_particles, of_shapes[:, shapes]], axis=1)
             on_device = [wp.array(b.view(np.int32), dtype=int, device=model.device) for b in of_shapes]
             self.shape_filter.group, self.shape_filter.mask = on_device
-        options = {"edges": edges, "points": points, "world": worlds, "group": group, "mask": mask}
+        options: dict[str, Any] = {"edges": edges, "points": points, "world": worlds, "group": group, "mask": mask}
         super().__init__(faces, vertex_count, **options, tets=tetrahedra, device=model.device)
         self.model = model
         planes = np.flatnonzero(collides & infinite).astype(np.int32)
