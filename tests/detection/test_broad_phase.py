@@ -1,5 +1,7 @@
 """Both broad phases against all pairs compared one by one: nothing dropped, nothing twice, nothing across worlds."""
 
+import functools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -209,6 +211,25 @@ def test_a_traversal_with_another_visit():
     assert counted[mesh.face_order < 0].sum() == 0
     # each quad has one pair within, and four with each of its 8 neighbours
     assert counted.sum() == 400 + 4 * (2 * 20 * 19 + 2 * 19 * 19)
+
+
+@pytest.mark.parametrize("broken", [0, 12])
+def test_faces_that_an_axis_separates_are_left_out(broken):
+    """Layers that fall together have the same queued pairs, of fewer candidates, also next to what is not finite."""
+    random = np.random.default_rng(broken)
+    x, faces = grid(8)
+    layers = np.arange(12)[:, None, None]
+    x0 = (x + 0.05 * layers * [0.0, 0.0, 1.0] + random.normal(scale=0.02, size=(12, *x.shape))).reshape(-1, 3)
+    x1 = x0 + np.array([0.0, 0.1, -0.4]) + random.normal(scale=0.02, size=x0.shape)
+    faces = (faces + len(x) * layers).reshape(-1, 3)
+    x1[random.choice(len(x1), broken, replace=False), 1] = np.nan
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    candidates, pairs = find_pairs(BroadPhaseHierarchy, mesh, x0, x1)
+    fewer, same = find_pairs(functools.partial(BroadPhaseHierarchy, counts_candidates=False), mesh, x0, x1)
+    for found, expected in zip(same, pairs, strict=True):
+        np.testing.assert_array_equal(found, expected)
+        assert len(expected) > 1000
+    assert sum(fewer) < 0.7 * sum(candidates)
 
 
 @pytest.mark.parametrize("dtype", [wp.vec3, wp.vec3d])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch, add_plates, bullet, place_plates
 
 import warp_bsc as bsc
-from warp_bsc.response.contacts.dividing_planes import add_solid
+from warp_bsc.response.contacts.dividing_planes import add_plane, add_solid, has_planes
 from warp_bsc.response.solve.sides import position_on_sides
 from warp_bsc.response.state.structs import DIVIDED, NO_NODE, DividingPlanes, Motion, allocate
 
@@ -203,6 +203,31 @@ def divide(planes, x0, x1, device):
     return end.numpy()[0], bool(cut.numpy()[0])
 
 
+@wp.kernel
+def _add_planes(motion: Motion, count: int, planes: DividingPlanes, found: wp.array[bool]):
+    for _plane in range(count):
+        add_plane(motion, planes, wp.vec4i(0, -1, -1, -1), 1, wp.vec3d(), wp.float64(0.0), wp.float64(0.0))
+    has_any, complete = has_planes(planes, 0)
+    found[0] = has_any
+    found[1] = complete
+
+
+@pytest.mark.parametrize("count", [0, 2, 3])
+def test_planes_that_do_not_fit_take_none_away(count, device):
+    """A vertex keeps those that it has, and its planes count as incomplete."""
+    motion = Motion()
+    motion.inverse_mass = wp.ones(1, dtype=float, device=device)
+    lists = allocate(DividingPlanes, 2, device, count=1, next=8, half=0)
+    lists.first.fill_(int(NO_NODE))
+    found = wp.empty(2, dtype=bool, device=device)
+    wp.launch(_add_planes, 1, inputs=[motion, count, lists, found], device=device)
+    assert found.numpy().tolist() == [count > 0, count == 2]
+    kept, node = 0, int(lists.first.numpy()[0])
+    while node != NO_NODE:
+        kept, node = kept + 1, int(lists.next.numpy()[node // 2])
+    assert kept == min(count, 2)
+
+
 def unit(*vector):
     return np.array(vector, dtype=float) / np.linalg.norm(vector)
 
@@ -348,3 +373,21 @@ def test_layers_that_fall_together_follow_each_other(device):
     room = gap * (np.arange(6)[:, None] + 0.5)
     assert (fallen[:3] > 0.6 * room[:3]).all() and (fallen[:3] < room[:3]).all()
     np.testing.assert_allclose(fallen[4:], fall, atol=1e-6)
+
+
+def test_edges_on_edges_push_nothing_aside(device):
+    """Wavy layers fall by twelve gaps, nearly edge on edge: what is across two parallel edges leans sideways."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    gap, fall, layers = 1e-4, 1.2e-3, 6
+    for layer in range(layers):
+        at = (2e-5 * (layer % 2), 1e-5 * (layer % 3), gap * layer)
+        add_patch(builder, 8, 0.01, at, velocity=(0.0, 0.0, -fall / DT if layer else 0.0), fixed=layer == 0)
+    heights = np.random.default_rng(0).uniform(-0.15 * gap, 0.15 * gap, len(builder.particle_q))
+    builder.particle_q = [(x, y, z + height) for (x, y, z), height in zip(builder.particle_q, heights, strict=True)]
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), substeps=None))
+    start = rollout.positions
+    rollout.step()
+    assert rollout.solver.report.certified and rollout.solver.report.hits > 1000 and rollout.collisions == 0
+    aside = np.linalg.norm((rollout.positions - start)[:, :2], axis=1)
+    assert aside.max() < 1.2e-5  # with planes across all pairs of edges twice as far

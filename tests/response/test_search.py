@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import DT, SOLVERS, STIFF, Rollout, bullet, crossing_sheets
+from pile_energy import DT as PILE_DT
+from pile_energy import pile
 from sheets import crumpled
 
 import warp_bsc as bsc
 from warp_bsc.detection import pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.response.contacts.proximities import add_proximities
 from warp_bsc.response.schedule import Result
 from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import NEVER
@@ -18,10 +21,10 @@ from warp_bsc.response.step import inspect
 CAPACITY = 4
 
 
-def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None, padding=None):
+def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None, **options):
     """The broad phase of a GPU, which stages on the CPU get here too."""
     assert checked_vertices is None
-    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, padding=padding)
+    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, **options)
 
 
 def stage(model, monkeypatch, *, tiny, inner="vbd", make=bsc.SolverCCD, **options):
@@ -104,6 +107,39 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
     assert queued[2] == queueless[2] > 0
     np.testing.assert_array_equal(queued[3], queueless[3])
     np.testing.assert_array_equal(queued[0], queueless[0])
+
+
+def test_proximities_are_those_of_queues(monkeypatch):
+    """Found in the hierarchy, without queues, they are the same constraints, and layers fall to the same positions."""
+    monkeypatch.setattr("warp_bsc.response.step.proximities.add_proximities", record_proximities(found := []))
+    model = pile(12)
+    solvers = stage(model, monkeypatch, tiny=False), bsc.SolverCCD(SOLVERS["vbd"](model))
+    control, most = model.control(), 0
+    starts, ends = ([model.state() for _ in solvers] for _ in range(2))
+    for _ in range(50):
+        for solver, start, end in zip(solvers, starts, ends, strict=True):
+            solver.step(start, end, control, None, PILE_DT)
+        np.testing.assert_array_equal(*(end.particle_q.numpy() for end in ends))
+        np.testing.assert_array_equal(*(end.particle_qd.numpy() for end in ends))
+        assert len(found) in (0, 2) and (not found or found[0] == found[1])
+        most = max(most, *(len(rows) for rows in found), 0)
+        found.clear()
+        for start in starts:
+            start.assign(ends[0])
+    assert most > 3000
+
+
+def record_proximities(found):
+    """Returns ``add_proximities`` such that the constraints it adds are listed, sorted, in ``found``."""
+
+    def recorded(work, **options):
+        add_proximities(work, **options)
+        first, last = (int(count.numpy()[0]) for count in (work.kept, work.constraints.count))
+        names = "vertices", "normal", "separation", "kind"
+        columns = [getattr(work.constraints, name).numpy()[first:last].tolist() for name in names]
+        found.append(sorted(map(str, zip(*columns, strict=True))))
+
+    return recorded
 
 
 @pytest.mark.gpu

@@ -281,8 +281,7 @@ def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind,
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     pipeline = DetectionPipeline(mesh)
     x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))
-    retry_until_fits(lambda: pipeline.find_contacts(x0, x1), pipeline, mesh.device)
-    retry_until_fits(pipeline.find_candidates, pipeline, mesh.device)
+    retry_until_fits(lambda: pipeline.find_candidates(x0, x1), pipeline, mesh.device)
     queued = pipeline.counts.vertex_face.queued, pipeline.counts.edge_edge.queued
     found = {}
     for narrow_phase, count, elements in zip(pipeline.narrow_phases, queued, (mesh.faces, mesh.edges), strict=True):

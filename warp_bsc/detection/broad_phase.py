@@ -94,12 +94,6 @@ class BroadPhase(Protocol):
         """
         ...
 
-    def pair_overlapping_elements(
-        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
-    ) -> None:
-        """Enqueues all candidates of the last run, with arguments as of :meth:`pair_elements`."""
-        ...
-
     def pair_edges_with_faces(
         self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
     ) -> None:
@@ -124,6 +118,7 @@ def make_broad_phase(
     not_finite: wp.array | None = None,
     checked_vertices: np.ndarray | None = None,
     padding: wp.array | None = None,
+    counts_candidates: bool = True,
 ) -> BroadPhase:
     """Returns the broad phase for a mesh's device.
 
@@ -136,10 +131,20 @@ def make_broad_phase(
         checked_vertices: Indices of the vertices that are counted; None for all.
         padding: How far the box of each vertex reaches beyond it, those of an edge or a face as far as the largest of
             its vertices, array of float64; None for boxes without a padding.
+        counts_candidates: Whether all candidates are counted. If not, a GPU leaves out those of faces that an axis
+            separates, without looking at them.
     """
     if mesh.device.is_cpu:
         return BroadPhaseSimd(mesh, count, padding=padding)
     checked = None
     if checked_vertices is not None and len(checked_vertices) < mesh.vertex_count:
         checked = wp.array(np.isin(np.arange(mesh.vertex_count), checked_vertices), dtype=int, device=mesh.device)
-    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, checked=checked, padding=padding)
+    return BroadPhaseHierarchy(
+        mesh,
+        count,
+        capacity=capacity,
+        not_finite=not_finite,
+        checked=checked,
+        padding=padding,
+        counts_candidates=counts_candidates,
+    )

@@ -5,6 +5,7 @@ from typing import Any
 
 import warp as wp
 
+from ..kernels.pipeline.boxes import boxes_apart, read_box
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
 from .element_pairs import PAIRS_OF_THREAD, pair_edges_with_faces, pair_elements, pair_points
@@ -28,10 +29,33 @@ class _FacePairs:
 
     pairs: wp.array[wp.vec2i]
     count: wp.array[wp.int64]
+    boxes: wp.array2d[wp.vec3]  # of faces, to leave out pairs that an axis separates; no array to keep them
+
+
+@wp.func
+def _not_apart(place: int, first: int, found: wp.uint32, boxes: wp.array2d[wp.vec3]) -> wp.uint32:
+    """Returns which of the faces at some places no axis separates from another at the start and at the end.
+
+    The box of a face with a position that is not finite is empty, and says nothing of the elements that it represents.
+    """
+    box = read_box(boxes, place)
+    left = found
+    if box[0][0] > box[1][0]:
+        left = wp.uint32(0)
+    while left != wp.uint32(0):
+        bit = left & (~left + wp.uint32(1))
+        left = left ^ bit
+        other = read_box(boxes, first + lowest_set_bit(bit))
+        if other[0][0] <= other[1][0]:
+            if boxes_apart(box[0], box[1], box[2], box[3], other[0], other[1], other[2], other[3]):
+                found = found ^ bit
+    return found
 
 
 @wp.func
 def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
+    if queue.boxes:
+        found = _not_apart(place, first, found, queue.boxes)
     slot = take_slots(queue.count, 0, count_set_bits(found))
     while found != wp.uint32(0):
         write(wp.vec2i(place, first + lowest_set_bit(found)), queue.pairs, slot)
@@ -55,6 +79,7 @@ class BroadPhaseHierarchy:
         not_finite: wp.array | None = None,
         checked: wp.array | None = None,
         padding: wp.array | None = None,
+        counts_candidates: bool = True,
     ):
         """Allocates the hierarchy and the queue for pairs of faces.
 
@@ -66,9 +91,12 @@ class BroadPhaseHierarchy:
                 None to count none.
             checked: Nonzero for each vertex that is counted, array of int; None for all.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
+            counts_candidates: Whether all candidates are counted, or only those of faces that no axis separates. Pairs
+                that filters leave out are always counted.
         """
         self.lock = threading.RLock()
         self._padding = padding
+        self._leaves_out_separated = not counts_candidates and not mesh.pair_filter.group
         self._device = device = mesh.device
         self._count = count
         self._not_finite, self._checked = not_finite, checked
@@ -117,8 +145,10 @@ class BroadPhaseHierarchy:
         keep_separated: bool = False,
     ) -> None:
         """Counts the candidates, and enqueues those that no coordinate axis separates; always only refits."""
-        self._pair_faces(x0, x1, changed)
-        self._pair_elements(keep_separated, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
+        self._pair_faces(x0, x1, changed, keep_separated or not self._leaves_out_separated)
+        queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
+        threads = -(-self.capacity // (int(PAIRS_OF_THREAD) * WIDTH)) * WIDTH
+        self._launch_over_pairs(pair_elements, threads, threads, keep_separated, *queues)
 
     def pair_points(
         self,
@@ -136,12 +166,6 @@ class BroadPhaseHierarchy:
         """Counts and enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
         queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
         self._launch_over_pairs(pair_points, self.capacity, keep_separated, *queues)
-
-    def pair_overlapping_elements(
-        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
-    ) -> None:
-        """Enqueues all candidates of the last run."""
-        self._pair_elements(True, vertex_face_counts, vertex_face, edge_edge_counts, edge_edge)
 
     def pair_edges_with_faces(
         self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
@@ -171,17 +195,14 @@ class BroadPhaseHierarchy:
         inputs = [self.hierarchy, self._warps_of_cluster, arguments]
         launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
-    def _pair_faces(self, x0, x1, changed=None):
+    def _pair_faces(self, x0, x1, changed=None, keep_separated=True):
         """Enqueues the pairs of faces whose swept boxes overlap, each once."""
         self.fit(x0, x1, changed)
         queue = _FacePairs()
         queue.pairs, queue.count = self._face_pairs, self._count
+        if not keep_separated:
+            queue.boxes = self.hierarchy.face_boxes
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
-
-    def _pair_elements(self, keep_separated, *queues):
-        """Enqueues the pairs of elements of all pairs of faces."""
-        threads = -(-self.capacity // (int(PAIRS_OF_THREAD) * WIDTH)) * WIDTH
-        self._launch_over_pairs(pair_elements, threads, threads, keep_separated, *queues)
 
     def _launch_over_pairs(self, kernel, threads, *arguments):
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]

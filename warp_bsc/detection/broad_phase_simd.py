@@ -80,7 +80,11 @@ class BroadPhaseSimd:
         if self._edges_of_faces:
             trees.append(self._edges_of_faces)
         self._build(trees, x0, x1, refit, changed)
-        self._pair_elements(vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, keep_separated)
+        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
+        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, **options)
+        self._edges.pair(self._edges, edge_edge_counts, edge_edge, ordered=True, **options)
+        if self._edges_of_faces:
+            self._edges.pair(self._edges_of_faces, edge_edge_counts, edge_edge, ordered=True, **options)
 
     def pair_points(
         self,
@@ -103,11 +107,9 @@ class BroadPhaseSimd:
         self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, **options)
         self._points.pair(self._points, vertex_vertex_counts, vertex_vertex, ordered=True, **options)
 
-    def pair_overlapping_elements(
-        self, vertex_face_counts: wp.array, vertex_face: wp.array, edge_edge_counts: wp.array, edge_edge: wp.array
-    ) -> None:
-        """Enqueues all candidates of the last run."""
-        self._pair_elements(vertex_face_counts, vertex_face, edge_edge_counts, edge_edge, True)
+    def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:
+        """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""
+        self._vertices.pair(self._faces, counts, pairs, keep_separated=True)
 
     def pair_edges_with_faces(
         self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
@@ -116,21 +118,6 @@ class BroadPhaseSimd:
         if not is_end:
             self._build([self._edges, self._faces], x, x, refit)
         self._edges.pair(self._faces, counts, pairs, at_end=True)
-
-    def _pair_elements(
-        self,
-        vertex_face_counts: wp.array,
-        vertex_face: wp.array,
-        edge_edge_counts: wp.array,
-        edge_edge: wp.array,
-        keep_separated: bool,
-    ) -> None:
-        """Enqueues the candidates of the trees, with arguments as of :meth:`pair_elements`."""
-        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
-        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, **options)
-        self._edges.pair(self._edges, edge_edge_counts, edge_edge, ordered=True, **options)
-        if self._edges_of_faces:
-            self._edges.pair(self._edges_of_faces, edge_edge_counts, edge_edge, ordered=True, **options)
 
     def _build(
         self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None

@@ -114,6 +114,7 @@ class DetectionPipeline:
         min_distances: "MinDistances | None" = None,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
+        counts_candidates: bool = True,
     ):
         """Allocates the buffers on the mesh's device.
 
@@ -130,6 +131,8 @@ class DetectionPipeline:
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`MIN_CAPACITY` together;
                 twice that for pairs of faces, a half for survivors, an eighth for contacts. A large capacity costs
                 memory, but no time. Default: eight pairs of faces, one vertex-face and two edge-edge pairs.
+            counts_candidates: Whether all candidates are counted. If not, a GPU does not look at those of faces that an
+                axis separates, such as layers that move together, and only counts others.
 
         Raises:
             ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
@@ -171,6 +174,7 @@ class DetectionPipeline:
             not_finite=self.counters.not_finite,
             checked_vertices=mesh.vertices if only_used_vertices else None,
             padding=padding,
+            counts_candidates=counts_candidates,
         )
         self.vertex_face = NarrowPhase(
             PairKind.VERTEX_FACE, self.counters.vertex_face, vertex_face, elements=(vertices, faces)
@@ -264,13 +268,17 @@ class DetectionPipeline:
         """The broad phase, whose boxes are those of the last run."""
         return self._broad_phase
 
-    def find_candidates(self) -> None:
-        """Enqueues all candidates of the last run in the queues of the narrow phases, which do not run.
+    def find_candidates(self, x0: wp.array, x1: wp.array, *, refit: bool = False) -> None:
+        """Enqueues all candidates of a motion in the queues of the narrow phases, which do not run.
 
-        The queue of that run's broad phase must have been large enough, see :meth:`grow`.
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
+            x1: Positions at the end, of the same type.
+            refit: As of :meth:`find_contacts`.
         """
-        self.counters.pairs.zero_()
-        self._broad_phase.pair_overlapping_elements(*_queues(self.vertex_face, self.edge_edge))
+        self.counters.array.zero_()
+        queues = _queues(self.vertex_face, self.edge_edge)
+        self._broad_phase.pair_elements(x0, x1, *queues, refit=refit, keep_separated=True)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.

@@ -49,7 +49,7 @@ MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
-MAX_PASSES = wp.constant(6)
+MAX_PASSES = wp.constant(4)
 """Passes over dividing planes in each division: layers that fall together by more than they are apart need several."""
 MAX_CUTS = wp.constant(64)
 """Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""

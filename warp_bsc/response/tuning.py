@@ -31,6 +31,8 @@ REACH = wp.constant(wp.float64(1.5))
 """Distance in separations up to which pairs are proximities even if they stand still: neighbours in a stack."""
 BEHIND = wp.constant(wp.float64(1.5))
 """Distance, as a multiple of that of the nearest face in its direction, from which an element is behind that face."""
+PARALLEL = wp.constant(wp.float64(0.03))
+"""Squared sine of an angle below which edges are parallel: vertices and other edges hold first what they would."""
 BEND_OF_SHEET, BEND_OF_BODY = wp.constant(wp.float64(0.5)), wp.constant(wp.float64(1e-3))
 """Sines of the angles by which a sheet may bend towards a body, and a body towards a sheet, which rounding allows."""
 

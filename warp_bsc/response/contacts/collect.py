@@ -247,7 +247,10 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
             status.loop[Loop.PROJECTING] = 1
         if iteration == 0 and kind == EDGE_EDGE:
             time = wp.where(near, ZERO, toi)
-            if rules.are_occluded(step, contacts.pairs[i], corners, added.normal, time):
+            skipped = rules.are_occluded(step, contacts.pairs[i], corners, added.normal, time)
+            if dividing.first and added.pace == Pace.SLOW:  # in recorded steps a turn would let results jump
+                skipped = skipped or rules.are_parallel(motion, corners)
+            if skipped:
                 return  # the next detection finds it, if it is still there
     target = widened(step.separation, status)
     if added.pace == Pace.SLOW:

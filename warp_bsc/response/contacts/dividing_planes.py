@@ -11,16 +11,12 @@ from .rules import inverse_mass_of
 
 FAR = wp.constant(wp.float64(1.0e300))
 """Farther than anything [m]."""
-INCOMPLETE = wp.constant(-2)
-"""End of a list that lacks a plane."""
 
 
 @wp.func
 def _add_node(planes: DividingPlanes, vertex: int, node: int):
     """Puts a node before the list of a vertex."""
-    after = wp.atomic_exch(planes.first, vertex, node)
-    if node >= 0:
-        planes.next[node] = after
+    planes.next[node / 2] = wp.atomic_exch(planes.first, vertex, node)
 
 
 @wp.func
@@ -36,23 +32,26 @@ def add_plane(
     """Adds a plane with a unit normal to the lists of those of up to four vertices, -1 for none, that can be moved.
 
     Vertices before ``split`` stay above the plane, the others below; see :class:`.DividingPlanes`. Where it does not
-    fit, their lists end in INCOMPLETE.
+    fit, they lack one.
 
     Returns:
         The index of the plane, -1 if it does not fit.
     """
     plane = take_slot_int(planes.count)
-    fits = plane < planes.normal.shape[0]
+    fits = plane < planes.place.shape[0]
     if fits:
         planes.vertices[plane] = corners
-        planes.normal[plane] = normal
+        planes.place[plane] = wp.vec4d(normal[0], normal[1], normal[2], ZERO)
         planes.distance[plane] = distance
         planes.split[plane] = wp.int8(split)
         if planes.half:
             planes.half[plane] = half
     for j in range(4):
         if corners[j] >= 0 and inverse_mass_of(motion, corners[j]) > 0.0:
-            _add_node(planes, corners[j], wp.where(fits, 4 * plane + j, INCOMPLETE))
+            if fits:
+                _add_node(planes, corners[j], 8 * plane + 2 * j + wp.where(j < split, 0, 1))
+            else:
+                planes.lacks[corners[j]] = 1
     return wp.where(fits, plane, -1)
 
 
@@ -61,7 +60,7 @@ def add_solid(motion: Motion, planes: DividingPlanes, vertex: int, normal: wp.ve
     """Adds the surface of the solid below an infinite plane, which a vertex stays above, and which does not move."""
     plane = add_plane(motion, planes, wp.vec4i(vertex, -1, -1, -1), 1, normal, ZERO, ZERO)
     if plane >= 0:
-        planes.offset[plane] = offset
+        planes.place[plane] = wp.vec4d(normal[0], normal[1], normal[2], offset)
         planes.margin[plane] = margin
 
 
@@ -73,11 +72,8 @@ def has_planes(planes: DividingPlanes, vertex: int):
     """
     if not planes.first:
         return False, False
-    node = planes.first[vertex]
-    has_any = node >= 0
-    while node >= 0:
-        node = planes.next[node]
-    return has_any, has_any and node != INCOMPLETE
+    has_any = planes.first[vertex] >= 0
+    return has_any, has_any and planes.lacks[vertex] == 0
 
 
 @wp.func
@@ -126,6 +122,6 @@ def add_dividing_plane(
     if distance <= ZERO:
         for j in range(4):
             if inverse_mass_of(motion, corners[j]) > 0.0:
-                _add_node(planes, corners[j], INCOMPLETE)
+                planes.lacks[corners[j]] = 1
         return False
     return add_plane(motion, planes, corners, split, normal, distance, half) >= 0

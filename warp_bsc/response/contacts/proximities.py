@@ -3,61 +3,23 @@
 import numpy as np
 import warp as wp
 
+from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...kernels.polynomials import EDGE_EDGE
 from ..schedule import Loop, SolveStatus, is_dividing, is_projecting
 from ..state.structs import ContactKind, Pace, Step
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
-from ..tuning import BEHIND, REACH, RESTING_PATH
+from ..tuning import REACH, RESTING_PATH
 from . import constraints
 from .closest import closest_vector
+from .nearest import NearestArguments, clip_paths, find_nearest_in_hierarchy, find_nearest_in_queue, is_behind
 from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
-from .rules import ContactClass, are_occluded, are_on_body, crossed_at_start, owner_of
+from .rules import ContactClass, are_occluded, are_on_body, are_parallel, crossed_at_start, owner_of
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def _direction(u: wp.vec3d) -> int:
-    """Returns to which of the six directions along the axes a vector is nearest."""
-    axis = int(0)
-    for other in range(1, 3):
-        if wp.abs(u[other]) > wp.abs(u[axis]):
-            axis = other
-    return 2 * axis + wp.where(u[axis] > ZERO, 1, 0)
-
-
-@wp.kernel
-def find_nearest(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float]):
-    """Finds how far each vertex is from the nearest face in each of six directions [m]; ``nearest`` is infinite before.
-
-    Only faces count that have the closest point within them.
-    """
-    i = wp.tid()
-    if not has_pair(vertex_face, i):
-        return
-    corners = vertices_of(vertex_face, i)
-    a, b, c, d = corners_of(step.motion.x0, corners)
-    _weights, normal, distance = weights_across(VERTEX_FACE, a, b, c, d)
-    if distance > ZERO:
-        wp.atomic_min(nearest, corners[0], _direction(-normal), float(distance))
-
-
-@wp.func
-def _is_behind(
-    corners: wp.vec4i, kind: int, normal: wp.vec3d, distance: wp.float64, nearest: wp.array2d[float]
-) -> bool:
-    """Returns whether another face is between two elements: seen from the vertex, or from both ends of an edge."""
-    a = nearest[corners[0], _direction(-normal)]
-    if kind == VERTEX_FACE:
-        return distance > BEHIND * wp.float64(a)
-    b = nearest[corners[1], _direction(-normal)]
-    c = nearest[corners[2], _direction(normal)]
-    d = nearest[corners[3], _direction(normal)]
-    return distance > BEHIND * wp.float64(wp.min(wp.max(a, b), wp.max(c, d)))
 
 
 @wp.func
@@ -86,6 +48,8 @@ def _add_proximity(
         return
     if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
+    if kind == EDGE_EDGE and are_parallel(motion, corners):
+        return
     if status.crossings[world] > 0:
         if crossed_at_start(step, kind, pair):
             return
@@ -106,37 +70,30 @@ def _add_proximity(
 
 
 @wp.func
-def _collect_proximity(step: Step, candidates: PairQueue, nearest: wp.array2d[float], i: int, status: SolveStatus):
+def _consider(
+    step: Step, kind: int, pair: wp.vec2i, corners: wp.vec4i, nearest: wp.array2d[float], status: SolveStatus
+):
     """Adds a constraint for a candidate if it is a proximity; most are not, and cost little."""
-    if not has_pair(candidates, i):
-        return
-    kind = candidates.kind
-    corners = vertices_of(candidates, i)
     a, b, c, d = corners_of(step.motion.x0, corners)
     weights, normal, distance = weights_across(kind, a, b, c, d)
     if distance == ZERO:
         return
     if nearest and status.crossings[step.motion.world[corners[0]]] == 0:
-        if _is_behind(corners, kind, normal, distance, nearest):
+        if is_behind(corners, kind, normal, distance, nearest):
             return
-    _add_proximity(step, kind, candidates.pairs[i], corners, weights, normal, distance, status)
+    _add_proximity(step, kind, pair, corners, weights, normal, distance, status)
 
 
 @wp.kernel
 def collect_proximities(
     step: Step, vertex_face: PairQueue, edge_edge: PairQueue, nearest: wp.array2d[float], status: SolveStatus
 ):
-    """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
-
-    In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
-    the one below stands still: with constraints for contacts alone, each layer would need an iteration. Only pairs
-    whose closest points are within both elements are used, because others soon are those of other elements, and none
-    with another face between them, if ``nearest`` is known and nothing crosses: neighbours in a stack hold what is
-    behind them.
-    """
+    """Adds constraints for the proximities among the candidates of two queues."""
     i = wp.tid()
-    _collect_proximity(step, vertex_face, nearest, i, status)
-    _collect_proximity(step, edge_edge, nearest, i, status)
+    if has_pair(vertex_face, i):
+        _consider(step, vertex_face.kind, vertex_face.pairs[i], vertices_of(vertex_face, i), nearest, status)
+    if has_pair(edge_edge, i):
+        _consider(step, edge_edge.kind, edge_edge.pairs[i], vertices_of(edge_edge, i), nearest, status)
 
 
 @wp.kernel
@@ -157,7 +114,7 @@ def disable_contacts_behind(step: Step, kept: wp.array[int], nearest: wp.array2d
     kind = constraints.kind_of_pair(added.kind[i])
     _weights, between = closest_vector(step.motion, corners, kind)
     distance = wp.length(between)
-    if distance > ZERO and _is_behind(corners, kind, between / distance, distance, nearest):
+    if distance > ZERO and is_behind(corners, kind, between / distance, distance, nearest):
         added.separation[i] = constraints.NEVER_VIOLATED
 
 
@@ -175,24 +132,56 @@ def drop_proximities(
 
 
 def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
-    """Adds constraints for proximities, in worlds that have contacts; in a CUDA graph none if not all fit.
+    """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
 
-    Contacts behind other faces keep their constraints ``in_substeps``, which are not detected one by one.
+    In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
+    the one below stands still: with constraints for contacts alone, each layer would need an iteration. Only pairs in
+    worlds that have contacts, and whose closest points are within both elements, are used, because others soon are
+    those of other elements, and none with another face between them, if nothing crosses: neighbours in a stack hold
+    what is behind them.
+
+    In a CUDA graph, none are added if not all fit. Contacts behind other faces keep their constraints ``in_substeps``,
+    which are not detected one by one.
     """
-    detector, nearest = work.detector, work.nearest
-    retry_until_fits(detector.find_candidates, detector, work.device)
+    nearest, clipped, ends = work.nearest, work.clipped, work.vertices.x1
     wp.copy(work.kept, work.constraints.count)
+    if nearest is not None and clipped is not None:
+        nearest.fill_(np.inf)
+        _find_nearest(work)
+        if not in_substeps:
+            work.launch_over_constraints(disable_contacts_behind, work.kept, nearest, work.status)
+        ends = clipped
+        work.launch(clip_paths, len(clipped), [work.step, nearest, work.status, clipped])
+    _collect(work, ends)
+    inputs = [work.step, work.kept, work.max_contacts, work.detector.counters.array, work.detector.capacities]
+    work.launch(drop_proximities, 1, inputs)
+
+
+def _find_nearest(work):
+    """Finds the nearest faces on the ways of all vertices in the last detection."""
+    detector, broad_phase = work.detector, work.detector.broad_phase
+    if isinstance(broad_phase, BroadPhaseHierarchy):  # without a queue, as layers behind others are many
+        arguments = NearestArguments()
+        arguments.faces, arguments.step, arguments.nearest = broad_phase.hierarchy, work.step, work.nearest
+        broad_phase.traverse(find_nearest_in_hierarchy(), arguments)
+        return
+
+    def find() -> None:
+        detector.counters.array.zero_()
+        broad_phase.pair_vertices_with_faces(detector.vertex_face.counts, detector.vertex_face.queue)
+
+    retry_until_fits(find, detector, work.device)
+    queue = queues_of(detector, candidates=True)[0]
+    work.launch_over(find_nearest_in_queue, counted([queue]), [work.step, queue, work.nearest])
+
+
+def _collect(work, ends):
+    """Adds constraints for the proximities among the pairs whose boxes overlap on the way to some ends."""
+    detector, x0 = work.detector, work.step.motion.x0
 
     def collect() -> None:
         queues = queues_of(detector, candidates=True)[:2]
-        if nearest is not None:
-            nearest.fill_(np.inf)
-            work.launch_over(find_nearest, counted(queues[:1]), [work.step, queues[0], nearest])
-            if not in_substeps:
-                work.launch_over_constraints(disable_contacts_behind, work.kept, nearest, work.status)
-        inputs = [work.step, *queues, nearest, work.status]
-        work.launch_over(collect_proximities, counted(queues), inputs)
+        work.launch_over(collect_proximities, counted(queues), [work.step, *queues, work.nearest, work.status])
 
+    retry_until_fits(lambda: detector.find_candidates(x0, ends, refit=True), detector, work.device)
     retry_until_fits(collect, work, work.device)
-    inputs = [work.step, work.kept, work.max_contacts, detector.counters.array, detector.capacities]
-    work.launch(drop_proximities, 1, inputs)

@@ -11,8 +11,8 @@ from ...kernels.pipeline.pairs import is_filtered
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
 from ..state.structs import Bodies, Motion, Step, body_of, can_move
-from ..state.vectors import ZERO, to_double
-from ..tuning import BEND_OF_BODY, BEND_OF_SHEET
+from ..state.vectors import ZERO, corners_of, to_double
+from ..tuning import BEND_OF_BODY, BEND_OF_SHEET, PARALLEL
 
 _COLLIDE_SHAPES = wp.constant(int(ShapeFlags.COLLIDE_SHAPES))
 
@@ -152,6 +152,18 @@ def classify_contact(
 def _at(motion: Motion, vertex: int, time: wp.float64) -> wp.vec3d:
     start = to_double(motion.x0[vertex])
     return start + time * (to_double(motion.x1[vertex]) - start)
+
+
+@wp.func
+def are_parallel(motion: Motion, edges: wp.vec4i) -> bool:
+    """Returns whether two edges are nearly parallel: bending a little turns what is across both by any angle.
+
+    A push in that direction would move cloth sideways, and strain it, where layers lie edge on edge.
+    """
+    a, b, c, d = corners_of(motion.x0, edges)
+    u = b - a
+    v = d - c
+    return wp.length_sq(wp.cross(u, v)) < PARALLEL * wp.length_sq(u) * wp.length_sq(v)
 
 
 @wp.func

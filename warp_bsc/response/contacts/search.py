@@ -5,7 +5,6 @@ import functools
 import warp as wp
 
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from ...detection.element_pairs import overlapping_edges, overlapping_vertices
 from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...detection.settings import TOLERANCE
 from ...kernels.ccd import impact_at_distance
@@ -23,12 +22,13 @@ from ..state.vectors import ZERO
 from .collect import mark_changed
 from .constraints import distances_at_start
 from .dividing_planes import add_dividing_plane
+from .face_pairs import pair_of_bit, unseparated_pairs
 from .first_contact import update_first_contact
 from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
-"""The pair of a point and another cell, behind those of :func:`_pairs_of_faces`."""
+"""The pair of a point and another cell, behind those of :func:`unseparated_pairs`."""
 
 
 @wp.struct
@@ -110,34 +110,6 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
 
 
 @wp.func
-def _pairs_of_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
-    """Returns the pairs of elements that two faces represent and whose boxes overlap, as bits."""
-    left = (overlapping_vertices(mesh, place, other, False) >> 3) & 7
-    left = left | (overlapping_vertices(mesh, other, place, False) & 56)
-    return left | (((overlapping_edges(mesh, place, other, False) >> 9) & 511) << 6)
-
-
-@wp.func
-def _pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
-    """Returns kind, elements and vertices of one of the pairs of :func:`_pairs_of_faces`."""
-    if bit < 6:
-        of = wp.where(bit < 3, place, other)
-        face = wp.where(bit < 3, other, place)
-        vertex = mesh.faces[of, bit % 3]
-        corners = wp.vec4i(vertex, mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2])
-        return VERTEX_FACE, wp.vec2i(vertex, mesh.order[face]), corners
-    side = (bit - 6) / 3
-    other_side = (bit - 6) % 3
-    corners = wp.vec4i(
-        mesh.faces[place, side],
-        mesh.faces[place, (side + 1) % 3],
-        mesh.faces[other, other_side],
-        mesh.faces[other, (other_side + 1) % 3],
-    )
-    return EDGE_EDGE, wp.vec2i(mesh.face_edges[place, side], mesh.face_edges[other, other_side]), corners
-
-
-@wp.func
 def _point_pair(mesh: FaceHierarchy, point: int, other: int):
     """Returns kind, elements and vertices of a pair of a point and another cell, at two places; kind -1 if none."""
     p = mesh.faces[point, 0]
@@ -160,7 +132,7 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
         while found != wp.uint32(0):
             other = first + lowest_set_bit(found)
             found = found & (found - wp.uint32(1))
-            left = _pairs_of_faces(mesh, place, other)
+            left = unseparated_pairs(mesh, place, other)
             point = int(-1)
             if wp.static(keep_distances):
                 if mesh.order[place] >= mesh.point_start:
@@ -172,7 +144,7 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
             while left != 0:  # one body for all, which is large
                 bit = lowest_set_bit(wp.uint32(left))
                 left = left & (left - 1)
-                kind, pair, corners = _pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
+                kind, pair, corners = pair_of_bit(mesh, place, other, wp.where(bit < _POINT_BIT, bit, 0))
                 if wp.static(keep_distances):
                     if bit == _POINT_BIT:
                         kind, pair, corners = _point_pair(mesh, point, place + other - point)

@@ -105,7 +105,8 @@ def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus):
     if plane >= planes.count[0] or planes.vertices[plane][3] < 0:
         return
     corners = planes.vertices[plane]
-    normal = planes.normal[plane]
+    place = planes.place[plane]
+    normal = wp.vec3d(place[0], place[1], place[2])
     split = int(planes.split[plane])
     half = ZERO
     if planes.half:
@@ -126,7 +127,8 @@ def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus):
             margin = least
         offset = wp.clamp(offset, least - below.reached, above.reached - least)
     # last, what cannot be moved decides
-    planes.offset[plane] = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
+    place[3] = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
+    planes.place[plane] = place
     planes.margin[plane] = float(margin)
 
 

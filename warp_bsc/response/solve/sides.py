@@ -25,12 +25,13 @@ _SMALLEST = wp.constant(float(2.0**-149))
 @wp.func
 def _half_space(planes: DividingPlanes, node: int):
     """Returns the normal of a vertex's side of a plane, its least coordinate along it, and the margin."""
-    plane = node / 4
-    side = wp.where(node % 4 < int(planes.split[plane]), ONE, -ONE)
-    least = side * planes.offset[plane]
+    plane = node / 8
+    side = wp.where(node % 2 == 0, ONE, -ONE)
+    place = planes.place[plane]
+    least = side * place[3]
     if planes.half:
         least += planes.half[plane]
-    return side * planes.normal[plane], least, wp.float64(planes.margin[plane])
+    return side * wp.vec3d(place[0], place[1], place[2]), least, wp.float64(planes.margin[plane])
 
 
 @wp.func
@@ -41,7 +42,7 @@ def _is_above(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> bool:
         normal, least, _margin = _half_space(planes, node)
         if wp.dot(normal, x) <= least:
             return False
-        node = planes.next[node]
+        node = planes.next[node / 2]
     return True
 
 
@@ -106,7 +107,7 @@ def _projected(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3d:
                         most = missing
                         normal = other
                         height = least + margin
-                node = planes.next[node]
+                node = planes.next[node / 2]
             if most == ZERO:
                 return x
             joins = True
@@ -152,7 +153,7 @@ def share_of_path(planes: DividingPlanes, vertex: int, x0: wp.vec3d, x1: wp.vec3
         after = wp.dot(normal, x1) - least
         if after <= ZERO and before > after:
             share = wp.min(share, wp.max(before - margin, ZERO) / (before - after))
-        node = planes.next[node]
+        node = planes.next[node / 2]
     return share
 
 
@@ -181,7 +182,7 @@ def _rounded(planes: DividingPlanes, vertex: int, x: wp.vec3d) -> wp.vec3:
         if missing > most or (missing == most and _precedes(other, normal)):
             most = missing
             normal = other
-        node = planes.next[node]
+        node = planes.next[node / 2]
     for axis in range(3):
         end[axis] = _towards(end[axis], x[axis], normal[axis])
     return end
@@ -200,7 +201,7 @@ def _most_correction(planes: DividingPlanes, vertex: int, start: wp.vec3d, end: 
     while node >= 0:
         normal, least, margin = _half_space(planes, node)
         below = wp.max(below, least + margin - wp.dot(normal, start))
-        node = planes.next[node]
+        node = planes.next[node / 2]
     return (ONE + _ROUNDING) * wp.length(end - start) + WEDGE * below
 
 

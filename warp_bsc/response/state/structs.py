@@ -226,20 +226,21 @@ NOT_PLACED, PLACED, CUT_SHORT = (wp.constant(i) for i in (0, 1, 2))
 class DividingPlanes:
     """Planes that vertices stay above or below, and a list for each vertex of those that concern it.
 
-    The nodes of lists are numbered ``4 plane + corner``, as the planes of two elements have four vertices. These planes
-    move, see :mod:`.solve.dividing_passes`.
+    The planes of two elements have four vertices, so that there are four nodes for each. A node is the number
+    ``8 plane + 2 corner + side``, side 1 of a vertex below, as this is what its vertex asks for: less to read where all
+    is scattered in memory. These planes move, see :mod:`.solve.dividing_passes`.
     """
 
     count: wp.array[int]  # of planes, whether they fit or not
     vertices: wp.array[wp.vec4i]  # of both elements, -1 for none
-    normal: wp.array[wp.vec3d]
+    place: wp.array[wp.vec4d]  # the normal, then the coordinate along it [m]
     distance: wp.array[wp.float64]  # of both elements along the normal at the start, without that to keep [m]
-    offset: wp.array[wp.float64]  # coordinate along the normal [m]
     half: wp.array[wp.float64]  # of the minimum distance of both elements [m]; empty without minimum distances
     margin: wp.array[float]  # by which projection exceeds it [m]
     split: wp.array[wp.int8]  # the first corner that stays below
-    next: wp.array[int]  # the next node in the list of the same vertex, or the end
-    first: wp.array[int]  # node of a vertex, or the end
+    next: wp.array[int]  # of half of a node, the next one in the list of the same vertex, or NO_NODE
+    first: wp.array[int]  # node of a vertex, or NO_NODE
+    lacks: wp.array[int]  # of a vertex, 1 if it has contacts without a plane
     placed: wp.array[int]  # of a vertex: NOT_PLACED, PLACED or CUT_SHORT
     wanted: wp.array[wp.vec3]  # where a vertex is to end, as near as its planes let it come [m]
     reached: wp.array[wp.vec3]  # an end of its path above its planes [m]

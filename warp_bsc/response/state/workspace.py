@@ -79,6 +79,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
     if dividing.first:
         dividing.first[i] = NO_NODE
+        dividing.lacks[i] = 0
         dividing.placed[i] = NOT_PLACED
 
 
@@ -121,7 +122,9 @@ class Workspace:
         self.particle_count, device = mesh.model.particle_count, mesh.device
         self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
+        self.detector = DetectionPipeline(
+            mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances, counts_candidates=False
+        )
         self.crossing_candidates = CrossingCandidates(mesh)
         self.step = step = Step()
         step.mesh = mesh.connectivity
@@ -142,14 +145,17 @@ class Workspace:
         if not differentiable:
             capacity = DIVIDING_PLANES * self.particle_count
             sizes = {"count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
-            sizes |= dict.fromkeys(("first", "placed", "wanted", "reached"), vertices)
+            sizes |= dict.fromkeys(("first", "lacks", "placed", "wanted", "reached"), vertices)
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
         self.status = allocate_status(self.worlds, device, **limits)
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
-        self.nearest = None if differentiable else wp.empty((mesh.vertex_count, 6), dtype=float, device=device)
+        self.nearest = self.clipped = None
+        if not differentiable:
+            self.nearest = wp.empty((vertices, 6), dtype=float, device=device)
+            self.clipped = wp.empty(vertices, dtype=wp.vec3, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self.vertices_at_planes = mesh.vertex_count if motion.moves_bodies else self.particle_count
@@ -304,7 +310,7 @@ class Workspace:
 
     def launch_over_planes(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the dividing planes."""
-        self.launch_over(kernel, [(self.dividing.normal, self.dividing.count, 0)], [self.step, *inputs])
+        self.launch_over(kernel, [(self.dividing.place, self.dividing.count, 0)], [self.step, *inputs])
 
     def launch_over_active_set(self, kernel: wp.Kernel, *inputs) -> None:
         """Launches a kernel over the active constraints."""

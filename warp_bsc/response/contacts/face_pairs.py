@@ -1,0 +1,38 @@
+"""The pairs of elements that two faces of a hierarchy represent, for threads that look at them where they find them."""
+
+import warp as wp
+
+from ...detection.element_pairs import overlapping_edges, overlapping_vertices
+from ...detection.face_hierarchy import FaceHierarchy
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+
+
+@wp.func
+def unseparated_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+    """Returns the pairs of elements that two faces represent and that no axis separates over the motion, as bits."""
+    left = (overlapping_vertices(mesh, place, other, False) >> 3) & 7
+    left = left | (overlapping_vertices(mesh, other, place, False) & 56)
+    return left | (((overlapping_edges(mesh, place, other, False) >> 9) & 511) << 6)
+
+
+@wp.func
+def overlapping_vertex_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
+    """Returns the pairs of a vertex and a face whose swept boxes overlap, of those of two faces, as bits."""
+    left = overlapping_vertices(mesh, place, other, True) & 7
+    return left | ((overlapping_vertices(mesh, other, place, True) & 7) << 3)
+
+
+@wp.func
+def pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
+    """Returns kind, elements and vertices of one of the pairs of the functions above."""
+    if bit < 6:
+        of = wp.where(bit < 3, place, other)
+        face = wp.where(bit < 3, other, place)
+        vertex = mesh.faces[of, bit % 3]
+        corners = wp.vec4i(vertex, mesh.faces[face, 0], mesh.faces[face, 1], mesh.faces[face, 2])
+        return VERTEX_FACE, wp.vec2i(vertex, mesh.order[face]), corners
+    edge = mesh.face_edges[place, (bit - 6) / 3]
+    other_edge = mesh.face_edges[other, (bit - 6) % 3]
+    a = wp.min(edge, other_edge)
+    b = wp.max(edge, other_edge)
+    return EDGE_EDGE, wp.vec2i(a, b), wp.vec4i(mesh.edges[a, 0], mesh.edges[a, 1], mesh.edges[b, 0], mesh.edges[b, 1])
