@@ -122,8 +122,8 @@ class BroadPhaseSimd:
     def _build(
         self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None
     ) -> None:
-        """Builds trees for a motion; with ``refit``, keeps their order unless the boxes have become loose."""
-        if refit:
+        """Builds trees for a motion; with ``refit``, keeps the order that they have unless boxes have become loose."""
+        if refit and all(tree.is_sorted for tree in trees):
             for tree in trees:
                 tree.fit(x0, x1, changed)
             if not any(tree.is_loose for tree in trees):

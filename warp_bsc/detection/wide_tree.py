@@ -271,6 +271,7 @@ class WideTree:
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
         self._size = self._sorted_size = 0.0  # of all packets, when fitted and when sorted
+        self.is_sorted = False
 
     @property
     def is_loose(self) -> bool:
@@ -296,7 +297,7 @@ class WideTree:
             wp.utils.radix_sort_pairs(self._codes, self._order, n)
         inputs, outputs = [self._corners, self._numbers, self._worlds, self._order], [self._elements, self._node_marks]
         launch_over(_fill_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
-        self._sorted_size = 0.0
+        self._sorted_size, self.is_sorted = 0.0, True
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Computes the boxes of all packets and nodes for a motion, without sorting.

@@ -42,11 +42,10 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     """
     detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else work.active
-    refit = only_changed or changed is not None  # a tree of which little is looked at need not be the best
 
     def find():
         ends = work.step.motion.x0, vertices.x1
-        detector.find_contacts(*ends, refit=refit, changed=changed, proximities=not only_changed)
+        detector.find_contacts(*ends, refit=True, changed=changed, proximities=not only_changed)
 
     retry_until_fits(find, detector, work.device)
     work.reserve(work.max_contacts)
