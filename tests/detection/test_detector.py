@@ -302,7 +302,7 @@ def test_of_what_has_changed_all_contacts_are_found_again(broad_phase, device):
         everything = find(start, second)
         find(start, first)
         changed = wp.array(moved, dtype=int, device=device)
-        again = find(start, second, refit=True, changed=changed)
+        again = find(start, second, changed=changed)
         candidates = sum(int(n.counts.numpy()[Count.CANDIDATES]) for n in pipeline.narrow_phases)
         assert (share == 0.0) == (candidates == 0)
         for full, part, (one, other) in zip(

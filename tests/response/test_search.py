@@ -109,8 +109,8 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
     np.testing.assert_array_equal(queued[0], queueless[0])
 
 
-def test_proximities_are_those_of_queues(monkeypatch):
-    """Found in the hierarchy, without queues, they are the same constraints, and layers fall to the same positions."""
+def test_proximities_of_the_hierarchy_are_those_of_trees(monkeypatch):
+    """With the nearest faces found without a queue, constraints are the same, and layers fall to the same positions."""
     monkeypatch.setattr("warp_bsc.response.step.proximities.add_proximities", record_proximities(found := []))
     model = pile(12)
     solvers = stage(model, monkeypatch, tiny=False), bsc.SolverCCD(SOLVERS["vbd"](model))

@@ -20,6 +20,9 @@ class BroadPhase(Protocol):
     A run only enqueues. Counts stay on the device, and the caller provides the queues of the results. Boxes are in
     single precision, rounded so that no overlap is missed. An element with a position that is not finite has no pairs.
 
+    A run keeps the tree of the one before, and only fits its boxes; nothing is allocated on a GPU. The tree of a CPU is
+    sorted again where boxes have become much larger. The pairs are the same.
+
     Attributes:
         lock: Held by each user of the broad phase from a run until its queues have been read.
     """
@@ -53,7 +56,6 @@ class BroadPhase(Protocol):
         edge_edge_counts: wp.array,
         edge_edge: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
@@ -66,8 +68,6 @@ class BroadPhase(Protocol):
             vertex_face: Queue for (vertex, face), array of vec2i.
             edge_edge_counts: By :class:`Count`, array of int64.
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
-            refit: Whether to keep the tree of the run before and to fit only its boxes. The pairs are the same, and
-                nothing is allocated on a GPU. The tree of a CPU is sorted again if its boxes have become much larger.
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. Pairs without one of
                 these vertices may be found as well.
             keep_separated: Whether to enqueue all candidates.
@@ -83,7 +83,6 @@ class BroadPhase(Protocol):
         vertex_vertex_counts: wp.array,
         vertex_vertex: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
@@ -94,16 +93,13 @@ class BroadPhase(Protocol):
         """
         ...
 
-    def pair_edges_with_faces(
-        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
-    ) -> None:
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
 
         Args:
             x: Positions, array of vec3 or vec3d.
             counts: By :class:`Count`, array of int64.
             pairs: Queue for (edge, face), array of vec2i.
-            refit: As of :meth:`pair_elements`.
             is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
                 boxes are reused on a CPU.
         """

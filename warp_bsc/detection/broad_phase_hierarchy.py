@@ -5,10 +5,10 @@ from typing import Any
 
 import warp as wp
 
-from ..kernels.pipeline.boxes import boxes_apart, read_box
+from ..kernels.pipeline.boxes import read_box
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
-from .element_pairs import PAIRS_OF_THREAD, pair_edges_with_faces, pair_elements, pair_points
+from .element_pairs import PAIRS_OF_THREAD, are_apart, pair_edges_with_faces, pair_elements, pair_points
 from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
 from .launch import launch, max_blocks
 from .mesh import CollisionMesh
@@ -46,9 +46,8 @@ def _not_apart(place: int, first: int, found: wp.uint32, boxes: wp.array2d[wp.ve
         bit = left & (~left + wp.uint32(1))
         left = left ^ bit
         other = read_box(boxes, first + lowest_set_bit(bit))
-        if other[0][0] <= other[1][0]:
-            if boxes_apart(box[0], box[1], box[2], box[3], other[0], other[1], other[2], other[3]):
-                found = found ^ bit
+        if other[0][0] <= other[1][0] and are_apart(box, other):
+            found = found ^ bit
     return found
 
 
@@ -140,11 +139,10 @@ class BroadPhaseHierarchy:
         edge_edge_counts: wp.array,
         edge_edge: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts the candidates, and enqueues those that no coordinate axis separates; always only refits."""
+        """Counts the candidates, and enqueues those that no coordinate axis separates."""
         self._pair_faces(x0, x1, changed, keep_separated or not self._leaves_out_separated)
         queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
         threads = -(-self.capacity // (int(PAIRS_OF_THREAD) * WIDTH)) * WIDTH
@@ -159,7 +157,6 @@ class BroadPhaseHierarchy:
         vertex_vertex_counts: wp.array,
         vertex_vertex: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
@@ -167,10 +164,8 @@ class BroadPhaseHierarchy:
         queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
         self._launch_over_pairs(pair_points, self.capacity, keep_separated, *queues)
 
-    def pair_edges_with_faces(
-        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
-    ) -> None:
-        """Enqueues the pairs (edge, face) of one configuration whose boxes overlap; always only refits."""
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
+        """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
         self._pair_faces(x, x)
         self._launch_over_pairs(pair_edges_with_faces, self.capacity, counts, pairs)
 

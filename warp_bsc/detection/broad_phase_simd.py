@@ -71,7 +71,6 @@ class BroadPhaseSimd:
         edge_edge_counts: wp.array,
         edge_edge: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
@@ -79,7 +78,7 @@ class BroadPhaseSimd:
         trees = [self._vertices, self._edges, self._faces]
         if self._edges_of_faces:
             trees.append(self._edges_of_faces)
-        self._build(trees, x0, x1, refit, changed)
+        self._build(trees, x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
         self._vertices.pair(self._faces, vertex_face_counts, vertex_face, **options)
         self._edges.pair(self._edges, edge_edge_counts, edge_edge, ordered=True, **options)
@@ -95,14 +94,13 @@ class BroadPhaseSimd:
         vertex_vertex_counts: wp.array,
         vertex_vertex: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
         """Counts and enqueues the candidates of points with edges that no face has, and with points."""
         if self._points is None or self._free_edges is None:
             return
-        self._build([self._points, self._free_edges], x0, x1, refit, changed)
+        self._build([self._points, self._free_edges], x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
         self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, **options)
         self._points.pair(self._points, vertex_vertex_counts, vertex_vertex, ordered=True, **options)
@@ -111,19 +109,15 @@ class BroadPhaseSimd:
         """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""
         self._vertices.pair(self._faces, counts, pairs, keep_separated=True)
 
-    def pair_edges_with_faces(
-        self, x: wp.array, counts: wp.array, pairs: wp.array, *, refit: bool = False, is_end: bool = False
-    ) -> None:
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
         if not is_end:
-            self._build([self._edges, self._faces], x, x, refit)
+            self._build([self._edges, self._faces], x, x)
         self._edges.pair(self._faces, counts, pairs, at_end=True)
 
-    def _build(
-        self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, refit: bool, changed: wp.array | None = None
-    ) -> None:
-        """Builds trees for a motion; with ``refit``, keeps the order that they have unless boxes have become loose."""
-        if refit and all(tree.is_sorted for tree in trees):
+    def _build(self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
+        """Fits the boxes of trees to a motion; sorts trees that never were, or whose boxes have become loose."""
+        if all(tree.is_sorted for tree in trees):
             for tree in trees:
                 tree.fit(x0, x1, changed)
             if not any(tree.is_loose for tree in trees):

@@ -119,7 +119,7 @@ class CollisionDetector:
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
-            self._pipeline.find_contacts(x0, x1, refit=self._has_run, changed=changed, sort=True, timer=timer)
+            self._pipeline.find_contacts(x0, x1, changed=changed, sort=True, timer=timer)
             return timer
 
         timer = retry_until_fits(launch, self._pipeline, self.mesh.device)

@@ -12,6 +12,7 @@ from .settings import NO_GRADIENTS, Count
 
 __all__ = [
     "PAIRS_OF_THREAD",
+    "are_apart",
     "overlapping_edges",
     "overlapping_vertices",
     "pair_edges_with_faces",
@@ -40,7 +41,8 @@ def _overlap(a: BoxRows, b: BoxRows):
 
 
 @wp.func
-def _apart(a: BoxRows, b: BoxRows):
+def are_apart(a: BoxRows, b: BoxRows) -> bool:
+    """Returns whether an axis separates two boxes at the start and at the end, on one side."""
     return boxes_apart(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3])
 
 
@@ -99,7 +101,7 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
                     found = found | (64 << corner)
                 else:
                     found = found | (1 << corner)
-                    if keep_separated or not _apart(box, other_box):
+                    if keep_separated or not are_apart(box, other_box):
                         found = found | (8 << corner)
     return found
 
@@ -135,7 +137,7 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
                                     found = found | (262144 << bit)
                                 else:
                                     found = found | (1 << bit)
-                                    if keep_separated or not _apart(box, other_box):
+                                    if keep_separated or not are_apart(box, other_box):
                                         found = found | (512 << bit)
     return found
 
@@ -287,7 +289,7 @@ def _pair_point(
                 _count_filtered(mesh, place, 1)
                 return
             take_slot(vertex_edge_counts, _CANDIDATES)
-            if keep_separated or not _apart(box, other_box):
+            if keep_separated or not are_apart(box, other_box):
                 append(wp.vec2i(point, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
 
 
@@ -323,5 +325,5 @@ def pair_points(
                 _count_filtered(mesh, place, 1)
                 return
             take_slot(vertex_vertex_counts, _CANDIDATES)
-            if keep_separated or not _apart(box, other_box):
+            if keep_separated or not are_apart(box, other_box):
                 append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)

@@ -190,10 +190,10 @@ class CrossingCandidates:
         self.pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         self.count = 0
 
-    def find(self, x: wp.array, *, refit: bool = False, is_end: bool = False) -> None:
+    def find(self, x: wp.array, *, is_end: bool = False) -> None:
         """Launches the broad phase; options are those of :meth:`.BroadPhase.pair_edges_with_faces`."""
         self._counters.array.zero_()
-        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, refit=refit, is_end=is_end)
+        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, is_end=is_end)
 
     def enqueue(self, pairs: np.ndarray) -> None:
         """Enqueues given pairs, int32, shape [n, 2], in place of those that the broad phase finds."""
@@ -252,7 +252,6 @@ class IntersectionFinder:
         self._mesh = mesh
         self._candidates = CrossingCandidates(mesh, broad_phase)
         self._lock = self._candidates.lock
-        self._has_run = False
         self._allocate(len(mesh.faces))
 
     def find(self, x: np.ndarray | wp.array, *, is_end: bool = False) -> Intersections:
@@ -268,9 +267,7 @@ class IntersectionFinder:
             TypeError: If the positions are no array of numbers.
             ValueError: If they have another shape or type, or are not finite.
         """
-        found = self._find(x, lambda positions: self._candidates.find(positions, refit=self._has_run, is_end=is_end))
-        self._has_run = True
-        return found
+        return self._find(x, lambda positions: self._candidates.find(positions, is_end=is_end))
 
     def find_at_end(self, x: np.ndarray | wp.array, start: Intersections, collisions: Collisions) -> Intersections:
         """Returns the intersections at the end of a motion: those of :meth:`find`, on a CPU in less time.

@@ -209,9 +209,8 @@ class DetectionPipeline:
         x0: wp.array,
         x1: wp.array,
         *,
-        refit: bool = False,
         changed: wp.array | None = None,
-        proximities: bool | None = None,
+        proximities: bool = True,
         sort: bool = False,
         timer: StageTimer = _UNTIMED,
         side_stream: wp.Stream | None = None,
@@ -221,13 +220,10 @@ class DetectionPipeline:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
-            refit: Whether to keep the tree of the run before, which is fast if little has moved since. The tree of a
-                GPU never changes.
             changed: Nonzero for each vertex whose motion has changed since the run before, or that was in a contact
                 then. Pairs without one of these vertices have no contact again, and are excluded. Warp array of int;
                 None for all.
-            proximities: Whether contacts with minimum distances include pairs that are only near; None for those of
-                runs that do not ``refit``.
+            proximities: Whether contacts with minimum distances of a response include pairs that are only near.
             sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
             timer: Measures the stages.
             side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
@@ -237,19 +233,16 @@ class DetectionPipeline:
         if self._filtered_of_worlds is not None:
             self._filtered_of_worlds.zero_()
         with timer.stage("broad phase"):
-            self._broad_phase.pair_elements(
-                x0, x1, *_queues(self.vertex_face, self.edge_edge), refit=refit, changed=changed
-            )
+            self._broad_phase.pair_elements(x0, x1, *_queues(self.vertex_face, self.edge_edge), changed=changed)
             if self.points:
-                self._broad_phase.pair_points(x0, x1, *_queues(*self.points), refit=refit, changed=changed)
+                self._broad_phase.pair_points(x0, x1, *_queues(*self.points), changed=changed)
             if self.mesh.device.is_cpu:
                 self._launch_count_not_finite(x0, x1)
         narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
         if self._min_distances is not None:
             options = {"tolerance": self.tolerance, "timer": timer}
-            near = not refit if proximities is None else proximities
-            run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=near, **options)
+            run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=proximities, **options)
         elif self.device_radius is None:
             run_narrow_phases(narrow_phases, x0, x1, **options)
         else:
@@ -268,17 +261,16 @@ class DetectionPipeline:
         """The broad phase, whose boxes are those of the last run."""
         return self._broad_phase
 
-    def find_candidates(self, x0: wp.array, x1: wp.array, *, refit: bool = False) -> None:
+    def find_candidates(self, x0: wp.array, x1: wp.array) -> None:
         """Enqueues all candidates of a motion in the queues of the narrow phases, which do not run.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
-            refit: As of :meth:`find_contacts`.
         """
         self.counters.array.zero_()
         queues = _queues(self.vertex_face, self.edge_edge)
-        self._broad_phase.pair_elements(x0, x1, *queues, refit=refit, keep_separated=True)
+        self._broad_phase.pair_elements(x0, x1, *queues, keep_separated=True)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.

@@ -183,7 +183,6 @@ class ProximityFinder:
             for kind in DistanceKind
         ]
         self._rings = make_rings(mesh, rings)
-        self._has_run = False
 
     @one_at_a_time
     def find(self, x: np.ndarray | wp.array) -> Proximities:
@@ -211,7 +210,6 @@ class ProximityFinder:
             raise ValueError(f"x must be at most 2^1000 to have distances, not {largest:g}")
         lower, upper = self._enlarge(positions)
         retry_until_fits(lambda: self._launch(x, lower, upper), self, mesh.device)
-        self._has_run = True
         found = [self._decide(queue, x, largest) for queue in self._queues]
         vertex_face, edge_edge, vertex_edge, vertex_vertex = (pairs for pairs, _, _ in found)
         distance, position = (np.concatenate([rows[i] for rows in found]) for i in (1, 2))
@@ -268,9 +266,8 @@ class ProximityFinder:
         queues = [array for queue in self._queues for array in (queue.counts, queue.candidates)]
         # all positions move from lower to upper: an axis that separates two elements at both ends may not separate
         # their enlarged boxes
-        options = {"refit": self._has_run, "keep_separated": True}
-        self._broad_phase.pair_elements(lower, upper, *queues[:4], **options)
-        self._broad_phase.pair_points(lower, upper, *queues[4:], **options)
+        self._broad_phase.pair_elements(lower, upper, *queues[:4], keep_separated=True)
+        self._broad_phase.pair_points(lower, upper, *queues[4:], keep_separated=True)
         mesh = self._mesh
         for queue in self._queues:
             launch_over_queue(

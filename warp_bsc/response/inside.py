@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags, ParticleFlags
 
+from .._arguments import as_numpy
 from ..detection.body_parts import connect_cells
 from ..detection.containment import ContainmentFinder
 from ..detection.mesh import CollisionMesh
@@ -196,7 +197,7 @@ def _read(values: wp.array | None, count: int) -> np.ndarray:
 
 def _checked(values: np.ndarray | wp.array, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Returns an argument on the host; raises ValueError if it has another shape."""
-    values = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+    values = as_numpy(values, name)
     if values.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, not {values.shape}")
     return values

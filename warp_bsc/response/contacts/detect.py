@@ -45,7 +45,7 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
 
     def find():
         ends = work.step.motion.x0, vertices.x1
-        detector.find_contacts(*ends, refit=True, changed=changed, proximities=not only_changed)
+        detector.find_contacts(*ends, changed=changed, proximities=not only_changed)
 
     retry_until_fits(find, detector, work.device)
     work.reserve(work.max_contacts)

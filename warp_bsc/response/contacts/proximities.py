@@ -143,15 +143,15 @@ def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
     In a CUDA graph, none are added if not all fit. Contacts behind other faces keep their constraints ``in_substeps``,
     which are not detected one by one.
     """
-    nearest, clipped, ends = work.nearest, work.clipped, work.vertices.x1
+    nearest, ends = work.nearest, work.vertices.x1
     wp.copy(work.kept, work.constraints.count)
-    if nearest is not None and clipped is not None:
+    if nearest is not None:
         nearest.fill_(np.inf)
         _find_nearest(work)
         if not in_substeps:
             work.launch_over_constraints(disable_contacts_behind, work.kept, nearest, work.status)
-        ends = clipped
-        work.launch(clip_paths, len(clipped), [work.step, nearest, work.status, clipped])
+        ends = work.clipped
+        work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)
     inputs = [work.step, work.kept, work.max_contacts, work.detector.counters.array, work.detector.capacities]
     work.launch(drop_proximities, 1, inputs)
@@ -183,5 +183,5 @@ def _collect(work, ends):
         queues = queues_of(detector, candidates=True)[:2]
         work.launch_over(collect_proximities, counted(queues), [work.step, *queues, work.nearest, work.status])
 
-    retry_until_fits(lambda: detector.find_candidates(x0, ends, refit=True), detector, work.device)
+    retry_until_fits(lambda: detector.find_candidates(x0, ends), detector, work.device)
     retry_until_fits(collect, work, work.device)

@@ -94,6 +94,9 @@ class Workspace:
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
+        nearest: How far each vertex is from the nearest face in each of six directions [m], see
+            :mod:`.contacts.nearest`; None if steps may be recorded.
+        clipped: Where paths end that are clipped there.
         differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
@@ -152,10 +155,8 @@ class Workspace:
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
-        self.nearest = self.clipped = None
-        if not differentiable:
-            self.nearest = wp.empty((vertices, 6), dtype=float, device=device)
-            self.clipped = wp.empty(vertices, dtype=wp.vec3, device=device)
+        self.nearest = None if differentiable else wp.empty((vertices, 6), dtype=float, device=device)
+        self.clipped = wp.empty(vertices, dtype=wp.vec3, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
         self.vertices_at_planes = mesh.vertex_count if motion.moves_bodies else self.particle_count
