@@ -55,7 +55,7 @@ def initialize_velocity_multipliers(step: Step, dt: wp.float64):
 
 
 @wp.func
-def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, dt: wp.float64, i: int):
+def _activate_constraint(step: Step, tolerance: wp.float64, dt: wp.float64, i: int):
     """Adds a constraint to the active set, if it pushed, and its contact points are still near each other."""
     constraints = step.constraints
     multiplier = constraints.velocity_multiplier[i]
@@ -75,11 +75,11 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
 
 
 @wp.kernel
-def activate_velocity_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, dt: wp.float64):
+def activate_velocity_constraints(step: Step, tolerance: wp.float64, dt: wp.float64):
     """Fills the active set for velocities."""
     i = wp.tid()
     if i < step.constraints.count[0]:
-        _activate_constraint(step, status, tolerance, dt, i)
+        _activate_constraint(step, tolerance, dt, i)
 
 
 @wp.func
@@ -156,7 +156,7 @@ def _sweep(
     more = status.loop[Loop.MORE_SWEEPS]
     while more == 1:
         for i in range(thread, count, threads):
-            _activate_constraint(step, status, tolerance, dt, i)
+            _activate_constraint(step, tolerance, dt, i)
         wait_for_others()
         active_count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
@@ -192,7 +192,7 @@ def project(work: Workspace, dt: float) -> None:
 
 
 def _activate(work, dt):
-    work.launch_over_constraints(activate_velocity_constraints, work.status, work.tolerance, dt)
+    work.launch_over_constraints(activate_velocity_constraints, work.tolerance, dt)
 
 
 def _update(work, last):
