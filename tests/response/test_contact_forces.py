@@ -8,7 +8,7 @@ from newton_scenes import DT, SOFT, SOLVERS, Changed, add_patch, add_plates, bul
 
 import warp_bsc as bsc
 from warp_bsc.response.forces import contact_forces
-from warp_bsc.response.forces.contact_forces import shapes_of_worlds
+from warp_bsc.response.state.mesh import members_of_worlds
 from warp_bsc.response.state.structs import ContactKind
 
 GRAVITY = 9.81
@@ -247,8 +247,8 @@ def test_what_pushes_before_the_stage_is_named(device):
     assert "self-contact" in bsc.SolverCCD(self_contact).report.impulses_elsewhere
 
 
-def test_shapes_of_worlds():
-    found = shapes_of_worlds(np.array([-1, 1, 0, 1, -1]), 3)
+def test_members_of_worlds():
+    found = members_of_worlds(np.array([-1, 1, 0, 1, -1]), 3)
     assert found.tolist() == [[0, 4, 2, -1], [0, 4, 1, 3], [0, 4, -1, -1]]
 
 

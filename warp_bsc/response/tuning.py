@@ -149,5 +149,5 @@ MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""
 CONTACTS_PER_PARTICLE, MIN_CONTACTS = 8, 4096
 """Contacts that a report lists, for each particle, and at least."""
-BLOCKS = 8
-"""Blocks of threads, for each multiprocessor of a GPU, of a launch over a queue."""
+THREADS = 2048
+"""Threads, for each multiprocessor of a GPU, of a launch over the entries of a queue."""

@@ -4,7 +4,7 @@ import warp as wp
 
 from ...detection.settings import Count
 from ...kernels.closest import contact_weights
-from ...kernels.pipeline.queues import has_overflowed, is_filled
+from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, count_filtered, is_dividing, widened
@@ -17,7 +17,7 @@ from . import constraints, rules
 from .constraints import TOUCH
 from .dividing_planes import add_dividing_plane, add_solid
 from .first_contact import update_first_contact
-from .queue import PairQueue, has_pair, vertices_of
+from .queue import PairQueue, has_pair, pair_count, vertices_of
 from .rules import ContactClass
 
 wp.set_module_options({"enable_backward": False})
@@ -25,6 +25,17 @@ wp.set_module_options({"enable_backward": False})
 _QUEUED = wp.constant(int(Count.QUEUED))
 _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 """Share of its distance at the start that a particle keeps."""
+
+
+@wp.func
+def _count_crossing(step: Step, edge: int, face: int, count: wp.array[int], of_worlds: wp.array[int]):
+    mesh = step.mesh
+    corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
+    movable = rules.owner_of(step.motion, corners) == ContactClass.OURS
+    if movable or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
+        if rules.crosses_face(step, edge, face):
+            wp.atomic_add(count, 0, 1)
+            wp.atomic_add(of_worlds, step.motion.world[corners[0]], 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -36,20 +47,11 @@ def count_crossings(
     # out
     count: wp.array[int],
     of_worlds: wp.array[int],
+    threads: int,
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
-    i = wp.tid()
-    mesh = step.mesh
-    if not is_filled(i, pairs, counts, _QUEUED):
-        return
-    edge = pairs[i][0]
-    face = pairs[i][1]
-    corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
-    movable = rules.owner_of(step.motion, corners) == ContactClass.OURS
-    if movable or step.motion.inverse_mass[mesh.faces[face, 2]] > 0.0:
-        if rules.crosses_face(step, edge, face):
-            wp.atomic_add(count, 0, 1)
-            wp.atomic_add(of_worlds, step.motion.world[corners[0]], 1)
+    for i in range(wp.tid(), int(wp.min(counts[_QUEUED], wp.int64(pairs.shape[0]))), threads):
+        _count_crossing(step, pairs[i][0], pairs[i][1], count, of_worlds)
 
 
 @wp.func
@@ -116,9 +118,10 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
     world = motion.world[vertex]
     if rules.inverse_mass_of(motion, vertex) == 0.0:
         return
-    for i in range(planes.end.shape[0]):
-        if planes.world[i] >= 0 and planes.world[i] != world:
-            continue
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
         after, error_after = signed_distance(planes.end[i], vertices.x1[vertex])
         kept, reach = distances_from_plane(motion, planes, i, vertex)
         if not (after <= kept + wp.max(reach, error_after)):  # nor where the plane is not finite
@@ -281,17 +284,18 @@ def collect_contacts(
     step: Step,
     dividing: DividingPlanes,
     status: SolveStatus,
+    threads: int,
 ):
     """Adds constraints for the contacts of two kinds, and counts them; after the last projection, dividing planes.
 
     Then it finds the first contact of each vertex as well. Does nothing if :mod:`.search` is to find all contacts
     because a queue overflowed: which contacts are among those that fit depends on the order of threads.
     """
-    i = wp.tid()
     if can_search and has_overflowed(counts, capacities):
         return
-    _collect_contact(step, first, i, dividing, status)
-    _collect_contact(step, second, i, dividing, status)
+    for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
+        _collect_contact(step, first, i, dividing, status)
+        _collect_contact(step, second, i, dividing, status)
 
 
 @wp.kernel

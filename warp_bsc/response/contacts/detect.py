@@ -4,12 +4,11 @@ import warp as wp
 
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
-from ...detection.settings import Count
 from ..schedule import Loop, Result, decide, decide_worlds
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
 from .impacts import count_grazing
-from .queue import counted, queues_of
+from .queue import queues_of
 from .search import find_contacts_without_queues
 
 
@@ -25,7 +24,7 @@ def _count_crossings(work):
     retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
     with work.all_worlds():
         inputs = [work.step, candidates.pairs, candidates.counts, crossings, work.status.crossings]
-        work.launch_over(count_crossings, [(candidates.pairs, candidates.counts, Count.QUEUED)], inputs)
+        work.launch_over_entries(count_crossings, inputs)
 
 
 def detect_penetrations(work: Workspace, *, ahead: bool) -> None:
@@ -57,10 +56,9 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
-        inputs = [*pair, *overflow, work.step, work.dividing, work.status]
-        work.launch_over(collect_contacts, counted(pair), inputs)
+        work.launch_over_entries(collect_contacts, [*pair, *overflow, work.step, work.dividing, work.status])
     if work.recorder is not None:
-        work.launch_over(count_grazing, counted(queues[:2]), [work.step, *queues[:2], work.record])
+        work.launch_over_entries(count_grazing, [work.step, *queues[:2], work.record])
     _decide(work, overflow)
     if can_search:
         wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow)

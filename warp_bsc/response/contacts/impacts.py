@@ -13,7 +13,7 @@ from ..state.record import StepRecord
 from ..state.structs import ContactKind, Motion, Step
 from ..state.vectors import ONE, ZERO, corners_of, relative
 from .constraints import kind_of_contact, kind_of_pair
-from .queue import PairQueue, has_pair, vertices_of
+from .queue import PairQueue, has_pair, pair_count, vertices_of
 from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
@@ -151,8 +151,8 @@ def _count_grazing(step: Step, contacts: PairQueue, i: int, record: StepRecord):
 
 
 @wp.kernel(enable_backward=False)
-def count_grazing(step: Step, vertex_face: PairQueue, edge_edge: PairQueue, record: StepRecord):
+def count_grazing(step: Step, vertex_face: PairQueue, edge_edge: PairQueue, record: StepRecord, threads: int):
     """Counts the contacts whose gradients are clamped, see :mod:`warp_bsc.kernels.gradients`."""
-    i = wp.tid()
-    _count_grazing(step, vertex_face, i, record)
-    _count_grazing(step, edge_edge, i, record)
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face), pair_count(edge_edge)), threads):
+        _count_grazing(step, vertex_face, i, record)
+        _count_grazing(step, edge_edge, i, record)

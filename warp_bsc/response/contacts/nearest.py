@@ -13,7 +13,7 @@ from ..state.structs import Step
 from ..state.vectors import ZERO, corners_of, to_double
 from ..tuning import BEHIND
 from .face_pairs import overlapping_vertex_faces, pair_of_bit
-from .queue import PairQueue, has_pair, vertices_of
+from .queue import PairQueue, pair_count, vertices_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,10 +59,9 @@ def _keep_nearest(step: Step, corners: wp.vec4i, nearest: wp.array2d[float]):
 
 
 @wp.kernel
-def find_nearest_in_queue(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float]):
+def find_nearest_in_queue(step: Step, vertex_face: PairQueue, nearest: wp.array2d[float], threads: int):
     """Keeps the nearest face of each vertex among the candidates of a queue."""
-    i = wp.tid()
-    if has_pair(vertex_face, i):
+    for i in range(wp.tid(), pair_count(vertex_face), threads):
         _keep_nearest(step, vertices_of(vertex_face, i), nearest)
 
 

@@ -9,14 +9,14 @@ from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ..schedule import Loop, SolveStatus, is_dividing, is_projecting
-from ..state.structs import ContactKind, Pace, Step
+from ..state.structs import ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import REACH, RESTING_PATH
 from . import constraints
 from .closest import closest_vector
 from .nearest import NearestArguments, clip_paths, find_nearest_in_hierarchy, find_nearest_in_queue, is_behind
-from .queue import PairQueue, counted, has_pair, queues_of, vertices_of
+from .queue import PairQueue, has_pair, pair_count, queues_of, vertices_of
 from .rules import ContactClass, are_occluded, are_on_body, are_parallel, crossed_at_start, owner_of
 
 wp.set_module_options({"enable_backward": False})
@@ -86,26 +86,25 @@ def _consider(
 
 @wp.kernel
 def collect_proximities(
-    step: Step, vertex_face: PairQueue, edge_edge: PairQueue, nearest: wp.array2d[float], status: SolveStatus
+    step: Step,
+    vertex_face: PairQueue,
+    edge_edge: PairQueue,
+    nearest: wp.array2d[float],
+    status: SolveStatus,
+    threads: int,
 ):
     """Adds constraints for the proximities among the candidates of two queues."""
-    i = wp.tid()
-    if has_pair(vertex_face, i):
-        _consider(step, vertex_face.kind, vertex_face.pairs[i], vertices_of(vertex_face, i), nearest, status)
-    if has_pair(edge_edge, i):
-        _consider(step, edge_edge.kind, edge_edge.pairs[i], vertices_of(edge_edge, i), nearest, status)
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face), pair_count(edge_edge)), threads):
+        if has_pair(vertex_face, i):
+            _consider(step, vertex_face.kind, vertex_face.pairs[i], vertices_of(vertex_face, i), nearest, status)
+        if has_pair(edge_edge, i):
+            _consider(step, edge_edge.kind, edge_edge.pairs[i], vertices_of(edge_edge, i), nearest, status)
 
 
-@wp.kernel
-def disable_contacts_behind(step: Step, kept: wp.array[int], nearest: wp.array2d[float], status: SolveStatus):
-    """Disables constraints for slow contacts of elements with another face between them at the start.
-
-    What falls by more than the layers of a stack are apart would collide with many of them, but meets only the nearest.
-    If it still collides with others after the projection, planes divide them.
-    """
-    i = wp.tid()
+@wp.func
+def _disable_if_behind(step: Step, nearest: wp.array2d[float], status: SolveStatus, i: int):
     added = step.constraints
-    if i >= kept[0] or added.pace[i] != Pace.SLOW or added.kind[i] >= ContactKind.PLANE:
+    if added.pace[i] != Pace.SLOW or added.kind[i] >= ContactKind.PLANE:
         return
     corners = added.vertices[i]
     world = step.motion.world[corners[0]]
@@ -116,6 +115,17 @@ def disable_contacts_behind(step: Step, kept: wp.array[int], nearest: wp.array2d
     distance = wp.length(between)
     if distance > ZERO and is_behind(corners, kind, between / distance, distance, nearest):
         added.separation[i] = constraints.NEVER_VIOLATED
+
+
+@wp.kernel
+def disable_contacts_behind(step: Step, nearest: wp.array2d[float], status: SolveStatus, threads: int):
+    """Disables constraints for slow contacts of elements with another face between them at the start.
+
+    What falls by more than the layers of a stack are apart would collide with many of them, but meets only the nearest.
+    If it still collides with others after the projection, planes divide them.
+    """
+    for i in range(wp.tid(), constraint_count(step), threads):
+        _disable_if_behind(step, nearest, status, i)
 
 
 @wp.kernel
@@ -149,7 +159,7 @@ def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
         nearest.fill_(np.inf)
         _find_nearest(work)
         if not in_substeps:
-            work.launch_over_constraints(disable_contacts_behind, work.kept, nearest, work.status)
+            work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
         ends = work.clipped
         work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)
@@ -172,7 +182,7 @@ def _find_nearest(work):
 
     retry_until_fits(find, detector, work.device)
     queue = queues_of(detector, candidates=True)[0]
-    work.launch_over(find_nearest_in_queue, counted([queue]), [work.step, queue, work.nearest])
+    work.launch_over_entries(find_nearest_in_queue, [work.step, queue, work.nearest])
 
 
 def _collect(work, ends):
@@ -181,7 +191,7 @@ def _collect(work, ends):
 
     def collect() -> None:
         queues = queues_of(detector, candidates=True)[:2]
-        work.launch_over(collect_proximities, counted(queues), [work.step, *queues, work.nearest, work.status])
+        work.launch_over_entries(collect_proximities, [work.step, *queues, work.nearest, work.status])
 
     retry_until_fits(lambda: detector.find_candidates(x0, ends), detector, work.device)
     retry_until_fits(collect, work, work.device)

@@ -31,6 +31,12 @@ def has_pair(queue: PairQueue, i: int) -> bool:
 
 
 @wp.func
+def pair_count(queue: PairQueue) -> int:
+    """Returns the number of pairs in a queue; those that did not fit are counted, but are not there."""
+    return int(wp.min(queue.counts[queue.count], wp.int64(queue.pairs.shape[0])))
+
+
+@wp.func
 def vertices_of(queue: PairQueue, i: int) -> wp.vec4i:
     """Returns the four vertices of a pair, those of its first element first; see :func:`points_of_pair`."""
     return points_of_pair(queue.kind, queue.elements, queue.pairs[i])
@@ -51,8 +57,3 @@ def queues_of(detector: DetectionPipeline, *, candidates: bool = False) -> list[
                 setattr(queue, name, getattr(found, name))
         queues.append(queue)
     return queues
-
-
-def counted(queues: list[PairQueue]) -> list[tuple]:
-    """Returns pairs, counts and the index of the count of each queue, as :meth:`.Workspace.launch_over` takes them."""
-    return [(queue.pairs, queue.counts, queue.count) for queue in queues]

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..state.mesh import host_array
+from ..state.mesh import host_array, members_of_worlds
 from ..state.motion import StateArrays
 from ..state.structs import allocate
 from ..state.workspace import Workspace
@@ -12,17 +12,6 @@ from .structs import Centres, ContactRows, ImpulseSums, KeptImpulses, PublishedI
 
 MAX_PAIRS = 2**20
 """Most entries of the matrices of pairs of shapes, over all worlds: they then take 38 MB."""
-
-
-def shapes_of_worlds(shape_world: np.ndarray, worlds: int) -> np.ndarray:
-    """Returns the shapes of each world, those that are in all worlds first, then -1, shape [worlds, n], int32."""
-    everywhere = np.flatnonzero(shape_world < 0)
-    own = [np.flatnonzero(shape_world == world) for world in range(worlds)]
-    found = np.full((worlds, len(everywhere) + max(map(len, own))), -1, dtype=np.int32)
-    found[:, : len(everywhere)] = everywhere
-    for world, shapes in enumerate(own):
-        found[world, len(everywhere) : len(everywhere) + len(shapes)] = shapes
-    return found
 
 
 class ContactForces:
@@ -37,13 +26,10 @@ class ContactForces:
     def __init__(self, work: Workspace, capacity: int, *, in_substeps: bool):
         """Allocates buffers for ``capacity`` contacts; ``in_substeps`` says whether steps may have substeps."""
         self._work, device, mesh = work, work.device, work.mesh
-        model, worlds = mesh.model, work.worlds
-        planes = mesh.planes.world
+        model, worlds, planes = mesh.model, work.worlds, mesh.planes.world
         shape_world = host_array(model.shape_world) if model.shape_count else np.zeros(0, dtype=np.int32)
-        if model.world_count <= 1:
-            shape_world, planes = np.zeros_like(shape_world), np.zeros_like(planes)
-        self.shapes_of_worlds = shapes_of_worlds(shape_world, worlds)
-        self._sides, sides = Sides(), shapes_of_worlds(planes, worlds)
+        self.shapes_of_worlds = members_of_worlds(shape_world, worlds)
+        self._sides, sides = Sides(), members_of_worlds(planes, worlds)
         self._set_sides(_numbers_in(self.shapes_of_worlds, model.shape_count), _numbers_in(sides, len(planes)))
         self._sides.planes_per_world = slots = max(1, sides.shape[1])
         self._sides.max_local = local = self.shapes_of_worlds.shape[1]
@@ -85,7 +71,7 @@ class ContactForces:
 
     def _allocate_kept(self, size):
         torques = size if self._work.mesh.model.body_count else 0
-        return allocate(KeptImpulses, size, self._work.device, torque=(torques, 2))
+        return allocate(KeptImpulses, size, self._work.device, count=1, torque=(torques, 2))
 
     def _reserve(self):
         """Keeps impulses of as many constraints as there can be; those of a CUDA graph cannot become more."""
@@ -114,9 +100,7 @@ class ContactForces:
         """Forgets the substeps of worlds that repeat them; ``restarts`` is 1 for these, shape [worlds]."""
         self._reserve()
         kept = [self._of_constraints, self._of_planes, self._unpaired]
-        size = max(len(self._of_constraints.impulse), self._slots, len(self._unpaired.of_particles))
-        size = max(size, len(self._unpaired.of_bodies))
-        self._work.launch(keep.restart_worlds, size, [self._work.step, restarts, self._sides, *kept])
+        self._work.launch_over_constraints(keep.restart_worlds, restarts, self._sides, *kept)
 
     def keep(self, substeps: int = 1, remaining: wp.array[int] | None = None) -> None:
         """Keeps the impulses of a substep after its projections, or those at the end of the step.
@@ -141,6 +125,7 @@ class ContactForces:
         self.published.max_impulse.zero_()
         outputs = [self._sums, rows]
         work.launch_over_constraints(publish.publish_contacts, self._sides, self._of_constraints, *outputs)
+        self._of_constraints.count.zero_()
         if self._slots:
             inputs = [step, work.motion.planes, self._sides, self._of_planes]
             work.launch(publish.publish_contacts_of_planes, work.vertices_at_planes, [*inputs, *outputs])

@@ -12,7 +12,7 @@ from ..state.fixed_sum import sum_of, sums_of
 from ..state.motion import StateArrays, continues, takes_part
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.poses import in_world
-from ..state.structs import ContactKind, Motion, Step, body_of, can_move, has_final_velocity
+from ..state.structs import ContactKind, Motion, Step, body_of, can_move, constraint_count, has_final_velocity
 from ..state.vectors import ONE, ZERO, relative, to_double, to_single
 from .structs import Centres, KeptImpulses, Sides, Unpaired
 from .sums import add_impulse, body_of_vertex, clear_kept
@@ -106,29 +106,21 @@ def _responds(step: Step, i: int) -> bool:
     return False
 
 
-@wp.kernel
-def keep_impulses(
-    # in
+@wp.func
+def _keep_impulse(
     step: Step,
     planes: MovingPlanes,
     sides: Sides,
     centres: Centres,
     substeps: int,
     remaining: wp.array[int],
-    # in and out
     of_constraints: KeptImpulses,
     of_planes: KeptImpulses,
     unpaired: Unpaired,
     lost: wp.array[int],
+    i: int,
 ):
-    """Adds the impulses of constraints in a substep, or without ``remaining``, after the step, to those that are kept.
-
-    Constraints of planes are made anew in each substep, one for a vertex and a plane: theirs are kept by these.
-    """
-    i = wp.tid()
     constraints, motion = step.constraints, step.motion
-    if i >= constraints.count[0]:
-        return
     impulse = constraints.velocity_multiplier[i]
     if wp.length_sq(impulse) == ZERO:
         return
@@ -166,6 +158,33 @@ def keep_impulses(
     if kept.torque:
         for side in range(2):
             kept.torque[place, side] += _torque_on(step, sides, centres, share, i, side, impulse)
+
+
+@wp.kernel
+def keep_impulses(
+    # in
+    step: Step,
+    planes: MovingPlanes,
+    sides: Sides,
+    centres: Centres,
+    substeps: int,
+    remaining: wp.array[int],
+    # in and out
+    of_constraints: KeptImpulses,
+    of_planes: KeptImpulses,
+    unpaired: Unpaired,
+    lost: wp.array[int],
+    threads: int,
+):
+    """Adds the impulses of constraints in a substep, or without ``remaining``, after the step, to those that are kept.
+
+    Constraints of planes are made anew in each substep, one for a vertex and a plane: theirs are kept by these.
+    """
+    count = constraint_count(step)
+    if wp.tid() == 0:
+        of_constraints.count[0] = wp.max(of_constraints.count[0], count)
+    for i in range(wp.tid(), count, threads):
+        _keep_impulse(step, planes, sides, centres, substeps, remaining, of_constraints, of_planes, unpaired, lost, i)
 
 
 @wp.func
@@ -212,18 +231,20 @@ def restart_worlds(
     of_constraints: KeptImpulses,
     of_planes: KeptImpulses,
     unpaired: Unpaired,
+    threads: int,
 ):
     """Clears what is kept of worlds that repeat their substeps."""
-    i = wp.tid()
     motion, constraints = step.motion, step.constraints
-    if i < wp.min(constraints.count[0], of_constraints.impulse.shape[0]):
+    for i in range(wp.tid(), wp.min(constraint_count(step), of_constraints.impulse.shape[0]), threads):
         if restarts[motion.world[constraints.vertices[i][0]]] == 1:
             clear_kept(of_constraints, i)
-    if i < of_planes.impulse.shape[0]:
-        if restarts[motion.world[i / sides.planes_per_world]] == 1:
-            clear_kept(of_planes, i)
-    if i < unpaired.of_particles.shape[0] and restarts[motion.world[i]] == 1:
-        unpaired.of_particles[i] = wp.vec3d()
-    if i < unpaired.of_bodies.shape[0] and restarts[wp.max(sides.body_world[i], 0)] == 1:
-        unpaired.of_bodies[i, 0] = wp.vec3d()
-        unpaired.of_bodies[i, 1] = wp.vec3d()
+    for slot in range(wp.tid(), of_planes.impulse.shape[0], threads):
+        if restarts[motion.world[slot / sides.planes_per_world]] == 1:
+            clear_kept(of_planes, slot)
+    for particle in range(wp.tid(), unpaired.of_particles.shape[0], threads):
+        if restarts[motion.world[particle]] == 1:
+            unpaired.of_particles[particle] = wp.vec3d()
+    for body in range(wp.tid(), unpaired.of_bodies.shape[0], threads):
+        if restarts[wp.max(sides.body_world[body], 0)] == 1:
+            unpaired.of_bodies[body, 0] = wp.vec3d()
+            unpaired.of_bodies[body, 1] = wp.vec3d()

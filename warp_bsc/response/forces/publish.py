@@ -102,18 +102,17 @@ def _kind_of(kind: int) -> int:
 
 
 @wp.kernel
-def publish_contacts(step: Step, sides: Sides, kept: KeptImpulses, sums: ImpulseSums, rows: ContactRows):
+def publish_contacts(step: Step, sides: Sides, kept: KeptImpulses, sums: ImpulseSums, rows: ContactRows, threads: int):
     """Adds the impulses of constraints to all sums, and writes a row for each that has one."""
-    i = wp.tid()
     constraints = step.constraints
-    if i >= kept.impulse.shape[0] or wp.length_sq(kept.impulse[i]) == ZERO:
-        return
-    if i >= constraints.count[0]:  # constraints of a CUDA graph did not fit, and were dropped
-        wp.atomic_add(rows.lost, 0, 1)
-        clear_kept(kept, i)
-        return
-    kind, corners, weights = _kind_of(constraints.kind[i]), constraints.vertices[i], constraints.weights[i]
-    _publish(step, sides, kept, i, kind, corners, weights, constraints.plane[i], sums, rows)
+    for i in range(wp.tid(), kept.count[0], threads):
+        if wp.length_sq(kept.impulse[i]) > ZERO:
+            if i < constraints.count[0]:
+                kind, corners, weights = _kind_of(constraints.kind[i]), constraints.vertices[i], constraints.weights[i]
+                _publish(step, sides, kept, i, kind, corners, weights, constraints.plane[i], sums, rows)
+            else:  # constraints of a CUDA graph did not fit, and were dropped
+                wp.atomic_add(rows.lost, 0, 1)
+                clear_kept(kept, i)
 
 
 @wp.kernel
@@ -124,8 +123,9 @@ def publish_contacts_of_planes(
     vertex = wp.tid()
     world = step.motion.world[vertex]
     weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
-    for plane in range(planes.end.shape[0]):
-        if planes.world[plane] < 0 or planes.world[plane] == world:
+    for place in range(planes.of_worlds.shape[1]):
+        plane = planes.of_worlds[world, place]
+        if plane >= 0:
             i = vertex * sides.planes_per_world + sides.plane_slot[plane]
             if wp.length_sq(kept.impulse[i]) > ZERO:
                 _publish(step, sides, kept, i, int(ContactKind.PLANE), wp.vec4i(vertex), weights, plane, sums, rows)

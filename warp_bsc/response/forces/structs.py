@@ -24,6 +24,7 @@ class Sides:
 class KeptImpulses:
     """Impulses on the first of two contact points by the second, summed over the substeps of a step."""
 
+    count: wp.array[int]  # the places, from the first on, at which there may be some
     impulse: wp.array[wp.vec3d]  # [N s]
     along: wp.array[wp.float64]  # the part along the normal [N s]
     normal: wp.array[wp.vec3d]

@@ -76,9 +76,11 @@ def finish_shares(
     share = from_units(sums[vertex])
     sums[vertex] = wp.int64(0)
     if vertex < layer.motion.x0.shape[0]:
-        for plane in range(layer.planes.end.shape[0]):
-            _normal, depth = contact_with_plane(layer, plane, vertex)
-            share += share_of(layer, depth)
+        of_worlds, world = layer.planes.of_worlds, layer.motion.world[vertex]
+        for place in range(of_worlds.shape[1]):
+            if of_worlds[world, place] >= 0:
+                _normal, depth = contact_with_plane(layer, of_worlds[world, place], vertex)
+                share += share_of(layer, depth)
     if has_overflowed(counts, capacities):
         share = ZERO
         if vertex == 0:
@@ -156,8 +158,10 @@ def sum_pushes(
 def move_particles(layer: Layer, sums: wp.array2d[wp.int64], end: StateArrays):
     """Moves each particle by the pushes of its contacts, in the motion and in the state; others keep every bit."""
     motion, vertex = layer.motion, wp.tid()
-    for plane in range(layer.planes.end.shape[0]):
-        add_to_sum(sums, vertex, 0, change_by_plane(layer, plane, vertex))
+    of_worlds, world = layer.planes.of_worlds, motion.world[vertex]
+    for place in range(of_worlds.shape[1]):
+        if of_worlds[world, place] >= 0:
+            add_to_sum(sums, vertex, 0, change_by_plane(layer, of_worlds[world, place], vertex))
     change = sum_of(sums, vertex, 0)
     if wp.length_sq(change) > ZERO and motion.is_not_finite[vertex] == 0:
         motion.x1[vertex] = with_delta(motion.x1[vertex], sums, vertex)

@@ -48,8 +48,9 @@ def find_extremes(motion: Motion, planes: MovingPlanes, gravity: wp.array[wp.vec
     up = -wp.normalize(gravity[wp.clamp(motion.world[vertex], 0, gravity.shape[0] - 1)])
     height = wp.dot(up, x)
     _widen(rule, 3, height, height)
-    for plane in range(planes.start.shape[0]):
-        if planes.world[plane] < 0 or planes.world[plane] == motion.world[vertex]:
+    for place in range(planes.of_worlds.shape[1]):
+        plane = planes.of_worlds[motion.world[vertex], place]
+        if plane >= 0:
             surface = planes.start[plane]
             steepness = wp.dot(up, wp.vec3(float(surface[0]), float(surface[1]), float(surface[2])))
             distance, _error = signed_distance(surface, x)

@@ -90,19 +90,10 @@ def _side(
     return side
 
 
-@wp.kernel
-def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus):
-    """Places each plane where both elements would meet by their masses, but between what they have reached.
-
-    Nor is it within a vertex that cannot be moved, which may have passed what the other has reached. Elements come no
-    nearer to each other than a share of their distance at the start, or of ``FAR_APART`` separations.
-    """
-    plane = wp.tid()
+@wp.func
+def _place_plane(step: Step, planes: DividingPlanes, status: SolveStatus, plane: int):
     loop = status.loop
-    if plane == 0:
-        loop[Loop.PASS] = loop[Loop.PASS] + 1
-        loop[Loop.MORE_PASSES] = 0
-    if plane >= planes.count[0] or planes.vertices[plane][3] < 0:
+    if planes.vertices[plane][3] < 0:
         return
     corners = planes.vertices[plane]
     place = planes.place[plane]
@@ -130,6 +121,21 @@ def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus):
     place[3] = wp.max(wp.min(offset, above.fixed - margin), margin - below.fixed)
     planes.place[plane] = place
     planes.margin[plane] = float(margin)
+
+
+@wp.kernel
+def place_planes(step: Step, planes: DividingPlanes, status: SolveStatus, threads: int):
+    """Places each plane where both elements would meet by their masses, but between what they have reached.
+
+    Nor is it within a vertex that cannot be moved, which may have passed what the other has reached. Elements come no
+    nearer to each other than a share of their distance at the start, or of ``FAR_APART`` separations.
+    """
+    loop = status.loop
+    if wp.tid() == 0:
+        loop[Loop.PASS] = loop[Loop.PASS] + 1
+        loop[Loop.MORE_PASSES] = 0
+    for plane in range(wp.tid(), wp.min(planes.count[0], planes.place.shape[0]), threads):
+        _place_plane(step, planes, status, plane)
 
 
 @wp.kernel

@@ -28,6 +28,7 @@ from ..state.structs import (
     DividingPlanes,
     Step,
     Tetrahedra,
+    constraint_count,
 )
 from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
@@ -39,16 +40,9 @@ from .sides import share_of_path
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
-def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus):
-    """Adds dividing planes for proximities, of which those of vertices and faces then may change velocities.
-
-    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
-    """
-    i = wp.tid()
+@wp.func
+def _divide_proximity(step: Step, dividing: DividingPlanes, status: SolveStatus, i: int):
     constraints, outcome = step.constraints, step.vertices.outcome
-    if i >= constraints.count[0]:
-        return
     kind = constraints.kind[i]
     if kind != ContactKind.VERTEX_FACE_PROXIMITY and kind != ContactKind.EDGE_EDGE_PROXIMITY:
         return
@@ -63,6 +57,16 @@ def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus
         for j in range(4):
             if step.motion.inverse_mass[corners[j]] > 0.0:
                 outcome[corners[j]] = outcome[corners[j]] | PROJECTED
+
+
+@wp.kernel
+def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus, threads: int):
+    """Adds dividing planes for proximities, of which those of vertices and faces then may change velocities.
+
+    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
+    """
+    for i in range(wp.tid(), constraint_count(step), threads):
+        _divide_proximity(step, dividing, status, i)
 
 
 @wp.kernel
@@ -353,7 +357,7 @@ def divide(work: Workspace, dt: float) -> None:
 
 
 def _pass_over_planes(work):
-    work.launch_over_planes(place_planes, work.dividing, work.status)
+    work.launch_over_constraints(place_planes, work.dividing, work.status)
     work.launch_over_particles(move_to_sides, work.dividing, work.tolerance, work.status)
 
 

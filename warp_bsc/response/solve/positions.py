@@ -16,7 +16,7 @@ from ..schedule import (
 )
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
-from ..state.structs import PROJECTED, ContactKind, Pace, Step
+from ..state.structs import PROJECTED, ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
@@ -77,10 +77,11 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
 
 
 @wp.kernel
-def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, in_substep: bool):
+def activate_position_constraints(
+    step: Step, status: SolveStatus, tolerance: wp.float64, in_substep: bool, threads: int
+):
     """Fills the active set for positions."""
-    i = wp.tid()
-    if i < step.constraints.count[0]:
+    for i in range(wp.tid(), constraint_count(step), threads):
         _activate_constraint(step, status, tolerance, in_substep, i)
 
 
@@ -102,10 +103,9 @@ def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, pla
 
 
 @wp.kernel
-def project_positions(step: Step, status: SolveStatus, record: StepRecord):
+def project_positions(step: Step, status: SolveStatus, record: StepRecord, threads: int):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
-    place = wp.tid()
-    if wp.int64(place) < step.constraints.active_count[0]:
+    for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):
         _project_constraint(step, status, record, place)
 
 
@@ -157,7 +157,7 @@ def _sweep(
     if thread == 0:
         begin_sweeps(status)
     wait_for_others()
-    count = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+    count = constraint_count(step)
     more = status.loop[Loop.MORE_SWEEPS]
     batch = int(0)
     while more == 1 and batch < batches:

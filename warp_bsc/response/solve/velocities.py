@@ -6,7 +6,7 @@ from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of
 from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, Loop, SolveStatus, begin_sweeps
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
-from ..state.structs import Step, has_final_velocity
+from ..state.structs import Step, constraint_count, has_final_velocity
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import TOLERANCE_OF_BODIES
@@ -47,10 +47,9 @@ def _initialize_multiplier(step: Step, dt: wp.float64, i: int):
 
 
 @wp.kernel
-def initialize_velocity_multipliers(step: Step, dt: wp.float64):
+def initialize_velocity_multipliers(step: Step, dt: wp.float64, threads: int):
     """Initializes the velocity multipliers of all constraints."""
-    i = wp.tid()
-    if i < step.constraints.count[0]:
+    for i in range(wp.tid(), constraint_count(step), threads):
         _initialize_multiplier(step, dt, i)
 
 
@@ -75,10 +74,9 @@ def _activate_constraint(step: Step, tolerance: wp.float64, dt: wp.float64, i: i
 
 
 @wp.kernel
-def activate_velocity_constraints(step: Step, tolerance: wp.float64, dt: wp.float64):
+def activate_velocity_constraints(step: Step, tolerance: wp.float64, dt: wp.float64, threads: int):
     """Fills the active set for velocities."""
-    i = wp.tid()
-    if i < step.constraints.count[0]:
+    for i in range(wp.tid(), constraint_count(step), threads):
         _activate_constraint(step, tolerance, dt, i)
 
 
@@ -96,10 +94,9 @@ def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, pla
 
 
 @wp.kernel
-def project_velocities(step: Step, status: SolveStatus, record: StepRecord):
+def project_velocities(step: Step, status: SolveStatus, record: StepRecord, threads: int):
     """Updates the velocity multipliers of the active set, in one Jacobi sweep."""
-    place = wp.tid()
-    if wp.int64(place) < step.constraints.active_count[0]:
+    for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):
         _project_constraint(step, status, record, place)
 
 
@@ -143,7 +140,7 @@ def _sweep(
     for world in range(thread, sums.shape[0], threads):
         for column in range(sums.shape[1]):
             sums[world, column] = wp.int64(0)
-    count = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+    count = constraint_count(step)
     for i in range(thread, count, threads):
         _initialize_multiplier(step, dt, i)
     wait_for_others()

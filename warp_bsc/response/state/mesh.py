@@ -283,6 +283,19 @@ def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence
     return incidence
 
 
+def members_of_worlds(world: np.ndarray, worlds: int) -> np.ndarray:
+    """Returns what is in each world, what is in all (-1) first, then -1; int32, shape [worlds, n]."""
+    everywhere = np.flatnonzero(world < 0)
+    numbers = np.flatnonzero(world >= 0)
+    numbers = numbers[np.argsort(world[numbers], kind="stable")]
+    counts = np.bincount(world[numbers], minlength=worlds)
+    found = np.full((worlds, len(everywhere) + counts.max()), -1, dtype=np.int32)
+    found[:, : len(everywhere)] = everywhere
+    column = np.arange(len(numbers)) - np.repeat(np.cumsum(counts) - counts, counts)
+    found[world[numbers], len(everywhere) + column] = numbers
+    return found
+
+
 def are_infinite_planes(model: Model) -> np.ndarray:
     """Returns which shapes of a model are infinite planes, shape [shape_count]."""
     return (host_array(model.shape_type) == GeoType.PLANE) & (host_array(model.shape_scale)[:, :2] <= 0.0).any(axis=1)

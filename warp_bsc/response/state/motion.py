@@ -6,7 +6,7 @@ import warp as wp
 from newton import BodyFlags
 
 from .friction import Friction
-from .mesh import ModelMesh, Placement, vertex_position
+from .mesh import ModelMesh, Placement, members_of_worlds, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
 from .structs import Bodies, Motion, add_zeros, body_of, can_move
@@ -214,6 +214,8 @@ class ModelMotion:
         of_planes = mesh.device_planes
         planes.friction, planes.world = friction.planes, of_planes.world
         planes.shape, planes.body, planes.shape_filter = of_planes.shape, of_planes.body, mesh.shape_filter
+        of_worlds = members_of_worlds(mesh.planes.world, max(1, model.world_count))
+        planes.of_worlds = wp.array(of_worlds, dtype=int, device=device)
         add_zeros(planes, ("start", "end"), len(friction.planes), device)
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies

@@ -23,6 +23,7 @@ class MovingPlanes:
     end: wp.array[wp.vec4d]
     friction: wp.array[float]
     world: wp.array[int]  # -1 for all
+    of_worlds: wp.array2d[int]  # the planes of each world, shape [worlds, n], then -1
     shape: wp.array[int]
     body: wp.array[int]  # that the plane moves with, -1 for none
     shape_filter: PairFilter  # groups and masks of shapes; empty if no pair is left out

@@ -185,6 +185,12 @@ class Step:
     restitution: wp.array[float]  # share of the approaching velocity that comes back, one number
 
 
+@wp.func
+def constraint_count(step: Step) -> int:
+    """Returns the number of constraints; those that did not fit are counted, but are not there."""
+    return wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+
+
 @wp.struct
 class Tetrahedra:
     """The tetrahedra of soft bodies whose inversions are looked for."""

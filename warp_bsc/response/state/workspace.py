@@ -22,7 +22,7 @@ from ..schedule import (
     start_sweeps,
 )
 from ..solve.cluster import BLOCK, threads_of_cluster
-from ..tuning import BLOCKS, DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, TOLERANCE
+from ..tuning import DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, THREADS, TOLERANCE
 from .motion import ModelMotion
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -166,7 +166,7 @@ class Workspace:
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
         at_once = not self.body_count and not differentiable
         self.sweeping_threads = threads_of_cluster(device, self.particle_count) if at_once else 0
-        self._max_blocks = BLOCKS * device.sm_count
+        self._threads = 1 if device.is_cpu else THREADS * device.sm_count
 
     def count_worlds(self) -> WorldCounts:
         """Counts contacts and filtered pairs of each world from now on, and returns the counts."""
@@ -291,33 +291,17 @@ class Workspace:
         """Launches a kernel on the device."""
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
 
-    def launch_over(self, kernel: wp.Kernel, queues: Sequence, inputs: Sequence) -> None:
-        """Launches a kernel over queues at once: over their entries on the CPU, over their capacity on a GPU.
+    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence) -> None:
+        """Launches a kernel that takes all entries of a queue, of which the device knows the number.
 
-        On the CPU it runs on one thread, unlike :func:`warp_bsc.detection.launch.launch_over_queue`, because Warp's
-        additions are not atomic there. On a GPU each thread takes several entries, so that capacity costs little.
-        Queues have their counts and the index of their own count with them; a thread takes an entry of each.
+        Its last input is the number of its threads: each takes every so many-th entry, so that capacity that is not
+        used costs nothing. On the CPU it is one thread, because Warp's additions are not atomic there.
         """
-        if self.device.is_cpu:
-            entries = max(min(len(queue), int(counts.numpy()[count])) for queue, counts, count in queues)
-            wp.launch(kernel, entries, inputs=inputs, device=self.device)
-        else:
-            entries = max(len(queue) for queue, _counts, _count in queues)
-            wp.launch(kernel, entries, inputs=inputs, device=self.device, max_blocks=self._max_blocks)
+        wp.launch(kernel, self._threads, inputs=[*inputs, self._threads], device=self.device)
 
     def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the constraints, with the step as its first input, as in all that follow."""
-        self.launch_over(kernel, [(self.constraints.vertices, self.constraints.count, 0)], [self.step, *inputs])
-
-    def launch_over_planes(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the dividing planes."""
-        self.launch_over(kernel, [(self.dividing.place, self.dividing.count, 0)], [self.step, *inputs])
-
-    def launch_over_active_set(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the active constraints."""
-        self.launch_over(
-            kernel, [(self.constraints.active_set, self.constraints.active_count, 0)], [self.step, *inputs]
-        )
+        """Launches a kernel that takes all constraints, with the step as its first input, as in all that follow."""
+        self.launch_over_entries(kernel, [self.step, *inputs])
 
     def launch_over_particles(self, kernel: wp.Kernel, *inputs, at_least_once: bool = False) -> None:
         """Launches a kernel over the particles; ``at_least_once`` even if there are none."""
@@ -352,7 +336,7 @@ class Workspace:
         self.reserve_entries(number)
         activate()
         for i in range(number):
-            self.launch_over_active_set(project, self.status, self.record)
+            self.launch_over_constraints(project, self.status, self.record)
             update(self, i == number - 1)
 
     def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:

@@ -7,7 +7,7 @@ from ..schedule import Loop, Result, SolveStatus
 from ..solve.sweeps import add_delta, count_active
 from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
-from ..state.structs import ContactKind, Motion, Step, can_move
+from ..state.structs import ContactKind, Motion, Step, can_move, constraint_count
 from ..state.vectors import ZERO
 from ..tuning import CALM_STEPS
 
@@ -83,10 +83,9 @@ def extrapolate(
 
 
 @wp.kernel
-def find_worlds(step: Step, has_constraints: wp.array[int]):
+def find_worlds(step: Step, has_constraints: wp.array[int], threads: int):
     """Marks the worlds that have constraints."""
-    i = wp.tid()
-    if i < step.constraints.count[0]:
+    for i in range(wp.tid(), constraint_count(step), threads):
         has_constraints[step.motion.world[step.constraints.vertices[i][0]]] = 1
 
 
@@ -151,21 +150,19 @@ def keep_detection(step: Step, status: SolveStatus, detected: wp.array[int], is_
 
 
 @wp.kernel
-def disable_constraints(step: Step, detected: wp.array[int], is_pending: wp.array[int]):
+def disable_constraints(step: Step, detected: wp.array[int], is_pending: wp.array[int], threads: int):
     """Disables constraints that a pass through the substeps added, in worlds that do not repeat it."""
-    i = wp.tid()
     constraints = step.constraints
-    if i < detected[0] or i >= constraints.count[0]:
-        return
-    if is_pending[step.motion.world[constraints.vertices[i][0]]] == 0:
-        constraints.separation[i] = NEVER_VIOLATED
+    for i in range(detected[0] + wp.tid(), constraint_count(step), threads):
+        if is_pending[step.motion.world[constraints.vertices[i][0]]] == 0:
+            constraints.separation[i] = NEVER_VIOLATED
 
 
 @wp.kernel
 def begin_pass(step: Step, passes: wp.array[int], detected: wp.array[int]):
     """Counts a pass through the substeps; in a second one, adds the contacts that the first one missed."""
     if passes[0] > 0:
-        detected[0] = wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+        detected[0] = constraint_count(step)
     passes[0] += 1
 
 
@@ -182,10 +179,9 @@ def _reset_constraint(step: Step, i: int, multiplier: wp.vec3d):
 
 
 @wp.kernel
-def keep_constraints(step: Step, detected: wp.array[int], number: wp.array[int]):
+def keep_constraints(step: Step, detected: wp.array[int], number: wp.array[int], threads: int):
     """Keeps the constraints of worlds with substeps beside those that a detection of their motion will add."""
-    i = wp.tid()
-    if i < detected[0]:
+    for i in range(wp.tid(), wp.min(detected[0], constraint_count(step)), threads):
         _reset_constraint(step, i, wp.vec3d())
         if number[step.motion.world[step.constraints.vertices[i][0]]] == 0:
             step.constraints.separation[i] = NEVER_VIOLATED
@@ -290,30 +286,27 @@ def start_substep(
 
 @wp.kernel
 def reset_constraints(
-    step: Step, status: SolveStatus, detected: wp.array[int], remaining: wp.array[int], substeps: int
+    step: Step, status: SolveStatus, detected: wp.array[int], remaining: wp.array[int], substeps: int, threads: int
 ):
     """Prepares constraints for the sweeps of a substep; those of planes are collected anew in each substep.
 
     The others begin with the multipliers that they had in the substep before, and with what these do to vertices and
     bodies: a contact at rest needs the same ones again.
     """
-    i = wp.tid()
-    if i == 0:
+    if wp.tid() == 0:
         status.loop[Loop.ITERATION] = 1
         status.loop[Loop.ACTIVE] = 0  # positions and velocities are swept without regard to a detection
-    constraints = step.constraints
-    if i >= constraints.count[0]:
-        return
-    multiplier = constraints.position_multiplier[i]
-    if i < detected[0] and constraints.kind[i] == ContactKind.PLANE:
-        constraints.separation[i] = NEVER_VIOLATED
-        multiplier = wp.vec3d()
-    if remaining[0] == substeps:
-        multiplier = wp.vec3d()
-    _reset_constraint(step, i, multiplier)
-    if wp.length_sq(multiplier) > ZERO:
-        count_active(step, i)
-        add_delta(step, i, multiplier, step.motion.x1, step.vertices.particle_delta_x, step.vertices.bodies.delta_x)
+    constraints, vertices = step.constraints, step.vertices
+    for i in range(wp.tid(), constraint_count(step), threads):
+        is_new = i < detected[0] and constraints.kind[i] == ContactKind.PLANE
+        if is_new:
+            constraints.separation[i] = NEVER_VIOLATED
+        is_new = is_new or remaining[0] == substeps
+        multiplier = wp.where(is_new, wp.vec3d(), constraints.position_multiplier[i])
+        _reset_constraint(step, i, multiplier)
+        if wp.length_sq(multiplier) > ZERO:
+            count_active(step, i)
+            add_delta(step, i, multiplier, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
 @wp.kernel
