@@ -8,9 +8,9 @@ import warp as wp
 from ..kernels.pipeline.boxes import read_box
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
-from .element_pairs import PAIRS_OF_THREAD, are_apart, pair_edges_with_faces, pair_elements, pair_points
+from .element_pairs import are_apart, pair_edges_with_faces, pair_elements, pair_points
 from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
-from .launch import launch, max_blocks
+from .launch import THREADS_OF_MULTIPROCESSOR, launch
 from .mesh import CollisionMesh
 from .settings import capacity_for
 
@@ -145,8 +145,7 @@ class BroadPhaseHierarchy:
         """Counts the candidates, and enqueues those that no coordinate axis separates."""
         self._pair_faces(x0, x1, changed, keep_separated or not self._leaves_out_separated)
         queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
-        threads = -(-self.capacity // (int(PAIRS_OF_THREAD) * WIDTH)) * WIDTH
-        self._launch_over_pairs(pair_elements, threads, threads, keep_separated, *queues)
+        self._launch_over_pairs(pair_elements, keep_separated, *queues)
 
     def pair_points(
         self,
@@ -162,12 +161,12 @@ class BroadPhaseHierarchy:
     ) -> None:
         """Counts and enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
         queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
-        self._launch_over_pairs(pair_points, self.capacity, keep_separated, *queues)
+        self._launch_over_pairs(pair_points, keep_separated, *queues)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
         self._pair_faces(x, x)
-        self._launch_over_pairs(pair_edges_with_faces, self.capacity, counts, pairs)
+        self._launch_over_pairs(pair_edges_with_faces, counts, pairs)
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
         """Boxes all elements of a motion, and all nodes.
@@ -199,7 +198,7 @@ class BroadPhaseHierarchy:
             queue.boxes = self.hierarchy.face_boxes
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
 
-    def _launch_over_pairs(self, kernel, threads, *arguments):
-        inputs = [self.hierarchy, self._face_pairs, self._count, *arguments]
-        blocks = max_blocks(self._device, 256)
-        launch(kernel, threads, inputs=inputs, device=self._device, max_blocks=blocks, record_tape=False)
+    def _launch_over_pairs(self, kernel, *arguments):
+        threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
+        inputs = [self.hierarchy, self._face_pairs, self._count, *arguments, threads]
+        launch(kernel, threads, inputs=inputs, device=self._device, record_tape=False)

@@ -11,7 +11,6 @@ from .face_hierarchy import FaceHierarchy
 from .settings import NO_GRADIENTS, Count
 
 __all__ = [
-    "PAIRS_OF_THREAD",
     "are_apart",
     "overlapping_edges",
     "overlapping_vertices",
@@ -26,8 +25,8 @@ _QUEUED = wp.constant(int(Count.QUEUED))
 
 _WIDTH = wp.constant(WIDTH)
 
-PAIRS_OF_THREAD = wp.constant(4)
-"""Most pairs of faces whose elements a thread pairs."""
+_PAIRS_OF_THREAD = wp.constant(4)
+"""Most pairs of faces whose elements a thread pairs at once."""
 _PAIRS_AT_ONCE = wp.constant(1 << 17)
 """Pairs of faces that a GPU works on at once, each by a thread of its own."""
 _BITS_OF_PAIR = wp.constant(15)
@@ -142,13 +141,19 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
     return found
 
 
-@wp.kernel(**NO_GRADIENTS)
-def pair_elements(
+@wp.func
+def _filled(pairs: wp.array[wp.vec2i], count: wp.array[wp.int64]) -> int:
+    """Returns the number of pairs in a queue."""
+    return int(wp.min(count[0], wp.int64(pairs.shape[0])))
+
+
+@wp.func
+def _pair_elements(
     mesh: FaceHierarchy,
-    # in
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
-    threads: int,
+    first: int,
+    turns: int,
     keep_separated: bool,
     # counts, in and out, and queues
     vertex_face_counts: wp.array[wp.int64],
@@ -156,17 +161,7 @@ def pair_elements(
     edge_edge_counts: wp.array[wp.int64],
     edge_edge: wp.array[wp.vec2i],
 ):
-    """Counts the candidates of pairs of faces, and enqueues those that no axis separates.
-
-    A thread first finds all its pairs, then takes slots for them: where pairs of faces are many, a warp makes one
-    atomic operation for 128 of them. Atomic operations on one address are serialized, so that fewer are faster.
-    """
-    i = wp.tid()
-    count = int(wp.min(face_pair_count[0], wp.int64(face_pairs.shape[0])))
-    turns = wp.min(wp.max((count - 1) / threads + 1, count / _PAIRS_AT_ONCE), PAIRS_OF_THREAD)
-    first = (i / _WIDTH) * turns * _WIDTH + i % _WIDTH
-    if first >= count:
-        return
+    """Counts and enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
     found = wp.uint64(0)
     candidates = wp.vec2i()  # vertex-face, edge-edge
     filtered = wp.vec2i()
@@ -219,6 +214,43 @@ def pair_elements(
             edge_edge_slot += wp.int64(1)
 
 
+@wp.kernel(**NO_GRADIENTS)
+def pair_elements(
+    mesh: FaceHierarchy,
+    # in
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    keep_separated: bool,
+    # counts, in and out, and queues
+    vertex_face_counts: wp.array[wp.int64],
+    vertex_face: wp.array[wp.vec2i],
+    edge_edge_counts: wp.array[wp.int64],
+    edge_edge: wp.array[wp.vec2i],
+    threads: int,
+):
+    """Counts the candidates of pairs of faces, and enqueues those that no axis separates.
+
+    A thread first finds all its pairs, then takes slots for them: where pairs of faces are many, a warp makes one
+    atomic operation for 128 of them. Atomic operations on one address are serialized, so that fewer are faster.
+    """
+    i = wp.tid()
+    count = _filled(face_pairs, face_pair_count)
+    turns = wp.clamp(count / _PAIRS_AT_ONCE, 1, _PAIRS_OF_THREAD)
+    for first in range((i / _WIDTH) * turns * _WIDTH + i % _WIDTH, count, turns * threads):
+        _pair_elements(
+            mesh,
+            face_pairs,
+            face_pair_count,
+            first,
+            turns,
+            keep_separated,
+            vertex_face_counts,
+            vertex_face,
+            edge_edge_counts,
+            edge_edge,
+        )
+
+
 @wp.func
 def _pair_edges_with_face(
     mesh: FaceHierarchy,
@@ -255,15 +287,14 @@ def pair_edges_with_faces(
     counts: wp.array[wp.int64],
     # out
     pairs: wp.array[wp.vec2i],
+    threads: int,
 ):
     """Enqueues the edges that two faces own, each with the other face, where their boxes overlap."""
-    i = wp.tid()
-    if not is_filled(i, face_pairs, face_pair_count, 0):
-        return
-    face = face_pairs[i][0]
-    other = face_pairs[i][1]
-    _pair_edges_with_face(mesh, face, other, counts, pairs)
-    _pair_edges_with_face(mesh, other, face, counts, pairs)
+    for i in range(wp.tid(), _filled(face_pairs, face_pair_count), threads):
+        face = face_pairs[i][0]
+        other = face_pairs[i][1]
+        _pair_edges_with_face(mesh, face, other, counts, pairs)
+        _pair_edges_with_face(mesh, other, face, counts, pairs)
 
 
 @wp.func
@@ -293,27 +324,17 @@ def _pair_point(
                 append(wp.vec2i(point, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
 
 
-@wp.kernel(**NO_GRADIENTS)
-def pair_points(
+@wp.func
+def _pair_two_points(
     mesh: FaceHierarchy,
-    # in
-    face_pairs: wp.array[wp.vec2i],
-    face_pair_count: wp.array[wp.int64],
+    place: int,
+    other: int,
     keep_separated: bool,
-    # counts, in and out, and queues
-    vertex_edge_counts: wp.array[wp.int64],
-    vertex_edge: wp.array[wp.vec2i],
+    # in and out
     vertex_vertex_counts: wp.array[wp.int64],
     vertex_vertex: wp.array[wp.vec2i],
 ):
-    """Counts and enqueues the points among two cells, with an edge that no face has or with another point."""
-    i = wp.tid()
-    if not is_filled(i, face_pairs, face_pair_count, 0):
-        return
-    place = face_pairs[i][0]
-    other = face_pairs[i][1]
-    _pair_point(mesh, place, other, keep_separated, vertex_edge_counts, vertex_edge)
-    _pair_point(mesh, other, place, keep_separated, vertex_edge_counts, vertex_edge)
+    """Enqueues two points, if the cells at two places are that."""
     if mesh.order[place] >= mesh.point_start and mesh.order[other] >= mesh.point_start and place != other:
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.vertex_boxes, 3 * other)
@@ -327,3 +348,26 @@ def pair_points(
             take_slot(vertex_vertex_counts, _CANDIDATES)
             if keep_separated or not are_apart(box, other_box):
                 append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)
+
+
+@wp.kernel(**NO_GRADIENTS)
+def pair_points(
+    mesh: FaceHierarchy,
+    # in
+    face_pairs: wp.array[wp.vec2i],
+    face_pair_count: wp.array[wp.int64],
+    keep_separated: bool,
+    # counts, in and out, and queues
+    vertex_edge_counts: wp.array[wp.int64],
+    vertex_edge: wp.array[wp.vec2i],
+    vertex_vertex_counts: wp.array[wp.int64],
+    vertex_vertex: wp.array[wp.vec2i],
+    threads: int,
+):
+    """Counts and enqueues the points among two cells, with an edge that no face has or with another point."""
+    for i in range(wp.tid(), _filled(face_pairs, face_pair_count), threads):
+        place = face_pairs[i][0]
+        other = face_pairs[i][1]
+        _pair_point(mesh, place, other, keep_separated, vertex_edge_counts, vertex_edge)
+        _pair_point(mesh, other, place, keep_separated, vertex_edge_counts, vertex_edge)
+        _pair_two_points(mesh, place, other, keep_separated, vertex_vertex_counts, vertex_vertex)

@@ -19,6 +19,7 @@ import warp as wp
 from .._private_names.of_warp import may_run_in_threads
 
 __all__ = [
+    "THREADS_OF_MULTIPROCESSOR",
     "GrowingBuffers",
     "cores",
     "launch",
@@ -31,7 +32,7 @@ __all__ = [
 
 _THREADS = os.cpu_count() or 1
 
-_THREADS_OF_MULTIPROCESSOR = 1024
+THREADS_OF_MULTIPROCESSOR = 1024
 """Threads of a launch over a queue for each multiprocessor of a GPU."""
 
 _threads = contextvars.ContextVar("threads", default=_THREADS)
@@ -156,7 +157,7 @@ def max_blocks(device: wp.Device, block_dim: int) -> int:
     """
     if device.is_cpu or not getattr(wp.config, "default_grid_stride", True):
         return 0
-    return device.sm_count * max(1, _THREADS_OF_MULTIPROCESSOR // block_dim)
+    return device.sm_count * max(1, THREADS_OF_MULTIPROCESSOR // block_dim)
 
 
 def launch_over(
