@@ -65,8 +65,8 @@ SOLVERS = {
 class Run:
     """A simulation of worlds with a solver."""
 
-    def __init__(self, make_solver, worlds):
-        self.model = model = build(worlds)
+    def __init__(self, make_solver, model):
+        self.model = model
         self.solver = make_solver(model)
         self.states, self.control = [model.state(), model.state()], model.control()
         self.pipeline = self.contacts = self._graph = None
@@ -94,11 +94,10 @@ class Run:
             self.solver.step(start, end, self.control, self.contacts, DT)
 
 
-def measure(make_solver, worlds, steps):
+def measure(make_solver, model, counter, steps):
     """Returns steps a second by the clock and by processor time, crossings found, and steps not certified or None."""
-    run = Run(make_solver, worlds)
+    run, device = Run(make_solver, model), model.device
     run.take_pair()
-    counter, device = CrossingCounter(run.model), run.model.device
     crossings, clock, processor = 0, 0.0, 0.0
     for _ in range(10):
         wp.synchronize_device(device)
@@ -127,8 +126,10 @@ def main():
     with wp.ScopedDevice(options.device or wp.get_preferred_device()):
         print(f"{'solver':30}{'worlds':>7}{'steps/s':>10}{'by processor':>14}{'crossings':>11}{'uncertified':>13}")
         for worlds in options.worlds:
+            model = build(worlds)
+            counter = CrossingCounter(model)
             for name, make_solver in SOLVERS.items():
-                by_clock, by_processor, crossings, uncertified = measure(make_solver, worlds, options.steps)
+                by_clock, by_processor, crossings, uncertified = measure(make_solver, model, counter, options.steps)
                 row = f"{name:30}{worlds:>7}{by_clock:>10.3g}{by_processor:>14.3g}{crossings:>11}"
                 print(f"{row}{'-' if uncertified is None else uncertified:>13}", flush=True)
 

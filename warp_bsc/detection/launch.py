@@ -6,6 +6,7 @@ kernel that was made twice. Here, one lock is held while a kernel is made, and w
 
 import contextlib
 import contextvars
+import copy
 import functools
 import os
 import threading
@@ -201,10 +202,13 @@ def launch_over(
     # other threads only run commands: Warp cannot load a kernel and pack its arguments in several threads at once
     options = {"outputs": outputs, "device": device, "record_tape": False, "record_cmd": True}
     with _loading(kernel, device, 0):
-        commands = [
-            wp.launch(kernel, min(chunk, count - first), inputs=[first, *inputs], **options)
-            for first in range(0, count, chunk)
-        ]
+        commands = [wp.launch(kernel, min(chunk, count), inputs=[0, *inputs], **options)]
+    for first in range(chunk, count, chunk):  # to pack all arguments again would take longer than many a chunk
+        command = copy.copy(commands[0])
+        command.params = list(command.params)
+        command.set_param_at_index(0, first)
+        command.set_dim(min(chunk, count - first))
+        commands.append(command)
     run = map if len(commands) < 2 else _pool(threads).map
     list(run(wp.Launch.launch, commands))
 

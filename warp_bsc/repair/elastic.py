@@ -3,15 +3,16 @@
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch_in_turn
+from ..detection.launch import launch, launch_in_turn
 from .contacts import Contacts, as_planes
-from .kernels import Planes, relax_springs, spread_moves
+from .kernels import Planes, grow_ring, relax_springs, spread_moves
 from .surface import Surface
 
 __all__ = ["Springs", "near", "within"]
 
 _BENDING = 0.3
 """Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges."""
+_NOT_REACHED = 2**31 - 1
 
 
 def near(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
@@ -23,17 +24,17 @@ def within(surface: Surface, vertices: np.ndarray, rings: int) -> np.ndarray:
     """Returns which vertices are within some edges of given ones, a mask or indices, bool, shape [n]."""
     reached = np.zeros(len(surface.home), dtype=bool)
     reached[vertices] = True
-    return _grown(reached, surface.ends, rings)
+    return _grown(reached, surface.device_edges, rings)
 
 
-def _grown(reached: np.ndarray, ends: np.ndarray, rings: int) -> np.ndarray:
-    """Returns which vertices are within some edges, whose two ends are given, of those that are reached."""
-    first, second = ends
-    for _ in range(rings if reached.any() else 0):
-        from_first, from_second = reached[first], reached[second]
-        reached[second[from_first]] = True
-        reached[first[from_second]] = True
-    return reached
+def _grown(reached: np.ndarray, edges: wp.array, rings: int) -> np.ndarray:
+    """Returns which vertices are within some edges, whose vertices are given, of those that are reached."""
+    if not reached.any():
+        return reached
+    ring_of = wp.array(np.where(reached, 0, _NOT_REACHED), dtype=int, device=edges.device)
+    for ring in range(rings):
+        launch(grow_ring, len(edges), inputs=[edges, ring], outputs=[ring_of], device=edges.device)
+    return ring_of.numpy() < _NOT_REACHED
 
 
 class Springs:
@@ -54,7 +55,7 @@ class Springs:
         vertices = self._vertices = np.flatnonzero(movable)
         first, second = surface.ends
         edges = np.flatnonzero(movable[first] | movable[second])
-        self._ends = surface.ends[:, edges]
+        self._edges = surface.array(surface.edges[edges], int)
         across = _vertices_across(surface, movable)
         ends = np.concatenate([surface.edges[edges], across])
         stiffness = np.repeat([1.0, _BENDING], [len(edges), len(across)])
@@ -72,7 +73,7 @@ class Springs:
 
     def around(self, vertices: np.ndarray, rings: int) -> np.ndarray:
         """Returns the movable vertices within some edges, that springs follow, of given ones, bool, shape [n]."""
-        return _grown(vertices.copy(), self._ends, rings) & self.movable
+        return _grown(vertices, self._edges, rings) & self.movable
 
     def spread(self, moves: np.ndarray, given: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns moves of all vertices, which join those of given vertices smoothly; Jacobi sweeps.
@@ -119,8 +120,8 @@ class Springs:
 
     def _sweep(self, kernel: wp.Kernel, dim: int, inputs: list, values: np.ndarray, sweeps: int) -> np.ndarray:
         """Returns values after some launches of a kernel that writes those of movable vertices."""
-        arrays = [self._surface.array(values), self._surface.array(values)]
-        return launch_in_turn(kernel, dim, sweeps, inputs=inputs, values=arrays).numpy()
+        given = self._surface.array(values)
+        return launch_in_turn(kernel, dim, sweeps, inputs=inputs, values=[given, wp.clone(given)]).numpy()
 
 
 def _vertices_across(surface: Surface, movable: np.ndarray) -> np.ndarray:

@@ -20,6 +20,17 @@ def _direction(v: wp.vec3d) -> wp.vec3d:
 
 
 @wp.kernel
+def grow_ring(edges: wp.array2d[int], ring: int, ring_of: wp.array[int]):
+    """Puts vertices into the next ring that an edge joins with a ring up to this one, in any order of threads."""
+    i = wp.tid()
+    a, b = edges[i, 0], edges[i, 1]
+    if ring_of[a] <= ring:
+        wp.atomic_min(ring_of, b, ring + 1)
+    if ring_of[b] <= ring:
+        wp.atomic_min(ring_of, a, ring + 1)
+
+
+@wp.kernel
 def contour_gradients(
     # mesh
     x: wp.array[wp.vec3d],

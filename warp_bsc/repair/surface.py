@@ -49,7 +49,8 @@ def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
 
 def differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns which rows of two arrays of vectors differ, bool, shape [n]."""
-    return (a[:, 0] != b[:, 0]) | (a[:, 1] != b[:, 1]) | (a[:, 2] != b[:, 2])  # faster than any(axis=1)
+    differs = a != b
+    return differs[:, 0] | differs[:, 1] | differs[:, 2]  # faster than any(axis=1)
 
 
 class Surface:
@@ -106,6 +107,12 @@ class Surface:
         self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
         self.detector = CollisionDetector(mesh)
         self._finder = self.detector.intersection_finder()
+        self._placed: tuple[np.ndarray, np.ndarray] | None = None
+
+    @functools.cached_property
+    def device_edges(self) -> wp.array:
+        """Vertices of the edges on the device, shape [m, 2]."""
+        return self.mesh.device_edges if self.edges is self.mesh.edges else self.array(self.edges, int)
 
     @functools.cached_property
     def distance_detector(self) -> CollisionDetector:
@@ -133,16 +140,24 @@ class Surface:
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units as those of the input: of its type, with its bits where nothing has moved."""
+        if self._placed is not None and self._placed[0] is x:
+            return self._placed[1]
         positions = self._input.copy()
         rows, moved = self._moved(x)
         positions[rows] = np.where(x[rows] == self.home[rows], positions[rows], moved)
         return positions
 
     def rounded(self, x: np.ndarray) -> np.ndarray:
-        """Returns positions in units as they will be returned, rounded to the type of the input."""
-        rounded = self.home.copy()
+        """Returns positions in units as they will be returned, rounded to the type of the input.
+
+        Those that were rounded last are looked at next: their :meth:`positions` are kept, so they must not be changed.
+        """
+        rounded, positions = self.home.copy(), self._input.copy()
         rows, moved = self._moved(x)
-        rounded[rows] = np.where(x[rows] == self.home[rows], rounded[rows], moved.astype(np.float64) / self.unit)
+        stays = x[rows] == self.home[rows]
+        positions[rows] = np.where(stays, positions[rows], moved)
+        rounded[rows] = np.where(stays, rounded[rows], moved.astype(np.float64) / self.unit)
+        self._placed = rounded, positions
         return rounded
 
     def _moved(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
