@@ -8,8 +8,8 @@ import warp as wp
 from newton_scenes import SOLVERS, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.substeps.strain import edges_at_rest, predict_substeps
-from warp_bsc.response.tuning import STRAIN, SUBSTEP_STRAIN
+from warp_bsc.response.substeps.strain import edges_at_rest, predict_substeps, review_substeps
+from warp_bsc.response.tuning import STRAIN, SUBSTEP_STRAIN, SUBSTEPS
 
 
 def test_lengths_at_rest_are_those_of_the_material(device):
@@ -105,14 +105,15 @@ def test_strain_is_reported_and_warned_of_once(device):
 def test_numbers_of_substeps_rise_at_once_and_fall_slowly(device):
     """Half as many after 16 calm steps; after 32, if the next ones had to take more again."""
     number, calm, patience = (wp.full(1, n, dtype=int, device=device) for n in (8, 0, 16))
-    choices, nothing = wp.array([2, 4, 8, 16, 32], dtype=int, device=device), wp.zeros(1, dtype=float, device=device)
+    choices = wp.array([2, 4, 8, 16, 32], dtype=int, device=device)
+    nothing, lasting = (wp.zeros(1, dtype=float, device=device) for _ in range(2))
 
     def steps(count, needed):
         """Takes steps whose strain asks for a number of substeps, and returns those of the last."""
         for _ in range(count):
             n = max(1, int(number.numpy()[0]))
             strain = wp.full(1, needed * float(SUBSTEP_STRAIN * STRAIN) / n, dtype=float, device=device)
-            arrays = [strain, nothing, choices, number, calm, patience]
+            arrays = [strain, nothing, choices, number, calm, patience, lasting]
             wp.launch(predict_substeps, 1, inputs=arrays, device=device)
         return int(number.numpy()[0])
 
@@ -122,3 +123,54 @@ def test_numbers_of_substeps_rise_at_once_and_fall_slowly(device):
     assert steps(1, 31.0) == 32
     assert steps(100, 17.0) == 32  # more than half
     assert steps(200, 0.0) == 0
+
+
+class Review:
+    """Reviews substeps of one world and predicts the next, as a step does with the strains that it is given."""
+
+    def __init__(self, device):
+        self.device = device
+        self.number, self.calm, self.patience = self._new(4), self._new(0), self._new(16)
+        self.missed, self.lasting = self._new(0.0, float), self._new(0.0, float)
+        self.choices = wp.array(SUBSTEPS, dtype=int, device=device)
+
+    def _new(self, value, dtype=int):
+        return wp.full(1, value, dtype=dtype, device=self.device)
+
+    def step(self, *final_strains, strain=0.002):
+        """Takes a step of 4 substeps after which contacts strain an element; returns how often it took them."""
+        self.number.fill_(4)
+        for number, final in enumerate(final_strains, 1):
+            pending, strains = self._new(1), [self._new(strain, float), self._new(final, float)]
+            inputs = [*strains, self.choices, self._new(number), self.number, self.missed, self.lasting]
+            chosen = wp.zeros(len(SUBSTEPS), dtype=int, device=self.device)
+            outputs = [pending, chosen, self._new(0), self._new(0), self._new(0.0, float)]
+            wp.launch(review_substeps, 1, inputs, outputs, device=self.device)
+            if not pending.numpy()[0]:
+                break
+        outputs = [self.number, self.calm, self.patience, self.lasting]
+        wp.launch(predict_substeps, 1, [*strains, self.choices], outputs, device=self.device)
+        return number
+
+
+def test_strain_that_repeats_do_not_lower_is_left(device):
+    """Substeps are repeated for it until they have not helped, and again only once it has grown."""
+    review = Review(device)
+    assert review.step(0.05, 0.03, 0.01) == 3 and review.lasting.numpy()[0] == 0.0
+    assert review.step(0.05, 0.045, 0.0) == 2
+    assert review.step(0.05) == review.step(0.056) == 1 and review.number.numpy()[0] == 4
+    assert review.step(0.06, 0.01) == 2
+    for _ in range(100):  # what is past is forgotten
+        assert review.step(0.0) == 1
+    assert review.step(0.05, 0.01) == 2
+
+
+def test_what_lasts_is_no_reason_for_substeps(device):
+    """Fewer are taken once the strain in them has asked for fewer for a while."""
+    review = Review(device)
+    review.step(0.05, 0.05)
+    numbers = []
+    for _ in range(16):
+        review.step(0.05)
+        numbers.append(int(review.number.numpy()[0]))
+    assert numbers == [4] * 15 + [2]

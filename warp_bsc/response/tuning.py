@@ -117,6 +117,11 @@ FREE_STEPS = wp.constant(4)
 """Steps with little strain that count as much as one with none: nothing touches, or it does not push."""
 MAX_REPEATS = wp.constant(2)
 """Most times that substeps are repeated in a step, with more of them or with contacts that they missed."""
+LOWERED, LASTING = wp.constant(0.8), wp.constant(1.25)
+"""Share of the strain after the substeps to which repeating them has to lower it, or it lasts; and multiple of what
+lasts up to which neither substeps nor repeats are taken for it: where folds are pressed, more of them do not help."""
+FORGOTTEN = wp.constant(0.05)
+"""Share of what lasts that is forgotten in a step with less."""
 MAX_STRAIN = wp.constant(0.2)
 """Largest strain by contacts of which the stage does not warn."""
 COMPRESSION = wp.constant(0.25)

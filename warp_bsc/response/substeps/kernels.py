@@ -24,6 +24,7 @@ def begin_step(
     number: wp.array[int],
     calm: wp.array[int],
     patience: wp.array[int],
+    lasting: wp.array[float],
     # out
     needs_whole_step: wp.array[int],
     strain: wp.array[float],
@@ -43,6 +44,7 @@ def begin_step(
         number[world] = 0
         calm[world] = 0
         patience[world] = CALM_STEPS
+        lasting[world] = 0.0
     if number[world] == 0:
         needs_whole_step[0] = 1
 

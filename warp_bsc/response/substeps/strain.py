@@ -9,8 +9,11 @@ from ..state.structs import Motion
 from ..state.workspace import Workspace
 from ..tuning import (
     COMPRESSION,
+    FORGOTTEN,
     FREE_STEPS,
     KEPT,
+    LASTING,
+    LOWERED,
     MAX_CALM_STEPS,
     MAX_MISSED,
     MAX_REPEATS,
@@ -71,6 +74,14 @@ def _lose_calm(calm: wp.array[int], patience: wp.array[int], world: int):
     calm[world] = 0
 
 
+@wp.func
+def _lasts(strain: float, lasting: wp.array[float], world: int) -> bool:
+    """Returns whether a strain is one that substeps do not lower, as they did not before; forgets what is past."""
+    known = lasting[world]
+    lasting[world] = wp.max(wp.min(known, strain), (1.0 - FORGOTTEN) * known)
+    return strain <= LASTING * known
+
+
 @wp.kernel
 def choose_substeps(
     # in
@@ -82,6 +93,7 @@ def choose_substeps(
     number: wp.array[int],
     calm: wp.array[int],
     patience: wp.array[int],
+    lasting: wp.array[float],
     # out
     is_chosen: wp.array[int],
     substeps: wp.array[int],
@@ -92,7 +104,7 @@ def choose_substeps(
     status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
     if number[world] == 0 and has_constraints[world] == 1:
         n = int(0)
-        if strain[world] > WHOLE_STRAIN:
+        if not _lasts(strain[world], lasting, world) and strain[world] > WHOLE_STRAIN:
             n = _choice(choices, strain[world] / STRAIN)
         number[world] = n
         if n > 0:
@@ -117,6 +129,8 @@ def review_substeps(
     passes: wp.array[int],
     # in and out
     number: wp.array[int],
+    missed_strain: wp.array[float],
+    lasting: wp.array[float],
     # out
     is_pending: wp.array[int],
     is_chosen: wp.array[int],
@@ -127,7 +141,8 @@ def review_substeps(
     """Repeats the substeps of worlds whose strain asks for more than twice as many.
 
     So it does where contacts that the substeps did not know strain an element after them: they know these then. If they
-    strain it too far, what was found is not what is to be met, and elements would stick to it.
+    strain it too far, what was found is not what is to be met, and elements would stick to it. A strain that is still
+    there after that lasts: it is not tried again until it grows.
     """
     world = wp.tid()
     n = number[world]
@@ -135,7 +150,11 @@ def review_substeps(
     if n == 0:
         return
     predicted = _predicted(n, strain[world])
-    missed = final_strain[world] / STRAIN
+    final = final_strain[world]
+    if passes[0] > 1 and final > LOWERED * missed_strain[world]:
+        lasting[world] = wp.max(lasting[world], final)
+    missed_strain[world] = final
+    missed = wp.where(final <= LASTING * lasting[world], 0.0, final / STRAIN)
     too_few = predicted > 2.0 * float(n) and n < choices[choices.shape[0] - 1]
     if passes[0] <= MAX_REPEATS and (too_few or (missed > 2.0 and missed < MAX_MISSED)):
         number[world] = wp.max(n, _choice(choices, predicted))
@@ -156,6 +175,7 @@ def predict_substeps(
     number: wp.array[int],
     calm: wp.array[int],
     patience: wp.array[int],
+    lasting: wp.array[float],
 ):
     """Predicts the substeps of the next step in each world that took some, by the strain of this step.
 
@@ -165,7 +185,8 @@ def predict_substeps(
     world = wp.tid()
     n = number[world]
     if n > 0:
-        predicted = wp.max(_predicted(n, strain[world]), final_strain[world] / STRAIN)
+        final = final_strain[world]
+        predicted = wp.max(_predicted(n, strain[world]), wp.where(_lasts(final, lasting, world), 0.0, final / STRAIN))
         if predicted > float(n):
             number[world] = _choice(choices, predicted)
             _lose_calm(calm, patience, world)

@@ -128,6 +128,7 @@ class Substeps:
             self._strain, self._final_strain = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
             self._calm = wp.zeros(worlds, dtype=int, device=device)  # steps with fewer
             self._patience = wp.full(worlds, int(CALM_STEPS), dtype=int, device=device)
+            self._missed_strain, self._lasting = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
             self._passes = wp.zeros(1, dtype=int, device=device)
@@ -151,7 +152,7 @@ class Substeps:
         self._start.assign(state)
         if self._chooses:
             self._needs_whole_step.zero_()
-            inputs = [self._motion.vertices.interrupted, self._number, self._calm, self._patience]
+            inputs = [self._motion.vertices.interrupted, self._number, self._calm, self._patience, self._lasting]
             outputs = [self._needs_whole_step, self._strain, self._final_strain, self._is_chosen, self._must_choose]
             self._work.launch(kernels.begin_step, self._work.worlds, inputs, outputs)
 
@@ -225,7 +226,7 @@ class Substeps:
         resolve_contacts(work, dt)
         self._meter.measure(self._motion.vertices, self._strain)
         inputs = [self._strain, self._has_constraints, self._device_choices, work.status]
-        inputs += [self._number, self._calm, self._patience]
+        inputs += [self._number, self._calm, self._patience, self._lasting]
         outputs = [self._is_chosen, self.substeps, self.strain]
         work.launch(choose_substeps, work.worlds, inputs, outputs)
         wp.capture_if(self.substeps, self._find_contacts_again)
@@ -253,7 +254,8 @@ class Substeps:
             wp.capture_while(self._repeats, self._take_chosen_numbers, step=step)
             self._report_worlds()
             inputs = [self._strain, self._final_strain, self._device_choices]
-            work.launch(predict_substeps, work.worlds, inputs, [self._number, self._calm, self._patience])
+            outputs = [self._number, self._calm, self._patience, self._lasting]
+            work.launch(predict_substeps, work.worlds, inputs, outputs)
         else:
             self._take_number_of_substeps(self._choices[0], step)
             self._finish(step.dt)
@@ -279,6 +281,7 @@ class Substeps:
             array.zero_()
         self._meter.measure(self._motion.vertices, self._final_strain)
         inputs = [self._strain, self._final_strain, self._device_choices, self._passes, self._number]
+        inputs += [self._missed_strain, self._lasting]
         outputs = [self._is_pending, self._is_chosen, self.substeps, self._repeats, self.strain]
         work.launch(review_substeps, work.worlds, inputs, outputs)
 
