@@ -391,3 +391,48 @@ def test_edges_on_edges_push_nothing_aside(device):
     assert rollout.solver.report.certified and rollout.solver.report.hits > 1000 and rollout.collisions == 0
     aside = np.linalg.norm((rollout.positions - start)[:, :2], axis=1)
     assert aside.max() < 1.2e-5  # with planes across all pairs of edges twice as far
+
+
+@pytest.mark.parametrize("z, start", [(0.0, 2e-3), (0.0, 0.0), (1e-3, 2e-3)])
+def test_what_ends_exactly_in_contact_is_divided(z, start, device):
+    """A contact at the very end of a step is one: on the ground, also from there, and on another patch that is held."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    add_patch(builder, 2, 0.05, (0.0, 0.0, start))
+    if z:
+        add_patch(builder, 4, 0.05, (0.01, 0.02, z), fixed=True)
+    builder.color()
+    model = builder.finalize(device=device)
+    ends = model.particle_q.numpy().copy()
+    ends[:9, 2] = z
+    solver = bsc.SolverCCD(Changed(model, lambda state: state.particle_q.assign(ends)), substeps=None, max_iterations=0)
+    state, end = model.state(), model.state()
+    solver.step(state, end, None, None, DT)
+    assert solver.report.certified and solver.report.hits and not solver.report.frozen
+    assert end.particle_q.numpy()[:9, 2].min() > z
+
+
+def test_what_is_pressed_onto_the_ground_does_not_come_ever_nearer(device):
+    """Under a held patch 5 micrometres above, its distance must not fall by a share in each step, down to 0."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_ground_plane()
+    add_patch(builder, 2, 0.05, (1.0, 0.0, 1e-4))
+    add_patch(builder, 4, 0.05, (1.01, 0.02, 2e-4), fixed=True)
+    for i in range(9, builder.particle_count):
+        builder.particle_mass[i] = 0.0
+    model, height = builder.finalize(device=device), 2e-4
+
+    def press(state):
+        x = state.particle_q.numpy().copy()
+        x[:9, 2] -= 1e-4
+        x[9:, 2] = height
+        state.particle_q.assign(x)
+
+    solver = bsc.SolverCCD(Changed(model, press), substeps=None)
+    state, end = model.state(), model.state()
+    for _ in range(150):
+        height = max(0.8 * height, 5e-6)
+        solver.step(state, end, None, None, DT)
+        state, end = end, state
+    assert solver.report.totals.uncertified_steps == solver.report.totals.frozen_steps == 0
+    assert state.particle_q.numpy()[:9, 2].min() > 1e-7

@@ -82,7 +82,8 @@ MAX_PLANE_STEPS = wp.constant(64)
 PLANE_MARGIN = wp.constant(wp.float64(0.1))
 """Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
 PLANE_APPROACH = wp.constant(wp.float64(0.25))
-"""Most of that, as a share of how far the vertex would be if it stood still: see :mod:`.contacts.dividing_planes`."""
+"""Most of that, beyond rounding, as a share of how far the vertex would be if it stood still: see
+:mod:`.contacts.dividing_planes`."""
 PLANE_DEPTH = wp.constant(wp.float64(0.05))
 """Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
 

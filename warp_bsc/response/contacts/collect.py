@@ -161,7 +161,11 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             if not dividing.first:
                 continue
             stays, _error_stays = signed_distance(plane, motion.x0[vertex])
-            margin = wp.min(PLANE_MARGIN * separation, PLANE_APPROACH * wp.max(stays - kept, ZERO))
+            stays = wp.max(stays - kept, ZERO)
+            least = wp.min(
+                stays, constraints.rounding_at(step, motion.x0[vertex])
+            )  # or a pressed vertex comes ever nearer
+            margin = wp.min(PLANE_MARGIN * separation, wp.max(PLANE_APPROACH * stays, least))
             offset = plane[3] + kept + wp.min(wp.float64(2.0) * error_after, margin)
             if kept < ZERO:
                 offset = plane[3] + kept - PLANE_DEPTH * separation

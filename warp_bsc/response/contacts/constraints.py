@@ -125,6 +125,12 @@ def _may_rest(motion: Motion, corners: wp.vec4i) -> bool:
 
 
 @wp.func
+def rounding_at(step: Step, x: wp.vec3) -> wp.float64:
+    """Returns the least distance of what rests at a position [m], more than 0: rounding closes smaller ones."""
+    return ROUNDING * wp.max(wp.float64(wp.max(wp.abs(x))), step.separation)
+
+
+@wp.func
 def feasible(step: Step, corners: wp.vec4i, target: wp.float64, start: wp.float64) -> wp.float64:
     """Returns the separation of slow elements [m]: hardly more than at the start, as standing still should nearly do.
 
@@ -136,9 +142,7 @@ def feasible(step: Step, corners: wp.vec4i, target: wp.float64, start: wp.float6
     least = SMALL_DISTANCE * step.separation
     if _may_rest(step.motion, corners):
         before = wp.min(start, REST * path)
-        x = to_double(step.motion.x1[corners[0]])
-        rounding = ROUNDING * wp.max(wp.abs(x[0]), wp.max(wp.abs(x[1]), wp.abs(x[2])))
-        least = wp.min(least, wp.max(REST * path, rounding))
+        least = wp.min(least, wp.max(REST * path, rounding_at(step, step.motion.x1[corners[0]])))
     recovered = wp.max(before + RECOVERY * path, least)
     return wp.min(target, wp.max(start, wp.min(step.separation, recovered)))
 

@@ -64,13 +64,15 @@ def _publish(
     _add_to_side(sums, shapes[0], bodies[0], impulse, first, rows.lost)
     _add_to_side(sums, shapes[1], bodies[1], -impulse, second, rows.lost)
     world = step.motion.world[corners[0]]
-    wp.atomic_max(sums.largest, world, float(along))
+    if float(along) > sums.largest[world]:  # rarely: all contacts of a world have this address
+        wp.atomic_max(sums.largest, world, float(along))
     if sums.of_pairs:
         size = sides.max_local + 1
         a = _local(sides, shapes[0])
         b = _local(sides, shapes[1])
-        add_impulse(sums.of_pairs, (world * size + a) * size + b, 0, impulse, rows.lost)
-        add_impulse(sums.of_pairs, (world * size + b) * size + a, 0, -impulse, rows.lost)
+        if a != b:  # of cloth with cloth, which all have one address, both add up to 0
+            add_impulse(sums.of_pairs, (world * size + a) * size + b, 0, impulse, rows.lost)
+            add_impulse(sums.of_pairs, (world * size + b) * size + a, 0, -impulse, rows.lost)
     row = take_slot_int(rows.count)
     if row < rows.kind.shape[0]:
         rows.kind[row] = kind
