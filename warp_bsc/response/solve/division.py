@@ -357,7 +357,7 @@ def divide(work: Workspace, dt: float) -> None:
 
 
 def _pass_over_planes(work):
-    work.launch_over_constraints(place_planes, work.dividing, work.status)
+    work.launch_over_entries(place_planes, [work.step, work.dividing, work.status])
     work.launch_over_particles(move_to_sides, work.dividing, work.tolerance, work.status)
 
 
