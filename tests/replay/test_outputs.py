@@ -8,10 +8,12 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from progress_lines import without_progress
 from pxr import Usd, UsdGeom
 from replay_files import (
+    OPTIONS,
     OUTPUTS,
     Page,
     errors_of,
@@ -44,7 +46,7 @@ def test_what_is_printed_names_the_files(stage, capsys, tmp_path):
     assert "note: Motion between time samples is taken to be linear." in output
 
 
-@pytest.mark.parametrize("option", ["--json", "--csv", "--overlay", "--report"])
+@pytest.mark.parametrize("option", OPTIONS)
 def test_no_output_replaces_what_the_scene_is_read_from(stage, tmp_path, capsys, option):
     layer = save(stage)
     prop = new_stage(tmp_path / "prop.usda")
@@ -79,6 +81,10 @@ def check_partial(folder, count, reason):
     assert count in (None, len(found["intervals"]))
     assert found["complete"] is False and reason in found["stopped"]
     assert (folder / "hits.csv").read_text().splitlines()[-1].startswith(f"# partial: {count or ''}")
+    columns = np.load(folder / "hits.npz")
+    facts = json.loads(str(columns["facts"]))
+    assert facts["complete"] is False and reason in facts["stopped"] and count in (None, len(columns["starts"]))
+    assert facts["hits"] == np.count_nonzero(columns["normal"].any(axis=1))
     overlay = Usd.Stage.Open(str(folder / "overlay.usda"))
     data = overlay.GetRootLayer().customLayerData["collisions"]
     assert data["complete"] is False and reason in data["stopped"]
@@ -193,9 +199,7 @@ def test_full_disk_has_room_for_all_files(tmp_path, size):
     for name in ("disk", "left"):
         (tmp_path / name).mkdir()
     files = [tmp_path / "disk" / name for name in OUTPUTS]
-    named = [
-        str(word) for pair in zip(("--json", "--csv", "--overlay", "--report"), files, strict=True) for word in pair
-    ]
+    named = [str(word) for pair in zip(OPTIONS, files, strict=True) for word in pair]
     command = [sys.executable, "-m", "warp_bsc", "replay", save(stage), "--device", "cpu", "--no-self", *named]
     done = in_small_disk(tmp_path, size, command)
     if done.returncode == 77 or "unshare" in done.stderr:

@@ -27,6 +27,7 @@ from warp_bsc.cli.main import main
 from warp_bsc.replay import checking, worker, workers
 
 FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
+FILES["--npz"] = "hits.npz"
 FRAMES, SIDE = 24, 5
 
 

@@ -13,14 +13,15 @@ from stages import FALLING, FLOOR, add_floor, add_mesh, animate, moved, new_stag
 
 from warp_bsc.cli.main import main
 
-OUTPUTS = ("hits.json", "hits.csv", "overlay.usda", "page.html")
+OUTPUTS = ("hits.json", "hits.csv", "overlay.usda", "page.html", "hits.npz")
+OPTIONS = ("--json", "--csv", "--overlay", "--report", "--npz")
 
 
 def replay(stage, *options, status=0):
     """Writes all files beside the scene, and returns their paths."""
     path = Path(save(stage)) if isinstance(stage, Usd.Stage) else Path(stage)
     files = [path.parent / name for name in OUTPUTS]
-    named = zip(("--json", "--csv", "--overlay", "--report"), map(str, files), strict=True)
+    named = zip(OPTIONS, map(str, files), strict=True)
     arguments = [argument for pair in named for argument in pair]
     assert main(["replay", str(path), "--device", "cpu", *arguments, *options]) == status
     return files

@@ -13,6 +13,7 @@ from typing import Any
 from .._atomic_file import STDOUT, naming, unfinished_path
 from ..replay.baseline import Baseline
 from ..replay.earlier import EarlierReplay, find_earlier
+from ..replay.hit_columns import HitsNpz
 from ..replay.hit_files import HitsCsv, HitsJson, replay_facts
 from ..replay.html_report import ReportPage
 from ..replay.intervals import replay
@@ -94,7 +95,8 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
     is_saved = arguments.json not in (None, STDOUT)
-    outputs = [file for file in (arguments.overlay, arguments.report, arguments.json, arguments.csv) if file]
+    named = (arguments.overlay, arguments.report, arguments.json, arguments.csv, arguments.npz)
+    outputs = [file for file in named if file]
     if "new" in arguments.fail_on and not arguments.baseline:
         raise ValueError("--fail-on new needs --baseline")
     if "distance" in arguments.fail_on and arguments.clearance is None:
@@ -103,6 +105,8 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--ignore-initial and --fail-on intersections need --intersections")
     if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
+    if arguments.npz == STDOUT:
+        raise ValueError("--npz: it is no text, name a file")
     if outputs.count(STDOUT) > 1:
         raise ValueError("--json, --csv and --report: only one of them can be printed on standard output")
     written = [*outputs, str(unfinished_path(arguments.json))] if is_saved else outputs
@@ -296,6 +300,7 @@ def _open_outputs(
             lambda path: HitsJson(path, facts=facts, has_strands=scene.has_strands, earlier_count=earlier_count),
         ),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
+        (arguments.npz, lambda path: HitsNpz(path, facts=facts, interval_count=len(scene))),
         (arguments.overlay, lambda path: Overlay(path, scene=scene)),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
     )

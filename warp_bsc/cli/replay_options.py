@@ -118,6 +118,9 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
     out.add_argument(
+        "--npz", **file, help="every collision as columns for NumPy, .npz, in a twentieth of the space of JSON"
+    )
+    out.add_argument(
         "--baseline",
         metavar="FILE",
         help="compare with the JSON file of an earlier replay with the same options: print which meshes collide, "

@@ -1,0 +1,193 @@
+"""Writes every collision, intersection and proximity of a replay as columns, in the compressed format of NumPy."""
+
+import json
+import os
+import tempfile
+import zipfile
+from typing import Any, cast
+
+import numpy as np
+
+from .._atomic_file import OutputFile
+from ..usd.segment import Segment
+from .outputs import without_last_eighth
+from .results import IntervalResult
+from .scene_contacts import PHASES, SceneContacts
+from .scene_intersections import SceneIntersections
+from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
+from .scene_proximities import SceneProximities
+from .summary import Summary
+
+__all__ = ["HitsNpz"]
+
+_KINDS = (*KINDS, "edge-face")
+_PHASES = (*PHASES, "crosses", "touches", "inside", "near", "")
+_CROSSES, _TOUCHES, _INSIDE, _NEAR, _NONE = range(len(PHASES), len(_PHASES))
+_NORMAL_UNIT = 2**15 - 1
+"""Units of a component of a normal: it is within 1.6e-5."""
+_ROW = np.dtype(
+    [
+        ("interval", "<u4"),
+        ("kind", "u1"),
+        ("phase", "u1"),
+        ("element", "u1", 2),
+        ("mesh", "<u4", 2),
+        ("index", "<i4", (2, 2)),
+        ("toi", "<f4"),
+        ("position", "<f4", 3),
+        ("normal", "<i2", 3),
+        ("distance", "<f4"),
+    ]
+)
+"""What is kept of a pair; its fields are the columns."""
+_ROWS_AT_ONCE = 2**16
+
+
+class HitsNpz:
+    """A ``.npz`` file, a :class:`~warp_bsc.replay.outputs.ReplayOutput`: columns with a row for each pair.
+
+    A pair takes 20 to 30 bytes, a twentieth of its text in JSON. Its columns, and what their numbers stand for::
+
+        hits = np.load("hits.npz")
+        hits["starts"][hits["interval"]], hits["ends"][hits["interval"]]  # time codes; toi is the share between them
+        hits["kinds"][hits["kind"]], hits["phases"][hits["phase"]]  # as in CSV, which has the same rows
+        hits["prims"][hits["mesh"]], hits["meshes"][hits["mesh"]]  # paths and names of both sides, shape [n, 2]
+        hits["elements"][hits["element"]], hits["index"]  # shape [n, 2], and [n, 2, 2]: one and -1, or both of an edge
+        hits["position"], hits["normal"] / 32767.0  # shape [n, 3]; normals are rounded, 0 for pairs at rest
+        json.loads(str(hits["facts"]))  # the scene, options, and whether all intervals are there
+
+    Times of impact, positions and distances are in single precision. Pairs at rest, intersections and proximities, are
+    at ``toi`` 0, in the last interval some at 1. The whole is on disk until the file is finished, so that memory does
+    not grow with it.
+
+    Attributes:
+        file: The file.
+    """
+
+    def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], interval_count: int):
+        """Opens the file.
+
+        Args:
+            path: The file.
+            facts: What :func:`~warp_bsc.replay.hit_files.replay_facts` returns.
+            interval_count: Number of intervals of the scene.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        self.file = OutputFile(path)
+        self._rows = tempfile.TemporaryFile(dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
+        self._facts, self._last = facts, interval_count - 1
+        self._meshes: dict[tuple[str, str], int] = {}  # numbers of names and prims
+        self._ends: list[int] = []  # numbers of rows up to each interval
+        self._times: list[tuple[float, float]] = []
+
+    def add(self, result: IntervalResult) -> None:
+        """Appends the rows of an interval."""
+        interval = result.summary
+        times = 2 if interval.index == self._last and interval.end > interval.start else 1
+        parts = [self._rows_of_contacts(result.contacts)]
+        for toi, pairs in enumerate((result.intersections or ())[:times]):
+            parts.append(self._rows_of_intersections(pairs, toi))
+        for toi, pairs in enumerate((result.proximities or ())[:times]):
+            parts.append(self._rows_of_proximities(pairs, toi))
+        rows = np.concatenate(parts)
+        rows["interval"] = len(self._ends)
+        before = self._ends[-1] if self._ends else 0
+        self._rows.seek(before * _ROW.itemsize)
+        self._rows.write(rows.tobytes())
+        self._ends.append(before + len(rows))
+        self._times.append((interval.start, interval.end))
+
+    def finish(self, summary: Summary) -> None:
+        """Compresses the columns, and moves the file to its path."""
+        count = min(len(summary.intervals), len(self._ends))  # the last interval may be missing
+        rows = self._ends[count - 1] if count else 0
+        self._rows.flush()
+        self.file.truncate(0)
+        part = summary.first(count)
+        facts = self._facts | {"complete": part.is_complete, "stopped": part.stopped, "hits": part.hits}
+        names, prims = ([names[side] for names in self._meshes] for side in range(2))
+        words = {"meshes": names, "prims": prims, "kinds": _KINDS, "phases": _PHASES, "elements": ELEMENT_WORDS}
+        starts, ends = np.array(self._times[:count], dtype=float).reshape(-1, 2).T
+        with zipfile.ZipFile(cast(Any, _Writer(self.file)), "w", zipfile.ZIP_DEFLATED) as archive:
+            values = {"facts": json.dumps(facts), "starts": starts, "ends": ends} | words
+            for name, value in values.items():
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
+            for name in _ROW.names or ():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    self._write_column(member, name, rows)
+        self.file.commit()
+        self._rows.close()
+
+    def shrink(self) -> bool:
+        """Drops the last eighth of the intervals."""
+        if not self._ends:
+            return False
+        self._ends = without_last_eighth(self._ends)
+        del self._times[len(self._ends) :]
+        self.file.truncate(0)
+        self._rows.truncate((self._ends[-1] if self._ends else 0) * _ROW.itemsize)
+        return True
+
+    def discard(self) -> None:
+        """Removes the temporary files."""
+        self._rows.close()
+        self.file.discard()
+
+    def _write_column(self, member, name: str, rows: int) -> None:
+        """Writes a column to the archive, some rows after the other."""
+        dtype, shape = _ROW[name].base, (rows, *_ROW[name].shape)
+        header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(member, header)
+        self._rows.seek(0)
+        for first in range(0, rows, _ROWS_AT_ONCE):
+            size = min(_ROWS_AT_ONCE, rows - first) * _ROW.itemsize
+            member.write(np.ascontiguousarray(np.frombuffer(self._rows.read(size), _ROW)[name]).tobytes())
+
+    def _rows_of(self, pairs: ScenePairs, kind, phase, toi) -> np.ndarray:
+        rows = np.zeros(len(pairs), dtype=_ROW)
+        rows["kind"], rows["phase"], rows["toi"] = kind, phase, toi
+        rows["element"], rows["index"], rows["position"] = pairs.elements, pairs.indices, pairs.position
+        rows["mesh"] = self._numbers(pairs.segment, pairs.meshes)
+        return rows
+
+    def _rows_of_contacts(self, contacts: SceneContacts) -> np.ndarray:
+        phase = np.full(len(contacts), _NONE) if contacts.phase is None else contacts.phase
+        rows = self._rows_of(contacts, contacts.kind, np.where(phase < 0, _NONE, phase), contacts.toi)
+        rows["normal"] = np.rint(_NORMAL_UNIT * contacts.normal)
+        return rows
+
+    def _rows_of_intersections(self, intersections: SceneIntersections, toi: int) -> np.ndarray:
+        is_edge = np.arange(len(intersections)) < intersections.edge_rows.stop
+        kind = np.where(is_edge, _KINDS.index("edge-face"), _KINDS.index("vertex-face"))
+        phase = np.where(is_edge, np.where(intersections.crosses, _CROSSES, _TOUCHES), _INSIDE)
+        return self._rows_of(intersections, kind, phase, toi)
+
+    def _rows_of_proximities(self, proximities: SceneProximities, toi: int) -> np.ndarray:
+        rows = self._rows_of(proximities, proximities.kind, _NEAR, toi)
+        rows["distance"] = proximities.distance
+        return rows
+
+    def _numbers(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:
+        """Returns the numbers in the file of meshes of a segment."""
+        number = np.zeros(len(segment.meshes), dtype=np.uint32)
+        for mesh in np.unique(meshes).tolist():
+            part = segment.meshes[mesh]
+            number[mesh] = self._meshes.setdefault((part.name, part.path), len(self._meshes))
+        return number[meshes]
+
+
+class _Writer:
+    """The file as a stream for an archive, which is written from its start to its end."""
+
+    def __init__(self, file: OutputFile):
+        self._file = file
+
+    def write(self, data) -> int:
+        self._file.write(bytes(data))
+        return len(data)
+
+    def flush(self) -> None:
+        pass
