@@ -13,6 +13,7 @@ import pytest
 from progress_lines import without_progress
 from pxr import Tf, Usd, UsdGeom
 
+from warp_bsc.cli import progress
 from warp_bsc.cli import replay as replay_command
 from warp_bsc.cli.main import main
 
@@ -520,3 +521,31 @@ def test_frames_that_begin_with_a_minus(capsys, scenes):
         found = json.loads(run(capsys, "replay", path, *frames, "--json"))
         assert [(interval["start"], interval["end"]) for interval in found["intervals"]] == [(-10, -9), (-9, -8)]
     assert "--frames" in fail(capsys, "replay", path, "--frames", "--json")
+
+
+def test_progress_for_programs(tmp_path, capsys):
+    """A line of JSON for each interval, and the same tables as without."""
+    words = ["replay", str(ASSETS / "cloth_twist.usd"), "--device", "cpu"]
+    assert main(words) == 0
+    tables = capsys.readouterr().out
+    assert main([*words, "--progress", "json"]) == 0
+    output = capsys.readouterr()
+    lines = [json.loads(line) for line in without_progress(output.err).splitlines()]
+    lines = [line for line in lines if line["activity"] == "replaying"]
+    assert [line["done"] for line in lines] == list(range(15)) and {line["of"] for line in lines} == {14}
+    assert [line["hits"] for line in lines] == sorted(line["hits"] for line in lines) and lines[-1]["hits"] == 33
+    assert [line["seconds"] for line in lines] == sorted(line["seconds"] for line in lines)
+    assert output.out.splitlines()[0] == tables.splitlines()[0]
+
+
+def test_progress_for_people_leaves_out_loading(monkeypatch, capsys):
+    """What is slower than one a second is told in seconds, and what came before the first is not counted."""
+    clock = iter([0.0, 5.0, 20.0, 35.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    run = progress.RunProgress("Replaying")
+    run.show(1, 5)
+    run.show(2, 5, "time 2")
+    run.show(61, 91)
+    assert capsys.readouterr().err.splitlines() == [
+        "Replaying: 2 of 5, time 2, 15.0 s each, about 45 s left", "Replaying: 61 of 91, 2.0/s, about 15 s left"
+    ]  # fmt: skip

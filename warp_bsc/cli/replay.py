@@ -126,7 +126,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         importlib.import_module("warp_bsc.usd.find_meshes")
     INTERRUPTS.check()
     try:
-        with RunProgress("Comparing vertices") as progress:
+        with RunProgress("Comparing vertices", as_json=arguments.progress == "json") as progress:
             scene = Scene(
                 arguments.scene,
                 selection=selection,
@@ -316,8 +316,9 @@ def _track(
     scene: Scene, arguments: argparse.Namespace, earlier: EarlierReplay | None
 ) -> Generator[IntervalResult, None, None]:
     """Yields the intervals of an earlier replay, then the others as they are found; shows progress and time left."""
-    with RunProgress("Replaying") as progress:
-        progress.show(0, len(scene))
+    hits = 0
+    with RunProgress("Replaying", as_json=arguments.progress == "json") as progress:
+        progress.show(0, len(scene), hits=hits)
         for result in replay(
             scene,
             method=arguments.method,
@@ -330,7 +331,8 @@ def _track(
             workers=arguments.workers,
         ):
             yield result
-            progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}")
+            hits += len(result.contacts)
+            progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}", hits=hits)
 
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:

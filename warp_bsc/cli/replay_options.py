@@ -146,6 +146,13 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         "address, such as tcp://head:8786, which need the scene at the same path and pip install 'warp-bsc[cluster]'",
     )
     run.add_argument(
+        "--progress",
+        choices=("text", "json"),
+        default="text",
+        help="text: a bar on a terminal, else a line every ten seconds; json: an object of JSON in a line of standard "
+        "error after each interval: activity, done, of, seconds, hits (default: text)",
+    )
+    run.add_argument(
         "--resume",
         action="store_true",
         help="continue an earlier run with the same options and files that was stopped or killed: take its finished "
