@@ -352,9 +352,9 @@ def calls_of_scenes() -> dict[str, Call]:
         ),
         "Scene": Call(
             bsc.Scene,
-            {"path": path},
+            {"source": path},
             {
-                "path": {"None": None, "number": 3, "list": ["a.usd"], "missing": "missing.usd"},
+                "source": {"None": None, "number": 3, "list": ["a.usd"], "missing": "missing.usd"},
                 "selection": {"string": "/World", "list": ["/World"]},
                 "frames": {"pair": (1, 3), "string": "1:3", "nothing there": bsc.FrameRange(1e6, 2e6)},
                 "subdivide": {**NOT_COUNT, "zero": 0},
@@ -737,6 +737,7 @@ TEXTS = {
     "--report",
     "--json",
     "--csv",
+    "--npz",
     "--baseline",
     "--allow-missing",
     "--device",

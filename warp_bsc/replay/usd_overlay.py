@@ -133,7 +133,7 @@ class Overlay:
 
         Raises:
             OSError: If the file cannot be written.
-            ValueError: If its name has another suffix.
+            ValueError: If its name has another suffix, or the scene has no file.
         """
         suffix = Path(path).suffix
         if suffix not in (".usda", ".usdc", ".usd"):

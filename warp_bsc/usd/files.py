@@ -13,12 +13,16 @@ __all__ = ["SceneFiles"]
 
 
 class SceneFiles:
-    """The files of all layers that a stage has opened so far, value clips included."""
+    """The files of all layers that a stage has opened so far, value clips included; and whether it was changed."""
 
     def __init__(self, stage: "Usd.Stage"):
-        """Records the versions of all files that a stage has opened so far."""
+        """Records the versions of all files that a stage has opened so far, and listens to changes of the stage."""
+        from pxr import Tf, Usd  # noqa: PLC0415 (slow)
+
         self._stage = stage
-        self._stamps = {}
+        self._stamps, changes = {}, []
+        self._changes = changes  # not this object, which the listener would keep
+        self._listener = Tf.Notice.Register(Usd.Notice.ObjectsChanged, lambda *_: changes.append(True), stage)
         self._find()
 
     def __contains__(self, path: str | os.PathLike) -> bool:
@@ -28,15 +32,21 @@ class SceneFiles:
         return any(os.path.exists(file) and os.path.samefile(path, file) for file in files[1:])
 
     def check(self) -> None:
-        """Checks that no file has changed, as crate files are read in parts, which would be of two versions.
+        """Checks that nothing has changed, as what is read in parts would be of two versions.
 
         Raises:
-            ValueError: If a file has changed since this object first saw it.
+            ValueError: If a file has changed since this object first saw it, or a program has changed the stage.
         """
+        self.check_stage()
         self._find()
         for path, stamp in self._stamps.items():
             if _stamp(path) != stamp:
                 raise ValueError(f"{path}: the file has changed since it was opened")
+
+    def check_stage(self) -> None:
+        """Checks that no program has changed the stage, with errors as of :meth:`check`; takes no time."""
+        if self._changes:
+            raise ValueError(f"{self._stage.GetRootLayer().identifier}: the stage has changed since the scene was made")
 
     def versions(self) -> dict[str, tuple[int, int]]:
         """Returns the size [bytes] and the time of the last change [ns] of each file, by its path."""

@@ -19,7 +19,12 @@ def layer_metadata(scene: Scene) -> dict[str, str | float]:
     """Returns the scene's metadata by name, for a layer over it, as a stage reads metadata only from its root layer.
 
     A missing default prim is replaced by the scene's first prim, a missing range of time codes by that of its times.
+
+    Raises:
+        ValueError: If the scene has no file.
     """
+    if not scene.has_file:
+        raise ValueError(f"{scene.path}: a stage in memory has no file for a layer to be over: export it")
     stage = scene.stage
     start, end = scene.times[0], scene.times[-1]
     if stage.HasAuthoredTimeCodeRange():

@@ -75,6 +75,8 @@ from .segment import Segment
 from .selection import Selection
 
 if TYPE_CHECKING:
+    from pxr import Sdf, Usd
+
     from .meshes import UsdMesh  # which imports pxr
 
 __all__ = ["Scene"]
@@ -90,7 +92,7 @@ if "USDC_USE_ASSET" not in os.environ:
 
 
 class Scene:
-    """The moving meshes of a USD file, as intervals between consecutive times: ``for interval in scene``.
+    """The moving meshes of a USD file or stage, as intervals between consecutive times: ``for interval in scene``.
 
     A scene holds one segment of the motion in memory and reads another one when an interval needs it. Threads may share
     a scene: they read one interval at a time. Jumps are found between intervals that are read in order.
@@ -99,8 +101,15 @@ class Scene:
     options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if the file
     has changed.
 
+    A stage in memory is read as it is, with edits that are not saved, session layer and population mask::
+
+        scene = bsc.Scene(stage)  # in Houdini hou.pwd().stage(), in usdview usdviewApi.stage
+        found = [(result.summary.start, len(result.contacts)) for result in bsc.replay(scene)]
+
+    For other processes it is flattened and written to a temporary file, which warns.
+
     Attributes:
-        path: The file.
+        path: The file; of a stage in memory the identifier of its root layer.
         selection: The meshes that are checked, and the pairs of them.
         stage: The open ``Usd.Stage``.
         files: The files that the stage is read from.
@@ -123,7 +132,7 @@ class Scene:
 
     def __init__(
         self,
-        path: str | os.PathLike,
+        source: "str | os.PathLike | Usd.Stage | Sdf.Layer",
         *,
         selection: Selection | None = None,
         frames: FrameRange | None = None,
@@ -136,7 +145,8 @@ class Scene:
         """Opens the file and finds its meshes.
 
         Args:
-            path: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it.
+            source: A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file, as OpenUSD's asset resolver finds it; or a
+                ``Usd.Stage`` or ``Sdf.Layer`` in memory, which the program must not change meanwhile.
             selection: Selects the meshes that are checked, and the pairs of them; default: those to be rendered.
             frames: The part of its time; default: all.
             subdivide: Number of intervals, 1 to 10,000, into which each step between two times is divided.
@@ -157,7 +167,12 @@ class Scene:
             ValueError: If the file is not USD, has no readable mesh, or no mesh is selected; if ``strict``, also if a
                 part cannot be read. The message names the argument, or the file, the prim and the time.
         """
-        check_instance(path, "path", (str, os.PathLike), "the path of a file")
+        stage, path = None, source
+        if not isinstance(source, (str, os.PathLike)):
+            from .stage import given_stage, name_of  # noqa: PLC0415 (imports pxr)
+
+            stage = given_stage(source)
+            path = name_of(stage)
         if selection is not None:
             check_instance(selection, "selection", Selection, "a Selection")
         if frames is not None:
@@ -172,7 +187,7 @@ class Scene:
             checked_flag(strict, "strict"),
             checked_strings(allow_missing, "allow_missing"),
         )
-        self._open(path, options, Revealed(), progress)
+        self._open(path, options, Revealed(), progress, stage)
 
     def _open(
         self,
@@ -180,12 +195,13 @@ class Scene:
         options: SceneOptions,
         revealed: Revealed,
         progress: Callable[[int, int], None] | None = None,
+        stage: "Usd.Stage | None" = None,
     ) -> None:
-        """Opens the file and finds its meshes, given what reading it has revealed in another process."""
+        """Opens the file or takes a stage, and finds its meshes, given what reading has revealed in another process."""
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
         from .find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
-        from .stage import open_stage  # noqa: PLC0415
+        from .stage import check_stage, open_stage  # noqa: PLC0415
         from .unreadable import LeftOut, UnreadableError, collecting  # noqa: PLC0415
 
         self._lock = threading.RLock()
@@ -194,7 +210,12 @@ class Scene:
         self.selection = options.selection or Selection()
         self._unreadable = UnreadableError
         self._left_out = LeftOut(path, options.strict, options.allow_missing)
-        self.stage = open_stage(path, self._left_out)  # prims expire with their stage
+        self._is_given, self._written = stage is not None, None
+        if stage is None:
+            self.stage = open_stage(path, self._left_out)  # prims expire with their stage
+        else:
+            self.stage = stage
+            check_stage(stage, path, self._left_out)
         self.files = SceneFiles(self.stage)
         self._messages = []  # OpenUSD's
         self._collecting = collecting
@@ -243,18 +264,23 @@ class Scene:
     @property
     def warnings(self) -> list[str]:
         """Sentences on unread contents and on changes to the motion; on jumps in the intervals read so far."""
-        warnings = [*map(left_out_warning, self.left_out[:_NAMED])]
+        sentences = [*map(left_out_warning, self.left_out[:_NAMED])]
         if len(self.left_out) > _NAMED:
-            warnings.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
-        warnings += map(message_warning, self._messages[:_NAMED])
-        warnings += self._left_out.notes[:_NAMED]
+            sentences.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
+        sentences += map(message_warning, self._messages[:_NAMED])
+        sentences += self._left_out.notes[:_NAMED]
         if len(self._left_out.notes) > _NAMED:
-            warnings.append(f"missing: {len(self._left_out.notes) - _NAMED} more, {len(self._left_out.notes)} in all")
-        warnings += self._warnings
-        warnings += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
+            sentences.append(f"missing: {len(self._left_out.notes) - _NAMED} more, {len(self._left_out.notes)} in all")
+        sentences += self._warnings
+        sentences += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
         if self._welded:
-            warnings.append(f"vertices with the same position at all times were welded: {self._welded}")
-        return warnings
+            sentences.append(f"vertices with the same position at all times were welded: {self._welded}")
+        return sentences
+
+    @property
+    def has_file(self) -> bool:
+        """Whether there is a file of it, over which a layer can be put; not if it is a stage in memory alone."""
+        return not self._is_given or bool(self.stage.GetRootLayer().realPath)
 
     @property
     def is_still(self) -> bool:
@@ -271,8 +297,14 @@ class Scene:
 
     def __reduce__(self):
         """Returns the call that opens the scene again."""
-        path = os.path.abspath(self.path) if os.path.exists(self.path) else self.path
         revealed = Revealed(tuple(self._parts), self._welds)
+        if self._is_given:
+            from .stage import write_for_others  # noqa: PLC0415 (imports pxr)
+
+            self.files.check()
+            self._written = self._written or write_for_others(self.stage, self)
+            return _open_again, (self._written, self._options, revealed, {}, self._contents()[:2])
+        path = os.path.abspath(self.path) if os.path.exists(self.path) else self.path
         return _open_again, (path, self._options, revealed, self.files.versions(), self._contents())
 
     def intervals(self, first: int = 0, stop: int | None = None) -> Iterator[Interval]:
@@ -307,7 +339,8 @@ class Scene:
         Raises:
             TypeError: If a number is not an integer.
             IndexError: If there is no such interval.
-            ValueError: If a mesh is broken and may not be left out, or nothing that moves is left.
+            ValueError: If a mesh is broken and may not be left out, nothing that moves is left, or the stage has
+                changed.
         """
         index = self._checked_index(index, "index", len(self) - 1)
         self.take_notes()
@@ -370,6 +403,7 @@ class Scene:
     @one_at_a_time
     def _read(self, index) -> Interval:
         """Returns an interval, with the notes on reading since the last call of :meth:`take_notes`."""
+        self.files.check_stage()
         segment, x0, x1, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
@@ -449,6 +483,6 @@ def _open_again(path, options, revealed, versions, contents) -> Scene:
     scene._open(path, options, revealed)
     if changed := scene.files.differing(versions):
         raise ValueError(f"{changed}: not the version of the file that the replay was started with")
-    if scene._contents() != contents:
+    if scene._contents()[: len(contents)] != contents:
         raise ValueError(f"{path}: this process does not read the same meshes as the one that started the replay")
     return scene

@@ -6,13 +6,19 @@
 import math
 import os
 import re
+import shutil
+import tempfile
+import warnings
+import weakref
 from pathlib import Path
+from typing import Any
 
-from pxr import Ar, Usd
+from pxr import Ar, Sdf, Usd
 
+from .._arguments import given
 from .unreadable import LeftOut, UnreadableError, collecting, describe_error, in_one_line
 
-__all__ = ["open_stage"]
+__all__ = ["check_stage", "given_stage", "name_of", "open_stage", "write_for_others"]
 
 # OpenUSD's messages on a missing file or prim; its error classes do not reach Python.
 _MISSING = re.compile(
@@ -20,6 +26,38 @@ _MISSING = re.compile(
     r"(.* introduced by @.*@<(?P<prim>.+?)>)?",
     re.DOTALL,
 )
+
+
+def given_stage(source: Any) -> Usd.Stage:
+    """Returns the stage that a program has opened, or one of its layer.
+
+    Raises:
+        TypeError: If it has given neither.
+        ValueError: If it has closed the stage.
+    """
+    if isinstance(source, Sdf.Layer):
+        return Usd.Stage.Open(source)
+    if not isinstance(source, Usd.Stage):
+        raise TypeError(f"source must be the path of a file, a Usd.Stage or an Sdf.Layer, not {given(source)}")
+    if not source:
+        raise ValueError("source: the stage has been closed")
+    return source
+
+
+def name_of(stage: Usd.Stage) -> str:
+    """Returns the path of the file of a stage, or the identifier of its root layer if it has none."""
+    root = stage.GetRootLayer()
+    return root.realPath or root.identifier
+
+
+def write_for_others(stage: Usd.Stage, owner: Any) -> str:
+    """Flattens a stage into a temporary file, which stays as long as its owner, warns of it, and returns its path."""
+    folder = tempfile.mkdtemp(prefix="warp_bsc_")
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    path = os.path.join(folder, "stage.usdc")
+    stage.Flatten().Export(path)
+    warnings.warn(f"{name_of(stage)}: flattened into {path}, for other processes", stacklevel=3)
+    return path
 
 
 def open_stage(path: str | os.PathLike, left_out: LeftOut) -> Usd.Stage:
@@ -46,6 +84,13 @@ def open_stage(path: str | os.PathLike, left_out: LeftOut) -> Usd.Stage:
             stage = Usd.Stage.Open(str(path))
         except RuntimeError as error:
             raise ValueError(f"{path}: not a readable USD file: {describe_error(error)}") from None
+    check_stage(stage, path, left_out)
+    return stage
+
+
+def check_stage(stage: Usd.Stage, path: str | os.PathLike, left_out: LeftOut) -> None:
+    """Checks a stage before it is read, with the arguments and errors of :func:`open_stage`."""
+    with collecting([], path):
         for layer in stage.GetUsedLayers():
             if not (0 < layer.timeCodesPerSecond < math.inf):  # OpenUSD would search for samples without end
                 raise ValueError(f"{path}: timeCodesPerSecond of {layer.identifier} is {layer.timeCodesPerSecond:g}")
@@ -56,4 +101,3 @@ def open_stage(path: str | os.PathLike, left_out: LeftOut) -> Usd.Stage:
             left_out.add_missing(unreadable, prim, missing["asset"].split(":SDF_FORMAT_ARGS:")[0])
         else:
             left_out.add(unreadable)
-    return stage
