@@ -37,10 +37,10 @@ def permissions(file):
 
 
 def test_permissions_are_those_of_the_file_before_or_as_the_umask_has_it(stage, tmp_path, temporary, umask):
-    assert [permissions(file) for file in replay(stage)] == [0o640] * 4
+    assert [permissions(file) for file in replay(stage)] == [0o640] * len(OUTPUTS)
     for file in tmp_path.iterdir():
         file.chmod(0o604)
-    assert [permissions(file) for file in replay(stage)] == [0o604] * 4
+    assert [permissions(file) for file in replay(stage)] == [0o604] * len(OUTPUTS)
     assert left_behind(tmp_path) == []
 
 
