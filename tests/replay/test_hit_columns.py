@@ -18,7 +18,7 @@ def rows_of_csv(path):
 
 def check_same_rows(folder):
     """Asserts that both files have the same rows, to the precision of the columns; returns the columns."""
-    columns, rows = np.load(folder / "hits.npz"), rows_of_csv(folder / "hits.csv")
+    columns, rows = dict(np.load(folder / "hits.npz")), rows_of_csv(folder / "hits.csv")  # read once
     assert len(rows) == len(columns["kind"]) > 0
     times = columns["starts"][columns["interval"]], columns["ends"][columns["interval"]]
     for number, row in enumerate(rows):
