@@ -121,6 +121,12 @@ def is_filled(i: int, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], cou
 
 
 @wp.func
+def filled_entries(queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int) -> int:
+    """Returns the number of entries of a queue; those that did not fit are counted, but are not there."""
+    return int(wp.min(counts[count], wp.int64(queue.shape[0])))
+
+
+@wp.func
 def has_overflowed(counts: wp.array[wp.int64], capacities: wp.array[wp.int64]) -> bool:
     """Returns whether one of the queues of a detection was too small for it."""
     for i in range(1, counts.shape[0]):  # the first counts positions that are not finite

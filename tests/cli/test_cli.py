@@ -523,7 +523,7 @@ def test_frames_that_begin_with_a_minus(capsys, scenes):
     assert "--frames" in fail(capsys, "replay", path, "--frames", "--json")
 
 
-def test_progress_for_programs(tmp_path, capsys):
+def test_progress_for_programs(capsys):
     """A line of JSON for each interval, and the same tables as without."""
     words = ["replay", str(ASSETS / "cloth_twist.usd"), "--device", "cpu"]
     assert main(words) == 0

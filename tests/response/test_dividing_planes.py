@@ -12,8 +12,9 @@ from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch, add_p
 
 import warp_bsc as bsc
 from warp_bsc.response.contacts.dividing_planes import add_plane, add_solid, has_planes
+from warp_bsc.response.contacts.first_contact import packed_contact
 from warp_bsc.response.solve.sides import position_on_sides
-from warp_bsc.response.state.structs import DIVIDED, NO_NODE, DividingPlanes, Motion, allocate
+from warp_bsc.response.state.structs import DIVIDED, NEVER, NO_NODE, DividingPlanes, Motion, allocate
 
 
 def staged(model, iterations, inner="vbd"):
@@ -410,6 +411,20 @@ def test_what_ends_exactly_in_contact_is_divided(z, start, device):
     solver.step(state, end, None, None, DT)
     assert solver.report.certified and solver.report.hits and not solver.report.frozen
     assert end.particle_q.numpy()[:9, 2].min() > z
+
+
+@wp.kernel(enable_backward=False)
+def _pack_last_contacts(i: int, before_never: wp.array[wp.bool]):
+    kind = wp.tid()
+    before_never[kind] = packed_contact(wp.float64(1.0), kind, i) < NEVER
+
+
+@pytest.mark.parametrize("i", [0, 2**28 - 1])
+def test_a_contact_at_the_very_end_comes_before_none(i, device):
+    """Of each kind that three bits hold."""
+    before_never = wp.zeros(8, dtype=wp.bool, device=device)
+    wp.launch(_pack_last_contacts, 8, [i], [before_never], device=device)
+    assert before_never.numpy().all()
 
 
 def test_what_is_pressed_onto_the_ground_does_not_come_ever_nearer(device):

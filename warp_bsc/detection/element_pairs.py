@@ -6,7 +6,7 @@ from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits
 from ..kernels.pipeline.pairs import is_filtered, owns_edge, owns_vertex
-from ..kernels.pipeline.queues import append, is_filled, raise_count, take_slot, take_slots, write
+from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots, write
 from .face_hierarchy import FaceHierarchy
 from .settings import NO_GRADIENTS, Count
 
@@ -142,12 +142,6 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
 
 
 @wp.func
-def _filled(pairs: wp.array[wp.vec2i], count: wp.array[wp.int64]) -> int:
-    """Returns the number of pairs in a queue."""
-    return int(wp.min(count[0], wp.int64(pairs.shape[0])))
-
-
-@wp.func
 def _pair_elements(
     mesh: FaceHierarchy,
     face_pairs: wp.array[wp.vec2i],
@@ -234,7 +228,7 @@ def pair_elements(
     atomic operation for 128 of them. Atomic operations on one address are serialized, so that fewer are faster.
     """
     i = wp.tid()
-    count = _filled(face_pairs, face_pair_count)
+    count = filled_entries(face_pairs, face_pair_count, 0)
     turns = wp.clamp(count / _PAIRS_AT_ONCE, 1, _PAIRS_OF_THREAD)
     for first in range((i / _WIDTH) * turns * _WIDTH + i % _WIDTH, count, turns * threads):
         _pair_elements(
@@ -290,7 +284,7 @@ def pair_edges_with_faces(
     threads: int,
 ):
     """Enqueues the edges that two faces own, each with the other face, where their boxes overlap."""
-    for i in range(wp.tid(), _filled(face_pairs, face_pair_count), threads):
+    for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
         face = face_pairs[i][0]
         other = face_pairs[i][1]
         _pair_edges_with_face(mesh, face, other, counts, pairs)
@@ -365,7 +359,7 @@ def pair_points(
     threads: int,
 ):
     """Counts and enqueues the points among two cells, with an edge that no face has or with another point."""
-    for i in range(wp.tid(), _filled(face_pairs, face_pair_count), threads):
+    for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
         place = face_pairs[i][0]
         other = face_pairs[i][1]
         _pair_point(mesh, place, other, keep_separated, vertex_edge_counts, vertex_edge)

@@ -140,12 +140,10 @@ class Surface:
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units as those of the input: of its type, with its bits where nothing has moved."""
-        if self._placed is not None and self._placed[0] is x:
-            return self._placed[1]
-        positions = self._input.copy()
-        rows, moved = self._moved(x)
-        positions[rows] = np.where(x[rows] == self.home[rows], positions[rows], moved)
-        return positions
+        if self._placed is None or self._placed[0] is not x:
+            self.rounded(x)
+        assert self._placed is not None
+        return self._placed[1]
 
     def rounded(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units as they will be returned, rounded to the type of the input.
@@ -153,18 +151,14 @@ class Surface:
         Those that were rounded last are looked at next: their :meth:`positions` are kept, so they must not be changed.
         """
         rounded, positions = self.home.copy(), self._input.copy()
-        rows, moved = self._moved(x)
+        (rows,) = np.nonzero(differ(x, self.home))
+        with np.errstate(over="ignore"):
+            moved = (x[rows] * self.unit).astype(self._dtype)
         stays = x[rows] == self.home[rows]
         positions[rows] = np.where(stays, positions[rows], moved)
         rounded[rows] = np.where(stays, rounded[rows], moved.astype(np.float64) / self.unit)
         self._placed = rounded, positions
         return rounded
-
-    def _moved(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the vertices that are not at their input, and their positions, of the type of the input."""
-        (rows,) = np.nonzero(differ(x, self.home))
-        with np.errstate(over="ignore"):
-            return rows, (x[rows] * self.unit).astype(self._dtype)
 
     def crossings(self, x: np.ndarray) -> np.ndarray:
         """Returns the edges that meet faces at positions in units, exactly, as returned: (edge, face), shape [n, 2]."""

@@ -103,7 +103,7 @@ class Scene:
 
     A stage in memory is read as it is, with edits that are not saved, session layer and population mask::
 
-        scene = bsc.Scene(stage)  # in Houdini hou.pwd().stage(), in usdview usdviewApi.stage
+        scene = bsc.Scene(stage)
         found = [(result.summary.start, len(result.contacts)) for result in bsc.replay(scene)]
 
     For other processes it is flattened and written to a temporary file, which warns.

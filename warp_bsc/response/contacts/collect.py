@@ -4,7 +4,7 @@ import warp as wp
 
 from ...detection.settings import Count
 from ...kernels.closest import contact_weights
-from ...kernels.pipeline.queues import has_overflowed
+from ...kernels.pipeline.queues import filled_entries, has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, count_filtered, is_dividing, widened
@@ -50,7 +50,7 @@ def count_crossings(
     threads: int,
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
-    for i in range(wp.tid(), int(wp.min(counts[_QUEUED], wp.int64(pairs.shape[0]))), threads):
+    for i in range(wp.tid(), filled_entries(pairs, counts, _QUEUED), threads):
         _count_crossing(step, pairs[i][0], pairs[i][1], count, of_worlds)
 
 
@@ -162,9 +162,8 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
                 continue
             stays, _error_stays = signed_distance(plane, motion.x0[vertex])
             stays = wp.max(stays - kept, ZERO)
-            least = wp.min(
-                stays, constraints.rounding_at(step, motion.x0[vertex])
-            )  # or a pressed vertex comes ever nearer
+            # what is pressed would come nearer by a share in each step, down to 0
+            least = wp.min(stays, constraints.rounding_at(step, motion.x0[vertex]))
             margin = wp.min(PLANE_MARGIN * separation, wp.max(PLANE_APPROACH * stays, least))
             offset = plane[3] + kept + wp.min(wp.float64(2.0) * error_after, margin)
             if kept < ZERO:

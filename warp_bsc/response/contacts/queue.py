@@ -5,7 +5,7 @@ import warp as wp
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import Count
 from ...kernels.pipeline.pairs import points_of_pair
-from ...kernels.pipeline.queues import is_filled
+from ...kernels.pipeline.queues import filled_entries, is_filled
 
 
 @wp.struct
@@ -32,8 +32,8 @@ def has_pair(queue: PairQueue, i: int) -> bool:
 
 @wp.func
 def pair_count(queue: PairQueue) -> int:
-    """Returns the number of pairs in a queue; those that did not fit are counted, but are not there."""
-    return int(wp.min(queue.counts[queue.count], wp.int64(queue.pairs.shape[0])))
+    """Returns the number of pairs in a queue."""
+    return filled_entries(queue.pairs, queue.counts, queue.count)
 
 
 @wp.func
