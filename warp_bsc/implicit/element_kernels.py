@@ -1,4 +1,4 @@
-"""Kernels between particles and elements: gather, scatter, and products with the Jacobians of elements."""
+"""Kernels between particles and elements: gather, scatter, and blocks of the Jacobians of elements."""
 
 import warp as wp
 
@@ -50,39 +50,6 @@ def set_units(
     if row // 3 == i:
         unit[row % 3] = _ONE
     units[e, row, i] = unit
-
-
-@wp.kernel
-def add_product(
-    # in
-    alpha: wp.float64,
-    transposed: int,
-    vertices: wp.array2d[int],
-    is_fixed: wp.array[int],
-    jacobian: wp.array3d[wp.vec3d],
-    x: wp.array[wp.vec3d],
-    # out
-    z: wp.array[wp.vec3d],
-):
-    """Subtracts alpha J x from z, with the Jacobian of the forces of an element; J^T x if ``transposed``."""
-    e, i = wp.tid()
-    v = vertices[e, i]
-    if v < 0:
-        return
-    if is_fixed[v] != 0:
-        return
-    product = wp.vec3d()
-    for j in range(vertices.shape[1]):
-        w = vertices[e, j]
-        if w >= 0:
-            if is_fixed[w] == 0:
-                if transposed != 0:
-                    for k in range(3):
-                        product += x[w][k] * jacobian[e, 3 * j + k, i]
-                else:
-                    for k in range(3):
-                        product[k] += wp.dot(jacobian[e, 3 * i + k, j], x[w])
-    wp.atomic_add(z, v, -alpha * product)
 
 
 @wp.func

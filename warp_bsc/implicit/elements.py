@@ -1,4 +1,4 @@
-"""Forces over elements of one kind: evaluated, differentiated, and multiplied with their Jacobians."""
+"""Forces over elements of one kind, evaluated and differentiated."""
 
 from collections.abc import Sequence
 
@@ -65,11 +65,6 @@ class Elements:
         inputs = [wp.float64(dt), x1, x0, *constants]
         options = {"adj_inputs": adjoints, "adj_outputs": [units], "adjoint": True, "device": self.device}
         wp.launch(self.kernel, shape[:2], inputs=inputs, outputs=[units], **options)
-
-    def add_product(self, alpha: float, x: wp.array, z: wp.array, is_fixed: wp.array, *, transposed: bool) -> None:
-        """Subtracts alpha J x, or alpha J^T x, from z; rows and columns of fixed particles are 0."""
-        inputs = [wp.float64(alpha), int(transposed), self.vertices, is_fixed, self.jacobian, x]
-        self._launch(element_kernels.add_product, (self.count, self._size), inputs, [z])
 
     def add_blocks(self, is_fixed: wp.array, blocks: wp.array) -> None:
         """Subtracts the blocks of the Jacobian on the diagonal from those of particles, mat33d."""

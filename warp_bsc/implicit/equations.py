@@ -13,13 +13,15 @@ from newton import ParticleFlags
 from newton.solvers import SolverVBD
 
 from ..response.adjoint.arrays import launch_adjoint
-from . import energies, kernels, matrix_kernels
+from . import energies, kernels
 from .attachments import Attachments
 from .bodies import Poses
 from .contacts import ContactElements, RecordedContacts
 from .elements import Elements, with_gradient
-from .matrix import ElasticMatrix
+from .matrix import StepMatrix
+from .matrix_kernels import Matrix
 from .self_contacts import RecordedPairs, SelfContactElements
+from .worlds import Worlds
 
 
 class Step(NamedTuple):
@@ -51,22 +53,23 @@ class Equations:
 
     Attributes:
         forces: Sum of the forces on each particle, 0 for fixed ones [N], vec3d, shape [particle_count].
+        matrix: What :meth:`differentiate` computed.
         is_fixed: 1 for particles that VBD does not move, 2 for those that an attachment holds, int32; 0 for others.
     """
 
-    def __init__(self, solver: SolverVBD):
-        """Allocates buffers for VBD of a model with particles."""
+    def __init__(self, solver: SolverVBD, worlds: Worlds):
+        """Allocates buffers for VBD of a model with particles, and the worlds of these."""
         model = self.model = solver.model
         self.device, n = model.device, model.particle_count
         self._x1, self._x0, self._of_x1, self._of_x0, self.forces = (self.zeros() for _ in range(5))
         self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
-        self._blocks = wp.zeros(n, dtype=wp.mat33d, device=self.device)
         self._attachments = Attachments(model, self.is_fixed)
         self._elastic = _elastic_elements(model) + self._attachments.springs
         self._contacts, self._self_contacts = ContactElements(solver), SelfContactElements(solver)
         self._in_contact: list[Elements] = []
-        self._matrix = ElasticMatrix(self._elastic, self.is_fixed)
+        self._matrix = StepMatrix(self._elastic, self.is_fixed, worlds)
         self._step: Step | None = None
+        self.matrix: Matrix | None = None
 
     def zeros(self) -> wp.array:
         """Returns a zero vector of float64 for each particle."""
@@ -88,11 +91,6 @@ class Equations:
         for elements in [*self._elements(), *self._attachments.holds]:
             elements.load(self._x1, self._x0)
 
-    @property
-    def is_symmetric(self) -> bool:
-        """Whether the matrix A of the step is symmetric: without contacts, whose friction depends on their load."""
-        return not self._in_contact
-
     def evaluate(self) -> wp.array:
         """Returns the forces, which vanish where the step is solved."""
         assert self._step is not None
@@ -104,35 +102,14 @@ class Equations:
             elements.add_forces(self._step.dt, self.forces)
         return self.forces
 
-    def differentiate(self) -> None:
-        """Computes the matrix A, the derivative of minus the forces, and the blocks of the preconditioner."""
+    def differentiate(self, *, transposed: bool) -> None:
+        """Computes the matrix A, the derivative of minus the forces, or A^T."""
         assert self._step is not None
-        dt = self._step.dt
+        dt, mass = self._step.dt, self.model.particle_mass
         for elements in self._elements():
             elements.differentiate(dt)
-        mass = self.model.particle_mass
         assert mass is not None
-        self._matrix.assemble(dt, mass, self._blocks)
-        for elements in self._in_contact:
-            elements.add_blocks(self.is_fixed, self._blocks)
-        self._launch(matrix_kernels.invert_blocks, [self._matrix.inertia], [self._blocks])
-
-    def product(self, x: wp.array, y: wp.array, z: wp.array, alpha: float, beta: float) -> None:
-        """Sets z to alpha A x + beta y; rows and columns of fixed particles are those of the identity."""
-        self._product(x, y, z, alpha, beta, transposed=False)
-
-    def transposed_product(self, x: wp.array, y: wp.array, z: wp.array, alpha: float, beta: float) -> None:
-        """Sets z to alpha A^T x + beta y."""
-        self._product(x, y, z, alpha, beta, transposed=True)
-
-    def _product(self, x, y, z, alpha, beta, *, transposed):
-        self._matrix.product(x, y, z, alpha, beta)
-        for elements in self._in_contact:
-            elements.add_product(alpha, x, z, self.is_fixed, transposed=transposed)
-
-    def precondition(self, x: wp.array, y: wp.array, z: wp.array, alpha: float, beta: float) -> None:
-        """Sets z to alpha M x + beta y, with the inverted blocks M of the diagonal."""
-        self._launch(matrix_kernels.apply_blocks, [wp.float64(alpha), wp.float64(beta), self._blocks, x, y], [z])
+        self.matrix = self._matrix.assemble(dt, mass, self._in_contact, transposed=transposed)
 
     def add_gradients(
         self, multipliers: wp.array, of_end: wp.array, of_velocity: wp.array | None, of_force: wp.array | None

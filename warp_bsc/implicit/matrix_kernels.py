@@ -1,4 +1,4 @@
-"""Kernels of linear algebra: the sparse matrix of a step, its preconditioner, and norms by world."""
+"""The matrix of a step: blocks that do not change their places, Jacobians of contacts, and its preconditioner."""
 
 import warp as wp
 
@@ -7,8 +7,81 @@ from .kernels import FIXED
 
 wp.set_module_options({"enable_backward": False})
 
-_ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
+
+
+@wp.struct
+class ContactRows:
+    """Jacobians of the forces of contacts, by particle.
+
+    Attributes:
+        offsets: First entry of each particle, and the end of the last, int32, shape [particle_count + 1]; or none.
+        entries: Element times the number of its particles plus the place of the particle in it, int32.
+        vertices: Particles of elements, -1 for none, int32, shape [n, size].
+        jacobian: Minus blocks of the matrix, see :class:`.elements.Elements`.
+    """
+
+    offsets: wp.array[int]
+    entries: wp.array[int]
+    vertices: wp.array2d[int]
+    jacobian: wp.array3d[wp.vec3d]
+
+
+@wp.struct
+class Matrix:
+    """The matrix A of a step, scaled: R^T A R, where R R^T are the inverted blocks of the diagonal.
+
+    Attributes:
+        offsets: First block of each row, and the end of the last, int32, shape [particle_count + 1].
+        columns: Columns of blocks, int32, shape [n].
+        values: Blocks of inertia and elastic forces, shape [n].
+        contacts, vertex_triangle, edge_edge: Blocks of contacts.
+        roots: R by particle.
+        eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts; column k of R belongs to number k.
+        unsymmetric: 1 for worlds with contacts, whose friction depends on their load, int32, shape [world_count].
+    """
+
+    offsets: wp.array[int]
+    columns: wp.array[int]
+    values: wp.array[wp.mat33d]
+    contacts: ContactRows
+    vertex_triangle: ContactRows
+    edge_edge: ContactRows
+    roots: wp.array[wp.mat33d]
+    eigenvalues: wp.array[wp.vec3d]
+    unsymmetric: wp.array[int]
+
+
+@wp.func
+def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d]) -> wp.vec3d:
+    """Returns row i of the product of the Jacobian of contacts with x."""
+    product = wp.vec3d()
+    if not rows.offsets:
+        return product
+    size = rows.vertices.shape[1]
+    for k in range(rows.offsets[i], rows.offsets[i + 1]):
+        e, row = rows.entries[k] // size, 3 * (rows.entries[k] % size)
+        for j in range(size):
+            vertex = rows.vertices[e, j]
+            if vertex >= 0:
+                of = x[vertex]
+                product += wp.vec3d(
+                    wp.dot(rows.jacobian[e, row, j], of),
+                    wp.dot(rows.jacobian[e, row + 1, j], of),
+                    wp.dot(rows.jacobian[e, row + 2, j], of),
+                )
+    return product
+
+
+@wp.func
+def row_product(matrix: Matrix, i: int, x: wp.array[wp.vec3d]) -> wp.vec3d:
+    """Returns row i of the product of a matrix with x."""
+    product = wp.vec3d()
+    for k in range(matrix.offsets[i], matrix.offsets[i + 1]):
+        product += matrix.values[k] * x[matrix.columns[k]]
+    product -= _contact_product(matrix.contacts, i, x)
+    product -= _contact_product(matrix.vertex_triangle, i, x)
+    return product - _contact_product(matrix.edge_edge, i, x)
 
 
 @wp.kernel
@@ -63,108 +136,118 @@ def copy_diagonal(
 
 
 @wp.kernel
-def sparse_product(
-    # in
-    alpha: wp.float64,
-    beta: wp.float64,
-    offsets: wp.array[int],
-    columns: wp.array[int],
-    values: wp.array[wp.mat33d],
-    x: wp.array[wp.vec3d],
-    y: wp.array[wp.vec3d],
-    # out
-    z: wp.array[wp.vec3d],
-):
-    """Sets z to alpha A x + beta y, with a sparse matrix A of blocks by row; z may be y."""
-    i = wp.tid()
-    product = wp.vec3d()
-    for k in range(offsets[i], offsets[i + 1]):
-        product += values[k] * x[columns[k]]
-    product = alpha * product
-    if beta != _ZERO:
-        product += beta * y[i]
-    z[i] = product
-
-
-@wp.kernel
-def invert_blocks(
+def factor_blocks(
     # in
     inertia: wp.array[wp.float64],
-    # in and out
     blocks: wp.array[wp.mat33d],
+    # out
+    roots: wp.array[wp.mat33d],
+    eigenvalues: wp.array[wp.vec3d],
 ):
-    """Inverts the symmetric parts of blocks, with eigenvalues made positive and at least the inertia.
+    """Factors the inverse of the symmetric parts of blocks, with eigenvalues made positive and at least the inertia.
 
     VBD leaves the negative terms of its blocks out, so that they are positive definite; this has the same purpose.
     """
     i = wp.tid()
     block = blocks[i]
     q, values = wp.eig3(wp.float64(0.5) * (block + wp.transpose(block)))
+    scale = wp.vec3d()
     for k in range(3):
-        values[k] = _ONE / wp.max(wp.abs(values[k]), inertia[i])
-    blocks[i] = q * wp.diag(values) * wp.transpose(q)
+        values[k] = wp.max(wp.abs(values[k]), inertia[i])
+        scale[k] = _ONE / wp.sqrt(values[k])
+    roots[i] = q * wp.diag(scale)
+    eigenvalues[i] = values
 
 
 @wp.kernel
-def apply_blocks(
+def scale_blocks(
     # in
-    alpha: wp.float64,
-    beta: wp.float64,
-    blocks: wp.array[wp.mat33d],
-    x: wp.array[wp.vec3d],
-    y: wp.array[wp.vec3d],
-    # out
-    z: wp.array[wp.vec3d],
+    rows: wp.array[int],
+    columns: wp.array[int],
+    roots: wp.array[wp.mat33d],
+    # in and out
+    values: wp.array[wp.mat33d],
 ):
-    """Sets z to alpha B x + beta y, with blocks B; z may be y."""
-    i = wp.tid()
-    product = alpha * (blocks[i] * x[i])
-    if beta != _ZERO:
-        product += beta * y[i]
-    z[i] = product
+    """Multiplies the blocks of a matrix by roots from both sides."""
+    k = wp.tid()
+    values[k] = wp.transpose(roots[rows[k]]) * values[k] * roots[columns[k]]
 
 
 @wp.kernel
-def sum_squares(
+def scale_jacobians(
+    # in
+    transposed: int,
+    vertices: wp.array2d[int],
+    is_fixed: wp.array[int],
+    roots: wp.array[wp.mat33d],
+    # in and out
+    jacobian: wp.array3d[wp.vec3d],
+):
+    """Multiplies the blocks of Jacobians, or of their transposes, by roots; those of fixed particles become 0."""
+    e, i, j = wp.tid()
+    v, w = vertices[e, i], vertices[e, j]
+    if i > j or v < 0 or w < 0:
+        return
+    upper, lower = wp.mat33d(), wp.mat33d()
+    if is_fixed[v] == 0 and is_fixed[w] == 0:
+        upper = wp.transpose(roots[v]) * block(jacobian, e, i, j) * roots[w]
+        lower = wp.transpose(roots[w]) * block(jacobian, e, j, i) * roots[v]
+    if transposed != 0:
+        upper, lower = wp.transpose(lower), wp.transpose(upper)
+    for k in range(3):
+        jacobian[e, 3 * i + k, j] = upper[k]
+        jacobian[e, 3 * j + k, i] = lower[k]
+
+
+@wp.kernel
+def count_entries(
+    # in
+    vertices: wp.array2d[int],
+    is_fixed: wp.array[int],
+    world: wp.array[int],
+    # out
+    counts: wp.array[int],
+    unsymmetric: wp.array[int],
+):
+    """Counts the elements of each free particle, and marks worlds that have some."""
+    e, i = wp.tid()
+    v = vertices[e, i]
+    if v >= 0:
+        if is_fixed[v] == 0:
+            wp.atomic_add(counts, v, 1)
+            unsymmetric[world[v]] = 1
+
+
+@wp.kernel
+def list_entries(
+    # in
+    vertices: wp.array2d[int],
+    is_fixed: wp.array[int],
+    # in and out
+    ends: wp.array[int],
+    # out
+    entries: wp.array[int],
+):
+    """Lists the elements of each free particle; ``ends`` are the ends of what is listed."""
+    e, i = wp.tid()
+    v = vertices[e, i]
+    if v >= 0:
+        if is_fixed[v] == 0:
+            entries[wp.atomic_add(ends, v, 1)] = e * vertices.shape[1] + i
+
+
+@wp.kernel
+def sum_scaled_squares(
     # in
     world: wp.array[int],
-    a: wp.array[wp.vec3d],
-    b: wp.array[wp.vec3d],
-    # out
-    sums: wp.array2d[wp.float64],
-):
-    """Adds squares to sums by world: of a to row 0, of b to row 1."""
-    i = wp.tid()
-    wp.atomic_add(sums, 0, world[i], wp.dot(a[i], a[i]))
-    wp.atomic_add(sums, 1, world[i], wp.dot(b[i], b[i]))
-
-
-@wp.kernel
-def sum_products(
-    # in
-    world: wp.array[int],
-    a: wp.array[wp.vec3d],
-    b: wp.array[wp.vec3d],
+    roots: wp.array[wp.mat33d],
+    forces: wp.array[wp.vec3d],
     # out
     sums: wp.array[wp.float64],
 ):
-    """Adds the products of two vectors to sums by world."""
+    """Adds the squares of scaled forces to sums by world."""
     i = wp.tid()
-    wp.atomic_add(sums, world[i], wp.dot(a[i], b[i]))
-
-
-@wp.kernel
-def find_failed(
-    # in
-    tolerance: wp.float64,
-    sums: wp.array2d[wp.float64],
-    # out
-    failed: wp.array[int],
-):
-    """Finds the worlds whose residual, squared in row 0, is not below the tolerance times the norm, in row 1."""
-    w = wp.tid()
-    solved = sums[0, w] <= tolerance * tolerance * sums[1, w]  # false if one is not finite
-    failed[w] = int(not solved)
+    wp.atomic_add(sums, world[i], wp.length_sq(wp.transpose(roots[i]) * forces[i]))
 
 
 @wp.kernel

@@ -25,8 +25,7 @@ class Polish:
         """Allocates buffers for a number of Newton steps."""
         self._equations, self._worlds, self._steps = equations, worlds, steps
         self._linear = LinearSolver(equations, worlds, tolerance=_TOLERANCE, max_iterations=max_iterations)
-        self._preconditioned = equations.zeros()
-        n, device = len(self._preconditioned), equations.device
+        n, device = equations.model.particle_count, equations.device
         self._trial, self._best = (wp.zeros(n, dtype=wp.vec3, device=device) for _ in range(2))
         self._merit, self._least = (wp.zeros(worlds.count, dtype=wp.float64, device=device) for _ in range(2))
         self._is_less = wp.zeros(worlds.count, dtype=int, device=device)
@@ -37,10 +36,9 @@ class Polish:
         world = self._worlds.of_particles
         for _ in range(self._steps):
             forces = equations.evaluate()
-            equations.differentiate()
+            equations.differentiate(transposed=False)
             self._measure(forces, self._least)
-            symmetric = equations.is_symmetric
-            direction = self._linear.solve(forces, transposed=False, symmetric=symmetric, failure=0.0)
+            direction = self._linear.solve(forces, failure=0.0)
             wp.copy(self._best, x1)
             for share in _SHARES:
                 self._launch(kernels.move, n, [share, x1, direction], [self._trial])
@@ -53,10 +51,11 @@ class Polish:
 
     def _measure(self, forces, merit):
         """Computes the squared norm of forces by world."""
-        self._equations.precondition(forces, forces, self._preconditioned, 1.0, 0.0)
+        matrix = self._equations.matrix
+        assert matrix is not None
         merit.zero_()
-        inputs = [self._worlds.of_particles, forces, self._preconditioned]
-        self._launch(matrix_kernels.sum_products, len(forces), inputs, [merit])
+        inputs = [self._worlds.of_particles, matrix.roots, forces]
+        self._launch(matrix_kernels.sum_scaled_squares, len(forces), inputs, [merit])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._equations.device)

@@ -118,7 +118,7 @@ class SolverImplicitAdjoint(WrappedSolver):
         max_iterations = checked_integer(max_iterations, "max_iterations", 1)
         check_attachments(model)
         worlds = self._worlds = Worlds(model)
-        self._equations = equations = Equations(solver)
+        self._equations = equations = Equations(solver, worlds)
         self._linear = LinearSolver(equations, worlds, tolerance=tolerance, max_iterations=max_iterations)
         self._polish = Polish(equations, worlds, self.polish, max_iterations) if self.polish else None
         self._poses = BodyPoses(solver)
@@ -318,8 +318,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         equations.load(step)
         dt = wp.float64(step.dt)
         self._launch(kernels.of_end, n, [dt, of_x1, of_v1, equations.is_fixed], [self._of_end, self._free])
-        equations.differentiate()
-        multipliers = self._linear.solve(self._free, transposed=True, symmetric=equations.is_symmetric)
+        equations.differentiate(transposed=True)
+        multipliers = self._linear.solve(self._free)
         if step.pairs is not None:
             inputs = [self._worlds.of_particles, step.pairs.dropped, wp.float64(math.nan)]
             self._launch(matrix_kernels.set_failed, n, inputs, [multipliers])

@@ -6,14 +6,13 @@ import warp as wp
 
 
 class Worlds:
-    """Worlds as rows of results and as batches of a linear solve.
+    """Worlds as rows of results and as independent systems of a linear solve.
 
     Attributes:
         count: Number of worlds that have particles. Particles of no world count as one.
         ids: The worlds, in the order of their particles, -1 for particles of no world, int32, shape [count].
         of_particles: Row of the world of each particle, int32, shape [particle_count].
-        offsets: First component of the vectors of each world, and the end of the last, int32, shape [count + 1].
-        largest: Largest number of components of a world.
+        offsets: First particle of each world, and the end of the last, int32, shape [count + 1].
     """
 
     def __init__(self, model: newton.Model):
@@ -31,6 +30,5 @@ class Worlds:
         ends = np.append(starts[1:], len(world))
         rows = np.repeat(np.arange(self.count, dtype=np.int32), ends - starts)
         self.of_particles = wp.array(rows, dtype=int, device=model.device)
-        offsets = 3 * np.append(starts, len(world)).astype(np.int32)
+        offsets = np.append(starts, len(world)).astype(np.int32)
         self.offsets = wp.array(offsets, dtype=int, device=model.device)
-        self.largest = int(3 * (ends - starts).max())
