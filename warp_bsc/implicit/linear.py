@@ -4,9 +4,10 @@ import math
 
 import warp as wp
 
-from ..response.solve.cluster import BLOCK, blocks_of_cluster
+from ..response.solve.cluster import blocks_of_cluster
 from . import linear_kernels
 from .equations import Equations
+from .linear_kernels import BLOCK, PARTS
 from .worlds import Worlds
 
 
@@ -33,12 +34,13 @@ class LinearSolver:
         self._equations, self._worlds = equations, worlds
         self._tolerance, self._max_iterations = tolerance, max_iterations
         device = equations.device
-        self._blocks = blocks_of_cluster(device)
-        self._threads = self._blocks * (1 if device.is_cpu else BLOCK)
-        self._partials = wp.zeros((worlds.count, self._blocks), dtype=wp.vec4d, device=device)
-        self._vectors = linear_kernels.Vectors()
-        for name in ("x", "residual", "shadow", "direction", "along", "product"):
+        blocks = blocks_of_cluster(device)
+        self._threads, self._parts = (1, 1) if device.is_cpu else (blocks * BLOCK, PARTS)
+        self._partials = wp.zeros((worlds.count, 2, blocks), dtype=wp.vec4d, device=device)
+        self._vectors, self._solution = linear_kernels.Vectors(), equations.zeros()
+        for name in ("x", "residual", "shadow", "direction", "along", "beyond", "last"):
             setattr(self._vectors, name, equations.zeros())
+        self._vectors.products = wp.zeros((2, len(self._solution)), dtype=wp.vec3d, device=device)
         self.failed = wp.zeros(worlds.count, dtype=int, device=device)
 
     def solve(self, b: wp.array, failure: float = math.nan) -> wp.array:
@@ -50,13 +52,13 @@ class LinearSolver:
         """
         worlds = self._worlds
         inputs = [self._equations.matrix, worlds.offsets, b, wp.float64(self._tolerance), self._max_iterations]
-        inputs += [wp.float64(failure), self._threads, self._partials, self._vectors]
+        inputs += [wp.float64(failure), self._threads, self._parts, self._partials, self._vectors]
         wp.launch(
             linear_kernels.solve,
             worlds.count * self._threads,
             inputs=inputs,
-            outputs=[self.failed],
+            outputs=[self._solution, self.failed],
             device=self._equations.device,
             block_dim=BLOCK,
         )
-        return self._vectors.x
+        return self._solution

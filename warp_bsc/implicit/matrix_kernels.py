@@ -52,14 +52,30 @@ class Matrix:
     unsymmetric: wp.array[int]
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const unsigned mask = ((1u << parts) - 1u) << (threadIdx.x & 31u & ~(unsigned)(parts - 1));
+    for (int offset = parts / 2; offset > 0; offset /= 2)
+        for (int c = 0; c < 3; ++c)
+            value[c] += __shfl_xor_sync(mask, value[c], offset);
+#endif
+    return value;
+"""
+)
+def _sum_of_parts(value: wp.vec3d, parts: int) -> wp.vec3d:
+    """Returns the sum of the values of ``parts`` threads that follow each other, a power of 2 below 32, in each."""
+    ...
+
+
 @wp.func
-def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d]) -> wp.vec3d:
-    """Returns row i of the product of the Jacobian of contacts with x."""
+def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d], part: int, parts: int) -> wp.vec3d:
+    """Returns a part of row i of the product of the Jacobian of contacts with x."""
     product = wp.vec3d()
     if not rows.offsets:
         return product
     size = rows.vertices.shape[1]
-    for k in range(rows.offsets[i], rows.offsets[i + 1]):
+    for k in range(rows.offsets[i] + part, rows.offsets[i + 1], parts):
         e, row = rows.entries[k] // size, 3 * (rows.entries[k] % size)
         for j in range(size):
             vertex = rows.vertices[e, j]
@@ -74,14 +90,15 @@ def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d]) -> wp.vec
 
 
 @wp.func
-def row_product(matrix: Matrix, i: int, x: wp.array[wp.vec3d]) -> wp.vec3d:
-    """Returns row i of the product of a matrix with x."""
+def row_product(matrix: Matrix, i: int, x: wp.array[wp.vec3d], part: int, parts: int) -> wp.vec3d:
+    """Returns row i of the product of a matrix with x, in each of the ``parts`` threads that compute it together."""
     product = wp.vec3d()
-    for k in range(matrix.offsets[i], matrix.offsets[i + 1]):
+    for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
         product += matrix.values[k] * x[matrix.columns[k]]
-    product -= _contact_product(matrix.contacts, i, x)
-    product -= _contact_product(matrix.vertex_triangle, i, x)
-    return product - _contact_product(matrix.edge_edge, i, x)
+    product -= _contact_product(matrix.contacts, i, x, part, parts)
+    product -= _contact_product(matrix.vertex_triangle, i, x, part, parts)
+    product -= _contact_product(matrix.edge_edge, i, x, part, parts)
+    return _sum_of_parts(product, parts)
 
 
 @wp.kernel
