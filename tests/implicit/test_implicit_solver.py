@@ -203,6 +203,7 @@ def test_pairs_that_self_contact_dropped_give_nan_in_their_world_and_are_counted
     rollout = Rollout(model, dt=1.0 / 240.0, start=(0.3, 0.1, -0.3), **options, **SELF_CONTACT)
     with pytest.warns(UserWarning, match="particle_vertex_contact_buffer_size"):
         gradient = rollout.backward()[0].particle_qd.grad.numpy()
+        rollout.adjoint.report.warn()  # a GPU may have counted only now
     free, world = model.particle_inv_mass.numpy() > 0.0, model.particle_world.numpy()
     assert np.isnan(gradient[free & (world == 0)]).all()
     assert np.isfinite(gradient[world == 1]).all()

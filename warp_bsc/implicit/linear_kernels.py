@@ -1,22 +1,21 @@
-"""Krylov solves in one launch: the threads of a cluster make all iterations for a world, and wait for each other.
+"""Krylov solves whose iterations are one launch a product, each world in a phase of its own.
 
-In most scenes an iteration takes less time than the launches of its kernels. What is left is waiting, so the iterations
-are those that wait once for each product with the matrix: in the pipelined methods, products of vectors follow from
-recurrences, and sums over all particles are complete when the next product begins (Ghysels and Vanroose 2014; Cools and
-Vanroose 2017).
+The pipelined methods have one sum over all particles for each product with the matrix, which is complete when the next
+product begins: other products follow from recurrences (Ghysels and Vanroose 2014, doi:10.1016/j.parco.2013.06.001;
+Cools and Vanroose 2017, doi:10.1016/j.parco.2017.04.005). So a launch adds up the sums of the last one, decides what is
+next for its world, computes a product, and changes all vectors.
 """
+
+from enum import IntEnum
 
 import warp as wp
 
-from ..response.solve.cluster import CLUSTER, wait_for_others
-from .matrix_kernels import Matrix, row_product
+from .matrix_kernels import Matrix, component, row_product, vector_at
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = 512
-"""Threads of a block."""
-PARTS = 4
-"""Threads of a particle on a GPU: they share the blocks of its row, and three of them own a component each."""
+BLOCK = 128
+"""Threads of a block on a GPU."""
 
 _ZERO = wp.constant(wp.float64(0.0))
 _TWO = wp.constant(wp.float64(2.0))
@@ -31,250 +30,302 @@ _ATTEMPTS = wp.constant(5)
 """Solves that are tried, each from the solution of the one before: its residual is computed anew."""
 
 
+class Phase(IntEnum):
+    """What a launch computes for a world."""
+
+    RESIDUAL = 0
+    """The residual b - A x."""
+    START = 1
+    """The product with the residual."""
+    CONJUGATE = 2
+    """An iteration of conjugate residuals."""
+    FIRST = 3
+    """The first half of an iteration of BiCGSTAB."""
+    SECOND = 4
+    """The second half."""
+    SOLVED = 5
+    FAILED = 6
+
+
+class Vector(IntEnum):
+    """Vectors of a solve."""
+
+    X = 0
+    """The solution, scaled as the matrix."""
+    RESIDUAL = 1
+    DIRECTION = 2
+    """The search direction."""
+    ALONG = 3
+    """A times the direction."""
+    BEYOND = 4
+    """A times that."""
+    LAST = 5
+    """A times that (BiCGSTAB)."""
+    SHADOW = 6
+    """The residual at the start (BiCGSTAB)."""
+    PRODUCT = 7
+    """A times the residual."""
+    OTHER = 8
+    """A times ``PRODUCT`` (BiCGSTAB); conjugate residuals write the next product here, and swap both."""
+
+
 @wp.struct
-class Vectors:
-    """Vectors of a solve, each of shape [particle_count].
+class State:
+    """State of the solve of a world.
 
     Attributes:
-        x: The solution, scaled as the matrix.
-        residual: b - A x; ``shadow``: the residual at the beginning (BiCGSTAB).
-        direction: The search direction; ``along``: A times it; ``beyond``: A times that.
-        products: A times the residual, of this iteration and the next in turn (conjugate residuals), or of this one and
-            A times that (BiCGSTAB), shape [2, particle_count].
-        last: A times ``beyond`` (BiCGSTAB).
+        phase: What the last launch computed, :class:`Phase`.
+        attempt, iterations: Numbers of solves begun, and of iterations in all.
+        limit: Largest squared norm of the residual.
+        curvature: Product of the residual and A times it (conjugate residuals), or of residual and shadow (BiCGSTAB).
+        divisor: What ``curvature`` is divided by to get the step.
+        step, momentum, smoothing: Coefficients of the iteration.
     """
 
-    x: wp.array[wp.vec3d]
-    residual: wp.array[wp.vec3d]
-    shadow: wp.array[wp.vec3d]
-    direction: wp.array[wp.vec3d]
-    along: wp.array[wp.vec3d]
-    beyond: wp.array[wp.vec3d]
-    products: wp.array2d[wp.vec3d]
-    last: wp.array[wp.vec3d]
-
-
-@wp.struct
-class Team:
-    """The threads that solve for a world.
-
-    Attributes:
-        world: The world.
-        lane: Number of this thread among them.
-        blocks: Number of blocks of threads.
-        part, parts: Which part of a row the thread computes, of how many; it owns components part, part + parts, ...
-        begin, end, stride: The particles of the thread.
-        partials: Sums of each block of threads, of two sums in turn, shape [world_count, 2, blocks].
-    """
-
-    world: int
-    lane: int
-    blocks: int
-    part: int
-    parts: int
-    begin: int
-    end: int
-    stride: int
-    partials: wp.array3d[wp.vec4d]
+    phase: int
+    attempt: int
+    iterations: int
+    limit: wp.float64
+    curvature: wp.float64
+    divisor: wp.float64
+    step: wp.float64
+    momentum: wp.float64
+    smoothing: wp.float64
 
 
 @wp.func
-def _sum(team: Team, turn: int, values: wp.vec4d) -> wp.vec4d:
-    """Returns the sums of values over all threads, the same in each, after all have come here.
-
-    Between two calls with the same ``turn``, 0 or 1, threads have to wait for each other elsewhere.
-    """
-    of_block = wp.tile_sum(wp.tile(values, preserve_type=True))
-    if team.lane % wp.block_dim() == 0:
-        team.partials[team.world, turn, team.lane // wp.block_dim()] = of_block[0]
-    wait_for_others()
-    total = wp.vec4d()
-    for block in range(team.blocks):
-        total += team.partials[team.world, turn, block]
-    return total
+def _iterate(state: State, square: wp.float64, phase: int, max_iterations: int) -> State:
+    """Begins an iteration, or ends the attempt: where its residual is small enough, or the method cannot go on."""
+    goes_on = square > _AIM * state.limit and state.curvature != _ZERO and state.divisor != _ZERO  # not so for NaN
+    if goes_on and state.iterations < max_iterations:
+        state.step = state.curvature / state.divisor
+        state.iterations += 1
+        state.phase = phase
+    else:
+        state.phase = int(Phase.RESIDUAL)
+    return state
 
 
 @wp.func
-def _begin(team: Team, matrix: Matrix, b: wp.array[wp.vec3d], of: Vectors) -> wp.vec4d:
-    """Computes the residual b - A x; returns the squared norms of the residual and of b."""
-    wait_for_others()
-    sums = wp.vec4d()
-    for i in range(team.begin, team.end, team.stride):
-        residual = wp.transpose(matrix.roots[i]) * b[i] - row_product(matrix, i, of.x, team.part, team.parts)
-        for c in range(team.part, 3, team.parts):
-            of.residual[i][c] = residual[c]
-            sums += wp.vec4d(_square(matrix, i, c, residual[c]), b[i][c] * b[i][c], _ZERO, _ZERO)
-    return _sum(team, 0, sums)
-
-
-@wp.func
-def _square(matrix: Matrix, i: int, c: int, residual: wp.float64) -> wp.float64:
-    """Returns the share of a component in the squared norm of the residual before it was scaled."""
-    return residual * residual * matrix.eigenvalues[i][c]
-
-
-@wp.func
-def _conjugate_residuals(team: Team, matrix: Matrix, of: Vectors, limit: wp.float64, most: int) -> int:
-    """Makes iterations of pipelined conjugate residuals, which need a symmetric matrix; returns their number.
-
-    The squared norm of A times the next direction follows from sums over the last one.
-    """
-    wait_for_others()
-    sums = wp.vec4d()
-    for i in range(team.begin, team.end, team.stride):
-        product = row_product(matrix, i, of.residual, team.part, team.parts)
-        for c in range(team.part, 3, team.parts):
-            residual, along = of.residual[i][c], product[c]
-            of.products[0, i][c] = along
-            of.direction[i][c] = _ZERO
-            of.along[i][c] = _ZERO
-            of.beyond[i][c] = _ZERO
-            sums += wp.vec4d(residual * along, along * along, _ZERO, _square(matrix, i, c, residual))
-    sums = _sum(team, 1, sums)
-    curvature, length, momentum = sums[0], sums[1], wp.float64(0.0)
-    iteration = int(0)
-    while iteration < most and sums[3] > limit and curvature != _ZERO and length > _ZERO:  # not so for NaN
-        step = curvature / length
-        now = iteration % 2
-        sums = wp.vec4d()
-        for i in range(team.begin, team.end, team.stride):
-            product = row_product(matrix, i, of.products[now], team.part, team.parts)
-            for c in range(team.part, 3, team.parts):
-                before = of.products[now, i][c]
-                beyond = product[c] + momentum * of.beyond[i][c]
-                along = before + momentum * of.along[i][c]
-                direction = of.residual[i][c] + momentum * of.direction[i][c]
-                residual = of.residual[i][c] - step * along
-                after = before - step * beyond
-                of.beyond[i][c] = beyond
-                of.along[i][c] = along
-                of.direction[i][c] = direction
-                of.x[i][c] += step * direction
-                of.residual[i][c] = residual
-                of.products[1 - now, i][c] = after
-                sums += wp.vec4d(residual * after, after * after, after * along, _square(matrix, i, c, residual))
-        sums = _sum(team, now, sums)
-        momentum = sums[0] / curvature
-        curvature = sums[0]
-        length = sums[1] + momentum * (_TWO * sums[2] + momentum * length)
-        iteration += 1
-    return iteration
-
-
-@wp.func
-def _bicgstab(team: Team, matrix: Matrix, of: Vectors, limit: wp.float64, most: int) -> int:
-    """Makes iterations of pipelined BiCGSTAB, for any matrix; returns their number."""
-    wait_for_others()
-    sums = wp.vec4d()
-    for i in range(team.begin, team.end, team.stride):
-        product = row_product(matrix, i, of.residual, team.part, team.parts)
-        for c in range(team.part, 3, team.parts):
-            residual = of.residual[i][c]
-            of.products[0, i][c] = product[c]
-            of.shadow[i][c] = residual
-            of.direction[i][c] = _ZERO
-            of.along[i][c] = _ZERO
-            of.beyond[i][c] = _ZERO
-            of.last[i][c] = _ZERO
-            sums += wp.vec4d(residual * residual, residual * product[c], _square(matrix, i, c, residual), _ZERO)
-    sums = _sum(team, 1, sums)
-    correlation, divisor, momentum, smoothing = sums[0], sums[1], wp.float64(0.0), wp.float64(0.0)
-    iteration = int(0)
-    while iteration < most and sums[2] > limit and correlation != _ZERO and divisor != _ZERO:  # not so for NaN
-        step = correlation / divisor
-        sums = wp.vec4d()
-        for i in range(team.begin, team.end, team.stride):
-            product = row_product(matrix, i, of.products[0], team.part, team.parts)
-            for c in range(team.part, 3, team.parts):
-                residual, before, shadow = of.residual[i][c], of.products[0, i][c], of.shadow[i][c]
-                direction = residual + momentum * (of.direction[i][c] - smoothing * of.along[i][c])
-                along = before + momentum * (of.along[i][c] - smoothing * of.beyond[i][c])
-                beyond = product[c] + momentum * (of.beyond[i][c] - smoothing * of.last[i][c])
-                of.products[1, i][c] = product[c]
-                of.direction[i][c] = direction
-                of.along[i][c] = along
-                of.beyond[i][c] = beyond
-                half, of_half = residual - step * along, before - step * beyond
-                sums += wp.vec4d(half * of_half, of_half * of_half, shadow * along, shadow * beyond)
-        sums = _sum(team, 0, sums)
-        smoothing = _ZERO
+def _next(state: State, sums: wp.vec4d, is_symmetric: bool, tolerance: wp.float64, max_iterations: int) -> State:
+    """Returns what follows the sums of the last launch."""
+    if state.phase == int(Phase.RESIDUAL):
+        if state.attempt == 0:
+            state.limit = tolerance * tolerance * sums[1]
+        if sums[0] <= state.limit or sums[1] <= _LEAST_SQUARE:
+            state.phase = int(Phase.SOLVED)
+        elif sums[0] > state.limit and state.attempt < _ATTEMPTS and state.iterations < max_iterations:
+            state.attempt += 1
+            state.phase = int(Phase.START)
+        else:
+            state.phase = int(Phase.FAILED)
+        return state
+    if state.phase == int(Phase.START):
+        state.momentum = _ZERO
+        state.smoothing = _ZERO
+        if is_symmetric and state.attempt == 1:
+            state.curvature = sums[0]
+            state.divisor = sums[1]
+            return _iterate(state, sums[3], int(Phase.CONJUGATE), max_iterations)
+        state.curvature = sums[2]
+        state.divisor = sums[0]
+        return _iterate(state, sums[3], int(Phase.FIRST), max_iterations)
+    if state.phase == int(Phase.CONJUGATE):
+        state.momentum = sums[0] / state.curvature
+        state.curvature = sums[0]
+        state.divisor = sums[1] + state.momentum * (_TWO * sums[2] + state.momentum * state.divisor)
+        return _iterate(state, sums[3], int(Phase.CONJUGATE), max_iterations)
+    if state.phase == int(Phase.FIRST):
+        state.smoothing = _ZERO
         if sums[1] > _ZERO:
-            smoothing = sums[0] / sums[1]
-        of_along, of_beyond = sums[2], sums[3]
-        sums = wp.vec4d()
-        for i in range(team.begin, team.end, team.stride):
-            product = row_product(matrix, i, of.beyond, team.part, team.parts)
-            for c in range(team.part, 3, team.parts):
-                half = of.residual[i][c] - step * of.along[i][c]
-                of_half = of.products[0, i][c] - step * of.beyond[i][c]
-                residual = half - smoothing * of_half
-                after = of_half - smoothing * (of.products[1, i][c] - step * product[c])
-                of.last[i][c] = product[c]
-                of.x[i][c] += step * of.direction[i][c] + smoothing * half
-                of.residual[i][c] = residual
-                of.products[0, i][c] = after
-                shadow = of.shadow[i][c]
-                sums += wp.vec4d(shadow * residual, shadow * after, _square(matrix, i, c, residual), _ZERO)
-        sums = _sum(team, 1, sums)
-        momentum, divisor = _ZERO, _ZERO
-        if smoothing != _ZERO:
-            momentum = step / smoothing * sums[0] / correlation
-            divisor = sums[1] + momentum * (of_along - smoothing * of_beyond)
-        correlation = sums[0]
-        iteration += 1
-    return iteration
+            state.smoothing = sums[0] / sums[1]
+        state.divisor = sums[2] - state.smoothing * sums[3]
+        state.phase = int(Phase.SECOND)
+        return state
+    if state.phase == int(Phase.SECOND):
+        if state.smoothing == _ZERO:
+            state.divisor = _ZERO
+        else:
+            state.momentum = state.step / state.smoothing * sums[0] / state.curvature
+            state.divisor = sums[1] + state.momentum * state.divisor
+        state.curvature = sums[0]
+        return _iterate(state, sums[2], int(Phase.FIRST), max_iterations)
+    return state
 
 
-@wp.kernel(module="unique", enable_backward=False, cluster_dim=CLUSTER, launch_bounds=BLOCK)
-def solve(
+@wp.func
+def _source(state: State) -> int:
+    """Returns the vector that the next product is with."""
+    if state.phase == int(Phase.RESIDUAL):
+        return int(Vector.X)
+    if state.phase == int(Phase.START):
+        return int(Vector.RESIDUAL)
+    if state.phase == int(Phase.SECOND):
+        return int(Vector.BEYOND)
+    return _product(state)
+
+
+@wp.func
+def _product(state: State) -> int:
+    """Returns the vector that is A times the residual."""
+    if state.phase == int(Phase.CONJUGATE):
+        return wp.where(state.iterations % 2 == 1, int(Vector.PRODUCT), int(Vector.OTHER))
+    return int(Vector.PRODUCT)
+
+
+@wp.func
+def _advance(state: State, of: wp.array2d[wp.float64], n: int, product: wp.float64, square: wp.float64) -> wp.vec4d:
+    """Changes component n of all vectors, given that of the product; returns its share in the sums.
+
+    ``square`` is the factor by which the square of a residual was scaled.
+    """
+    residual = of[int(Vector.RESIDUAL), n] + _ZERO
+    if state.phase == int(Phase.START):
+        of[int(Vector.PRODUCT), n] = product
+        of[int(Vector.SHADOW), n] = residual
+        for k in range(int(Vector.DIRECTION), int(Vector.LAST) + 1):
+            of[k, n] = _ZERO
+        return wp.vec4d(residual * product, product * product, residual * residual, square * residual * residual)
+    before = of[_product(state), n] + _ZERO
+    if state.phase == int(Phase.CONJUGATE):
+        beyond = product + state.momentum * of[int(Vector.BEYOND), n]
+        along = before + state.momentum * of[int(Vector.ALONG), n]
+        direction = residual + state.momentum * of[int(Vector.DIRECTION), n]
+        residual -= state.step * along
+        after = before - state.step * beyond
+        of[int(Vector.X), n] += state.step * direction
+        of[int(Vector.RESIDUAL), n] = residual
+        of[int(Vector.DIRECTION), n] = direction
+        of[int(Vector.ALONG), n] = along
+        of[int(Vector.BEYOND), n] = beyond
+        of[int(Vector.PRODUCT) + int(Vector.OTHER) - _product(state), n] = after
+        return wp.vec4d(residual * after, after * after, after * along, square * residual * residual)
+    if state.phase == int(Phase.FIRST):
+        old_along, old_beyond = of[int(Vector.ALONG), n] + _ZERO, of[int(Vector.BEYOND), n] + _ZERO
+        direction = residual + state.momentum * (of[int(Vector.DIRECTION), n] - state.smoothing * old_along)
+        along = before + state.momentum * (old_along - state.smoothing * old_beyond)
+        beyond = product + state.momentum * (old_beyond - state.smoothing * of[int(Vector.LAST), n])
+        of[int(Vector.DIRECTION), n] = direction
+        of[int(Vector.ALONG), n] = along
+        of[int(Vector.BEYOND), n] = beyond
+        of[int(Vector.OTHER), n] = product
+        half, of_half = residual - state.step * along, before - state.step * beyond
+        shadow = of[int(Vector.SHADOW), n] + _ZERO
+        return wp.vec4d(half * of_half, of_half * of_half, shadow * along, shadow * beyond)
+    half = residual - state.step * of[int(Vector.ALONG), n]
+    of_half = before - state.step * of[int(Vector.BEYOND), n]
+    residual = half - state.smoothing * of_half
+    after = of_half - state.smoothing * (of[int(Vector.OTHER), n] - state.step * product)
+    of[int(Vector.X), n] += state.step * of[int(Vector.DIRECTION), n] + state.smoothing * half
+    of[int(Vector.RESIDUAL), n] = residual
+    of[int(Vector.PRODUCT), n] = after
+    of[int(Vector.LAST), n] = product
+    shadow = of[int(Vector.SHADOW), n] + _ZERO
+    return wp.vec4d(shadow * residual, shadow * after, square * residual * residual, _ZERO)
+
+
+@wp.kernel
+def advance(
     # in
     matrix: Matrix,
-    particles: wp.array[int],
     b: wp.array[wp.vec3d],
+    particles: wp.array[int],
+    world_of_block: wp.array[int],
+    blocks: wp.array[int],
     tolerance: wp.float64,
     max_iterations: int,
-    failure: wp.float64,
-    threads: int,
+    turn: int,
     parts: int,
-    # buffers
-    partials: wp.array3d[wp.vec4d],
-    of: Vectors,
+    # in and out
+    states: wp.array2d[State],
+    partials: wp.array2d[wp.vec4d],
+    of: wp.array2d[wp.float64],
+):
+    """Computes the next product of each world.
+
+    States and sums of blocks are read at ``turn``, 0 or 1, and written at the other. ``particles`` and ``blocks`` are
+    the first ones of the worlds, and the end of the last. A particle has ``parts`` threads, 1, 2 or 4: they share the
+    blocks of its row, and each owns some of its components.
+    """
+    block, lane = wp.tid() // wp.block_dim(), wp.tid() % wp.block_dim()
+    world = world_of_block[block]
+    first_block = blocks[world]
+    count = blocks[world + 1] - first_block
+    state = states[turn, world]
+    sums = wp.vec4d()
+    for k in range(lane, count, wp.block_dim()):
+        sums += partials[turn, first_block + k]
+    sums = wp.tile_sum(wp.tile(sums, preserve_type=True))[0]
+    if state.attempt >= 0:
+        state = _next(state, sums, matrix.unsymmetric[world] == 0, tolerance, max_iterations)
+    else:
+        state.attempt = 0  # the first launch
+    if block == first_block and lane == 0:
+        states[1 - turn, world] = state
+    sums = wp.vec4d()
+    if state.phase < int(Phase.SOLVED):
+        begin, part = particles[world], lane % parts
+        thread = (block - first_block) * wp.block_dim() + lane
+        for i in range(begin + thread // parts, particles[world + 1], count * wp.block_dim() // parts):
+            product = row_product(matrix, i, of[_source(state)], part, parts)
+            if state.phase == int(Phase.RESIDUAL):
+                product = wp.transpose(matrix.roots[i]) * b[i] - product
+            for c in range(part, 3, parts):
+                n = 3 * i + c
+                value, square = component(product, c), matrix.eigenvalues[n] + _ZERO
+                if state.phase == int(Phase.RESIDUAL):
+                    of_b = component(b[i], c)
+                    of[int(Vector.RESIDUAL), n] = value
+                    sums += wp.vec4d(square * value * value, of_b * of_b, _ZERO, _ZERO)
+                else:
+                    sums += _advance(state, of, n, value, square)
+    sums = wp.tile_sum(wp.tile(sums, preserve_type=True))[0]
+    if lane == 0:
+        partials[1 - turn, block] = sums
+
+
+@wp.kernel
+def begin(
+    # out
+    states: wp.array2d[State],
+):
+    """Sets the states before the first launch."""
+    world = wp.tid()
+    state = State()
+    state.phase = int(Phase.RESIDUAL)
+    state.attempt = -1
+    states[0, world] = state
+
+
+@wp.kernel
+def find_unfinished(
+    # in
+    states: wp.array2d[State],
+    # out
+    unfinished: wp.array[int],
+):
+    """Sets a number to 1 if a world is not finished."""
+    if states[0, wp.tid()].phase < int(Phase.SOLVED):
+        unfinished[0] = 1
+
+
+@wp.kernel
+def finish(
+    # in
+    world: wp.array[int],
+    states: wp.array2d[State],
+    roots: wp.array[wp.mat33d],
+    of: wp.array2d[wp.float64],
+    failure: wp.float64,
     # out
     x: wp.array[wp.vec3d],
     failed: wp.array[int],
 ):
-    """Solves A x = b in each world; ``particles`` are the first ones of the worlds, and the end of the last."""
-    team = Team()
-    team.world = wp.tid() // threads
-    team.lane = wp.tid() % threads
-    team.blocks = partials.shape[2]
-    team.part = team.lane % parts
-    team.parts = parts
-    team.begin = particles[team.world] + team.lane // parts
-    team.end = particles[team.world + 1]
-    team.stride = threads // parts
-    team.partials = partials
-    for i in range(team.begin, team.end, team.stride):
-        for c in range(team.part, 3, parts):
-            of.x[i][c] = _ZERO
-    sums = _begin(team, matrix, b, of)
-    limit = tolerance * tolerance * sums[1]
-    is_solved = sums[1] <= _LEAST_SQUARE
-    iterations = int(0)
-    for attempt in range(_ATTEMPTS):
-        if not is_solved and iterations < max_iterations:
-            most = max_iterations - iterations
-            if attempt == 0 and matrix.unsymmetric[team.world] == 0:
-                iterations += _conjugate_residuals(team, matrix, of, _AIM * limit, most)
-            else:
-                iterations += _bicgstab(team, matrix, of, _AIM * limit, most)
-            sums = _begin(team, matrix, b, of)
-            is_solved = sums[0] <= limit  # not so for NaN
-    wait_for_others()
-    for i in range(team.begin, team.end, team.stride):
-        if team.part == 0:
-            x[i] = wp.vec3d(failure, failure, failure)
-            if is_solved:
-                x[i] = matrix.roots[i] * of.x[i]
-    if team.lane == 0:
-        failed[team.world] = int(not is_solved)
+    """Computes the solution, not scaled, or a value in worlds that failed, which are marked."""
+    i = wp.tid()
+    w = world[i]
+    is_solved = states[0, w].phase == int(Phase.SOLVED)
+    failed[w] = int(not is_solved)
+    x[i] = wp.vec3d(failure, failure, failure)
+    if is_solved:
+        x[i] = roots[i] * vector_at(of[int(Vector.X)], i)

@@ -47,7 +47,7 @@ class StepMatrix:
         matrix.columns = wp.array((blocks % n).astype(np.int32), dtype=int, device=device)
         matrix.values = wp.zeros(len(blocks), dtype=wp.mat33d, device=device)
         matrix.roots = wp.zeros(n, dtype=wp.mat33d, device=device)
-        matrix.eigenvalues = wp.zeros(n, dtype=wp.vec3d, device=device)
+        matrix.eigenvalues = wp.zeros(3 * n, dtype=wp.float64, device=device)
         matrix.unsymmetric = wp.zeros(worlds.count, dtype=int, device=device)
 
     def assemble(self, dt: float, mass: wp.array, in_contact: Sequence[Elements], *, transposed: bool) -> Matrix:

@@ -37,7 +37,8 @@ class Matrix:
         values: Blocks of inertia and elastic forces, shape [n].
         contacts, vertex_triangle, edge_edge: Blocks of contacts.
         roots: R by particle.
-        eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts; column k of R belongs to number k.
+        eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R, float64,
+            shape [3 particle_count].
         unsymmetric: 1 for worlds with contacts, whose friction depends on their load, int32, shape [world_count].
     """
 
@@ -48,8 +49,20 @@ class Matrix:
     vertex_triangle: ContactRows
     edge_edge: ContactRows
     roots: wp.array[wp.mat33d]
-    eigenvalues: wp.array[wp.vec3d]
+    eigenvalues: wp.array[wp.float64]
     unsymmetric: wp.array[int]
+
+
+@wp.func
+def vector_at(x: wp.array[wp.float64], i: int) -> wp.vec3d:
+    """Returns the vector of particle i."""
+    return wp.vec3d(x[3 * i], x[3 * i + 1], x[3 * i + 2])
+
+
+@wp.func
+def component(vector: wp.vec3d, c: int) -> wp.float64:
+    """Returns component c of a vector, which an index that is not constant would put into slow local memory."""
+    return wp.where(c == 0, vector[0], wp.where(c == 1, vector[1], vector[2]))
 
 
 @wp.func_native(
@@ -69,7 +82,7 @@ def _sum_of_parts(value: wp.vec3d, parts: int) -> wp.vec3d:
 
 
 @wp.func
-def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d], part: int, parts: int) -> wp.vec3d:
+def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
     """Returns a part of row i of the product of the Jacobian of contacts with x."""
     product = wp.vec3d()
     if not rows.offsets:
@@ -80,7 +93,7 @@ def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d], part: int
         for j in range(size):
             vertex = rows.vertices[e, j]
             if vertex >= 0:
-                of = x[vertex]
+                of = vector_at(x, vertex)
                 product += wp.vec3d(
                     wp.dot(rows.jacobian[e, row, j], of),
                     wp.dot(rows.jacobian[e, row + 1, j], of),
@@ -90,11 +103,11 @@ def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.vec3d], part: int
 
 
 @wp.func
-def row_product(matrix: Matrix, i: int, x: wp.array[wp.vec3d], part: int, parts: int) -> wp.vec3d:
+def row_product(matrix: Matrix, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
     """Returns row i of the product of a matrix with x, in each of the ``parts`` threads that compute it together."""
     product = wp.vec3d()
     for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
-        product += matrix.values[k] * x[matrix.columns[k]]
+        product += matrix.values[k] * vector_at(x, matrix.columns[k])
     product -= _contact_product(matrix.contacts, i, x, part, parts)
     product -= _contact_product(matrix.vertex_triangle, i, x, part, parts)
     product -= _contact_product(matrix.edge_edge, i, x, part, parts)
@@ -159,7 +172,7 @@ def factor_blocks(
     blocks: wp.array[wp.mat33d],
     # out
     roots: wp.array[wp.mat33d],
-    eigenvalues: wp.array[wp.vec3d],
+    eigenvalues: wp.array[wp.float64],
 ):
     """Factors the inverse of the symmetric parts of blocks, with eigenvalues made positive and at least the inertia.
 
@@ -172,8 +185,8 @@ def factor_blocks(
     for k in range(3):
         values[k] = wp.max(wp.abs(values[k]), inertia[i])
         scale[k] = _ONE / wp.sqrt(values[k])
+        eigenvalues[3 * i + k] = values[k]
     roots[i] = q * wp.diag(scale)
-    eigenvalues[i] = values
 
 
 @wp.kernel

@@ -14,16 +14,11 @@ MAX_PARTICLES = 1024
 """Most particles of a scene that are swept in one launch, for each block: larger ones need more of the GPU."""
 
 
-def blocks_of_cluster(device: wp.Device) -> int:
-    """Returns how many blocks of threads wait for each other on a device."""
-    return CLUSTER if device.is_cuda and device.arch >= 90 else 1
-
-
 def threads_of_cluster(device: wp.Device, particles: int) -> int:
     """Returns how many threads sweep over a scene in one launch; 0 if there are too many particles."""
     if device.is_cpu:
         return 1
-    blocks = blocks_of_cluster(device)
+    blocks = CLUSTER if device.arch >= 90 else 1
     return blocks * BLOCK if particles <= blocks * MAX_PARTICLES else 0
 
 
