@@ -16,7 +16,8 @@ What cannot be known is NaN:
 - An array that the tape had used before the step that ended in it, such as one of two states that take turns, would
   get gradients of several times. That of what was moved is NaN, and counted.
 
-What the tape itself writes between two steps, it differentiates.
+What the tape itself writes between two steps, it differentiates. An array of which it writes a part is taken to be
+written by it alone: gradients of what a program wrote into the same array go on to the start of the step before.
 """
 
 import contextlib
