@@ -18,7 +18,7 @@ from replay_files import (
     read_polygons,
     replay,
 )
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
@@ -292,7 +292,7 @@ def test_overlay_agrees_with_json(tmp_path, suffix):
     shutil.copy(ASSETS / scene.name, scene)
     names = [str(tmp_path / name) for name in ("hits.json", f"overlay.{suffix}")]
     assert main(["replay", str(scene), "--device", "cpu", "--json", names[0], "--overlay", names[1]]) == 0
-    found = json.loads(Path(names[0]).read_text())
+    found = with_names(json.loads(Path(names[0]).read_text()))
     overlay = Usd.Stage.Open(names[1])
     positions = {}
     for result in bsc.replay(bsc.Scene(str(scene)), device="cpu"):

@@ -118,7 +118,7 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
     out.add_argument(
-        "--npz", **file, help="every collision as columns for NumPy, .npz, in a twentieth of the space of JSON"
+        "--npz", **file, help="every collision as columns for NumPy, .npz, in a fifteenth of the space of JSON"
     )
     out.add_argument(
         "--baseline",

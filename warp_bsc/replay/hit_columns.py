@@ -46,7 +46,7 @@ _ROWS_AT_ONCE = 2**16
 class HitsNpz:
     """A ``.npz`` file, a :class:`~warp_bsc.replay.outputs.ReplayOutput`: columns with a row for each pair.
 
-    A pair takes less than 30 bytes, a twentieth of its text in JSON. Its columns, and what their numbers stand for::
+    A pair takes less than 30 bytes, a fifteenth of its text in JSON. Its columns, and what their numbers stand for::
 
         hits = np.load("hits.npz")
         hits["starts"][hits["interval"]], hits["ends"][hits["interval"]]  # time codes; toi is the share between them
