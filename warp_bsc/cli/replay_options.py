@@ -42,6 +42,7 @@ examples:
   warp-bsc replay cloth.usd --clearance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
+  warp-bsc replay shot.usd --report hits.html --json hits.json --limit 1000
   warp-bsc replay shot.usd --workers 16 --json hits.json --resume
   warp-bsc replay shot.usd --workers tcp://head:8786 --report hits.html
 
@@ -119,6 +120,14 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
     out.add_argument(
         "--npz", **file, help="every collision as columns for NumPy, .npz, in a fifteenth of the space of JSON"
+    )
+    out.add_argument(
+        "--limit",
+        type=positive,
+        metavar="N",
+        help="list in all these files at most N collisions of an interval, the earliest, and N edges through faces, "
+        "parts inside others and proximities at a time, with one of each two meshes; all are counted, and files and "
+        "tables say how many are not listed (default: all)",
     )
     out.add_argument(
         "--baseline",

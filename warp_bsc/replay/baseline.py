@@ -18,7 +18,7 @@ __all__ = ["Baseline", "NewFinding"]
 Event = Literal["collides", "crosses", "is inside", "is near"]
 """What two meshes may do in a replay."""
 
-_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate"}
+_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit"}
 """The options that do not change what is compared; ``intersections`` is checked by itself."""
 
 

@@ -22,6 +22,7 @@ from .hit_records import (
     interval_line,
     tail_line,
 )
+from .limit import not_listed
 from .outputs import RecordFile
 from .results import IntervalResult
 from .scene_contacts import PHASES, SceneContacts
@@ -135,6 +136,7 @@ class HitsJson(RecordFile):
             "warnings": summary.scene.warnings,
             "left_out": summary.scene.left_out,
             "hits": summary.hits,
+            "not_listed": asdict(missing) if (missing := not_listed(summary, with_end=summary.is_complete)) else None,
             "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
             "mesh_pairs": mesh_pairs_to_list(summary.mesh_pairs, numbers),
@@ -151,7 +153,7 @@ class HitsJson(RecordFile):
 
 
 class HitsCsv(RecordFile):
-    """A CSV file: a row for each contact, intersection and proximity, and a last line with # if intervals are missing.
+    """A CSV file: a row for each contact, intersection and proximity, and last lines with # if some are missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
     start, in the last interval its end too. A part of a mesh that is inside another mesh has the phase "inside" and the
@@ -191,10 +193,12 @@ class HitsCsv(RecordFile):
             yield from _csv_rows(where, proximities, _proximity_columns)
 
     def tail(self, summary: Summary) -> str:
-        """Returns a line on the missing intervals, empty if there are none."""
-        if summary.is_complete:
-            return ""
-        return f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
+        """Returns lines on rows that a limit leaves out, and on missing intervals; empty if there are none."""
+        limited = str(not_listed(summary, with_end=summary.is_complete) or "")
+        lines = f"# limit: {limited}\n" * bool(limited)
+        if not summary.is_complete:
+            lines += f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
+        return lines
 
 
 _Pairs = TypeVar("_Pairs", bound=ScenePairs)
