@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pxr import Sdf
 from replay_files import OPTIONS, OUTPUTS, Page, falling_through_quads, many_hits, near_and_inside_stage, replay
 from stages import save
 from waving_sheets import write_scene
@@ -109,6 +110,9 @@ def test_all_files_list_the_same_and_say_what_they_leave_out(tmp_path, capsys):
     assert csv.startswith("# limit: ") and said in csv and said in printed
     assert any(said in note for note in page["notes"]) and f"{whole['hits']:,}" in str(page["tiles"])
     assert json.loads(str(np.load(tmp_path / "hits.npz")["facts"]))["not_listed"] == missing
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "overlay.usda"))
+    assert said in layer.documentation
+    assert layer.customLayerData["collisions"]["collisionsNotListed"] == whole["hits"] - 15
 
 
 def test_a_limit_that_leaves_nothing_out_says_nothing(tmp_path, capsys):

@@ -32,7 +32,7 @@ from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .options import Commands, add_command
 from .progress import RunProgress
-from .replay_options import DESCRIPTION, EPILOG, add_replay_options, describe_selection
+from .replay_options import DESCRIPTION, EPILOG, add_replay_options, command_of, describe_selection
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
@@ -308,7 +308,7 @@ def _open_outputs(
         ),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.npz, lambda path: HitsNpz(path, facts=facts, interval_count=len(scene))),
-        (arguments.overlay, lambda path: Overlay(path, scene=scene)),
+        (arguments.overlay, lambda path: Overlay(path, scene=scene, command=command_of(arguments))),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
     )
     outputs = []
