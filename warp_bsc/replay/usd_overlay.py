@@ -380,7 +380,8 @@ def _hidden(keys: list[Key]) -> dict[str, list[str]]:
     hidden = {
         variant: [f"{pair}/{name}" for pair, name in keys if name not in shown] for variant, shown in VARIANTS.items()
     }
-    return hidden | {pair: [other for other in pairs if other != pair] for pair in pairs}
+    # not the pairs themselves: Blender 4.4 crashes where a prim above a point instancer is invisible
+    return hidden | {pair: [f"{other}/{name}" for other, name in keys if other != pair] for pair in pairs}
 
 
 def _box(points, margin=0.0) -> np.ndarray:
