@@ -218,10 +218,11 @@ class Overlay:
         """
         keys = np.sort(meshes, axis=1)
         pairs, groups, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        of_groups = np.split(np.argsort(groups.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
         rows: dict[str, list[np.ndarray]] = {}
         for group in np.argsort(-counts, kind="stable").tolist():
             first, second = (segment.meshes[mesh].name for mesh in pairs[group])
-            rows.setdefault(self._prim_of(first, second), []).append(np.flatnonzero(groups.reshape(-1) == group))
+            rows.setdefault(self._prim_of(first, second), []).append(of_groups[group])
         return [(name, np.sort(np.concatenate(parts))) for name, parts in rows.items()]
 
     def _prim_of(self, first: str, second: str) -> str:
