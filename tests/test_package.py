@@ -82,7 +82,11 @@ LIBRARIES = {
         "torch",  # takes its solvers
         "jax",
     },
-    "pxr": {"usd", "warp_bsc/replay/usd_validation.py"},  # a rule of its validation framework
+    "pxr": {
+        "usd",
+        "warp_bsc/replay/usd_validation.py",  # a rule of its validation framework
+        "warp_bsc/replay/usdview_plugin.py",  # a plugin of its viewer
+    },
     "rich": {"cli"},
     "argparse": {"cli"},
     "matplotlib": {"bench"},

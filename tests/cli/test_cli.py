@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from progress_lines import without_progress
 from pxr import Tf, Usd, UsdGeom
+from stages import with_names
 
 from warp_bsc.cli import progress
 from warp_bsc.cli import replay as replay_command
@@ -78,7 +79,7 @@ def fail(capsys, *arguments):
 
 @pytest.mark.parametrize("method", ["float", "conservative", "exact"])
 def test_replay_finds_the_interval(capsys, falling_scene, method):
-    found = json.loads(run(capsys, "replay", falling_scene, "--json", "--method", method))
+    found = with_names(json.loads(run(capsys, "replay", falling_scene, "--json", "--method", method)))
     assert [interval["hits"] for interval in found["intervals"]] == [0, 0, 0, 3]
     interval = found["intervals"][3]
     assert (interval["start"], interval["end"]) == (3, 4)
@@ -180,7 +181,7 @@ def test_obstacles_that_touch_do_not_count(capsys, scenes):
 
 
 def test_recording_of_newton(capsys):
-    found = json.loads(run(capsys, "replay", ASSETS / "cloth_twist.usd", "--json"))
+    found = with_names(json.loads(run(capsys, "replay", ASSETS / "cloth_twist.usd", "--json")))
     assert [interval["hits"] for interval in found["intervals"]] == [1, 2, 2, 3, 7, 3, 5, 0, 0, 3, 2, 1, 3, 1]
     assert found["mesh_pairs"] == [{"meshes": ["/root/model/triangles"] * 2, "hits": 33}]
 

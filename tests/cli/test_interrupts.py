@@ -10,9 +10,11 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 from progress_lines import without_progress
-from pxr import Sdf
+from pxr import Sdf, Usd
+from replay_files import errors_of
 from waving_sheets import FRAMES, OUTPUTS, options, write_old, write_scene
 
 from warp_bsc.cli import replay as replay_command
@@ -31,9 +33,9 @@ def scene(tmp_path_factory):
 def read_left(folder, reason):
     """How many intervals each of the files has, None if it is the old one; all of them are valid."""
     assert {path.name for path in folder.iterdir()} == set(OUTPUTS.values())
-    texts = [(folder / name).read_text() for name in OUTPUTS.values()]
-    counts = [None] * 4
-    hits, rows, overlay, page = texts
+    *texts, columns = [(folder / name).read_bytes() for name in OUTPUTS.values()]
+    counts = [None] * len(OUTPUTS)
+    hits, rows, overlay, page = (text.decode() for text in texts)
     partial = rf"partial: (\d+) of {FRAMES - 1} intervals(?: were checked)?; {reason}"
     if hits != "old":
         found = json.loads(hits)
@@ -53,6 +55,13 @@ def read_left(folder, reason):
         assert page.rstrip().endswith("</html>")
         said = re.search("P" + partial[1:], page)
         counts[3] = int(said.group(1)) if said else FRAMES - 1
+    if columns != b"old":
+        arrays = dict(np.load(folder / "hits.npz"))
+        counts[4] = len(arrays["starts"])
+        facts = json.loads(str(arrays["facts"]))
+        assert facts["complete"] == (counts[4] == FRAMES - 1)
+        assert facts["complete"] or re.fullmatch(reason, facts["stopped"])
+        assert arrays["interval"].max() < counts[4] and facts["hits"] == arrays["normal"].any(axis=1).sum()
     return counts
 
 
@@ -69,13 +78,15 @@ def check_stopped(folder, number, moment, scene):
     if number == signal.SIGKILL:
         (folder / "hits.json.part").unlink(missing_ok=True)
     counts = read_left(folder, "interrupted" + (f" by {name}" if number != signal.SIGINT else ""))
+    if counts[list(OUTPUTS).index("--overlay")]:
+        assert errors_of(Usd.Stage.Open(str(folder / "overlay.usda"))) == []
     if status == 0:  # it was faster
-        assert counts == [FRAMES - 1] * 4
+        assert counts == [FRAMES - 1] * len(OUTPUTS)
     elif number == signal.SIGKILL:
         assert status == -number
         assert set(counts) <= {None, FRAMES - 1}
     elif status == -number:  # Python was not there yet, or not any more
-        assert counts in ([None] * 4, [FRAMES - 1] * 4)
+        assert counts in ([None] * len(OUTPUTS), [FRAMES - 1] * len(OUTPUTS))
     else:
         assert status == 128 + number
         assert said == "warp-bsc: interrupted" + (f" by {name}\n" if number != signal.SIGINT else "\n")
@@ -125,7 +136,7 @@ def test_signal(tmp_path, monkeypatch, capsys, scene, number):
     assert status == 128 + number
     # the line before is there where this process is the first to compile kernels
     assert capsys.readouterr().err.splitlines()[-1] == f"warp-bsc: {said}"
-    assert read_left(tmp_path, said) == [3] * 4
+    assert read_left(tmp_path, said) == [3] * len(OUTPUTS)
     assert [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)] == handlers
 
 
@@ -139,7 +150,7 @@ def test_signals_that_follow_disturb_nothing(tmp_path, monkeypatch, scene):
     monkeypatch.setattr(replay_command, "_finish", disturbed)
     status = replay_with(monkeypatch, scene, tmp_path, lambda: os.kill(os.getpid(), signal.SIGTERM))
     assert status == 128 + signal.SIGTERM
-    assert read_left(tmp_path, "interrupted by SIGTERM") == [3] * 4
+    assert read_left(tmp_path, "interrupted by SIGTERM") == [3] * len(OUTPUTS)
 
 
 def test_signal_while_the_files_are_finished(tmp_path, monkeypatch, capsys, scene):
@@ -152,7 +163,7 @@ def test_signal_while_the_files_are_finished(tmp_path, monkeypatch, capsys, scen
     monkeypatch.setattr(replay_command, "_finish", disturbed)
     write_old(tmp_path)
     assert main(["replay", scene, *options(tmp_path)]) == 128 + signal.SIGTERM
-    assert read_left(tmp_path, "") == [FRAMES - 1] * 4
+    assert read_left(tmp_path, "") == [FRAMES - 1] * len(OUTPUTS)
     assert capsys.readouterr().err == "warp-bsc: interrupted by SIGTERM\n"
 
 
@@ -163,7 +174,7 @@ def test_signal_in_a_destructor_is_not_lost(tmp_path, monkeypatch, scene):
 
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)
     assert replay_with(monkeypatch, scene, tmp_path, Sink) == 128 + signal.SIGTERM
-    assert read_left(tmp_path, "interrupted by SIGTERM") == [4] * 4
+    assert read_left(tmp_path, "interrupted by SIGTERM") == [4] * len(OUTPUTS)
 
 
 def test_signal_that_the_program_was_told_to_ignore(tmp_path, monkeypatch, scene):
@@ -172,7 +183,7 @@ def test_signal_that_the_program_was_told_to_ignore(tmp_path, monkeypatch, scene
         assert replay_with(monkeypatch, scene, tmp_path, lambda: os.kill(os.getpid(), signal.SIGHUP)) == 0
     finally:
         signal.signal(signal.SIGHUP, handler)
-    assert read_left(tmp_path, "") == [FRAMES - 1] * 4
+    assert read_left(tmp_path, "") == [FRAMES - 1] * len(OUTPUTS)
 
 
 def test_replay_in_another_thread(tmp_path, monkeypatch, scene):
@@ -198,7 +209,7 @@ def test_error_leaves_what_was_finished(tmp_path, monkeypatch, capsys, scene, er
     assert replay_with(monkeypatch, scene, tmp_path, fail) == 2
     said = without_progress(capsys.readouterr().err)
     assert said.startswith("warp-bsc: error: ") and "broken" in said and len(said.splitlines()) == 1
-    assert read_left(tmp_path, "stopped by an error: .*broken.*") == [3] * 4
+    assert read_left(tmp_path, "stopped by an error: .*broken.*") == [3] * len(OUTPUTS)
 
 
 @pytest.mark.parametrize("change", ["another", "cut off", "garbage", "another in its place"])
@@ -222,4 +233,7 @@ def test_scene_that_changes_meanwhile(tmp_path, monkeypatch, capfd, change):
     message = f"{path}: the file has changed since it was opened"
     assert capfd.readouterr().err.splitlines()[-1] == f"warp-bsc: error: {message}"
     left = read_left(folder, f"stopped by an error: {message}")
-    assert left in ([3] * 4, [2] * 4)  # nothing is written any more, also where the third is just about to be
+    assert left in (
+        [3] * len(OUTPUTS),
+        [2] * len(OUTPUTS),
+    )  # nothing is written any more, also where the third is just about to be

@@ -1,4 +1,4 @@
-"""The columns of a replay for NumPy: the rows of its CSV file, in a twentieth of the space of its JSON file."""
+"""The columns of a replay for NumPy: the rows of its CSV file, in a fifteenth of the space of its JSON file."""
 
 import csv
 import json
@@ -59,7 +59,7 @@ def test_a_hit_takes_less_than_30_bytes(tmp_path):
     words = sum(columns[name].size for name in ("facts", "meshes", "prims", "kinds", "phases", "elements"))
     sizes = {name: (tmp_path / f"hits.{name}").stat().st_size for name in ("json", "npz")}
     assert len(columns["kind"]) > 5000 and words < 100
-    assert sizes["npz"] < 30 * len(columns["kind"]) < sizes["json"] / 10
+    assert sizes["npz"] < 30 * len(columns["kind"]) < sizes["json"] / 5
 
 
 def test_columns_are_not_printed(tmp_path, capsys):

@@ -4,8 +4,8 @@ import csv
 import json
 
 import pytest
-from replay_files import falling_through_quads, replay
-from stages import save
+from replay_files import falling_through_quads, near_and_inside_stage, replay
+from stages import FALLING, add_mesh, moved, save
 
 from warp_bsc.cli.main import main
 
@@ -27,6 +27,21 @@ def test_csv_has_what_json_has(stage, tmp_path):
         *contact["position"], contact["toi"], contact["time"]
     ]  # fmt: skip
     assert (row["kind"], row["interval"], float(row["start"]), float(row["end"])) == ("vertex-face", "2", 2, 3)
+
+
+def test_json_names_prims_once(tmp_path):
+    """In its first line, whatever it lists: collisions, intersections, proximities, their sums, and ignored pairs."""
+    stage = near_and_inside_stage(tmp_path)
+    heights = {0: -0.5, 1: 0.25, 2: -0.25}
+    add_mesh(stage, "/World/Crossing", {time: moved(FALLING, (0.5, 1.0, z)) for time, z in heights.items()})
+    text = replay(stage, "--clearance", "0.3", "--ignore", "/World/Falling", "/World/Crossing")[0].read_text()
+    found = json.loads(text)
+    assert found["hits"] and found["intersections"] and found["nearest"]
+    first, rest = text.split("\n", 1)
+    assert "/World/" not in rest
+    names = ["/World/Floor", "/World/Falling", "/World/Case", "/World/Inside", "/World/Crossing"]
+    assert found["meshes"] == found["prims"] == names
+    assert first.count("/World/Floor") == 2  # in these two lists
 
 
 @pytest.mark.parametrize("order", [["SCENE", "--json"], ["--json", "SCENE"]])

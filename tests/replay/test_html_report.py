@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from chromium import CHROMIUM, Browser
 from replay_files import Page, falling_through_quads, many_hits, near_and_inside_stage, replay
-from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage
+from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, with_names
 
 import warp_bsc as bsc
 from warp_bsc.replay import html_report
@@ -63,7 +63,7 @@ def test_page_is_self_contained_and_escapes(tmp_path):
 
 
 def test_page_has_every_interval_with_hits(stage, tmp_path):
-    found = json.loads(replay(stage, "--validate", "all")[0].read_text())
+    found = with_names(json.loads(replay(stage, "--validate", "all")[0].read_text()))
     page = Page((tmp_path / "page.html").read_text())
     data = page.data
     assert data["intervals"] == [[0, 1, 0, 0], [1, 2, 0, 0], [2, 3, 1, 0], [3, 4, 0, 0]]
@@ -264,7 +264,7 @@ def test_intervals_are_gone_through_in_chromium(stage, tmp_path, browser):
 
 @pytest.mark.browser
 def test_table_is_sorted_and_filtered_in_chromium(tmp_path, browser):
-    found = json.loads(replay(many_hits(tmp_path / "scene.usda"))[0].read_text())
+    found = with_names(json.loads(replay(many_hits(tmp_path / "scene.usda"))[0].read_text()))
     page = tmp_path / "page.html"
     browser.open(page)
     total = sum(map(sum, Page(page.read_text()).data["rows"]))

@@ -86,6 +86,8 @@ def check_partial(folder, count, reason):
     assert facts["complete"] is False and reason in facts["stopped"] and count in (None, len(columns["starts"]))
     assert facts["hits"] == np.count_nonzero(columns["normal"].any(axis=1))
     overlay = Usd.Stage.Open(str(folder / "overlay.usda"))
+    assert errors_of(overlay) == []
+    assert Page((folder / "page.html").read_text()).data["partial"].startswith("Partial: ")
     data = overlay.GetRootLayer().customLayerData["collisions"]
     assert data["complete"] is False and reason in data["stopped"]
     assert left_behind(folder) == []
@@ -127,7 +129,10 @@ def test_interrupted_in_the_middle_of_a_record(stage, tmp_path, monkeypatch):
     replay(stage, status=130)
     assert len(json.loads((tmp_path / "hits.json").read_text())["intervals"]) == 2
     assert len(Page((tmp_path / "page.html").read_text()).data["intervals"]) == 2
-    Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    assert len(np.load(tmp_path / "hits.npz")["starts"]) == 2
+    assert (tmp_path / "hits.csv").read_text().splitlines()[-1].startswith("# partial: 2 of 4 intervals")
+    overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    assert errors_of(overlay) == [] and overlay.GetRootLayer().customLayerData["collisions"]["intervals"] == 2
 
 
 def test_broken_scene_leaves_what_was_finished(stage, tmp_path, capsys):
@@ -166,6 +171,7 @@ def test_full_disk(tmp_path, capsys):
     assert found["complete"] is False and found["hits"] == count
     assert (tmp_path / "hits.csv").read_text().splitlines()[-1].startswith("# partial: ")
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
+    assert errors_of(overlay) == []
     kept = overlay.GetRootLayer().customLayerData["collisions"]["intervals"]
     assert 0 < kept <= count + 1
     assert len(read_contacts(overlay, kept - 1)[0]) == 1

@@ -14,11 +14,12 @@ from replay_files import (
     falling_through_quads,
     left_behind,
     near_and_inside_stage,
+    prims_of_pairs,
     read_contacts,
     read_polygons,
     replay,
 )
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
@@ -35,10 +36,12 @@ def stage(tmp_path):
 
 def read_curves(overlay, time, root="/Collisions"):
     """The ends of the segments in which triangles meet."""
-    curves = UsdGeom.BasisCurves(overlay.GetPrimAtPath(f"{root}/Intersections"))
-    counts = curves.GetCurveVertexCountsAttr().Get(time)
-    assert set(counts) <= {2} and curves.GetTypeAttr().Get() == UsdGeom.Tokens.linear
-    return np.array(curves.GetPointsAttr().Get(time)).reshape(-1, 2, 3)
+    segments = [np.zeros((0, 2, 3))]
+    for curves in map(UsdGeom.BasisCurves, prims_of_pairs(overlay, "Intersections", root)):
+        counts = curves.GetCurveVertexCountsAttr().Get(time)
+        assert set(counts) <= {2} and curves.GetTypeAttr().Get() == UsdGeom.Tokens.linear
+        segments.append(np.array(curves.GetPointsAttr().Get(time)).reshape(-1, 2, 3))
+    return np.concatenate(segments)
 
 
 @pytest.mark.parametrize("suffix", ["usda", "usdc", "usd"])
@@ -59,7 +62,7 @@ def test_overlay(stage, tmp_path, suffix):
     assert primvars["toi"] == pytest.approx([0.5], abs=1e-5)
     assert (primvars["primA"], primvars["elementA"]) == (["/World/Falling"], [(0, -1)])
     assert (primvars["primB"], primvars["elementB"]) == (["/World/Floor"], [(1, -1)])
-    contacts = overlay.GetPrimAtPath("/Collisions/VertexFace")
+    contacts = overlay.GetPrimAtPath("/Collisions/Floor_with_Falling/VertexFace")
     for time in (0, 1, 3, 4):
         assert len(read_contacts(overlay, time)[0]) == len(read_polygons(overlay, time)) == 0
     low, high = contacts.GetAttribute("extent").Get(2)
@@ -70,9 +73,9 @@ def test_overlay(stage, tmp_path, suffix):
 def test_overlay_emits_light_and_is_a_guide(stage, tmp_path):
     replay(stage)
     overlay = Usd.Stage.Open(str(tmp_path / "overlay.usda"))
-    shown = {"Polygons": "Polygons", "VertexFace/Marker": "VertexFace", "EdgeEdge/Marker": "EdgeEdge"}
-    for path, name in (shown | {"Intersections": "Intersections"}).items():
-        prim = overlay.GetPrimAtPath(f"/Collisions/{path}")
+    shown = {"Polygons": "Polygons", "VertexFace/Marker": "VertexFace", "Intersections": "Intersections"}
+    for path, name in shown.items():
+        prim = overlay.GetPrimAtPath(f"/Collisions/Floor_with_Falling/{path}")
         assert UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         shader, _, _ = material.ComputeSurfaceSource()
@@ -134,7 +137,7 @@ def test_overlay_has_the_curves_along_which_surfaces_cut(tmp_path):
                 np.testing.assert_allclose(ends, a + along[:, None] * (b - a), atol=1e-6)
                 assert (along.min(), along.max()) == pytest.approx((0, 1), abs=1e-6)
         prims = overlay.GetPrimAtPath("/Collisions").GetAttribute("prims").Get()
-        api = UsdGeom.PrimvarsAPI(overlay.GetPrimAtPath("/Collisions/Intersections"))
+        api = UsdGeom.PrimvarsAPI(*prims_of_pairs(overlay, "Intersections"))
         names = {prims[value] for name in ("primA", "primB") for value in api.GetPrimvar(name).Get(1)}
         assert names == {"/World/Floor", "/World/Falling"}
 
@@ -152,7 +155,7 @@ def test_overlay_has_what_is_near_and_inside(near_and_inside, tmp_path, suffix):
     overlay = Usd.Stage.Open(str(path))
     assert errors_of(overlay) == []
     names = overlay.GetPrimAtPath("/Collisions").GetAttribute("prims").Get()
-    near, inside = (UsdGeom.PointInstancer(overlay.GetPrimAtPath(f"/Collisions/{name}")) for name in ("Near", "Inside"))
+    near, inside = (UsdGeom.PointInstancer(*prims_of_pairs(overlay, name)) for name in ("Near", "Inside"))
     places = [[*map(tuple, near.GetPositionsAttr().Get(time))] for time in (0, 0.5, 1, 1.5, 2)]
     assert places == [[], [], [(0.5, -0.5, 0.125)], [(0.5, -0.5, 0.125)], [(0.5, -0.5, 0.0625)]]
     primvars = UsdGeom.PrimvarsAPI(near)
@@ -164,16 +167,14 @@ def test_overlay_has_what_is_near_and_inside(near_and_inside, tmp_path, suffix):
         np.testing.assert_allclose(np.abs(np.subtract(place, (0, 0, 3))), 0.125, atol=1e-6)
         numbers = [UsdGeom.PrimvarsAPI(inside).GetPrimvar(name).Get(time)[0] for name in ("primA", "primB")]
         assert [names[number] for number in numbers] == ["/World/Inside", "/World/Case"]
-    for path in ("Near/Marker", "Inside/Marker"):
-        prim = overlay.GetPrimAtPath(f"/Collisions/{path}")
-        assert UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
-        assert tuple(prim.GetAttribute("primvars:displayColor").Get()[0]) == pytest.approx(
-            COLORS[path[: path.index("/")]]
-        )
+    for instancer in (near, inside):
+        name, marker = instancer.GetPrim().GetName(), instancer.GetPrim().GetChild("Marker")
+        assert UsdGeom.Imageable(marker).ComputePurpose() == UsdGeom.Tokens.guide
+        assert tuple(marker.GetAttribute("primvars:displayColor").Get()[0]) == pytest.approx(COLORS[name])
     assert main([*arguments, "--no-intersections"]) == 0
     overlay = Usd.Stage.Open(str(tmp_path / f"overlay.{suffix}"))
     overlay.Reload()
-    assert not overlay.GetPrimAtPath("/Collisions/Near") and not overlay.GetPrimAtPath("/Collisions/Inside")
+    assert prims_of_pairs(overlay, "Near") == prims_of_pairs(overlay, "Inside") == []
 
 
 def test_overlay_shows_nothing_between_its_samples(tmp_path):
@@ -186,7 +187,7 @@ def test_overlay_shows_nothing_between_its_samples(tmp_path):
     at_start = [[contact["position"] for contact in interval["contacts"]] for interval in found["intervals"]]
     assert [len(points) > 0 for points in at_start] == [True, True, True, False, True, False]
     extents = [
-        overlay.GetPrimAtPath(f"/Collisions/{kind}").GetAttribute("extent") for kind in ("VertexFace", "EdgeEdge")
+        prim.GetAttribute("extent") for kind in ("VertexFace", "EdgeEdge") for prim in prims_of_pairs(overlay, kind)
     ]
     for time in (0, 1, 2.999, 3, 4.5, 5.999, 6, 7, 9, 10, 11.999, 12, 13, 14.999, 15, 16.5, 18, 20):
         expected = at_start[int(time // 3)] if time < 18 else []
@@ -292,7 +293,7 @@ def test_overlay_agrees_with_json(tmp_path, suffix):
     shutil.copy(ASSETS / scene.name, scene)
     names = [str(tmp_path / name) for name in ("hits.json", f"overlay.{suffix}")]
     assert main(["replay", str(scene), "--device", "cpu", "--json", names[0], "--overlay", names[1]]) == 0
-    found = json.loads(Path(names[0]).read_text())
+    found = with_names(json.loads(Path(names[0]).read_text()))
     overlay = Usd.Stage.Open(names[1])
     positions = {}
     for result in bsc.replay(bsc.Scene(str(scene)), device="cpu"):

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from progress_lines import without_progress
 from pxr import Ts, UsdGeom, Vt
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save
+from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc.cli import replay as replay_command
@@ -123,7 +123,7 @@ def alone(troubled, tmp_path_factory):
 
 
 def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
-    found = json.loads(alone["hits.json"])
+    found = with_names(json.loads(alone["hits.json"]))
     assert found["complete"] and found["hits"] + len(found["ignored"]) > 0
     assert [re.sub(r" at time.*| is not.*", "", line) for line in found["left_out"]] == [
         "from time 8 on: /World/Breaks: vertex 3",

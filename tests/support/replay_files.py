@@ -129,11 +129,16 @@ def errors_of(stage):
     return [error.GetMessage() for error in validation.ValidationContext(validators).Validate(stage)]
 
 
+def prims_of_pairs(overlay, name, root="/Collisions"):
+    """The prims with a name below each pair of meshes."""
+    pairs = [child for child in overlay.GetPrimAtPath(root).GetChildren() if child.GetName() != "Materials"]
+    return [prim for pair in pairs if (prim := pair.GetChild(name))]
+
+
 def read_contacts(overlay, time, kinds=("VertexFace", "EdgeEdge"), root="/Collisions"):
     """Points of contact, and the values of each primvar, meshes by their names."""
     prims, points, primvars = overlay.GetPrimAtPath(root).GetAttribute("prims").Get(), [], {}
-    for kind in kinds:
-        instancer = UsdGeom.PointInstancer(overlay.GetPrimAtPath(f"{root}/{kind}"))
+    for instancer in (UsdGeom.PointInstancer(prim) for kind in kinds for prim in prims_of_pairs(overlay, kind, root)):
         api = UsdGeom.PrimvarsAPI(instancer)
         points.extend(instancer.GetPositionsAttr().Get(time))
         assert len(instancer.GetProtoIndicesAttr().Get(time)) == len(instancer.GetPositionsAttr().Get(time))
@@ -149,8 +154,10 @@ def read_contacts(overlay, time, kinds=("VertexFace", "EdgeEdge"), root="/Collis
 
 def read_polygons(overlay, time, root="/Collisions"):
     """The triangles of the polygons that collide, as points: of one side, then of the other."""
-    mesh = UsdGeom.Mesh(overlay.GetPrimAtPath(f"{root}/Polygons"))
-    points = np.array(mesh.GetPointsAttr().Get(time)).reshape(-1, 3)
-    counts, corners = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
-    assert list(counts) == [3] * (len(corners) // 3)
-    return points[np.array(corners, dtype=int)].reshape(-1, 3, 3)
+    triangles = [np.zeros((0, 3, 3))]
+    for mesh in map(UsdGeom.Mesh, prims_of_pairs(overlay, "Polygons", root)):
+        points = np.array(mesh.GetPointsAttr().Get(time)).reshape(-1, 3)
+        counts, corners = mesh.GetFaceVertexCountsAttr().Get(time), mesh.GetFaceVertexIndicesAttr().Get(time)
+        assert list(counts) == [3] * (len(corners) // 3)
+        triangles.append(points[np.array(corners, dtype=int)].reshape(-1, 3, 3))
+    return np.concatenate(triangles)

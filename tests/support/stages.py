@@ -68,13 +68,32 @@ def save(stage):
     return stage.GetRootLayer().realPath
 
 
+def with_names(found):
+    """The content of a JSON file with the names of two meshes, and in rows their prims, instead of their numbers."""
+
+    def named(value):
+        if isinstance(value, list):
+            return [named(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        value = {name: named(item) for name, item in value.items()}
+        if "mesh" in value:
+            numbers = value.pop("mesh")
+            value["meshes"] = [found["meshes"][number] for number in numbers]
+            if "kind" in value:
+                value["prims"] = [found["prims"][number] for number in numbers]
+        return value
+
+    return named(found)
+
+
 def find(stage, *options, status=0):
-    """What a replay finds, as its JSON has it."""
+    """What a replay finds, as its JSON has it, with names."""
     path = save(stage) if isinstance(stage, Usd.Stage) else str(stage)
     out = f"{path}.json"
     assert main(["replay", path, "--device", "cpu", "--validate", "all", "--json", out, *options]) == status
     with open(out) as file:
-        return json.load(file)
+        return with_names(json.load(file))
 
 
 def hits(found, index=None):

@@ -4,7 +4,13 @@ import numpy as np
 from pxr import UsdGeom, Vt
 from stages import new_stage, save
 
-OUTPUTS = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usda", "--report": "page.html"}
+OUTPUTS = {
+    "--json": "hits.json",
+    "--csv": "hits.csv",
+    "--overlay": "overlay.usda",
+    "--report": "page.html",
+    "--npz": "hits.npz",
+}
 FRAMES, SIDE = 40, 10
 
 

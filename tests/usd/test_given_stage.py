@@ -1,5 +1,6 @@
 """Stages that a program has opened: read as they are in memory, and not changed meanwhile."""
 
+import functools
 import warnings
 from pathlib import Path
 
@@ -89,7 +90,7 @@ def test_a_layer_needs_a_file(tmp_path):
     stage, anonymous = falling_through_quads(tmp_path), Sdf.Layer.CreateAnonymous()
     anonymous.TransferContent(stage.GetRootLayer())
     scene = bsc.Scene(anonymous)
-    for make in (Overlay, PointsLayer):
+    for make in (functools.partial(Overlay, command=""), PointsLayer):
         with pytest.raises(ValueError, match="a stage in memory has no file for a layer to be over: export it"):
             make(tmp_path / "layer.usda", scene=scene)
     assert not (tmp_path / "layer.usda").exists()

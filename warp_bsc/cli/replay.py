@@ -17,6 +17,7 @@ from ..replay.hit_columns import HitsNpz
 from ..replay.hit_files import HitsCsv, HitsJson, replay_facts
 from ..replay.html_report import ReportPage
 from ..replay.intervals import replay
+from ..replay.limit import limit_rows, not_listed
 from ..replay.outputs import ReplayOutput
 from ..replay.results import IntervalResult
 from ..replay.summary import Summary
@@ -31,7 +32,7 @@ from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .options import Commands, add_command
 from .progress import RunProgress
-from .replay_options import DESCRIPTION, EPILOG, add_replay_options, describe_selection
+from .replay_options import DESCRIPTION, EPILOG, add_replay_options, command_of, describe_selection
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
@@ -105,6 +106,8 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--ignore-initial and --fail-on intersections need --intersections")
     if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
+    if arguments.limit and not outputs:
+        raise ValueError("--limit needs a file: --json, --csv, --npz, --overlay or --report")
     if arguments.npz == STDOUT:
         raise ValueError("--npz: it is no text, name a file")
     if outputs.count(STDOUT) > 1:
@@ -175,6 +178,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
             nonlocal writing
             started = time.perf_counter()
             scene.files.check()
+            if arguments.limit:
+                result = limit_rows(result, arguments.limit)
             for output in outputs:
                 with naming(output.file.name):
                     output.add(result)
@@ -201,7 +206,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
                 problem = _explain(error, scene)  # readers and writers all find a change of the scene's files
                 problems += [] if interrupt or problem in problems else [problem]
             stopped = f"stopped by an error: {problems[0]}" if problems else str(interrupt or "")
-            summary = Summary(scene, intervals=intervals, stopped=stopped, **settings)
+            summary = Summary(scene, intervals=intervals, stopped=stopped, limit=arguments.limit, **settings)
             finished = outputs if intervals else []  # an earlier file is better than an empty one
             if len(intervals) < earlier_count:  # or than a shorter one, as a later run can resume it
                 finished = [output for output in finished if not isinstance(output, HitsJson)]
@@ -225,6 +230,8 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
                 print_repair(console, summary)
                 if baseline:
                     print_new(console, baseline.new_in(summary))
+                if finished and (missing := str(not_listed(summary, with_end=True) or "")):
+                    say(console, f"--limit: {missing}")
                 for output in finished:
                     say(console, f"Wrote {output.file.path}.")
                     if isinstance(output, Overlay):
@@ -301,7 +308,7 @@ def _open_outputs(
         ),
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.npz, lambda path: HitsNpz(path, facts=facts, interval_count=len(scene))),
-        (arguments.overlay, lambda path: Overlay(path, scene=scene)),
+        (arguments.overlay, lambda path: Overlay(path, scene=scene, command=command_of(arguments))),
         (arguments.report, lambda path: ReportPage(path, scene=scene)),
     )
     outputs = []
@@ -331,13 +338,13 @@ def _track(
             workers=arguments.workers,
         ):
             yield result
-            hits += len(result.contacts)
+            hits += result.summary.hits
             progress.show(result.summary.index + 1, len(scene), f"time {result.summary.end:g}", hits=hits)
 
 
 def _describe_options(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
     """Returns the options that the results depend on, except method, device and clearance."""
-    names = "subdivide", "intersections", "ignore_initial", "validate"
+    names = "subdivide", "intersections", "ignore_initial", "validate", "limit"
     return describe_selection(scene, arguments) | {name: getattr(arguments, name) for name in names}
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import shlex
 from dataclasses import asdict
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ from ..usd.selection import PURPOSES
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_detection_options, add_fail_on, distance, positive
 
-__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options", "add_scene_selection", "describe_selection"]
+__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options", "add_scene_selection", "command_of", "describe_selection"]
 
 DESCRIPTION = """\
 Find the collisions of the meshes of a USD scene, with themselves and with each
@@ -42,6 +43,7 @@ examples:
   warp-bsc replay cloth.usd --clearance 0.002 --fail-on distance
   warp-bsc replay shot.usd --ignore-initial --ignore '/World/Hair*' /World/Head
   warp-bsc replay shot.usd --baseline hits_v1.json --fail-on new || echo "worse"
+  warp-bsc replay shot.usd --report hits.html --json hits.json --limit 1000
   warp-bsc replay shot.usd --workers 16 --json hits.json --resume
   warp-bsc replay shot.usd --workers tcp://head:8786 --report hits.html
 
@@ -118,7 +120,15 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
     out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
     out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
     out.add_argument(
-        "--npz", **file, help="every collision as columns for NumPy, .npz, in a twentieth of the space of JSON"
+        "--npz", **file, help="every collision as columns for NumPy, .npz, in a fifteenth of the space of JSON"
+    )
+    out.add_argument(
+        "--limit",
+        type=positive,
+        metavar="N",
+        help="list in all these files at most N collisions of an interval, the earliest, and N edges through faces, "
+        "parts inside others and proximities at a time, with one of each two meshes; all are counted, and files and "
+        "tables say how many are not listed (default: all)",
     )
     out.add_argument(
         "--baseline",
@@ -223,6 +233,36 @@ def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str,
     del selection["ignored_names"], selection["ignored_inside"]  # found, not chosen
     frames = asdict(arguments.frames) if arguments.frames else None
     return selection | {"frames": frames, "strict": arguments.strict, "allow_missing": arguments.allow_missing}
+
+
+def command_of(arguments: argparse.Namespace) -> str:
+    """Returns the command that finds the same as given options: without those on output and processes, for a shell."""
+    words = ["warp-bsc", "replay", arguments.scene]
+    if not arguments.self_collisions:
+        words.append("--no-self")
+    if not arguments.intersections:
+        words.append("--no-intersections")
+    for name in ("strict", "ignore_initial"):
+        words += [_option(name)] * getattr(arguments, name)
+    for name, default in (("method", "exact"), ("subdivide", 1), ("validate", 0)):
+        value = getattr(arguments, name)
+        words += [_option(name), str(value)] if value != default else []
+    for name in ("clearance", "limit", "ignore_from"):
+        value = getattr(arguments, name)
+        words += [_option(name), str(value)] if value is not None else []
+    if frames := arguments.frames:
+        numbers = [frames.start, frames.end] + [frames.step] * (frames.step is not None)
+        words += ["--frames", ":".join("" if number is None else str(number) for number in numbers)]
+    for name in ("between", "purpose", "prims", "exclude", "allow_missing"):
+        values = getattr(arguments, name)
+        words += [_option(name), *values] if values else []
+    for pair in arguments.ignore:
+        words += ["--ignore", *pair]
+    return shlex.join(words)
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _output(text: str) -> str:

@@ -18,7 +18,7 @@ __all__ = ["Baseline", "NewFinding"]
 Event = Literal["collides", "crosses", "is inside", "is near"]
 """What two meshes may do in a replay."""
 
-_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate"}
+_WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit"}
 """The options that do not change what is compared; ``intersections`` is checked by itself."""
 
 
@@ -63,6 +63,7 @@ class Baseline:
                 found = _read(path)
             own_clearance, is_complete = found["clearance"], found["complete"]
             earlier = {"method": found["method"], **found["options"]}
+            self._names = found["meshes"]
             for span in found["collision_spans"]:
                 self._add("collides", span)
             for span in found["intersections"]:
@@ -72,7 +73,7 @@ class Baseline:
                     self._add("crosses", span)
             for span in found["proximity_spans"]:
                 self._add("is near", span)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
         if not is_complete:
             raise ValueError(f"{path}: its replay was stopped; the baseline must be complete")
@@ -112,7 +113,8 @@ class Baseline:
         return new
 
     def _add(self, event: Event, span: dict) -> None:
-        self._spans[event][tuple(sorted(span["meshes"]))].append((span["since"], span["until"]))
+        meshes = tuple(sorted(self._names[mesh] for mesh in span["mesh"]))
+        self._spans[event][meshes].append((span["since"], span["until"]))
 
     def _new_at(
         self, time: float, event: Event, pairs: Iterable[tuple[str, str]], including: tuple[Event, ...] = ()

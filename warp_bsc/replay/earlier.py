@@ -67,6 +67,7 @@ class EarlierReplay:
             self._file.close()
             raise ValueError(f"{path}: not a resumable replay of this version") from None
         own_facts = json.loads(json.dumps(facts))
+        self._names = own_facts["meshes"]
         for fact in own_facts:
             if fact != "device" and earlier_facts.get(fact) != own_facts[fact]:
                 self._file.close()
@@ -94,7 +95,7 @@ class EarlierReplay:
             following = next(intervals, None)
             if fields is None or (following is None and needs_following(fields)):
                 return
-            yield read_result(interval, fields, following)
+            yield read_result(interval, fields, following, self._names)
             fields = following
 
     def close(self) -> None:
@@ -123,4 +124,6 @@ def describe_difference(fact: str, earlier: dict[str, Any], now: dict[str, Any])
         return f"{name} was {before.get(name)}, and is {after[name]}"
     if fact == "files":
         return "the scene's files have changed"
+    if fact in ("meshes", "prims"):
+        return "the scene has other meshes, or another version wrote the file"
     return f"{fact} was {before}, and is {after}"

@@ -4,12 +4,14 @@ import json
 import os
 import tempfile
 import zipfile
+from dataclasses import asdict
 from typing import Any, cast
 
 import numpy as np
 
 from .._atomic_file import OutputFile
 from ..usd.segment import Segment
+from .limit import not_listed
 from .outputs import without_last_eighth
 from .results import IntervalResult
 from .scene_contacts import PHASES, SceneContacts
@@ -46,7 +48,7 @@ _ROWS_AT_ONCE = 2**16
 class HitsNpz:
     """A ``.npz`` file, a :class:`~warp_bsc.replay.outputs.ReplayOutput`: columns with a row for each pair.
 
-    A pair takes less than 30 bytes, a twentieth of its text in JSON. Its columns, and what their numbers stand for::
+    A pair takes less than 30 bytes, a fifteenth of its text in JSON. Its columns, and what their numbers stand for::
 
         hits = np.load("hits.npz")
         hits["starts"][hits["interval"]], hits["ends"][hits["interval"]]  # time codes; toi is the share between them
@@ -54,7 +56,7 @@ class HitsNpz:
         hits["prims"][hits["mesh"]], hits["meshes"][hits["mesh"]]  # paths and names of both sides, shape [n, 2]
         hits["elements"][hits["element"]], hits["index"]  # shape [n, 2], and [n, 2, 2]: one and -1, or both of an edge
         hits["position"], hits["normal"] / 32767.0  # shape [n, 3]; normals are rounded, 0 for pairs at rest
-        json.loads(str(hits["facts"]))  # the scene, options, and whether all intervals are there
+        json.loads(str(hits["facts"]))  # the scene, options, whether all intervals are there, what a limit leaves out
 
     Times of impact, positions and distances are in single precision. Pairs at rest, intersections and proximities, are
     at ``toi`` 0, in the last interval some at 1. The whole is on disk until the file is finished, so that memory does
@@ -107,6 +109,8 @@ class HitsNpz:
         self.file.truncate(0)
         part = summary.first(count)
         facts = self._facts | {"complete": part.is_complete, "stopped": part.stopped, "hits": part.hits}
+        missing = not_listed(part, with_end=part.is_complete)
+        facts["not_listed"] = asdict(missing) if missing else None
         names, prims = ([names[side] for names in self._meshes] for side in range(2))
         words = {"meshes": names, "prims": prims, "kinds": _KINDS, "phases": _PHASES, "elements": ELEMENT_WORDS}
         starts, ends = np.array(self._times[:count], dtype=float).reshape(-1, 2).T

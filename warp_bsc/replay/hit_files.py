@@ -20,9 +20,9 @@ from .hit_records import (
     intersection_kinds,
     intersection_phases,
     interval_line,
-    mesh_pairs_to_list,
     tail_line,
 )
+from .limit import not_listed
 from .outputs import RecordFile
 from .results import IntervalResult
 from .scene_contacts import PHASES, SceneContacts
@@ -30,6 +30,7 @@ from .scene_intersections import SceneIntersections
 from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
+from .summary_records import mesh_pairs_to_list, with_numbers
 
 __all__ = ["HitsCsv", "HitsJson", "replay_facts"]
 
@@ -65,11 +66,19 @@ def replay_facts(
         "vertices": scene.vertex_count,
         "faces": scene.face_count,
         "meshes": scene.names,
+        "prims": [scene.paths[name] for name in scene.names],
     }
 
 
 class HitsJson(RecordFile):
     """A JSON file: facts of the replay, every interval with its contacts and intersections, then the sums.
+
+    It names meshes and their prims once, in the lists ``meshes`` and ``prims``; everywhere else ``mesh`` has the
+    numbers of two meshes in these lists::
+
+        found = json.load(open("hits.json"))
+        for contact in found["intervals"][0]["contacts"]:
+            print([found["prims"][mesh] for mesh in contact["mesh"]], contact["elements"], contact["time"])
 
     An interval lists the intersections, parts inside others and proximities at its start; if the next interval may
     start elsewhere, or there is none, those at its end as well. :mod:`~warp_bsc.replay.hit_records` has the lines.
@@ -94,6 +103,7 @@ class HitsJson(RecordFile):
         """
         super().__init__(path)
         self._facts = facts
+        self._numbers = {name: number for number, name in enumerate(facts["meshes"])}
         self._earlier_count = earlier_count
         self._saved_at = -math.inf
         self._kinds = [kind.label for kind in DistanceKind if has_strands or kind in tuple(PairKind)]
@@ -114,10 +124,11 @@ class HitsJson(RecordFile):
     def record(self, result: IntervalResult) -> Iterator[str | bytes]:
         """Yields the text of an interval with all of its contacts."""
         yield ("," if self.record_count else "") + "\n"
-        yield from interval_line(result, self._kinds)
+        yield from interval_line(result, self._kinds, self._numbers)
 
     def tail(self, summary: Summary) -> str:
         """Returns the text after the last interval."""
+        numbers = self._numbers
         sums = {
             "complete": summary.is_complete,
             "stopped": summary.stopped,
@@ -125,21 +136,24 @@ class HitsJson(RecordFile):
             "warnings": summary.scene.warnings,
             "left_out": summary.scene.left_out,
             "hits": summary.hits,
+            "not_listed": asdict(missing) if (missing := not_listed(summary, with_end=summary.is_complete)) else None,
             "certified": summary.certified,
             "certified_for": CERTIFIED_FOR,
-            "mesh_pairs": mesh_pairs_to_list(summary.mesh_pairs),
-            "collision_spans": [asdict(span) for span in summary.collision_spans],
-            "ignored": mesh_pairs_to_list(summary.ignored),
-            "intersections": [asdict(span) | {"trend": span.trend} for span in summary.intersection_spans],
-            "proximity_spans": [asdict(span) for span in summary.proximity_spans],
-            "nearest": [asdict(nearest) for nearest in summary.nearest],
+            "mesh_pairs": mesh_pairs_to_list(summary.mesh_pairs, numbers),
+            "collision_spans": [with_numbers(span, numbers) for span in summary.collision_spans],
+            "ignored": mesh_pairs_to_list(summary.ignored, numbers),
+            "intersections": [
+                with_numbers(span, numbers) | {"trend": span.trend} for span in summary.intersection_spans
+            ],
+            "proximity_spans": [with_numbers(span, numbers) for span in summary.proximity_spans],
+            "nearest": [with_numbers(nearest, numbers) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,
         }
         return tail_line(sums)
 
 
 class HitsCsv(RecordFile):
-    """A CSV file: a row for each contact, intersection and proximity, and a last line with # if intervals are missing.
+    """A CSV file: a row for each contact, intersection and proximity, and last lines with # if some are missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
     start, in the last interval its end too. A part of a mesh that is inside another mesh has the phase "inside" and the
@@ -179,10 +193,12 @@ class HitsCsv(RecordFile):
             yield from _csv_rows(where, proximities, _proximity_columns)
 
     def tail(self, summary: Summary) -> str:
-        """Returns a line on the missing intervals, empty if there are none."""
-        if summary.is_complete:
-            return ""
-        return f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
+        """Returns lines on rows that a limit leaves out, and on missing intervals; empty if there are none."""
+        limited = str(not_listed(summary, with_end=summary.is_complete) or "")
+        lines = f"# limit: {limited}\n" * bool(limited)
+        if not summary.is_complete:
+            lines += f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
+        return lines
 
 
 _Pairs = TypeVar("_Pairs", bound=ScenePairs)

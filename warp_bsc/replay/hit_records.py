@@ -1,26 +1,23 @@
 """The lines of the JSON file of a replay, each written and read back by neighbouring functions.
 
-The first line holds the facts of the replay, the last one its sums, each of the others an interval. The fields of its
-pairs are columns, by which they are both written and read.
+The first line holds the facts of the replay, names of meshes and prims among them, the last one its sums, each of the
+others an interval. The fields of its pairs are columns, by which they are both written and read.
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
 
-from ..detection.collisions import DetectionStats, StageCounts
-from ..detection.settings import DistanceKind
 from ..usd.interval import Interval
-from .results import IntersectionSummary, IntervalResult, summarize
+from .results import IntervalResult
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import DIAGONAL, EDGE, ELEMENT_WORDS, FACE, KINDS, ScenePairs
 from .scene_proximities import SceneProximities
-from .validation import Validation
+from .summary_records import read_summary, summary_fields
 
 __all__ = [
     "head_line",
@@ -29,7 +26,6 @@ __all__ = [
     "interval_line",
     "is_interval_line",
     "is_tail_line",
-    "mesh_pairs_to_list",
     "needs_following",
     "read_head",
     "read_interval",
@@ -158,8 +154,6 @@ _KIND = Column(
 )
 _POSITION = _numbers("position", (-1, 3))
 _ELEMENTS = (
-    Column("meshes", lambda pairs, rows: pairs.mesh_names(rows)),
-    Column("prims", lambda pairs, rows: pairs.mesh_paths(rows)),
     Column("elements", lambda pairs, rows: pairs.element_names(rows)),
     Column("indices", lambda pairs, rows: pairs.element_indices(rows)),
     Column("triangle", lambda pairs, rows: pairs.triangles(rows)),
@@ -201,29 +195,38 @@ _PROXIMITIES = (
 
 
 def _write_pairs(
-    name: str, pairs: ScenePairs, columns: Sequence[Column], which: slice = slice(None)
+    name: str, pairs: ScenePairs, of_meshes: np.ndarray, columns: Sequence[Column], which: slice = slice(None)
 ) -> Iterator[str | bytes]:
-    """Yields a member of a JSON object: the list of all pairs, or of some rows of them."""
-    names = [column.name for column in columns]
+    """Yields a member of a JSON object: the list of all pairs, or of some rows of them.
+
+    Args:
+        name: Its name.
+        pairs: The pairs.
+        of_meshes: Numbers in the file of the meshes of their segment.
+        columns: The fields after ``mesh``, the numbers of the two meshes.
+        which: The rows.
+    """
+    names = ["mesh", *(column.name for column in columns)]
     yield f', "{name}": ['
     for number, rows in enumerate(pairs.chunks(which)):
-        values = zip(*(column.write(pairs, rows) for column in columns), strict=True)
+        meshes = of_meshes[pairs.meshes[rows]].tolist()
+        values = zip(meshes, *(column.write(pairs, rows) for column in columns), strict=True)
         yield (b"," if number else b"") + orjson.dumps([dict(zip(names, row, strict=True)) for row in values])[1:-1]
     yield "]"
 
 
-def _read_pairs(interval: Interval, rows: list[dict], columns: Sequence[Column]) -> dict[str, Any]:
-    """Returns the arrays of pairs of an interval, given the fields of each."""
+def _read_pairs(interval: Interval, rows: list[dict], names: list[str], columns: Sequence[Column]) -> dict[str, Any]:
+    """Returns the arrays of pairs of an interval, given the fields of each and the names of the meshes in the file."""
     arrays = {column.array: column.read([row[column.name] for row in rows]) for column in columns if column.array}
-    return _read_elements(interval, rows) | arrays
+    return _read_elements(interval, rows, names) | arrays
 
 
-def _read_elements(interval: Interval, rows: list[dict]) -> dict[str, Any]:
-    """Returns the arrays that :data:`_ELEMENTS` describe, and the segment."""
+def _read_elements(interval: Interval, rows: list[dict], names: list[str]) -> dict[str, Any]:
+    """Returns the arrays that ``mesh`` and :data:`_ELEMENTS` describe, and the segment."""
     segment = interval.segment
     numbers = {mesh.name: number for number, mesh in enumerate(segment.meshes)}
     kinds = {word: kind for kind, word in enumerate(ELEMENT_WORDS)}
-    meshes = np.array([[numbers[name] for name in row["meshes"]] for row in rows], dtype=np.int64).reshape(-1, 2)
+    meshes = np.array([[numbers[names[mesh]] for mesh in row["mesh"]] for row in rows], dtype=np.int64).reshape(-1, 2)
     elements = [[kinds[element.split()[0]] for element in row["elements"]] for row in rows]
     elements = np.array(elements, dtype=np.int64).reshape(-1, 2)
     indices = [[[*numbers, -1][:2] for numbers in row["indices"]] for row in rows]
@@ -249,44 +252,25 @@ def _read_elements(interval: Interval, rows: list[dict]) -> dict[str, Any]:
 # An interval -------------------------------------------------------------------------------------------------------
 
 
-def interval_line(result: IntervalResult, kinds: Sequence[str]) -> Iterator[str | bytes]:
+def interval_line(result: IntervalResult, kinds: Sequence[str], numbers: Mapping[str, int]) -> Iterator[str | bytes]:
     """Yields the text of an interval, without its line break.
 
     Args:
         result: The result.
         kinds: Labels of the kinds of pair whose numbers are written.
+        numbers: Numbers of meshes in the file, by name.
     """
-    interval, contacts = result.summary, result.contacts
+    contacts = result.contacts
     is_joined = contacts.interval.is_joined
-    fields = {
-        "index": interval.index,
-        "start": interval.start,
-        "end": interval.end,
-        "pairs_tested": interval.pairs_tested,
-        "hits": interval.hits,
-        **{f"{kind}_hits": getattr(interval, f"{kind}_hits") for kind in kinds},
-        "earliest": asdict(interval.earliest) if interval.earliest else None,
-        "mesh_pairs": mesh_pairs_to_list(interval.mesh_pairs.items()),
-        "ignored": mesh_pairs_to_list(interval.ignored.items()),
-        "certified": interval.certified,
-        "stages": {kind: asdict(getattr(interval.stats, kind)) for kind in kinds},
-        "validation": asdict(interval.validation) if interval.validation else None,
-    }
-    if interval.intersections:
-        start, end = interval.intersections
-        fields["separate_hits"] = interval.separate_hits
-        fields["phases"] = dict(zip(PHASES, interval.phases or (), strict=True))
-        fields["intersections"] = {"start": _intersection_counts(start), "end": _intersection_counts(end)}
-    if interval.proximities:
-        fields["proximities"] = dict(zip(("start", "end"), map(asdict, interval.proximities), strict=True))
-    yield json.dumps(fields, allow_nan=False)[:-1]
+    of_meshes = np.array([numbers[mesh.name] for mesh in contacts.segment.meshes], dtype=np.int64)
+    yield json.dumps(summary_fields(result.summary, kinds, numbers), allow_nan=False)[:-1]
     is_compared = contacts.phase is not None
-    yield from _write_pairs("contacts", contacts, _CONTACTS + _COMPARISON * is_compared)
+    yield from _write_pairs("contacts", contacts, of_meshes, _CONTACTS + _COMPARISON * is_compared)
     for found, ending in zip(result.intersections or (), ("", _AT_END)[: 2 - is_joined], strict=False):
-        yield from _write_pairs(f"edges_through_faces{ending}", found, _INTERSECTIONS, found.edge_rows)
-        yield from _write_pairs(f"inside{ending}", found, _INTERSECTIONS, found.inside_rows)
+        yield from _write_pairs(f"edges_through_faces{ending}", found, of_meshes, _INTERSECTIONS, found.edge_rows)
+        yield from _write_pairs(f"inside{ending}", found, of_meshes, _INTERSECTIONS, found.inside_rows)
     for found, ending in zip(result.proximities or (), ("", _AT_END)[: 2 - is_joined], strict=False):
-        yield from _write_pairs(f"proximity_pairs{ending}", found, _PROXIMITIES)
+        yield from _write_pairs(f"proximity_pairs{ending}", found, of_meshes, _PROXIMITIES)
     yield "}"
 
 
@@ -310,13 +294,16 @@ def needs_following(fields: dict[str, Any]) -> bool:
     return any(name in fields and f"{name}{_AT_END}" not in fields for name in lists)
 
 
-def read_result(interval: Interval, fields: dict[str, Any], following: dict[str, Any] | None) -> IntervalResult:
+def read_result(
+    interval: Interval, fields: dict[str, Any], following: dict[str, Any] | None, names: list[str]
+) -> IntervalResult:
     """Returns the result of an interval, as if it had just been found.
 
     Args:
         interval: The interval, as the scene yields it.
         fields: Its fields in the file.
         following: Those of the next interval; may be None if the interval does not need them.
+        names: Names of the meshes in the file.
     """
 
     def rows_at(end: bool, *names: str) -> list[dict]:
@@ -331,7 +318,7 @@ def read_result(interval: Interval, fields: dict[str, Any], following: dict[str,
     if "edges_through_faces" in fields:
         start, end = (
             SceneIntersections(
-                **_read_pairs(interval, rows_at(is_end, "edges_through_faces", "inside"), _INTERSECTIONS),
+                **_read_pairs(interval, rows_at(is_end, "edges_through_faces", "inside"), names, _INTERSECTIONS),
                 time=time,
                 x=x,
             )
@@ -340,48 +327,17 @@ def read_result(interval: Interval, fields: dict[str, Any], following: dict[str,
         intersections = start, end
     if "proximity_pairs" in fields:
         start, end = (
-            SceneProximities(**_read_pairs(interval, rows_at(is_end, "proximity_pairs"), _PROXIMITIES), time=time)
+            SceneProximities(
+                **_read_pairs(interval, rows_at(is_end, "proximity_pairs"), names, _PROXIMITIES), time=time
+            )
             for is_end, time, _ in moments
         )
         proximities = start, end
-    rows = fields["contacts"]
+    rows, summary = fields["contacts"], read_summary(fields, interval, names)
     contacts = SceneContacts(
-        **_read_pairs(interval, rows, _CONTACTS + _COMPARISON * bool(intersections)),
+        **_read_pairs(interval, rows, names, _CONTACTS + _COMPARISON * bool(intersections)),
         interval=interval,
         counted=np.ones(len(rows), dtype=bool),
-        ignored=_mesh_pairs_from_list(fields["ignored"]),
-    )
-    # a scene without curves and points has no counts of their pairs
-    counts = {kind.label: StageCounts(**fields["stages"].get(kind.label, {})) for kind in DistanceKind}
-    validation = fields["validation"]
-    if validation:
-        validation = Validation(**validation | {"disagreements": tuple(validation["disagreements"])})
-    summary = summarize(
-        contacts,
-        intersections,
-        proximities,
-        certified=fields["certified"],
-        stats=DetectionStats(**counts, milliseconds={}),
-        validation=validation,
+        ignored=summary.ignored,
     )
     return IntervalResult(summary, contacts, intersections, proximities, None)
-
-
-def _intersection_counts(found: IntersectionSummary) -> dict[str, Any]:
-    """Returns the numbers of the intersections at one time."""
-    pairs = [
-        {"meshes": meshes, "crossings": crossings, "touches": touches}
-        for meshes, (crossings, touches) in found.mesh_pairs.items()
-    ]
-    inside = [{"meshes": meshes, "parts": parts} for meshes, parts in found.inside.items()]
-    return asdict(found) | {"mesh_pairs": pairs, "inside": inside}
-
-
-def mesh_pairs_to_list(mesh_pairs: Iterable[tuple[tuple[str, str], int]]) -> list[dict[str, Any]]:
-    """Returns numbers of colliding pairs, given by two meshes, as a list of objects."""
-    return [{"meshes": meshes, "hits": hits} for meshes, hits in mesh_pairs]
-
-
-def _mesh_pairs_from_list(mesh_pairs: list[dict[str, Any]]) -> dict[tuple[str, str], int]:
-    """Returns the numbers in a list of :func:`mesh_pairs_to_list`, by two meshes."""
-    return {(first, second): pair["hits"] for pair in mesh_pairs for first, second in [pair["meshes"]]}

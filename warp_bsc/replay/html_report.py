@@ -12,6 +12,7 @@ import numpy as np
 
 from ..usd.scene import Scene
 from .html_page import block, fill_page, inert, shared_part, spread
+from .limit import not_listed
 from .outputs import RecordFile
 from .page_view import choose_faces
 from .results import IntervalResult
@@ -203,9 +204,14 @@ class ReportPage(RecordFile):
         rest = sum(at.crossings + at.touches + sum(at.inside.values()) for at in summary.intersections)
         near = sum(at.pairs for at in summary.proximities)
         names = "collisions", "intersections at rest", "proximities"
-        for name, found, shown in zip(names, (summary.hits, rest, near), zip(*rows, strict=True), strict=True):
-            if sum(shown) < found:
-                notes.append(f"The table has {sum(shown):,} of {found:,} {name}: {most}. JSON and CSV files have all.")
+        missing = not_listed(summary, with_end=True)
+        limited = (missing.collisions[0], missing.intersections[0], missing.proximities[0]) if missing else (0, 0, 0)
+        if missing and any(limited):
+            notes.append(f"{missing} This holds for other files of the replay, and the views in 3D, as well.")
+        found = summary.hits - limited[0], rest - limited[1], near - limited[2]
+        for name, listed, shown in zip(names, found, zip(*rows, strict=True), strict=True):
+            if sum(shown) < listed:
+                notes.append(f"The table has {sum(shown):,} of {listed:,} {name}: {most}. JSON and CSV files have all.")
         if self._some_strands:
             notes.append(f"{self._some_strands:,} views in 3D have only some of the curves or points, spread evenly.")
         if self._without_view:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -50,6 +51,8 @@ class SceneContacts(ScenePairs):
     ignored: dict[tuple[str, str], int]
     separate: np.ndarray | None = None
     phase: np.ndarray | None = None
+
+    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "kind", "toi", "time", "normal", "separate", "phase")
 
     @cached_property
     def colliding_faces(self) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -47,6 +47,8 @@ class SceneIntersections(ScenePairs):
     time: float
     crosses: np.ndarray
     x: np.ndarray = field(repr=False)
+
+    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "crosses")
 
     @property
     def crossings(self) -> int:

@@ -1,6 +1,7 @@
 """Pairs of elements of a scene's meshes, in the prims' own numbers."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -68,8 +69,16 @@ class ScenePairs:
     faces: np.ndarray
     position: np.ndarray
 
+    BY_PAIR: ClassVar[tuple[str, ...]] = ("elements", "meshes", "indices", "vertices", "faces", "position")
+    """Names of the arrays with a row for each pair."""
+
     def __len__(self) -> int:
         return len(self.meshes)
+
+    def take(self, rows: np.ndarray) -> Self:
+        """Returns some pairs, given their rows or a mask, without the others."""
+        arrays = {name: getattr(self, name) for name in self.BY_PAIR}
+        return replace(self, **{name: array[rows] for name, array in arrays.items() if array is not None})
 
     def chunks(self, rows: slice = slice(None)) -> list[slice]:
         """Returns rows, default all, as slices of limited length, as their text takes many times their memory."""

@@ -1,6 +1,7 @@
 """The proximities at one time of a scene: pairs of elements up to the clearance apart."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,6 +27,8 @@ class SceneProximities(ScenePairs):
     time: float
     kind: np.ndarray
     distance: np.ndarray
+
+    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "kind", "distance")
 
 
 def name_proximities(

@@ -123,6 +123,8 @@ class Summary:
         intervals: The finished intervals, in order.
         stopped: Reason why the replay ended before the scene; empty if it is complete.
         clearance: Distance up to which proximities were found, in the scene's unit of length; None without them.
+        limit: Largest number of rows of each list of an interval in files, see :mod:`~warp_bsc.replay.limit`; None if
+            files list all.
     """
 
     scene: Scene
@@ -131,6 +133,7 @@ class Summary:
     intervals: list[IntervalSummary]
     stopped: str = ""
     clearance: float | None = None
+    limit: int | None = None
 
     @property
     def is_complete(self) -> bool:

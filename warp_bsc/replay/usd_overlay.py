@@ -1,27 +1,28 @@
 """Writes a USD layer over the scene that shows its collisions in usdview and other programs that read USD."""
 
 import os
+import re
 import secrets
-import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .._atomic_file import OutputFile
+from .._version import __version__
 from ..usd.layer import just_before, layer_metadata, unused_path
-from ..usd.layer_writer import SHAPES, LayerContent, LayerPrim, PrimKind, write_binary_layer, write_text_layer
+from ..usd.layer_writer import LayerContent, LayerGroup, LayerPrim, PrimKind, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
 from ..usd.segment import Segment
-from .outputs import without_last_eighth
+from .limit import not_listed
 from .results import IntervalResult
+from .sample_spool import Key, Sample, SampleSpool
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import ScenePairs
 from .summary import Summary
 
-__all__ = ["COLORS", "LIFT", "SHOWN_BY", "Overlay"]
+__all__ = ["COLORS", "LIFT", "MOST_PAIRS", "SHOWN_BY", "VARIANTS", "Overlay"]
 
 COLORS = {
     "Polygons": (0.85, 0.08, 0.06),
@@ -39,6 +40,17 @@ curves pass through faces, vertices of parts that are inside others, middles of 
 
 LIFT = 2e-4
 """Distance of the coloured polygons from those of the scene, as a share of the size of its moving meshes."""
+
+MOST_PAIRS = 32
+"""Largest number of pairs of meshes with a prim of their own; the prim ``Rest`` has the others."""
+
+VARIANTS = {
+    "all": tuple(COLORS),
+    "collisions": ("Polygons", "VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex"),
+    "intersections": ("Intersections", "CurveIntersections", "Inside"),
+    "clearance": ("Near",),
+}
+"""Variants of the set ``warp_bsc``, besides those that show one pair of meshes alone, and the prims that they show."""
 
 SHOWN_BY = (
     "Its prims are guides, which programs hide at first: usdview shows them by Display, Display Purposes, Guide; "
@@ -76,25 +88,27 @@ _PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
     "Inside": ("PointInstancer", _MARKERS | _ELEMENTS),
     "Near": ("PointInstancer", _MARKERS | {"primvars:distance": "float[]"} | _ELEMENTS),
 }
-"""Prims of the layer: their types, and the types of their attributes that have time samples."""
+"""Prims below a pair of meshes: their types, and the types of their attributes that have time samples."""
 
-_ONLY_IF_FOUND = "VertexEdge", "VertexVertex", "CurveIntersections", "Inside", "Near"
-"""The prims that a layer contains only if they are not empty at all times."""
+_REST = "Rest"
 
 
 class Overlay:
     """A layer whose sublayer is the scene, so that opening the layer shows both. It does not change the scene's prims.
 
-    The prims below ``/Collisions`` are
+    ``/Collisions`` has a prim for each pair of meshes, such as ``Coat_with_Body`` or ``Coat_with_itself``, so that a
+    pair can be hidden. Its attribute ``meshes`` has their names. The first :data:`MOST_PAIRS` pairs that meet have one,
+    those with the most rows in an interval first; ``Rest`` has the others. The variant set ``warp_bsc`` shows all, what
+    is of one kind (:data:`VARIANTS`), or one pair alone. Below a pair are these prims, if they are not always empty:
 
     - ``Polygons``, a mesh of the polygons that collide, or have an edge or a vertex that collides, as triangles. They
       are lifted by :data:`LIFT` to both sides, move with the scene, and exist from the start of the interval to its
       end;
-    - ``VertexFace`` and ``EdgeEdge``, and if curves or points collide ``VertexEdge`` and ``VertexVertex``: markers at
-      the contact points of these kinds, from the start of their interval to its end. Each is an instance with the
-      primvars ``toi``; ``primA`` and ``primB``, the two meshes, as indices in the attribute ``prims`` of
-      ``/Collisions``, which lists their names; ``elementA`` and ``elementB``, the two elements in the prims' own
-      numbers: the point and -1 for a vertex, the polygon and -1 for a face, the points at both ends of an edge;
+    - ``VertexFace``, ``EdgeEdge``, ``VertexEdge`` and ``VertexVertex``: markers at the contact points of these kinds,
+      from the start of their interval to its end. Each is an instance with the primvars ``toi``; ``primA`` and
+      ``primB``, the two meshes, as indices in the attribute ``prims`` of ``/Collisions``, which lists their names;
+      ``elementA`` and ``elementB``, the two elements in the prims' own numbers: the point and -1 for a vertex, the
+      polygon and -1 for a face, the points at both ends of an edge;
     - ``Intersections``, the curves along which surfaces cut each other at a time of the scene, from that time to the
       next. Each segment in which two triangles meet is a curve, with ``primA`` and ``primB``. Elements that only touch
       have no curve;
@@ -103,8 +117,7 @@ class Overlay:
       the outer mesh is hidden;
     - ``Near``, markers halfway between the two elements of each proximity, with the primvar ``distance``.
 
-    The last three are missing where there are none. They exist from a time of the scene to the next, and have the
-    primvars of contact points except ``toi``.
+    The last three exist from a time of the scene to the next, and have the primvars of contact points except ``toi``.
 
     Each prim emits light of its own colour by its own material, which overrides the materials of the scene. Contact
     points are instances of a mesh, as Blender does not bind materials to USD's points; Blender shows the curves grey,
@@ -113,23 +126,27 @@ class Overlay:
     Their purpose is guide, so that renders and replays of the layer exclude them. Programs hide guides by default;
     :data:`SHOWN_BY`, which the layer's documentation and the command line repeat, explains how to show them.
 
-    A name that ends in ``.usda`` makes a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
-    smaller. USD interpolates between samples; values that must not move have an empty sample just before the next one.
+    The layer's ``customLayerData`` has the command that finds the same, without the options that choose files and
+    processes, and the numbers of findings; ``assetInfo`` of ``/Collisions`` names the scene and the version.
 
-    USD's own layers hold their whole content in memory. This one writes its samples to a temporary file, the spool, and
-    sorts them by attribute at the end, a few megabytes at a time. It does not read the scene again, whose file may have
-    become unreadable.
+    A name that ends in ``.usda`` makes a layer in USD's text format, ``.usdc`` and ``.usd`` a binary one, which is
+    smaller.
+
+    USD's own layers hold their whole content in memory. This one writes its samples to a
+    :class:`~warp_bsc.replay.sample_spool.SampleSpool`, and sorts them by attribute at the end, a few megabytes at a
+    time. It does not read the scene again, whose file may have become unreadable.
 
     Attributes:
         file: The file.
     """
 
-    def __init__(self, path: str | os.PathLike, *, scene: Scene):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene, command: str):
         """Opens the file.
 
         Args:
             path: The file, with a name that ends in ``.usda``, ``.usdc`` or ``.usd``.
             scene: The scene.
+            command: The command that finds the same.
 
         Raises:
             OSError: If the file cannot be written.
@@ -139,40 +156,39 @@ class Overlay:
         if suffix not in (".usda", ".usdc", ".usd"):
             raise ValueError(f"{path}: the name of an overlay, a layer of USD, must end in .usda, .usdc or .usd")
         self._is_text = suffix == ".usda"
-        self._scene = scene
-        self._samples: dict[str, list[_Sample]] = {name: [] for name in _PARTS}
-        self._ends = []  # offset in the spool at the end of each complete interval
+        self._scene, self._command = scene, command
         self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
+        self._pairs: dict[frozenset[str], LayerGroup] = {}  # prims of pairs of meshes, by the names of the two
         self._root_path = unused_path(scene, "/Collisions")
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
         self._metadata = layer_metadata(scene)
         self.file = OutputFile(path)
-        self._spool = tempfile.TemporaryFile(buffering=0, dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
+        self._spool = SampleSpool(self.file.folder, {name: types for name, (_, types) in _PARTS.items()})
 
     def add(self, result: IntervalResult) -> None:
         """Adds the contacts of an interval, and the intersections and proximities at its start."""
         contacts = result.contacts
-        interval = contacts.interval
-        self._sample("Polygons", interval.start, *self._find_polygons(contacts))
-        for kind, name in enumerate(("VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex")):
-            rows = np.flatnonzero(contacts.kind == kind)
-            self._sample(name, interval.start, self._find_points(contacts, rows, {"toi": contacts.toi}))
-        for name, arrays in self._find_at_rest(result, 0).items():
-            self._sample(name, interval.start, arrays)
+        found: dict[Key, Sample] = {}
+        for pair, rows in self._by_pair(contacts.segment, contacts.meshes):
+            of_pair = contacts.take(rows)
+            if polygons := self._find_polygons(of_pair):
+                found[pair, "Polygons"] = polygons
+            for kind, name in enumerate(("VertexFace", "EdgeEdge", "VertexEdge", "VertexVertex")):
+                if len(of_kind := np.flatnonzero(of_pair.kind == kind)):
+                    found[pair, name] = self._find_points(of_pair, of_kind, {"toi": of_pair.toi})
+        self._spool.add(contacts.interval.start, found | self._find_at_rest(result, 0))
         self._last = result
-        self._ends.append(self._spool.tell())
 
     def finish(self, summary: Summary) -> None:
         """Writes the layer and moves it to its path."""
-        del self._ends[len(summary.intervals) :]
-        summary = summary.first(len(self._ends))
+        self._spool.keep(len(summary.intervals))
+        summary = summary.first(self._spool.interval_count)
         end = summary.intervals[-1].end if summary.intervals else self._scene.times[0]
         last, self._last = self._last, None
         if last and last.summary.end == end > last.summary.start:
-            for name, arrays in self._find_at_rest(last, 1).items():
-                self._sample(name, end, arrays, interval=len(self._ends) - 1)
+            self._spool.add_last(end, self._find_at_rest(last, 1))
         content = self._content(summary, end)
         if self._is_text:
             self.file.truncate(0)
@@ -185,20 +201,50 @@ class Overlay:
 
     def shrink(self) -> bool:
         """Drops the samples of the last intervals."""
-        if not self._ends:
-            return False
-        self._ends = without_last_eighth(self._ends)
         self._last = None
-        self._spool.truncate(self._ends[-1] if self._ends else 0)
-        return True
+        return self._spool.shrink()
 
     def discard(self) -> None:
         """Removes the temporary files."""
-        self._spool.close()
+        self._spool.discard()
         self.file.discard()
 
-    def _find_polygons(self, contacts: SceneContacts):
-        """Returns the mesh of the polygons that collide in an interval, and its points just before the end."""
+    def _by_pair(self, segment: Segment, meshes: np.ndarray) -> list[tuple[str, np.ndarray]]:
+        """Returns names of the prims of pairs of meshes with their rows, ascending, the pairs with the most rows first.
+
+        Args:
+            segment: The segment.
+            meshes: Two meshes of the segment in each row, shape [n, 2].
+        """
+        keys = np.sort(meshes, axis=1)
+        pairs, groups, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        of_groups = np.split(np.argsort(groups.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
+        rows: dict[str, list[np.ndarray]] = {}
+        for group in np.argsort(-counts, kind="stable").tolist():
+            first, second = (segment.meshes[mesh].name for mesh in pairs[group])
+            rows.setdefault(self._prim_of(first, second), []).append(of_groups[group])
+        return [(name, np.sort(np.concatenate(parts))) for name, parts in rows.items()]
+
+    def _prim_of(self, first: str, second: str) -> str:
+        """Returns the name of the prim of two meshes."""
+        pair = frozenset((first, second))
+        if pair in self._pairs:
+            return self._pairs[pair].name
+        if len(self._pairs) == MOST_PAIRS:
+            return _REST
+        words = [re.sub(r"\W", "_", name.rpartition("/")[2], flags=re.ASCII) for name in (first, second)]
+        name = f"{words[0]}_with_{'itself' if first == second else words[1]}"
+        name = f"_{name}" if name[0].isdigit() else name
+        unique, number, used = name, 1, {group.name for group in self._pairs.values()}
+        while unique in used:
+            number += 1
+            unique = f"{name}_{number}"
+        label = f"{first} with {'itself' if first == second else second}"
+        self._pairs[pair] = LayerGroup(unique, label, {"meshes": list(dict.fromkeys((first, second)))})
+        return unique
+
+    def _find_polygons(self, contacts: SceneContacts) -> Sample | None:
+        """Returns the mesh of the polygons that collide in an interval, None if there are none."""
         segment, faces = contacts.interval.segment, []
         for number, polygons in contacts.colliding_polygons().items():
             mesh = segment.meshes[number]
@@ -206,7 +252,7 @@ class Overlay:
             last = np.searchsorted(mesh.polygons, polygons, side="right")
             faces += [mesh.faces.start + np.arange(start, stop) for start, stop in zip(first, last, strict=True)]
         if not faces:
-            return None, None
+            return None
         vertices, corners = np.unique(segment.faces[np.concatenate(faces)], return_inverse=True)
         corners = corners.reshape(-1, 3)
         start, stop = (self._lift(x[vertices], corners) for x in (contacts.interval.x0, contacts.interval.x1))
@@ -216,7 +262,7 @@ class Overlay:
             "faceVertexIndices": np.concatenate([corners, corners[:, ::-1] + len(vertices)]).reshape(-1),
             "points": start,
         }
-        return arrays, (just_before(contacts.interval.end), stop)
+        return Sample(arrays, (just_before(contacts.interval.end), stop))
 
     def _lift(self, x, corners) -> np.ndarray:
         """Returns the points of triangles moved along their normals, first to one side, then to the other."""
@@ -228,28 +274,27 @@ class Overlay:
         step = LIFT * self._size * np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
         return np.concatenate([x + step, x - step])
 
-    def _find_at_rest(self, result: IntervalResult, end: int) -> dict[str, dict[str, np.ndarray] | None]:
+    def _find_at_rest(self, result: IntervalResult, end: int) -> dict[Key, Sample]:
         """Returns the samples of intersections and proximities at the start of an interval, 0, or at its end, 1."""
         samples = {}
         if result.intersections:
             found = result.intersections[end]
-            rows = np.arange(found.inside_rows.start, found.inside_rows.stop)
-            samples = {
-                "Intersections": self._find_curves(found),
-                "CurveIntersections": self._find_points(found, found.of_curves, {}),
-                "Inside": self._find_points(found, rows, {}),
-            }
+            inside = np.arange(found.inside_rows.start, found.inside_rows.stop)
+            for pair, rows in self._by_pair(found.segment, found.cuts.meshes):
+                samples[pair, "Intersections"] = self._find_curves(found, rows)
+            for name, rows_of_name in (("CurveIntersections", found.of_curves), ("Inside", inside)):
+                for pair, rows in self._by_pair(found.segment, found.meshes[rows_of_name]):
+                    samples[pair, name] = self._find_points(found, rows_of_name[rows], {})
         if result.proximities:
-            found = result.proximities[end]
-            samples["Near"] = self._find_points(found, np.arange(len(found)), {"distance": found.distance})
+            near = result.proximities[end]
+            for pair, rows in self._by_pair(near.segment, near.meshes):
+                samples[pair, "Near"] = self._find_points(near, rows, {"distance": near.distance})
         return samples
 
-    def _find_points(self, pairs: ScenePairs, rows: np.ndarray, values: dict[str, np.ndarray]):
-        """Returns some pairs as points with their values, None without pairs."""
-        if not len(rows):
-            return None
+    def _find_points(self, pairs: ScenePairs, rows: np.ndarray, values: dict[str, np.ndarray]) -> Sample:
+        """Returns some pairs as points with their values."""
         prims, indices = self._number_prims(pairs.segment, pairs.meshes[rows]), pairs.indices[rows]
-        return {
+        arrays = {
             "extent": _box(pairs.position[rows], _MARKER_SIZE * self._size / 2),
             "positions": pairs.position[rows],
             "protoIndices": np.zeros(len(rows)),
@@ -259,20 +304,20 @@ class Overlay:
             "primvars:elementA": indices[:, 0],
             "primvars:elementB": indices[:, 1],
         }
+        return Sample(arrays)
 
-    def _find_curves(self, found: SceneIntersections):
-        """Returns the segments in which triangles meet as curves, None without any."""
+    def _find_curves(self, found: SceneIntersections, rows: np.ndarray) -> Sample:
+        """Returns some segments in which triangles meet as curves."""
         cuts = found.cuts
-        if not len(cuts.points):
-            return None
-        prims, points = self._number_prims(found.segment, cuts.meshes), cuts.points.reshape(-1, 3)
-        return {
+        prims, points = self._number_prims(found.segment, cuts.meshes[rows]), cuts.points[rows].reshape(-1, 3)
+        arrays = {
             "extent": _box(points, _CURVE_WIDTH * self._size / 2),
             "points": points,
-            "curveVertexCounts": np.full(len(cuts.points), 2),
+            "curveVertexCounts": np.full(len(rows), 2),
             "primvars:primA": prims[:, 0],
             "primvars:primB": prims[:, 1],
         }
+        return Sample(arrays)
 
     def _number_prims(self, segment: Segment, meshes: np.ndarray) -> np.ndarray:
         """Returns numbers of meshes of a segment that hold for the whole layer."""
@@ -280,121 +325,64 @@ class Overlay:
         names = [segment.meshes[mesh].name for mesh in used]
         return np.array([self._prims.setdefault(name, len(self._prims)) for name in names])[rows].reshape(-1, 2)
 
-    def _sample(self, name, time, arrays, moved=None, interval=None):
-        """Adds a sample of a prim's attributes to the spool, except an empty one after an empty one.
-
-        Args:
-            name: The prim.
-            time: Time code.
-            arrays: Values by attribute, None for an empty sample.
-            moved: A time just before the next sample, and the points at that time.
-            interval: Number of the interval that the sample belongs to; default: the one that is added.
-        """
-        samples = self._samples[name]
-        if arrays is None and samples and samples[-1].is_empty:
-            return
-        types = _PARTS[name][1]
-        self._spool.seek(0, os.SEEK_END)
-        stored = {attribute: self._store(types[attribute], array) for attribute, array in (arrays or {}).items()}
-        after = (moved[0], self._store(types["points"], moved[1])) if moved else None
-        samples.append(_Sample(len(self._ends) if interval is None else interval, time, stored, after))
-
-    def _store(self, value_type, array) -> "_Stored":
-        """Appends an array to the spool."""
-        data = np.ascontiguousarray(array, dtype=SHAPES[value_type][0])
-        stored = _Stored(self._spool.tell(), data.nbytes)
-        rest = memoryview(data.tobytes())
-        while rest:
-            rest = rest[self._spool.write(rest) :]
-        return stored
-
-    def _load(self, value_type, stored) -> np.ndarray:
-        """Reads an array from the spool."""
-        dtype, width = SHAPES[value_type]
-        self._spool.seek(stored.offset)
-        data = self._spool.read(stored.size)
-        if len(data) != stored.size:
-            raise RuntimeError("the spool of the overlay is truncated")
-        return np.frombuffer(data, dtype).reshape((-1, width) if width > 1 else -1)
-
-    def _complete(self, name: str) -> "list[_Sample]":
-        """Returns the samples of a prim that belong to complete intervals."""
-        return [sample for sample in self._samples[name] if sample.interval < len(self._ends)]
-
-    def _time_samples(self, name, attribute, end) -> Iterator[tuple[float, np.ndarray]]:
-        """Yields the time samples of an attribute up to the end of the last interval, in order."""
-        value_type = _PARTS[name][1][attribute]
-        empty = self._load(value_type, _Stored(0, 0)) if attribute != "extent" else np.zeros((2, 3), np.float32)
-        samples = self._complete(name)
-        for index, sample in enumerate(samples):
-            if sample.is_empty:
-                yield sample.time, empty
-                continue
-            value = self._load(value_type, sample.arrays[attribute])
-            yield sample.time, value
-            is_last = index + 1 == len(samples)
-            following = end if is_last else samples[index + 1].time
-            if attribute == "points" and sample.moved:
-                yield sample.moved[0], self._load(value_type, sample.moved[1])
-            # Between two values USD interpolates, which would show points on the way from one contact to another.
-            elif value_type.startswith(("float", "point")) and (before := just_before(following)) > sample.time:
-                yield before, value if attribute == "extent" else empty
-            if is_last and end > sample.time:
-                yield end, empty
-
     def _content(self, summary: Summary, end: float) -> LayerContent:
         """Returns the content of the layer, given the last time of its intervals."""
         source = Path(os.path.relpath(Path(self._scene.path).resolve(), self.file.path.parent.resolve())).as_posix()
-        found = {"complete": summary.is_complete, "hits": summary.hits, "intervals": len(summary.intervals)}
-        if summary.intersections:
-            found["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
-        if summary.stopped:
-            found["stopped"] = summary.stopped
-        widths = {"Mesh": 0.0, "PointInstancer": _MARKER_SIZE * self._size, "BasisCurves": _CURVE_WIDTH * self._size}
+        missing = str(not_listed(summary, with_end=True) or "")
+        keys = self._spool.keys()
         return LayerContent(
             metadata=self._metadata,
-            documentation=f"Collisions found by warp-bsc replay. {SHOWN_BY} {summary.motion}",
-            custom={"collisions": found},
+            documentation=" ".join(
+                text for text in ("Collisions found by warp-bsc replay.", SHOWN_BY, missing, summary.motion) if text
+            ),
+            custom={"collisions": self._facts(summary)},
+            asset={"name": f"Collisions in {Path(self._scene.path).name}", "version": f"warp-bsc {__version__}"},
             sublayer=source if source.startswith("../") else f"./{source}",
             root=self._root_path,
             strings={"prims": list(self._prims)},
-            prims=[
-                LayerPrim(name, kind, attributes, COLORS[name], widths[kind])
-                for name, (kind, attributes) in _PARTS.items()
-                if name not in _ONLY_IF_FOUND or any(not sample.is_empty for sample in self._complete(name))
-            ],
-            samples=lambda name, attribute: self._time_samples(name, attribute, end),
+            groups=self._groups({pair for pair, _ in keys}),
+            prims=[self._layer_prim(pair, name) for pair, name in keys],
+            variant_set="warp_bsc",
+            hidden=_hidden(keys),
+            samples=lambda prim, attribute: self._spool.time_samples(tuple(prim.split("/")), attribute, end),
         )
 
+    def _facts(self, summary: Summary) -> dict[str, Any]:
+        """Returns what programs read of the layer without its prims."""
+        facts = {
+            "command": self._command,
+            "complete": summary.is_complete,
+            "hits": summary.hits,
+            "intervals": len(summary.intervals),
+        }
+        if missing := not_listed(summary, with_end=True):
+            facts["limit"] = missing.limit
+            facts["collisionsNotListed"] = missing.collisions[0]
+        if summary.intersections:
+            facts["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
+        if summary.stopped:
+            facts["stopped"] = summary.stopped
+        return facts
 
-@dataclass(frozen=True)
-class _Stored:
-    """An array in the spool, by its offset and size [bytes]."""
+    def _groups(self, used: set[str]) -> list[LayerGroup]:
+        """Returns the prims of pairs of meshes that have findings, the rest last."""
+        rest = [LayerGroup(_REST, "other pairs of meshes", {})]
+        return [group for group in (*self._pairs.values(), *rest) if group.name in used]
 
-    offset: int
-    size: int
+    def _layer_prim(self, pair: str, name: str) -> LayerPrim:
+        kind, attributes = _PARTS[name]
+        widths = {"Mesh": 0.0, "PointInstancer": _MARKER_SIZE * self._size, "BasisCurves": _CURVE_WIDTH * self._size}
+        return LayerPrim(f"{pair}/{name}", kind, attributes, name, COLORS[name], widths[kind])
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """A sample of a prim in the spool.
-
-    Attributes:
-        interval: Number of the interval.
-        time: Time code.
-        arrays: Its arrays, by attribute; none for an empty sample.
-        moved: A time just before the next sample, and the points at that time, if they move.
-    """
-
-    interval: int
-    time: float
-    arrays: dict[str, _Stored]
-    moved: tuple[float, _Stored] | None
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether the prim is empty at that time."""
-        return not self.arrays
+def _hidden(keys: list[Key]) -> dict[str, list[str]]:
+    """Returns the prims that each variant hides, given pairs and their prims."""
+    pairs = list(dict.fromkeys(pair for pair, _ in keys))
+    hidden = {
+        variant: [f"{pair}/{name}" for pair, name in keys if name not in shown] for variant, shown in VARIANTS.items()
+    }
+    # not the pairs themselves: Blender 4.4 crashes where a prim above a point instancer is invisible
+    return hidden | {pair: [f"{other}/{name}" for other, name in keys if other != pair] for pair in pairs}
 
 
 def _box(points, margin=0.0) -> np.ndarray:

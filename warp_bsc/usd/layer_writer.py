@@ -16,6 +16,7 @@ import numpy as np
 __all__ = [
     "SHAPES",
     "LayerContent",
+    "LayerGroup",
     "LayerPrim",
     "PrimKind",
     "as_os_error",
@@ -34,13 +35,29 @@ _TEXT_ROWS = 4096  # rows of an array that are formatted at a time
 
 
 @dataclass(frozen=True)
+class LayerGroup:
+    """A prim of a layer that only has other prims below it.
+
+    Attributes:
+        name: Its name.
+        label: Its display name.
+        strings: Its attributes, lists of texts, by name.
+    """
+
+    name: str
+    label: str
+    strings: dict[str, list[str]]
+
+
+@dataclass(frozen=True)
 class LayerPrim:
     """A prim of a layer.
 
     Attributes:
-        name: Its name.
+        name: Its name, after the name of its group and a slash.
         kind: ``"Mesh"``, ``"PointInstancer"``, whose instances are octahedra, or ``"BasisCurves"``.
         attributes: Types of its attributes that have time samples, by their names.
+        material: Name of its material, which prims of the same colour share.
         color: The colour of the light that it emits.
         width: Width of the octahedron or of the curves.
     """
@@ -48,6 +65,7 @@ class LayerPrim:
     name: str
     kind: PrimKind
     attributes: dict[str, str]
+    material: str
     color: tuple[float, float, float]
     width: float = 0.0
 
@@ -60,10 +78,14 @@ class LayerContent:
         metadata: Metadata of the layer, by name.
         documentation: Text for people.
         custom: Values for programs, by name.
+        asset: The ``assetInfo`` of the root prim.
         sublayer: Path of its sublayer, relative to its own folder. It is not read.
         root: Path of the prim above all prims, of purpose guide.
         strings: Attributes of that prim, lists of texts, by name.
-        prims: The prims.
+        groups: The prims below it.
+        prims: The prims below these.
+        variant_set: Name of its variant set, whose first variant is selected.
+        hidden: Names of the groups and prims that each variant hides.
         samples: Yields the time samples of an attribute in order, given its prim and its name: time codes and arrays of
             :data:`SHAPES`.
     """
@@ -71,10 +93,14 @@ class LayerContent:
     metadata: dict[str, Any]
     documentation: str
     custom: dict[str, Any]
+    asset: dict[str, Any]
     sublayer: str
     root: str
     strings: dict[str, list[str]]
+    groups: list[LayerGroup]
     prims: list[LayerPrim]
+    variant_set: str
+    hidden: dict[str, list[str]]
     samples: Callable[[str, str], Iterable[tuple[float, np.ndarray]]]
 
 
@@ -155,8 +181,12 @@ def _define_prims(layer, content):
     stage = Usd.Stage.Open(layer)
     root = UsdGeom.Scope.Define(stage, content.root)
     root.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    for name, texts in content.strings.items():
-        root.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.StringArray).Set(texts)
+    root.GetPrim().SetAssetInfo(content.asset)
+    _define_strings(root.GetPrim(), content.strings)
+    for group in content.groups:
+        prim = UsdGeom.Scope.Define(stage, f"{content.root}/{group.name}").GetPrim()
+        prim.SetDisplayName(group.label)
+        _define_strings(prim, group.strings)
     UsdGeom.Scope.Define(stage, f"{content.root}/Materials")
     for part in content.prims:
         prim = stage.DefinePrim(f"{content.root}/{part.name}", part.kind)
@@ -178,14 +208,45 @@ def _define_prims(layer, content):
             shown = _define_marker(stage, prim, part.width / 2)
         # The same colour for programs that show no materials.
         UsdGeom.Gprim(shown).CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set([part.color])
-        material = UsdShade.Material.Define(stage, f"{content.root}/Materials/{part.name}")
-        shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
-        shader.CreateIdAttr("UsdPreviewSurface")
-        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set((0, 0, 0))
-        shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(part.color)
-        shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
-        material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-        UsdShade.MaterialBindingAPI.Apply(shown).Bind(material)
+        UsdShade.MaterialBindingAPI.Apply(shown).Bind(_define_material(stage, content.root, part))
+    _define_variants(root.GetPrim(), content.variant_set, content.hidden)
+
+
+def _define_strings(prim, strings):
+    """Defines attributes of a prim that are lists of texts."""
+    from pxr import Sdf  # noqa: PLC0415 (slow)
+
+    for name, texts in strings.items():
+        prim.CreateAttribute(name, Sdf.ValueTypeNames.StringArray).Set(texts)
+
+
+def _define_material(stage, root, part):
+    """Defines the material of a prim if it is not there, and returns it."""
+    from pxr import Sdf, UsdShade  # noqa: PLC0415 (slow)
+
+    material = UsdShade.Material.Define(stage, f"{root}/Materials/{part.material}")
+    shader = UsdShade.Shader.Define(stage, f"{material.GetPath()}/Surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set((0, 0, 0))
+    shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(part.color)
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(1.0)
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    return material
+
+
+def _define_variants(root, name, hidden):
+    """Defines the variants of a prim, each of which hides some prims below it, and selects the first."""
+    from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+    variants = root.GetVariantSets().AddVariantSet(name)
+    for variant, prims in hidden.items():
+        variants.AddVariant(variant)
+        variants.SetVariantSelection(variant)
+        with variants.GetVariantEditContext():
+            for prim in prims:
+                path = root.GetPath().AppendPath(prim)
+                UsdGeom.Imageable(root.GetStage().OverridePrim(path)).CreateVisibilityAttr(UsdGeom.Tokens.invisible)
+    variants.SetVariantSelection(next(iter(hidden)))
 
 
 def _define_marker(stage, instancer, radius):

@@ -120,6 +120,7 @@ class Scene:
         up_axis: "Y" or "Z".
         dtype: Type of the positions, float32 or float64.
         names: Names of all meshes that are checked at some time.
+        paths: Paths of the prims that they are read from, by name.
         display_names: Display names in the file, by name; empty where there is none.
         comments: Comment and documentation of the file, pairs of a title and a text.
         vertex_count: Number of vertices of the first segment, welded.
@@ -252,6 +253,7 @@ class Scene:
         self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
         read = [mesh for mesh in self._usd_meshes if any(mesh.states.values())]
         self.names = [mesh.name for mesh in read]
+        self.paths = {mesh.name: mesh.path for mesh in read}
         self.display_names = {mesh.name: mesh.display_name for mesh in read}
         self.has_strands = any(mesh.is_strands for mesh in read)
         self.turning = sum(mesh.turns for mesh in read)
