@@ -92,6 +92,8 @@ def test_solutions_are_those_of_dense_solves(device, name, transposed):
         assert np.linalg.eigvalsh(matrix).min() < -1.0
     x, solver = system.solve(transposed=transposed)
     assert not solver.failed.numpy().any()
+    if is_symmetric:
+        assert solver.indefinite.numpy().any() == (np.linalg.eigvalsh(matrix).min() < 0.0)
     matrix = matrix.T if transposed else matrix
     assert np.linalg.norm(matrix @ x.ravel() - b) <= 1.1 * TOLERANCE * np.linalg.norm(b)
     expected = np.linalg.solve(matrix, b)

@@ -191,18 +191,19 @@ def report_residuals(
 
 
 @wp.kernel
-def count_failed(
+def count_solves(
     # in
     failed: wp.array[int],
+    indefinite: wp.array[int],
     # out
     counts: wp.array[wp.int64],
 ):
-    """Counts a solve, and the worlds in which it failed. One thread."""
-    n = int(0)
-    for w in range(failed.shape[0]):
-        n += failed[w]
-    counts[2] = counts[2] + wp.int64(1)
-    counts[3] = counts[3] + wp.int64(n)
+    """Counts a solve, the worlds in which it failed, and those whose matrix was not positive definite."""
+    w = wp.tid()
+    if w == 0:
+        wp.atomic_add(counts, 2, wp.int64(1))
+    wp.atomic_add(counts, 3, wp.int64(failed[w]))
+    wp.atomic_add(counts, 6, wp.int64(indefinite[w]))
 
 
 @wp.kernel

@@ -29,6 +29,7 @@ class LinearSolver:
 
     Attributes:
         failed: 1 for worlds whose last system was not solved, int32, shape [world_count].
+        indefinite: 1 for worlds whose last matrix was found not to be positive definite, likewise.
     """
 
     def __init__(self, equations: Equations, worlds: Worlds, *, tolerance: float, max_iterations: int):
@@ -61,7 +62,7 @@ class LinearSolver:
         self._unfinished = wp.zeros(1, dtype=int, device=device)
         self._solution = equations.zeros()
         self._vectors = wp.zeros((len(Vector), 3 * len(self._solution)), dtype=wp.float64, device=device)
-        self.failed = wp.zeros(worlds.count, dtype=int, device=device)
+        self.failed, self.indefinite = (wp.zeros(worlds.count, dtype=int, device=device) for _ in range(2))
 
     def solve(self, b: wp.array, failure: float = math.nan) -> wp.array:
         """Returns the solution x of A x = b, with the matrix that the equations have; the next call overwrites it.
@@ -91,7 +92,7 @@ class LinearSolver:
         self._unfinished.fill_(1)
         wp.capture_while(self._unfinished, self._advance, launches=launches)
         inputs = [worlds.of_particles, self._states, matrix.roots, self._vectors, wp.float64(failure)]
-        self._launch(linear_kernels.finish, len(b), inputs, [self._solution, self.failed])
+        self._launch(linear_kernels.finish, len(b), inputs, [self._solution, self.failed, self.indefinite])
         return self._solution
 
     def _advance(self, launches):

@@ -76,6 +76,7 @@ class State:
     Attributes:
         phase: What the last launch computed, :class:`Phase`.
         attempt, iterations: Numbers of solves begun, and of iterations in all.
+        is_indefinite: Whether the product of a vector and A times it was negative: A is not positive definite.
         limit: Largest squared norm of the residual.
         curvature: Product of the residual and A times it (conjugate residuals), or of residual and shadow (BiCGSTAB).
         divisor: What ``curvature`` is divided by to get the step.
@@ -85,6 +86,7 @@ class State:
     phase: int
     attempt: int
     iterations: int
+    is_indefinite: int
     limit: wp.float64
     curvature: wp.float64
     divisor: wp.float64
@@ -120,6 +122,8 @@ def _next(state: State, sums: wp.vec4d, is_symmetric: bool, tolerance: wp.float6
         else:
             state.phase = int(Phase.FAILED)
         return state
+    if state.phase <= int(Phase.CONJUGATE) and sums[0] < _ZERO:
+        state.is_indefinite = 1
     if state.phase == int(Phase.START):
         state.momentum = _ZERO
         state.smoothing = _ZERO
@@ -320,12 +324,14 @@ def finish(
     # out
     x: wp.array[wp.vec3d],
     failed: wp.array[int],
+    indefinite: wp.array[int],
 ):
-    """Computes the solution, not scaled, or a value in worlds that failed, which are marked."""
+    """Computes the solution, not scaled, or a value in worlds that failed; marks these, and those not definite."""
     i = wp.tid()
     w = world[i]
     is_solved = states[0, w].phase == int(Phase.SOLVED)
     failed[w] = int(not is_solved)
+    indefinite[w] = states[0, w].is_indefinite
     x[i] = wp.vec3d(failure, failure, failure)
     if is_solved:
         x[i] = roots[i] * vector_at(of[int(Vector.X)], i)

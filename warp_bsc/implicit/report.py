@@ -25,8 +25,8 @@ class ImplicitReport:
         self._worlds = worlds
         device, count = worlds.of_particles.device, worlds.count
         self.device_residuals = wp.zeros((2, count), dtype=wp.float64, device=device)  # last, largest
-        self.device_counts = wp.zeros(6, dtype=wp.int64, device=device)
-        self._host = wp.zeros(6, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
+        self.device_counts = wp.zeros(7, dtype=wp.int64, device=device)
+        self._host = wp.zeros(7, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
         self._said = set()
 
     @property
@@ -65,6 +65,15 @@ class ImplicitReport:
         return self._count(3)
 
     @property
+    def indefinite_solves(self) -> int:
+        """Linear solves that found their matrix not to be positive definite, each world of a step for itself.
+
+        Forces then move particles on in a direction instead of back, as where an element is compressed: the end of
+        the step balances them, but it is no minimum of energy. Gradients are those of that balance.
+        """
+        return self._count(6)
+
+    @property
     def overflowed_steps(self) -> int:
         """Steps on tapes in which pairs did not fit into the buffers of VBD's self-contact, which drops those.
 
@@ -90,7 +99,7 @@ class ImplicitReport:
 
     def warn(self) -> None:
         """Warns once each of steps not converged and of gradients that are NaN, as far as the host knows."""
-        _, unconverged, _, failed, overflowed, ambiguous = self._host.numpy()
+        _, unconverged, _, failed, overflowed, ambiguous, _ = self._host.numpy()
         if unconverged:
             self._warn_once(
                 "residual",

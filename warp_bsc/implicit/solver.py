@@ -323,7 +323,8 @@ class SolverImplicitAdjoint(WrappedSolver):
         if step.pairs is not None:
             inputs = [self._worlds.of_particles, step.pairs.dropped, wp.float64(math.nan)]
             self._launch(matrix_kernels.set_failed, n, inputs, [multipliers])
-        self._launch(kernels.count_failed, 1, [self._linear.failed], [self.report.device_counts])
+        inputs = [self._linear.failed, self._linear.indefinite]
+        self._launch(kernels.count_solves, self._worlds.count, inputs, [self.report.device_counts])
         self.report.copy_counts()
         by_forces = equations.add_gradients(multipliers, self._of_end, of_v0, of_force)
         if of_x0 is not None:
