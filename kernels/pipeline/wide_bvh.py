@@ -61,7 +61,7 @@ import warp as wp
     constexpr int buffered = 512;
     int found[2 * buffered];
     int count = 0;
-    wp::int64 overlapping = 0, filtered = 0;
+    wp::int64 filtered = 0;
     auto flush = [&]() {
         const wp::int64 slot = __atomic_fetch_add(&counts.data[queued_count], (wp::int64)count, __ATOMIC_RELAXED);
         for (int i = 0; i < count && slot + i < capacity; ++i) {
@@ -123,6 +123,17 @@ import warp as wp
             mask &= ~bits(shared);
             if (!mask)
                 continue;
+            if (!keep_separated && !at_end) {
+                Ints apart = 0;
+                for (int axis = 0; axis < 3; ++axis) {
+                    const float* at = box + 32 * axis + lane;
+                    apart |= (other_low0[axis] > at[8]) & (other_low1[axis] > at[24]);
+                    apart |= (other_high0[axis] < at[0]) & (other_high1[axis] < at[16]);
+                }
+                mask &= ~bits(apart);
+                if (!mask)
+                    continue;
+            }
             if (group.data) {
                 unsigned left_out = 0;
                 for (unsigned rest = mask; rest; rest &= rest - 1) {
@@ -136,16 +147,6 @@ import warp as wp
                 mask &= ~left_out;
                 if (!mask)
                     continue;
-            }
-            overlapping += __builtin_popcount(mask);
-            if (!keep_separated && !at_end) {
-                Ints apart = 0;
-                for (int axis = 0; axis < 3; ++axis) {
-                    const float* at = box + 32 * axis + lane;
-                    apart |= (other_low0[axis] > at[8]) & (other_low1[axis] > at[24]);
-                    apart |= (other_high0[axis] < at[0]) & (other_high1[axis] < at[16]);
-                }
-                mask &= ~bits(apart);
             }
             if (count > buffered - 8)
                 flush();
@@ -189,8 +190,6 @@ import warp as wp
     }
     if (count)
         flush();
-    if (overlapping)
-        __atomic_fetch_add(&counts.data[candidate_count], overlapping, __ATOMIC_RELAXED);
     if (filtered)
         __atomic_fetch_add(&counts.data[filtered_count], filtered, __ATOMIC_RELAXED);
 """
@@ -220,20 +219,18 @@ def pair_packet(
     counts: wp.array[wp.int64],
     filtered_of_worlds: wp.array[wp.int64],
     # indices of counts
-    candidate_count: int,
     queued_count: int,
     filtered_count: int,
     # out
     pairs: wp.array[wp.vec2i],
 ):
-    """Enqueues the pairs of a packet's elements with those of a tree that share no corner and that no axis separates.
+    """Enqueues the pairs of a packet's elements with those of a tree that share no corner, and whose boxes overlap.
 
-    A candidate, a pair whose swept boxes overlap, is counted, and enqueued unless an axis separates the two at the
-    start and at the end, on the same side; with ``keep_separated`` all candidates are enqueued. With ``at_end`` the
-    boxes at the end count instead of the swept ones, and all pairs that overlap are enqueued. Pairs without a changed
-    element are excluded. With ``symmetric`` both are of one tree, and each pair is found once. With ``ordered`` the
-    smaller number comes first, else that of the packet. With groups, the pairs that a :class:`.pairs.PairFilter` leaves
-    out are counted, by world as well if there is an array for that, and are no candidates.
+    Those are the swept boxes, unless an axis separates the two at the start and at the end, on the same side; with
+    ``keep_separated`` such pairs are enqueued as well. With ``at_end`` they are the boxes at the end. Pairs without a
+    changed element are excluded. With ``symmetric`` both are of one tree, and each pair is found once. With ``ordered``
+    the smaller number comes first, else that of the packet. With groups, the pairs that a :class:`.pairs.PairFilter`
+    leaves out are counted, by world as well if there is an array for that, and are not enqueued.
     """
     ...
 

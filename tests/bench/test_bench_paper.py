@@ -56,13 +56,11 @@ def test_json_has_everything(capsys):
     collisions = CollisionDetector(CollisionMesh(step.faces, len(step.x0), device="cpu"), method="exact").detect(
         step.x0, step.x1
     )
-    stats = collisions.stats
-    assert scene["candidates"] == stats.vertex_face.candidates + stats.edge_edge.candidates
     total = sum(scene["queries"].values())
     assert total <= 3002
     assert sum(scene["decided_by"].values()) == total
     assert list(scene["decided_by"]) == list(STAGES)
-    assert total == scene["candidates"]
+    assert total == scene["overlapping"]
     assert scene["collisions"] == len(collisions.vertex_face) + len(collisions.edge_edge)
     assert scene["errors"]["exact"] == {"hits": scene["collisions"], "false_positives": 0, "false_negatives": 0}
     assert scene["errors"]["conservative"]["false_negatives"] == 0

@@ -1,7 +1,5 @@
 """Both broad phases against all pairs compared one by one: nothing dropped, nothing twice, nothing across worlds."""
 
-import functools
-
 import numpy as np
 import pytest
 import warp as wp
@@ -36,12 +34,12 @@ def find_pairs(broad_phase, mesh, x0, x1):
     finder.pair_edges_with_faces(x0, counts[2], queues[2])
     counts = counts.numpy()
     found = [queue.numpy()[: count[Count.QUEUED]] for queue, count in zip(queues, counts, strict=True)]
-    return counts[:2, Count.CANDIDATES].tolist(), [in_lexicographic_order(pairs) for pairs in found]
+    return [in_lexicographic_order(pairs) for pairs in found]
 
 
 def all_pairs(mesh, x0, x1):
     """The same by comparing every pair."""
-    candidates, near = [], []
+    near = []
     vertices, edges, faces = mesh.vertices[:, None], mesh.edges, mesh.faces
     world = np.zeros(mesh.vertex_count) if mesh.world is None else mesh.world
     kinds = [(vertices, faces, mesh.vertices, x1), (edges, edges, np.arange(len(edges)), x1)]
@@ -59,10 +57,9 @@ def all_pairs(mesh, x0, x1):
         distinct = ~(first[i][:, :, None] == second[j][:, None]).any(axis=(1, 2))
         i, j = i[distinct], j[distinct]
         below, above = (high[:, i] < other_low[:, j]).all(axis=0), (low[:, i] > other_high[:, j]).all(axis=0)
-        candidates.append(len(i))
         meet = ~(below | above).any(axis=1)
         near.append(in_lexicographic_order(np.stack([numbers[i[meet]], j[meet]], axis=1)))
-    return candidates[:2], near
+    return near
 
 
 def in_lexicographic_order(pairs):
@@ -107,12 +104,11 @@ def test_trees_of_several_levels(broad_phase):
     a = 2 * columns[:-1, None] + np.array([[0, 1, 2]])
     b = 2 * columns[:-1, None] + np.array([[1, 3, 2]])
     mesh = bsc.CollisionMesh(np.concatenate([a, b])[np.random.default_rng(0).permutation(2 * n)], len(x0))
-    candidates, (vertex_face, edge_edge, edge_face) = find_pairs(broad_phase, mesh, x0, x0)
-    assert candidates == [len(vertex_face), len(edge_edge)]
+    vertex_face, edge_edge, edge_face = find_pairs(broad_phase, mesh, x0, x0)
     # each vertex touches the boxes of the triangles of two quads, and is in three of these, the ends one of two or two
     assert len(vertex_face) == 2 * (n + 1) * 4 - 8 - 3 * len(mesh.faces)
-    expected = all_pairs(bsc.CollisionMesh(np.concatenate([a[:50], b[:50]]), 102), x0[:102], x0[:102])[1]
-    longer = all_pairs(bsc.CollisionMesh(np.concatenate([a[:60], b[:60]]), 122), x0[:122], x0[:122])[1]
+    expected = all_pairs(bsc.CollisionMesh(np.concatenate([a[:50], b[:50]]), 102), x0[:102], x0[:102])
+    longer = all_pairs(bsc.CollisionMesh(np.concatenate([a[:60], b[:60]]), 122), x0[:122], x0[:122])
     for found, short, long in zip([vertex_face, edge_edge, edge_face], expected, longer, strict=True):
         assert len(found) == len(set(found))
         assert len(found) == len(long) + (n - 60) * (len(long) - len(short)) // 10
@@ -215,7 +211,7 @@ def test_a_traversal_with_another_visit():
 
 @pytest.mark.parametrize("broken", [0, 12])
 def test_faces_that_an_axis_separates_are_left_out(broken):
-    """Layers that fall together have the same queued pairs, of fewer candidates, also next to what is not finite."""
+    """Layers that fall together have few pairs of faces, and all their candidates, also next to what is not finite."""
     random = np.random.default_rng(broken)
     x, faces = grid(8)
     layers = np.arange(12)[:, None, None]
@@ -224,12 +220,21 @@ def test_faces_that_an_axis_separates_are_left_out(broken):
     faces = (faces + len(x) * layers).reshape(-1, 3)
     x1[random.choice(len(x1), broken, replace=False), 1] = np.nan
     mesh = bsc.CollisionMesh(faces, len(x0))
-    candidates, pairs = find_pairs(BroadPhaseHierarchy, mesh, x0, x1)
-    fewer, same = find_pairs(functools.partial(BroadPhaseHierarchy, counts_candidates=False), mesh, x0, x1)
-    for found, expected in zip(same, pairs, strict=True):
-        np.testing.assert_array_equal(found, expected)
+    found, count = find_pairs(BroadPhaseHierarchy, mesh, x0, x1), wp.zeros(1, dtype=wp.int64, device=mesh.device)
+    for pairs, expected in zip(found, all_pairs(mesh, x0, x1), strict=True):
+        assert pairs == expected
         assert len(expected) > 1000
-    assert sum(fewer) < 0.7 * sum(candidates)
+    x0, x1 = (wp.array(x, dtype=wp.vec3d, device=mesh.device) for x in (x0, x1))
+    counts = []
+    for keep_separated in (False, True):
+        count.zero_()
+        finder = BroadPhaseHierarchy(mesh, count, capacity=10)
+        queues = [
+            wp.zeros(size, dtype=dtype, device=mesh.device) for size, dtype in [(len(Count), wp.int64), (1, wp.vec2i)]
+        ]
+        finder.pair_elements(x0, x1, *queues, *queues, keep_separated=keep_separated)
+        counts.append(int(count.numpy()[0]))
+    assert counts[0] < 0.7 * counts[1]
 
 
 @pytest.mark.parametrize("dtype", [wp.vec3, wp.vec3d])
@@ -257,13 +262,13 @@ def test_elements_without_finite_positions_have_no_pairs(broad_phase, dtype, at_
     x0, x1, faces = crumpled(1, 12)
     mesh = bsc.CollisionMesh(faces, len(x0))
     x0, x1 = x0.astype(dtype), x1.astype(dtype)
-    _, everything = all_pairs(mesh, x0, x1)
+    everything = all_pairs(mesh, x0, x1)
     broken = random.random(len(x0)) < 0.05
     values = random.choice(np.array([np.nan, np.inf, -np.inf], dtype=dtype), (len(x0), 3))
     some = broken[:, None] & (random.random((len(x0), 3)) < 0.5)
     some[broken, 0] |= ~some[broken].any(axis=1)
     wrong = [np.where(some & (at_end == bool(i)), values, x) for i, x in enumerate((x0, x1))]
-    _, found = find_pairs(broad_phase, mesh, *wrong)
+    found = find_pairs(broad_phase, mesh, *wrong)
     of_faces, of_edges, of_vertices = broken[faces].any(axis=1), broken[mesh.edges].any(axis=1), broken
     kinds = [(of_vertices, of_faces, True), (of_edges, of_edges, True), (of_edges, of_faces, not at_end)]
     for pairs, expected, (first, second, moves) in zip(found, everything, kinds, strict=True):

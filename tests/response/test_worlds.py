@@ -186,7 +186,7 @@ def test_nothing_is_found_in_a_world_that_takes_no_part(stage, device):
             state, end = end, state
         assert hits > 0
         solver.reset(state)
-        queued.append(solver._work.detector.counters.read().edge_edge.candidates)
+        queued.append(solver._work.detector.counters.read().edge_edge.queued)
     assert queued[1] <= queued[0] // 3
 
 
@@ -363,7 +363,7 @@ def test_a_graph_reads_the_mask_of_each_replay(device):
         if replay == 2:
             for i in range(2):
                 solvers[i].reset(states[i][0], wp.array([False, True, False, False], dtype=bool, device=device))
-    assert moved > 3 and (filtered > 100).all()
+    assert moved > 3 and (filtered > 30).all()
 
 
 def cloth_on_a_sphere(turn, height):

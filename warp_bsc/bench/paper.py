@@ -131,7 +131,7 @@ class SceneBenchmark:
         triangles: Number of triangles in the largest mesh of its intervals.
         precision: Bits of a coordinate, 32 or 64.
         intervals: The numbers of the intervals that were measured.
-        candidates: Number of their candidate pairs.
+        overlapping: Number of their pairs of elements that share no vertex and whose swept boxes overlap.
         queries: Number of these pairs that are measured, by kind.
         collisions: Number of checked queries that collide.
         unsure: Number of queries that floating point could not certify.
@@ -150,7 +150,7 @@ class SceneBenchmark:
     triangles: int
     precision: int
     intervals: list[int]
-    candidates: int
+    overlapping: int
     queries: dict[PairKind, int]
     collisions: int
     unsure: int
@@ -199,12 +199,12 @@ def benchmark_scene(
         progress: Called before each part with its name.
 
     Raises:
-        ValueError: If there are no candidate pairs.
+        ValueError: If no swept boxes overlap.
     """
     progress("candidate pairs")
-    queries, candidates = _gather(intervals, places[-1].device, effort.queries)
-    if not candidates:
-        raise ValueError(f"{name}: no candidate pairs: no swept boxes overlap in the intervals measured")
+    queries, overlapping = _gather(intervals, places[-1].device, effort.queries)
+    if not overlapping:
+        raise ValueError(f"{name}: no pairs: no swept boxes overlap in the intervals measured")
 
     found_hits, unsure, disagreeing = _find_hits(queries, places, progress)
     progress("the truth")
@@ -231,7 +231,7 @@ def benchmark_scene(
         triangles=max(len(scene.faces) for scene in scenes),
         precision=8 * scenes[0].x0.itemsize,
         intervals=[number for number, _ in intervals],
-        candidates=candidates,
+        overlapping=overlapping,
         queries={kind: len(found) for kind, found in queries.items()},
         collisions=collisions,
         unsure=unsure,
@@ -250,15 +250,15 @@ def benchmark_scene(
 def _gather(
     intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, max_queries: int
 ) -> tuple[dict[PairKind, Queries], int]:
-    """Returns the candidate pairs of some intervals by kind, or a random part of them; and their number."""
+    """Returns the overlapping pairs of some intervals by kind, or a random part of them; and their number."""
     random = np.random.default_rng(SEED)
     x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
     elements, pairs = ({kind: [] for kind in PairKind} for _ in range(2))
-    vertices = candidates = 0
+    vertices = overlapping = 0
     for _, scene in intervals:
-        found = _find_candidates(scene, device)
+        found = _find_overlapping(scene, device)
         number = sum(len(kind_pairs) for _, kind_pairs in found.values())
-        candidates += number
+        overlapping += number
         share = min(1.0, max_queries / len(intervals) / max(number, 1))
         for kind, (kind_elements, kind_pairs) in found.items():
             before = [
@@ -273,15 +273,15 @@ def _gather(
     queries = {
         kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in PairKind
     }
-    return {kind: found for kind, found in queries.items() if len(found)}, candidates
+    return {kind: found for kind, found in queries.items() if len(found)}, overlapping
 
 
-def _find_candidates(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
-    """Returns the vertices of the elements, and the candidate pairs, by kind."""
+def _find_overlapping(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
+    """Returns the vertices of the elements, and the pairs whose swept boxes overlap, by kind."""
     mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
     pipeline = DetectionPipeline(mesh)
     x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))
-    retry_until_fits(lambda: pipeline.find_candidates(x0, x1), pipeline, mesh.device)
+    retry_until_fits(lambda: pipeline.find_overlapping(x0, x1), pipeline, mesh.device)
     queued = pipeline.counts.vertex_face.queued, pipeline.counts.edge_edge.queued
     found = {}
     for narrow_phase, count, elements in zip(pipeline.narrow_phases, queued, (mesh.faces, mesh.edges), strict=True):

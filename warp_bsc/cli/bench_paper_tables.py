@@ -68,14 +68,14 @@ def _print_queries(console: Console, rows: _Rows) -> None:
         "Scene",
         "Triangles",
         "Intervals",
-        "Candidates",
+        "Overlapping",
         "Queries",
         "Collisions",
         "Unsure",
-        caption="Candidates: pairs whose swept boxes overlap. Queries: a random part of them, measured below.",
+        caption="Overlapping: pairs whose swept boxes overlap. Queries: a random part of them, measured below.",
     )
     for name, found in rows:
-        numbers = [found.triangles, len(found.intervals), found.candidates, sum(found.queries.values())]
+        numbers = [found.triangles, len(found.intervals), found.overlapping, sum(found.queries.values())]
         table.add_row(name, *(f"{number:,}" for number in [*numbers, found.collisions, found.unsure]))
     console.print(table)
     console.print()
@@ -209,7 +209,7 @@ def _scene_to_dict(found: SceneBenchmark) -> dict[str, Any]:
         "triangles": found.triangles,
         "precision": found.precision,
         "intervals": found.intervals,
-        "candidates": found.candidates,
+        "overlapping": found.overlapping,
         "queries": {kind.label: number for kind, number in found.queries.items()},
         "collisions": found.collisions,
         "unsure": found.unsure,

@@ -15,7 +15,9 @@ __all__ = ["BroadPhase", "make_broad_phase"]
 
 
 class BroadPhase(Protocol):
-    """Finds the candidates of a mesh: pairs of elements that share no vertex and whose swept boxes overlap.
+    """Finds the candidates of a mesh: pairs of elements that share no vertex, and whose swept boxes overlap.
+
+    Of these, pairs that a coordinate axis separates at the start and at the end, on the same side, are left out.
 
     A run only enqueues. Counts stay on the device, and the caller provides the queues of the results. Boxes are in
     single precision, rounded so that no overlap is missed. An element with a position that is not finite has no pairs.
@@ -59,7 +61,7 @@ class BroadPhase(Protocol):
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts the candidates, and enqueues those that no coordinate axis separates at the start and at the end.
+        """Enqueues the candidates.
 
         Args:
             x0: Positions at the start, array of vec3 or vec3d.
@@ -70,7 +72,7 @@ class BroadPhase(Protocol):
             edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. Pairs without one of
                 these vertices may be found as well.
-            keep_separated: Whether to enqueue all candidates.
+            keep_separated: Whether to enqueue the pairs that an axis separates, too.
         """
         ...
 
@@ -86,7 +88,7 @@ class BroadPhase(Protocol):
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts and enqueues the candidates of points with the edges that no face has, and with points.
+        """Enqueues the candidates of points with the edges that no face has, and with points.
 
         Call it after :meth:`pair_elements`, with the same arguments but queues for (point, edge) and (point, point),
         the smaller first. A mesh without points has none.
@@ -114,7 +116,6 @@ def make_broad_phase(
     not_finite: wp.array | None = None,
     checked_vertices: np.ndarray | None = None,
     padding: wp.array | None = None,
-    counts_candidates: bool = True,
 ) -> BroadPhase:
     """Returns the broad phase for a mesh's device.
 
@@ -127,8 +128,6 @@ def make_broad_phase(
         checked_vertices: Indices of the vertices that are counted; None for all.
         padding: How far the box of each vertex reaches beyond it, those of an edge or a face as far as the largest of
             its vertices, array of float64; None for boxes without a padding.
-        counts_candidates: Whether all candidates are counted. If not, a GPU leaves out those of faces that an axis
-            separates, without looking at them.
     """
     if mesh.device.is_cpu:
         return BroadPhaseSimd(mesh, count, padding=padding)
@@ -142,5 +141,4 @@ def make_broad_phase(
         not_finite=not_finite,
         checked=checked,
         padding=padding,
-        counts_candidates=counts_candidates,
     )

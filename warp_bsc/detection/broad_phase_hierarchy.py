@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..kernels.pipeline.boxes import read_box
-from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
+from ..kernels.pipeline.hierarchy import WIDTH, bits_of_warp, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
 from .element_pairs import are_apart, pair_edges_with_faces, pair_elements, pair_points
 from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
@@ -36,18 +36,18 @@ class _FacePairs:
 def _not_apart(place: int, first: int, found: wp.uint32, boxes: wp.array2d[wp.vec3]) -> wp.uint32:
     """Returns which of the faces at some places no axis separates from another at the start and at the end.
 
-    The box of a face with a position that is not finite is empty, and says nothing of the elements that it represents.
+    All threads of a warp go through the same faces, so that each of these is read once for all. The box of a face with
+    a position that is not finite is empty, and says nothing of the elements that it represents.
     """
     box = read_box(boxes, place)
-    left = found
-    if box[0][0] > box[1][0]:
-        left = wp.uint32(0)
+    has_box = box[0][0] <= box[1][0]
+    left = bits_of_warp(found)
     while left != wp.uint32(0):
         bit = left & (~left + wp.uint32(1))
         left = left ^ bit
         other = read_box(boxes, first + lowest_set_bit(bit))
-        if other[0][0] <= other[1][0] and are_apart(box, other):
-            found = found ^ bit
+        if has_box and other[0][0] <= other[1][0] and are_apart(box, other):
+            found = found & ~bit
     return found
 
 
@@ -78,7 +78,6 @@ class BroadPhaseHierarchy:
         not_finite: wp.array | None = None,
         checked: wp.array | None = None,
         padding: wp.array | None = None,
-        counts_candidates: bool = True,
     ):
         """Allocates the hierarchy and the queue for pairs of faces.
 
@@ -90,12 +89,9 @@ class BroadPhaseHierarchy:
                 None to count none.
             checked: Nonzero for each vertex that is counted, array of int; None for all.
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
-            counts_candidates: Whether all candidates are counted, or only those of faces that no axis separates. Pairs
-                that filters leave out are always counted.
         """
         self.lock = threading.RLock()
         self._padding = padding
-        self._leaves_out_separated = not counts_candidates and not mesh.pair_filter.group
         self._device = device = mesh.device
         self._count = count
         self._not_finite, self._checked = not_finite, checked
@@ -142,8 +138,8 @@ class BroadPhaseHierarchy:
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts the candidates, and enqueues those that no coordinate axis separates."""
-        self._pair_faces(x0, x1, changed, keep_separated or not self._leaves_out_separated)
+        """Enqueues the candidates."""
+        self._pair_faces(x0, x1, changed, keep_separated)
         queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
         self._launch_over_pairs(pair_elements, keep_separated, *queues)
 
@@ -159,7 +155,7 @@ class BroadPhaseHierarchy:
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts and enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
+        """Enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
         queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
         self._launch_over_pairs(pair_points, keep_separated, *queues)
 
@@ -190,7 +186,7 @@ class BroadPhaseHierarchy:
         launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
     def _pair_faces(self, x0, x1, changed=None, keep_separated=True):
-        """Enqueues the pairs of faces whose swept boxes overlap, each once."""
+        """Enqueues the pairs of faces whose swept boxes overlap, each once, or those that no axis separates."""
         self.fit(x0, x1, changed)
         queue = _FacePairs()
         queue.pairs, queue.count = self._face_pairs, self._count

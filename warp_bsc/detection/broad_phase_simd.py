@@ -74,7 +74,7 @@ class BroadPhaseSimd:
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts the candidates, and enqueues those that no coordinate axis separates."""
+        """Enqueues the candidates."""
         trees = [self._vertices, self._edges, self._faces]
         if self._edges_of_faces:
             trees.append(self._edges_of_faces)
@@ -97,7 +97,7 @@ class BroadPhaseSimd:
         changed: wp.array | None = None,
         keep_separated: bool = False,
     ) -> None:
-        """Counts and enqueues the candidates of points with edges that no face has, and with points."""
+        """Enqueues the candidates of points with edges that no face has, and with points."""
         if self._points is None or self._free_edges is None:
             return
         self._build([self._points, self._free_edges], x0, x1, changed)

@@ -20,7 +20,8 @@ class StageCounts:
     """Numbers of pairs of one kind that entered or left each stage.
 
     Attributes:
-        candidates: Pairs that share no vertex and whose swept boxes overlap.
+        candidates: Pairs that share no vertex, whose swept boxes overlap, and that no coordinate axis separates at the
+            start and at the end, on the same side.
         survivors: Candidates that no cull decides.
         free: Candidates that are certified free, by the culls or later.
         hits: Candidates certified to collide.
@@ -28,8 +29,7 @@ class StageCounts:
         exact: Candidates that exact arithmetic decided on the device, or whose time of impact it found there.
         host: Candidates whose exponents are too far apart for that, or that may come within a minimum distance only for
             a moment of the step. The host decides them, except in a CUDA graph, where they stay unsure.
-        filtered: Pairs that share no vertex and whose swept boxes overlap, but that groups and masks of the mesh leave
-            out. They are no candidates.
+        filtered: Pairs that would be candidates, but that groups and masks of the mesh leave out.
     """
 
     candidates: int = 0
@@ -45,9 +45,9 @@ class StageCounts:
     def of(cls, counts: PairCounts, *, exact: bool) -> "StageCounts":
         """Returns the numbers of one kind of pair from its counters; ``exact``: whether there was an exact stage."""
         return cls(
-            candidates=counts.candidates,
+            candidates=counts.queued,
             survivors=counts.survivors,
-            free=counts.candidates - counts.found,
+            free=counts.queued - counts.found,
             hits=counts.found - counts.unsure,
             unsure=counts.unsure,
             exact=counts.for_exact - counts.too_wide_8 if exact else 0,

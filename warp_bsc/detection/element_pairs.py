@@ -19,7 +19,6 @@ __all__ = [
     "pair_points",
 ]
 
-_CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _FILTERED = wp.constant(int(Count.FILTERED))
 _QUEUED = wp.constant(int(Count.QUEUED))
 
@@ -43,6 +42,12 @@ def _overlap(a: BoxRows, b: BoxRows):
 def are_apart(a: BoxRows, b: BoxRows) -> bool:
     """Returns whether an axis separates two boxes at the start and at the end, on one side."""
     return boxes_apart(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3])
+
+
+@wp.func
+def _meet(a: BoxRows, b: BoxRows, keep_separated: bool) -> bool:
+    """Returns whether two boxes overlap over the time of the motion, and no axis separates them at both ends."""
+    return _overlap(a, b) and (keep_separated or not are_apart(a, b))
 
 
 @wp.func
@@ -82,8 +87,8 @@ def _count_filtered(mesh: FaceHierarchy, place: int, count: int):
 def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
 
-    Those that no axis separates, or all with ``keep_separated``, are bits 3 to 5 as well. Those that a filter leaves
-    out are bits 6 to 8 instead.
+    Those that an axis separates are left out, unless ``keep_separated``. Those that a filter leaves out are bits 3 to 5
+    instead.
     """
     owned = mesh.owned[face]
     found = int(0)
@@ -95,13 +100,11 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
         if owns_vertex(owned, corner):
             box = read_box(mesh.vertex_boxes, 3 * face + corner)
             vertex = mesh.faces[face, corner]
-            if _overlap(box, other_box) and not _has_vertex(mesh.faces, other, vertex):
+            if _meet(box, other_box, keep_separated) and not _has_vertex(mesh.faces, other, vertex):
                 if is_filtered(mesh.pair_filter, wp.vec3i(vertex), _corners(mesh.faces, other)):
-                    found = found | (64 << corner)
+                    found = found | (8 << corner)
                 else:
                     found = found | (1 << corner)
-                    if keep_separated or not are_apart(box, other_box):
-                        found = found | (8 << corner)
     return found
 
 
@@ -109,8 +112,8 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
 def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
     """Returns which edges that two faces own have overlapping boxes: bit 3 i + j for sides i and j.
 
-    Those that no axis separates, or all with ``keep_separated``, are bits 9 to 17 as well. Those that a filter leaves
-    out are bits 18 to 26 instead.
+    Those that an axis separates are left out, unless ``keep_separated``. Those that a filter leaves out are bits 9 to
+    17 instead.
     """
     owned = mesh.owned[face]
     other_owned = mesh.owned[other]
@@ -130,14 +133,12 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
                         d = mesh.faces[other, _next(other_side)]
                         if a != c and a != d and b != c and b != d:
                             other_box = read_box(mesh.edge_boxes, 3 * other + other_side)
-                            if _overlap(box, other_box):
+                            if _meet(box, other_box, keep_separated):
                                 bit = 3 * side + other_side
                                 if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), wp.vec3i(c, d, d)):
-                                    found = found | (262144 << bit)
+                                    found = found | (512 << bit)
                                 else:
                                     found = found | (1 << bit)
-                                    if keep_separated or not are_apart(box, other_box):
-                                        found = found | (512 << bit)
     return found
 
 
@@ -155,34 +156,28 @@ def _pair_elements(
     edge_edge_counts: wp.array[wp.int64],
     edge_edge: wp.array[wp.vec2i],
 ):
-    """Counts and enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
+    """Enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
     found = wp.uint64(0)
-    candidates = wp.vec2i()  # vertex-face, edge-edge
+    queued = wp.vec2i()  # vertex-face, edge-edge
     filtered = wp.vec2i()
-    queued = wp.vec2i()
     for turn in range(turns):
         at = first + turn * _WIDTH
         if is_filled(at, face_pairs, face_pair_count, 0):
             face = face_pairs[at][0]
             other = face_pairs[at][1]
             vertices = overlapping_vertices(mesh, face, other, keep_separated)
-            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 9)
+            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
             edges = overlapping_edges(mesh, face, other, keep_separated)
-            candidates[0] += count_set_bits(wp.uint32(vertices & 0o7007))
-            candidates[1] += count_set_bits(wp.uint32(edges & 511))
-            filtered_vertices = count_set_bits(wp.uint32(vertices & 0o700700))
-            filtered_edges = count_set_bits(wp.uint32(edges >> 18))
+            filtered_vertices = count_set_bits(wp.uint32(vertices & 0o7070))
+            filtered_edges = count_set_bits(wp.uint32(edges >> 9))
             filtered[0] += filtered_vertices
             filtered[1] += filtered_edges
             _count_filtered(mesh, face, filtered_vertices + filtered_edges)
-            # of the rest only what no axis separates
-            vertices = ((vertices >> 3) & 7) | ((vertices >> 9) & 56)
-            edges = (edges >> 9) & 511
+            vertices = (vertices & 7) | ((vertices >> 3) & 56)
+            edges = edges & 511
             queued[0] += count_set_bits(wp.uint32(vertices))
             queued[1] += count_set_bits(wp.uint32(edges))
             found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
-    raise_count(vertex_face_counts, _CANDIDATES, candidates[0])
-    raise_count(edge_edge_counts, _CANDIDATES, candidates[1])
     if mesh.pair_filter.group:
         raise_count(vertex_face_counts, _FILTERED, filtered[0])
         raise_count(edge_edge_counts, _FILTERED, filtered[1])
@@ -222,7 +217,7 @@ def pair_elements(
     edge_edge: wp.array[wp.vec2i],
     threads: int,
 ):
-    """Counts the candidates of pairs of faces, and enqueues those that no axis separates.
+    """Enqueues the candidates of pairs of faces.
 
     A thread first finds all its pairs, then takes slots for them: where pairs of faces are many, a warp makes one
     atomic operation for 128 of them. Atomic operations on one address are serialized, so that fewer are faster.
@@ -307,15 +302,13 @@ def _pair_point(
     if mesh.order[place] >= mesh.point_start and cell >= mesh.face_count and cell < mesh.point_start:
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.edge_boxes, 3 * other)
-        if _overlap(box, other_box):
+        if _meet(box, other_box, keep_separated):
             point = mesh.faces[place, 0]
             if is_filtered(mesh.pair_filter, wp.vec3i(point), _corners(mesh.faces, other)):
                 take_slot(vertex_edge_counts, _FILTERED)
                 _count_filtered(mesh, place, 1)
                 return
-            take_slot(vertex_edge_counts, _CANDIDATES)
-            if keep_separated or not are_apart(box, other_box):
-                append(wp.vec2i(point, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
+            append(wp.vec2i(point, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
 
 
 @wp.func
@@ -332,16 +325,14 @@ def _pair_two_points(
     if mesh.order[place] >= mesh.point_start and mesh.order[other] >= mesh.point_start and place != other:
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.vertex_boxes, 3 * other)
-        if _overlap(box, other_box):
+        if _meet(box, other_box, keep_separated):
             p = mesh.faces[place, 0]
             q = mesh.faces[other, 0]
             if is_filtered(mesh.pair_filter, wp.vec3i(p), wp.vec3i(q)):
                 take_slot(vertex_vertex_counts, _FILTERED)
                 _count_filtered(mesh, place, 1)
                 return
-            take_slot(vertex_vertex_counts, _CANDIDATES)
-            if keep_separated or not are_apart(box, other_box):
-                append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)
+            append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -358,7 +349,7 @@ def pair_points(
     vertex_vertex: wp.array[wp.vec2i],
     threads: int,
 ):
-    """Counts and enqueues the points among two cells, with an edge that no face has or with another point."""
+    """Enqueues the points among two cells, with an edge that no face has or with another point."""
     for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
         place = face_pairs[i][0]
         other = face_pairs[i][1]

@@ -114,7 +114,6 @@ class DetectionPipeline:
         min_distances: "MinDistances | None" = None,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
-        counts_candidates: bool = True,
     ):
         """Allocates the buffers on the mesh's device.
 
@@ -131,8 +130,6 @@ class DetectionPipeline:
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`MIN_CAPACITY` together;
                 twice that for pairs of faces, a half for survivors, an eighth for contacts. A large capacity costs
                 memory, but no time. Default: eight pairs of faces, one vertex-face and two edge-edge pairs.
-            counts_candidates: Whether all candidates are counted. If not, a GPU does not look at those of faces that an
-                axis separates, such as layers that move together, and only counts others.
 
         Raises:
             ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
@@ -174,7 +171,6 @@ class DetectionPipeline:
             not_finite=self.counters.not_finite,
             checked_vertices=mesh.vertices if only_used_vertices else None,
             padding=padding,
-            counts_candidates=counts_candidates,
         )
         self.vertex_face = NarrowPhase(
             PairKind.VERTEX_FACE, self.counters.vertex_face, vertex_face, elements=(vertices, faces)
@@ -261,8 +257,8 @@ class DetectionPipeline:
         """The broad phase, whose boxes are those of the last run."""
         return self._broad_phase
 
-    def find_candidates(self, x0: wp.array, x1: wp.array) -> None:
-        """Enqueues all candidates of a motion in the queues of the narrow phases, which do not run.
+    def find_overlapping(self, x0: wp.array, x1: wp.array) -> None:
+        """Enqueues all pairs whose swept boxes overlap in the queues of the narrow phases, which do not run.
 
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.

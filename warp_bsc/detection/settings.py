@@ -117,9 +117,8 @@ class Count(enum.IntEnum):
     """Indices of the counts of one kind of pair in an array, in the order of the stages.
 
     Attributes:
-        CANDIDATES: Pairs that share no vertex and whose swept boxes overlap.
-        QUEUED: Pairs enqueued for the narrow phase: candidates that no coordinate axis separates at the start and at
-            the end, on the same side.
+        QUEUED: Pairs enqueued for the narrow phase, the candidates: they share no vertex, their swept boxes overlap,
+            and no coordinate axis separates them at the start and at the end, on the same side.
         SURVIVORS: Queued pairs that no cull decides.
         CONTACTS: Survivors that classification, or advancement with a minimum distance, does not certify free.
         FOUND: Contacts that are not certified free when their time of impact is sought either.
@@ -134,26 +133,24 @@ class Count(enum.IntEnum):
         FILTERED: Pairs that would be candidates, but are left out by groups and masks.
     """
 
-    CANDIDATES = 0
-    QUEUED = 1
-    SURVIVORS = 2
-    CONTACTS = 3
-    FOUND = 4
-    UNSURE = 5
-    FOR_EXACT = 6
-    TOO_WIDE_1 = 7
-    TOO_WIDE_2 = 8
-    TOO_WIDE_8 = 9
-    REFUTED = 10
-    SUBDIVIDED = 11
-    FILTERED = 12
+    QUEUED = 0
+    SURVIVORS = 1
+    CONTACTS = 2
+    FOUND = 3
+    UNSURE = 4
+    FOR_EXACT = 5
+    TOO_WIDE_1 = 6
+    TOO_WIDE_2 = 7
+    TOO_WIDE_8 = 8
+    REFUTED = 9
+    SUBDIVIDED = 10
+    FILTERED = 11
 
 
 @dataclass(frozen=True)
 class PairCounts:
     """Counts of one kind of pair, or capacities for them, on the host; the attributes are those of :class:`Count`."""
 
-    candidates: int = 0
     queued: int = 0
     survivors: int = 0
     contacts: int = 0

@@ -19,7 +19,6 @@ __all__ = ["WideTree", "hilbert_transpose", "sort_trees"]
 
 _CODE_BITS = 10
 """Bits of a Hilbert code an axis."""
-_CANDIDATES = wp.constant(int(Count.CANDIDATES))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _FILTERED = wp.constant(int(Count.FILTERED))
 _LOOSE = 1.5
@@ -184,7 +183,6 @@ def _pair_packets(
         at_end,
         counts,
         filtered_of_worlds,
-        _CANDIDATES,
         _QUEUED,
         _FILTERED,
         pairs,
@@ -342,7 +340,7 @@ class WideTree:
             counts: By :class:`Count`, array of int64.
             pairs: Queue of the candidates, array of vec2i.
             ordered: Whether the smaller number comes first; else that of this tree does.
-            keep_separated: Whether to enqueue candidates that a coordinate axis separates, too.
+            keep_separated: Whether to enqueue overlapping pairs that a coordinate axis separates, too.
             at_end: Whether to enqueue the pairs that overlap at the end of the motion.
             filtered_of_worlds: Counts of the pairs that are left out, by world, array of int64; None for none.
         """

@@ -193,5 +193,5 @@ def _collect(work, ends):
         queues = queues_of(detector, candidates=True)[:2]
         work.launch_over_entries(collect_proximities, [work.step, *queues, work.nearest, work.status])
 
-    retry_until_fits(lambda: detector.find_candidates(x0, ends), detector, work.device)
+    retry_until_fits(lambda: detector.find_overlapping(x0, ends), detector, work.device)
     retry_until_fits(collect, work, work.device)

@@ -125,9 +125,7 @@ class Workspace:
         self.particle_count, device = mesh.model.particle_count, mesh.device
         self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self.detector = DetectionPipeline(
-            mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances, counts_candidates=False
-        )
+        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
         self.crossing_candidates = CrossingCandidates(mesh)
         self.step = step = Step()
         step.mesh = mesh.connectivity
