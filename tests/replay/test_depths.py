@@ -87,7 +87,7 @@ def test_where_nothing_is_divided_the_plane_counts(tmp_path):
 
 
 def test_parts_inside_and_touching(tmp_path):
-    small = trimesh.creation.icosphere(subdivisions=1, radius=0.2).vertices + (0.5, 0, 0)
+    small = np.array(trimesh.creation.icosphere(subdivisions=1, radius=0.2).vertices) + np.array([0.5, 0.0, 0.0])
     outer = trimesh.creation.box((4.0, 4.0, 4.0))
     touching = [(2.0, 0.1, 0.1), (3.0, 0.0, 0.0), (3.0, 0.3, 0.0)], [(0, 1, 2)]
     inner = small, trimesh.creation.icosphere(subdivisions=1).faces

@@ -260,7 +260,7 @@ def _find_sides(shape: _Shape, crossings: _Crossings, left_out: np.ndarray) -> _
     # Each region twice, on either side: a crossing connects one region on one side with the other one on the other.
     links = np.concatenate([np.stack([first, second + count], axis=1), np.stack([first + count, second], axis=1)])
     sides = connect_cells(links, 2 * count)
-    one, other = sides[:count], sides[count:]
+    one, other = np.split(sides, 2)
     has_sides = np.zeros(count, dtype=bool)
     has_sides[first] = has_sides[second] = True
     group = np.where(has_sides & (one != other), np.minimum(one, other), -1)
@@ -277,7 +277,7 @@ def _depth_behind(shape: _Shape, surface: _Surface, x: np.ndarray, crossings: _C
     sides = _find_sides(shape, crossings, at_border)
     group = np.where(at_border, -1, sides.group[sides.region])
     at_edges = float(crossings.near.max())
-    if (group < 0).all():
+    if group.max() < 0:
         return _Depth(None, at_edges)
     largest = np.zeros((len(sides.group) + 1, 2))
     np.maximum.at(largest, (group, sides.is_second[sides.region].astype(int)), distance)
@@ -293,7 +293,7 @@ def _depth_within(shape: _Shape, x: np.ndarray, crossings: _Crossings) -> _Depth
         return _Depth(None, 0.0)
     sides = _find_sides(shape, crossings, np.zeros(len(shape.vertices), dtype=bool))
     group, at_edges, depth = sides.group[sides.region], float(crossings.near.max()), 0.0
-    if (group < 0).all():
+    if group.max() < 0:
         return _Depth(None, at_edges)
     sizes = np.zeros((len(sides.group) + 1, 2), dtype=np.int64)
     np.add.at(sizes, (group, sides.is_second[sides.region].astype(int)), 1)
