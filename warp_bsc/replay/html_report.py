@@ -162,7 +162,8 @@ class ReportPage(RecordFile):
 
     def _largest_depths(self, times: int) -> Depths:
         """Returns the largest depth of each two meshes and the first time with it, of the intervals in the page."""
-        last = [(found.time, self._depth_finder.find(found)) for _, found in self._last if isinstance(found, SceneIntersections)]
+        at_end = [found for _, found in self._last if isinstance(found, SceneIntersections)]
+        last = [(found.time, self._depth_finder.find(found)) for found in at_end]
         largest: Depths = {}
         for time, depths in [*self._depths[:times], *last]:
             for meshes, depth in depths.items():

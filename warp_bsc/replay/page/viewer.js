@@ -52,7 +52,7 @@ function makeViewer() {
     if (data.near.length && !data.nothing) atEnds(nearAt, "pair", "within the clearance");
     const isEmpty = !shown;
     byId("viewer").querySelector(".controls").classList.toggle("idle", isEmpty);
-    if (shown?.outline) title += `; ${count(shown.faces.length / 3)} of ${count(shown.of)} triangles are shown around them, grey: an outline of all`;
+    if (shown?.outline) title += `; ${count(shown.faces.length / 3)} of ${count(shown.of)} triangles near them are shown, and a grey outline of all`;
     byId("viewer-title").textContent = title;
     if (isEmpty) {
       say(hitsIn(index) + atStart(index) + atStart(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
@@ -218,9 +218,9 @@ function makeViewer() {
   function drawMarks(parts, scale, pixel) {
     const end = state.time < 0.5 ? 0 : 1, marks = parts.marks[end], cuts = parts.cuts[end];
     // Large markers of many contacts would hide one another and the surfaces.
-    const number = parts.dots.count + marks.count;
-    const size = Math.max(number > 5000 ? 2.5 : 4, 15 - 2.2 * Math.log10(Math.max(1, number)) ** 1.4) * scale;
-    for (const [test, fade] of [[gl.GREATER, number > 5000 ? 0.12 : 0.45], [gl.LEQUAL, 1]]) {
+    const number = parts.dots.count + marks.count, isCrowded = number > 20000;
+    const size = Math.max(isCrowded ? 2.5 : 4, 15 - 2.2 * Math.log10(Math.max(1, number)) ** 1.4) * scale;
+    for (const [test, fade] of [[gl.GREATER, isCrowded ? 0.12 : 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
       set(lines, { pixel, time: 0, fade: test === gl.LEQUAL ? 1 : 0.45 });
       gl.vertexAttrib3fv(gl.getAttribLocation(lines, "color"), CURVE_COLOR); // cut curves have one colour
