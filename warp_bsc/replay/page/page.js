@@ -3,7 +3,7 @@
 
 // --- The state: the interval in the view, and the filters of the table. The address contains it after the #. ---
 
-const state = { interval: -1, prims: [], text: "", kind: "", only: false };
+const state = { interval: -1, prims: [], text: "", kind: "", only: false, isReady: false };
 const LAST = data.intervals.length - 1;
 const edgesAt = (index) => (data.rest[index] ? data.rest[index][1] + data.rest[index][2] : 0);
 const insideAt = (index) => (data.rest[index] ? data.rest[index][3] : 0);
@@ -24,6 +24,7 @@ function addressOf(interval, prims) {
 
 // Writes what is shown to the address: interval and filter, and camera and meshes of the view.
 function onView() {
+  if (!state.isReady) return; // the address is still to be read
   const parts = new URLSearchParams(addressOf(state.interval, state.prims).slice(1));
   if (viewer?.cameraPath()) parts.set("camera", viewer.cameraPath());
   addMeshStates(parts);
@@ -39,6 +40,7 @@ function readAddress() {
   const interval = Number(parts.get("interval") ?? -1);
   if (Number.isInteger(interval) && interval >= 0 && interval <= LAST) showInterval(interval);
   filterRows();
+  state.isReady = true;
   onView();
 }
 

@@ -5,7 +5,7 @@ class LongTable {
   // columns: {title, width, number, fill(cell, row), key(row)}; key returns a number or a text to sort by. Rows are shown
   // in the order in which they are given, which is that of the column `natural.index`; `natural.way` is -1 if it descends.
   constructor(parent, columns, rowHeight, select, natural = { index: 0, way: 1 }) {
-    Object.assign(this, { parent, columns, rowHeight, select, natural, rows: [], sorted: natural, selected: -1, drawn: null, given: [] });
+    Object.assign(this, { parent, columns, rowHeight, select, natural, rows: [], sorted: natural, selected: -1, drawn: null, given: [], isPrinting: false });
     const table = add(parent, "table");
     const head = add(add(table, "thead"), "tr");
     this.heads = columns.map((column, index) => {
@@ -18,7 +18,7 @@ class LongTable {
     this.markOrder();
     this.note = add(parent, "p", { class: "muted small print-only" });
     addEventListener("beforeprint", () => this.drawForPrint());
-    addEventListener("afterprint", () => this.refresh());
+    addEventListener("afterprint", () => { this.isPrinting = false; this.refresh(); });
     parent.addEventListener("scroll", () => this.draw());
     new ResizeObserver(() => this.draw()).observe(parent);
     this.body.addEventListener("click", (event) => {
@@ -86,12 +86,14 @@ class LongTable {
 
   // A print has the first rows only, and says so.
   drawForPrint() {
+    this.isPrinting = true;
     const shown = Math.min(this.rows.length, 50);
     this.body.replaceChildren(this.lines(0, shown));
     this.note.textContent = shown < this.rows.length ? `The first ${count(shown)} of ${count(this.rows.length)} rows.` : "";
   }
 
   draw() {
+    if (this.isPrinting) return; // which changes sizes
     const { parent, rows, rowHeight } = this;
     const top = Math.floor(parent.scrollTop / rowHeight), seen = Math.ceil(parent.clientHeight / rowHeight);
     // Visible rows stay in the document: a click needs its row until it ends.
