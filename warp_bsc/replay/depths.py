@@ -25,6 +25,7 @@ from .scene_intersections import SceneIntersections
 __all__ = ["DepthFinder"]
 
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
+_FIRST_REACH = 0.02  # part of the size of a mesh or a surface up to which vertices are searched first
 _SAME_POINT = 1e-6  # part of an edge within which it passes through two neighbouring faces at once: at their side
 
 
@@ -34,14 +35,23 @@ def find_closest(
     surface: wp.uint64,
     # in
     points: wp.array[wp.vec3],
+    reach: float,
     # out
     faces: wp.array[wp.int32],
     coordinates: wp.array[wp.vec3],
     distances: wp.array[wp.float32],
 ):
-    """Finds the face of a surface that is closest to each point, its closest point, barycentric, and the distance."""
+    """Finds the face of a surface that is closest to each point, its closest point, barycentric, and the distance.
+
+    The distance is infinite where it is larger than ``reach``.
+    """
     i = wp.tid()
-    query = wp.mesh_query_point_no_sign(surface, points[i], wp.inf)
+    query = wp.mesh_query_point_no_sign(surface, points[i], reach)
+    if not query.result:
+        faces[i] = 0
+        coordinates[i] = wp.vec3(1.0, 0.0, 0.0)
+        distances[i] = wp.inf
+        return
     faces[i] = query.face
     coordinates[i] = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
     distances[i] = wp.length(points[i] - wp.mesh_eval_position(surface, query.face, query.u, query.v))
@@ -170,6 +180,12 @@ class _Shape:
         return alone, vertices
 
 
+def _box(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the lowest and the highest corner of the box of some positions."""
+    columns = np.ascontiguousarray(places.T)  # faster to reduce
+    return columns.min(axis=1), columns.max(axis=1)
+
+
 class _Surface:
     """The surface of a mesh at one time, for distances from it."""
 
@@ -177,12 +193,27 @@ class _Surface:
         """Builds it of some faces, default all."""
         self._shape = shape
         self._faces = np.arange(len(shape.faces)) if faces is None else faces
-        points = wp.array(x[shape.vertices], dtype=wp.vec3, device="cpu")
+        places = x[shape.vertices]
+        self._low, self._high = _box(places)
+        points = wp.array(places, dtype=wp.vec3, device="cpu")
         corners = wp.array(shape.faces[self._faces].reshape(-1), dtype=int, device="cpu")
         self._mesh = wp.Mesh(points, corners)
 
-    def distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the distances of points, shape [n], and whether the closest point is on a border of the mesh."""
+    @property
+    def size(self) -> float:
+        """Diagonal of the mesh's box."""
+        return float(np.linalg.norm(self._high - self._low))
+
+    def may_be_near(self, points: np.ndarray, reach: float) -> np.ndarray:
+        """Returns which points are in the mesh's box, enlarged by a distance, shape [n]."""
+        columns = zip(points.T, self._low - reach, self._high + reach, strict=True)
+        return np.logical_and.reduce([(column >= low) & (column <= high) for column, low, high in columns])
+
+    def distances(self, points: np.ndarray, reach: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the distances of points, shape [n], and whether the closest point is on a border of the mesh.
+
+        Distances larger than ``reach`` are infinite.
+        """
         count = len(points)
         given = wp.array(points, dtype=wp.vec3, device="cpu")
         faces = wp.empty(count, dtype=int, device="cpu")
@@ -191,12 +222,13 @@ class _Surface:
             wp.empty(count, dtype=float, device="cpu"),
         )
         outputs = [faces, coordinates, distances]
-        launch(find_closest, count, inputs=[self._mesh.id, given], outputs=outputs, device="cpu")
+        launch(find_closest, count, inputs=[self._mesh.id, given, reach], outputs=outputs, device="cpu")
         sides, vertices = self._shape.borders
         face, on_side = self._faces[faces.numpy()], coordinates.numpy() < _ON_SIDE
         at_corner = on_side.sum(axis=1) == 2
         corner = self._shape.faces[face, np.argmin(on_side, axis=1)]
-        return distances.numpy(), np.where(at_corner, vertices[corner], (on_side & sides[face]).any(axis=1))
+        at_border = np.where(at_corner, vertices[corner], (on_side & sides[face]).any(axis=1))
+        return distances.numpy(), at_border & np.isfinite(distances.numpy())
 
 
 class _Crossings:
@@ -268,20 +300,41 @@ def _find_sides(shape: _Shape, crossings: _Crossings, left_out: np.ndarray) -> _
 
 
 def _depth_behind(shape: _Shape, surface: _Surface, x: np.ndarray, crossings: _Crossings) -> _Depth:
-    """Returns the depth of a mesh behind the surface of another one that its edges pass through."""
+    """Returns the depth of a mesh behind the surface of another one that its edges pass through.
+
+    Vertices are searched up to some distance from the surface, which grows until one side of each group is within it.
+    """
     if not len(crossings.odd):
         return _Depth(None, 0.0)
-    of_parts = np.isin(shape.parts, shape.parts[shape.edges[crossings.odd, 0]])
-    distance, at_border = np.zeros(len(of_parts)), np.zeros(len(of_parts), dtype=bool)
-    distance[of_parts], at_border[of_parts] = surface.distances(x[shape.vertices[of_parts]])
-    sides = _find_sides(shape, crossings, at_border)
-    group = np.where(at_border, -1, sides.group[sides.region])
     at_edges = float(crossings.near.max())
-    if group.max() < 0:
-        return _Depth(None, at_edges)
-    largest = np.zeros((len(sides.group) + 1, 2))
-    np.maximum.at(largest, (group, sides.is_second[sides.region].astype(int)), distance)
-    return _Depth(float(largest[:-1].min(axis=1).max()), at_edges)
+    places, of_parts = x[shape.vertices], np.isin(shape.parts, shape.parts[shape.edges[crossings.odd, 0]])
+    ends = places[shape.edges[crossings.odd]]
+    low, high = _box(places)
+    size = max(surface.size, float(np.linalg.norm(high - low)))
+    reach = max(2.0 * float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max()), _FIRST_REACH * size)
+    while True:
+        distance, at_border = np.full(len(places), np.inf), np.zeros(len(places), dtype=bool)
+        near = np.flatnonzero(of_parts & surface.may_be_near(places, reach))
+        distance[near], at_border[near] = surface.distances(places[near], reach)
+        is_far = distance == np.inf
+        sides = _find_sides(shape, crossings, at_border | is_far)
+        group, side = (
+            np.where(at_border | is_far, -1, sides.group[sides.region]),
+            sides.is_second[sides.region].astype(int),
+        )
+        if group.max() < 0:
+            return _Depth(None, at_edges)
+        largest = np.zeros((len(sides.group) + 1, 2))
+        np.maximum.at(largest, (group, side), np.where(is_far, 0.0, distance))
+        if is_far.any():
+            first, second = shape.edges.T
+            first, second = shape.edges[crossings.open & (is_far[first] != is_far[second])].T
+            beside = np.where(is_far[first], second, first)
+            largest[group[beside], side[beside]] = np.inf
+        depth = float(largest[:-1].min(axis=1).max())
+        if np.isfinite(depth):
+            return _Depth(depth, at_edges)
+        reach *= 4.0
 
 
 def _depth_within(shape: _Shape, x: np.ndarray, crossings: _Crossings) -> _Depth:

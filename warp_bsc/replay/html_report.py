@@ -77,6 +77,7 @@ class ReportPage(RecordFile):
         if self._center is None:
             x = interval.x0.astype(np.float64)
             self._center = (x.min(axis=0) + x.max(axis=0)) / 2 if len(x) else np.zeros(3)
+        center = self._center
         numbers = self._number_meshes(contacts)
         rows = _choose_rows(contacts, self._most_rows)
         rows = rows[np.argsort(contacts.toi[rows], kind="stable")]
@@ -92,7 +93,7 @@ class ReportPage(RecordFile):
         yield text + more
         positions = [contacts.position, *(found.position for found in (*at_rest, *near))]
         if index == 0 or sum(map(len, positions)):
-            yield from self._views.of(result, np.concatenate(positions), numbers, self._center)
+            yield from self._views.of(result, np.concatenate(positions), numbers, center)
         self._depths[index:] = [(interval.start, self._depth_finder.find(at_rest[0]) if at_rest else {})]
         self._rows[index:] = [(len(rows), rest_rows, near_rows)]
         self._last = [(name, found[1]) for name, found in (("rest", at_rest), ("near", near)) if found]

@@ -116,7 +116,8 @@ def _nothing_found(summary: Summary) -> str:
     checked += [f"{at_rest:,} {_plural('time', at_rest)}"] * bool(at_rest)
     text = (
         f"{sentence[:1].upper()}{sentence[1:]}: {' and '.join(checked)} of {len(scene.names):,} "
-        f"{_plural('mesh', len(scene.names), 'es')} and {scene.face_count:,} triangles were checked, {times}"
+        f"{_plural('mesh', len(scene.names), 'es')} and {scene.face_count:,} "
+        f"{_plural('triangle', scene.face_count)} were checked, {times}"
     )
     text += f", certified for {CERTIFIED_FOR}." if summary.certified else ", not certified: collisions may be missing."
     if not at_rest:
