@@ -204,6 +204,32 @@ def test_clean_scene_is_one_sentence(tmp_path, browser):
     assert browser.console == []
 
 
+def sentence_of(stage, *options, status=0):
+    return Page(replay(stage, *options, status=status)[3].read_text()).data["nothing"]
+
+
+def test_sentence_says_what_was_not_checked(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    add_mesh(stage, "/World/Falling", falling(0.25, -0.25))
+    assert sentence_of(stage) == ""
+    said = sentence_of(stage, "--ignore", "/World/Floor", "/World/Falling")
+    assert said.startswith("Nothing collides, nothing intersects: 1 interval and 2 times of 2 meshes and 3 triangles ")
+    assert said.endswith(
+        " Left out: 1 collision of ignored pairs. Only some pairs of meshes were checked, as options say."
+    )
+    said = sentence_of(stage, "--prims", "/World/Falling", "--no-intersections", "--method", "float")
+    assert said == (
+        "Nothing collides: 1 interval of 1 mesh and 1 triangle were checked, time 0 to 1, not certified: "
+        "collisions may be missing. Intersections at rest were not checked."
+    )
+    said = sentence_of(stage, "--prims", "/World/Falling", "--clearance", "0.1")
+    assert said.startswith("Nothing collides, nothing intersects, nothing is within 0.1 of another: ")
+    add_mesh(stage, "/World/Broken", {0: FALLING, 1: FALLING[:2]})
+    said = sentence_of(stage, "--exclude", "/World/Floor", status=4)
+    assert said.endswith(" Not checked: 1 part that cannot be read; see the notes.")
+
+
 def test_charts_without_bars_are_left_out(tmp_path, browser):
     browser.open(replay(falling_through_quads(tmp_path), "--no-intersections")[3])
     assert browser.value("document.querySelectorAll('#intervals svg').length") == 1

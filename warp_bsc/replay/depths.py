@@ -284,10 +284,10 @@ class _Sides(NamedTuple):
 
 def _find_sides(shape: _Shape, crossings: _Crossings, left_out: np.ndarray) -> _Sides:
     """Returns the sides of a surface that the vertices of a mesh are on; some vertices are left out."""
-    is_used = ~left_out[shape.edges].any(axis=1)
+    is_used: np.ndarray = ~left_out[shape.edges].any(axis=1)
     roots = connect_cells(shape.edges[crossings.open & is_used], len(shape.vertices))
-    regions, region = np.unique(roots, return_inverse=True)
-    region, count = region.reshape(-1), len(regions)
+    is_root = roots == np.arange(len(roots))
+    region, count = (np.cumsum(is_root) - 1)[roots], int(is_root.sum())
     first, second = region[shape.edges[crossings.odd[is_used[crossings.odd]]]].T
     # Each region twice, on either side: a crossing connects one region on one side with the other one on the other.
     links = np.concatenate([np.stack([first, second + count], axis=1), np.stack([first + count, second], axis=1)])

@@ -74,10 +74,10 @@ class ReportPage(RecordFile):
         """Yields the blocks of an interval: collisions, intersections and proximities at its start, and the view."""
         interval, contacts = result.contacts.interval, result.contacts
         index = interval.index
-        if self._center is None:
-            x = interval.x0.astype(np.float64)
-            self._center = (x.min(axis=0) + x.max(axis=0)) / 2 if len(x) else np.zeros(3)
         center = self._center
+        if center is None:
+            x = interval.x0.astype(np.float64)
+            center = self._center = (x.min(axis=0) + x.max(axis=0)) / 2 if len(x) else np.zeros(3)
         numbers = self._number_meshes(contacts)
         rows = _choose_rows(contacts, self._most_rows)
         rows = rows[np.argsort(contacts.toi[rows], kind="stable")]

@@ -106,6 +106,8 @@ def _nothing_found(summary: Summary) -> str:
     found = summary.hits or any(at.pairs for at in summary.proximities)
     if found or not summary.is_complete or not all(at.is_empty for at in summary.intersections):
         return ""
+    if summary.scene.is_still and not summary.intersections:
+        return ""  # nothing was checked
     scene, at_rest = summary.scene, len(summary.intersections)
     what = ["Nothing collides"] * (not scene.is_still) + ["nothing intersects"] * bool(at_rest)
     if summary.clearance is not None:
@@ -123,7 +125,12 @@ def _nothing_found(summary: Summary) -> str:
     if not at_rest:
         text += " Intersections at rest were not checked."
     if hits := sum(hits for _, hits in summary.ignored):
-        text += f" Left out: {hits:,} collisions of ignored pairs."
+        text += f" Left out: {hits:,} {_plural('collision', hits)} of ignored pairs."
+    if parts := len(scene.left_out):
+        text += f" Not checked: {parts:,} {_plural('part', parts)} that cannot be read; see the notes."
+    selection = scene.selection
+    if selection.between or selection.ignore or selection.ignored_names or not selection.self_collisions:
+        text += " Only some pairs of meshes were checked, as options say."
     return text
 
 
