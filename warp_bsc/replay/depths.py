@@ -284,7 +284,7 @@ class _Sides(NamedTuple):
 
 def _find_sides(shape: _Shape, crossings: _Crossings, left_out: np.ndarray) -> _Sides:
     """Returns the sides of a surface that the vertices of a mesh are on; some vertices are left out."""
-    is_used: np.ndarray = ~left_out[shape.edges].any(axis=1)
+    is_used = ~(left_out[shape.edges[:, 0]] | left_out[shape.edges[:, 1]])
     roots = connect_cells(shape.edges[crossings.open & is_used], len(shape.vertices))
     is_root = roots == np.arange(len(roots))
     region, count = (np.cumsum(is_root) - 1)[roots], int(is_root.sum())
