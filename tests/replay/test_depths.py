@@ -66,8 +66,12 @@ def test_needle_through_a_sheet(tmp_path):
 
 
 def test_fin_through_a_sheet(tmp_path):
-    """The sheet extends far on both sides of the fin: the fin is what would have to move."""
-    fin = [(0.3, 0.05, -0.25), (0.3, 0.05, 0.5), (3.0, 0.05, 0.5)], [(0, 1, 2)]
+    """The sheet extends far on both sides of the fin: the fin is what would have to move.
+
+    Its end is beyond the sheet, around which its edges connect both sides.
+    """
+    corners = [(x, 0.05, z) for z in (-0.25, -0.1, 0.1, 0.5) for x in (0.3, 3.0)]
+    fin = corners, [face for i in (0, 2, 4) for face in ((i, i + 1, i + 3), (i, i + 3, i + 2))]
     found, _ = depths(tmp_path, {"Fin": fin, "Sheet": grid(UP)})
     assert found == {("Fin", "Sheet"): pytest.approx(0.25, abs=1e-6)}
 

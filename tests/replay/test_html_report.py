@@ -198,6 +198,8 @@ def test_page_in_chromium(tmp_path, browser):
     assert browser.value("document.getElementById('viewer-message').hidden")  # it would say why there is no view in 3D
     assert browser.value("document.getElementById('viewer-heading').textContent") == "Time 250 to 251"
     assert browser.value("location.hash") == "#interval=4"
+    assert browser.value("rows.count") > 30
+    assert browser.value("rows.time.every((time, row) => !row || rows.time[row - 1] <= time)")
 
     def pixels():
         picture = tmp_path / "page.png"
