@@ -15,10 +15,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 
 from ..detection.body_parts import connect_cells
-from ..detection.launch import launch
+from ..detection.closest_points import ClosestPointFinder
 from ..usd.segment import Segment
 from .scene_intersections import SceneIntersections
 
@@ -27,34 +26,6 @@ __all__ = ["DepthFinder"]
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
 _FIRST_REACH = 0.02  # part of the size of a mesh or a surface up to which vertices are searched first
 _SAME_POINT = 1e-6  # part of an edge within which it passes through two neighbouring faces at once: at their side
-
-
-@wp.kernel
-def find_closest(
-    # mesh
-    surface: wp.uint64,
-    # in
-    points: wp.array[wp.vec3],
-    reach: float,
-    # out
-    faces: wp.array[wp.int32],
-    coordinates: wp.array[wp.vec3],
-    distances: wp.array[wp.float32],
-):
-    """Finds the face of a surface that is closest to each point, its closest point, barycentric, and the distance.
-
-    The distance is infinite where it is larger than ``reach``.
-    """
-    i = wp.tid()
-    query = wp.mesh_query_point_no_sign(surface, points[i], reach)
-    if not query.result:
-        faces[i] = 0
-        coordinates[i] = wp.vec3(1.0, 0.0, 0.0)
-        distances[i] = wp.inf
-        return
-    faces[i] = query.face
-    coordinates[i] = wp.vec3(query.u, query.v, 1.0 - query.u - query.v)
-    distances[i] = wp.length(points[i] - wp.mesh_eval_position(surface, query.face, query.u, query.v))
 
 
 class DepthFinder:
@@ -195,9 +166,7 @@ class _Surface:
         self._faces = np.arange(len(shape.faces)) if faces is None else faces
         places = x[shape.vertices]
         self._low, self._high = _box(places)
-        points = wp.array(places, dtype=wp.vec3, device="cpu")
-        corners = wp.array(shape.faces[self._faces].reshape(-1), dtype=int, device="cpu")
-        self._mesh = wp.Mesh(points, corners)
+        self._finder = ClosestPointFinder(places, shape.faces[self._faces])
 
     @property
     def size(self) -> float:
@@ -214,21 +183,13 @@ class _Surface:
 
         Distances larger than ``reach`` are infinite.
         """
-        count = len(points)
-        given = wp.array(points, dtype=wp.vec3, device="cpu")
-        faces = wp.empty(count, dtype=int, device="cpu")
-        coordinates, distances = (
-            wp.empty(count, dtype=wp.vec3, device="cpu"),
-            wp.empty(count, dtype=float, device="cpu"),
-        )
-        outputs = [faces, coordinates, distances]
-        launch(find_closest, count, inputs=[self._mesh.id, given, reach], outputs=outputs, device="cpu")
+        closest = self._finder.find(points, reach)
         sides, vertices = self._shape.borders
-        face, on_side = self._faces[faces.numpy()], coordinates.numpy() < _ON_SIDE
+        face, on_side = self._faces[closest.faces], closest.coordinates < _ON_SIDE
         at_corner = on_side.sum(axis=1) == 2
         corner = self._shape.faces[face, np.argmin(on_side, axis=1)]
         at_border = np.where(at_corner, vertices[corner], (on_side & sides[face]).any(axis=1))
-        return distances.numpy(), at_border & np.isfinite(distances.numpy())
+        return closest.distances, at_border & np.isfinite(closest.distances)
 
 
 class _Crossings:
