@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import CHROMIUM, Browser
-from replay_files import Page, falling_through_quads, many_hits, near_and_inside_stage, replay
+from replay_files import Page, add_up, falling_through_quads, many_hits, near_and_inside_stage, replay
 from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, with_names
 
 import warp_bsc as bsc
-from warp_bsc.replay import html_report
+from warp_bsc.replay import html_report, view_blocks
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>{{script}}"
@@ -87,10 +87,11 @@ def test_page_has_every_interval_with_hits(stage, tmp_path):
     np.testing.assert_allclose(block["position"] + center, contact["position"], atol=1e-6)
 
     faces, view = page.block("faces-0")["faces"].reshape(-1, 3), page.block("view-2")
-    start, end = (view[name].reshape(-1, 3) + center for name in ("start", "end"))
+    start, end = (points + center for points in add_up(view))
     assert len(faces) == 5 and faces.max() == len(start) - 1 and view["faces"] == 0
-    np.testing.assert_allclose((end - start)[-3:], [(0, 0, -0.5)] * 3, atol=1e-6)
-    np.testing.assert_allclose(start[-3:], moved(FALLING, (0, 0, 0.25)), atol=1e-6)
+    assert view["step"] == 8 / 2**20  # the scene is 8 units wide
+    np.testing.assert_allclose((end - start)[-3:], [(0, 0, -0.5)] * 3, atol=view["step"])
+    np.testing.assert_allclose(start[-3:], moved(FALLING, (0, 0, 0.25)), atol=view["step"])
     assert [data["meshes"][mesh] for mesh in page.block("faces-0")["mesh_of_vertex"][[0, -1]]] == [
         {"name": "/World/Floor", "moves": False}, {"name": "/World/Falling", "moves": True}
     ]  # fmt: skip
@@ -100,7 +101,9 @@ def test_page_has_every_interval_with_hits(stage, tmp_path):
     for index, at_rest in ((3, last.intersections[0]), (4, last.intersections[1])):
         block = page.block(f"rest-{index}")
         assert (block["kind"] == np.where(at_rest.crosses, 4, 5)).all()
-        np.testing.assert_allclose(block["curves"].reshape(-1, 2, 3) + center, at_rest.cuts.points, atol=1e-6)
+        curves = np.stack(add_up(block, "curve_"), axis=1) + center
+        np.testing.assert_allclose(curves, at_rest.cuts.points, atol=block["curve_step"])
+        assert (block["curve_meshes"].reshape(-1, 2) == [0, 1]).all()
 
 
 def test_page_without_collisions(tmp_path):
@@ -149,8 +152,10 @@ def test_page_where_little_is_there(tmp_path, visible):
 
 
 def test_page_says_what_it_leaves_out(tmp_path, monkeypatch):
-    for name, value in {"_ALL_ROWS": 40, "_FEWEST_ROWS": 5, "_ALL_FACES": 90, "_FEWEST_FACES": 10}.items():
+    for name, value in {"_ALL_ROWS": 40, "_FEWEST_ROWS": 5}.items():
         monkeypatch.setattr(html_report, name, value)
+    for name, value in {"_ALL_FACES": 90, "_FEWEST_FACES": 10, "_FEWEST_OUTLINE": 30, "_ALL_OUTLINES": 90}.items():
+        monkeypatch.setattr(view_blocks, name, value)
     stage = many_hits(tmp_path / "scene.usda")
     found = json.loads(replay(stage)[0].read_text())
     page = Page((tmp_path / "page.html").read_text())
@@ -168,7 +173,7 @@ def test_page_says_what_it_leaves_out(tmp_path, monkeypatch):
         faces = page.block(f"faces-{view['faces']}")["faces"].reshape(-1, 3)
         assert view["of"] == 200 and 0 < len(faces) <= 30 and view["lit"].max() < len(faces)
 
-    monkeypatch.setattr(html_report, "_VIEW_BYTES", 1000)
+    monkeypatch.setattr(view_blocks, "_BYTES", 1000)
     replay(stage)
     page = Page((tmp_path / "page.html").read_text())
     assert "view-0" in page.blocks and "view-2" not in page.blocks and "hits-2" in page.blocks
@@ -193,6 +198,8 @@ def test_page_in_chromium(tmp_path, browser):
     assert browser.value("document.getElementById('viewer-message').hidden")  # it would say why there is no view in 3D
     assert browser.value("document.getElementById('viewer-heading').textContent") == "Time 250 to 251"
     assert browser.value("location.hash") == "#interval=4"
+    assert browser.value("rows.count") > 30
+    assert browser.value("rows.time.every((time, row) => !row || rows.time[row - 1] <= time)")
 
     def pixels():
         picture = tmp_path / "page.png"
@@ -275,7 +282,9 @@ def test_table_is_sorted_and_filtered_in_chromium(tmp_path, browser):
     )  # only those around what is in sight
     column = "[...document.querySelectorAll('#rows tr[data-at] td:nth-child({})')].map((cell) => cell.textContent)"
 
-    browser.click("#rows th button", 0)
+    assert browser.value("document.querySelector('#rows th').getAttribute('aria-sort')") == "ascending"
+    assert browser.value("rows.time.every((time, row) => !row || rows.time[row - 1] <= time)")
+    assert browser.value("table.rows.every((row, place) => row === place)")
     browser.click("#rows th button", 0)  # the latest first
     assert browser.value("document.querySelector('#rows th').getAttribute('aria-sort')") == "descending"
     times = [float(text) for text in browser.value(column.format(1))]

@@ -15,6 +15,7 @@ from warp_bsc.cli.main import main
 from warp_bsc.replay.limit import limit_rows
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
+TWIST = str(ASSETS / "cloth_twist.usd")
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +114,16 @@ def test_all_files_list_the_same_and_say_what_they_leave_out(tmp_path, capsys):
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "overlay.usda"))
     assert said in layer.documentation
     assert layer.customLayerData["collisions"]["collisionsNotListed"] == whole["hits"] - 15
+
+
+def test_a_page_has_no_depth_of_intersections_that_are_not_listed(tmp_path):
+    note = "Meshes have no depth at times at which intersections are not listed."
+    for limit, has_depth in (("100000", True), ("2", False)):
+        page = str(tmp_path / "page.html")
+        assert main(["replay", TWIST, "--device", "cpu", "--limit", limit, "--report", page]) == 0
+        page = Page(Path(page).read_text()).data
+        assert any(pair["depth"] for pair in page["pairs"]) == has_depth
+        assert (note in page["notes"]) != has_depth
 
 
 def test_a_limit_that_leaves_nothing_out_says_nothing(tmp_path, capsys):

@@ -118,6 +118,14 @@ class Page(HTMLParser):
         return found
 
 
+def add_up(block, prefix=""):
+    """The points of a block at the start and at the end, shape [n, 3] each, from columns of differences."""
+    starts, ends = (block[f"{prefix}{name}"].reshape(3, -1).T for name in ("start", "end"))
+    starts, ends = (np.where(part % 2, -(part + 1) // 2, part // 2) for part in (starts, ends))
+    start = np.cumsum(starts, axis=0)
+    return block[f"{prefix}step"] * start, block[f"{prefix}step"] * (start + ends)
+
+
 def errors_of(stage):
     """What usdchecker finds wrong."""
     validation = pytest.importorskip("pxr.UsdValidation")

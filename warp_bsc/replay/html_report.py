@@ -5,35 +5,37 @@ Every interval is a block of compressed arrays, which the page's script unpacks 
 
 import os
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..usd.scene import Scene
+from .depths import DepthFinder
 from .html_page import block, fill_page, inert, shared_part, spread
 from .limit import not_listed
 from .outputs import RecordFile
-from .page_view import choose_faces
-from .results import IntervalResult
+from .report_data import MAX_PAIRS, Depths, report_data, report_title
+from .results import IntersectionSummary, IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import ScenePairs
 from .scene_proximities import SceneProximities
-from .summary import CERTIFIED_FOR, Summary
+from .summary import Summary
+from .view_blocks import ViewBlocks, moving_points
 
 __all__ = ["ReportPage"]
 
-_ALL_FACES = 1_500_000  # in the views of all intervals together; divided by their number, the limit of an interval ...
-_FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... within these bounds
-_ALL_ROWS = 600_000  # in the table, likewise; the time to open the page grows with them
-_FEWEST_ROWS, _MOST_ROWS = 100, 50_000
-_VIEW_BYTES = 64 << 20  # of all views together
-_MAX_PAIRS = 10_000  # of meshes
-_MAX_ROWS = 10  # of the small tables
-_MAX_DISAGREEMENTS = 200
+_ALL_ROWS = 300_000  # in the table; divided by the number of intervals, twice the limit of an interval ...
+_FEWEST_ROWS, _MOST_ROWS = 100, 50_000  # ... within these bounds
+_MOST_CAMERAS, _MOST_CAMERA_TIMES = 100, 100_000
 _CROSSES, _TOUCHES, _INSIDE, _PROXIMITY = range(4, 8)  # kinds of rows, after those of collisions: see rows.js
 _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "second_1")
+
+_SCRIPTS = (
+    "blocks.js", "rows.js", "elements.js", "table.js", "meshes.js", "view3d.js", "shaders.js", "view_data.js",
+    "cameras.js", "viewer.js", "timeline.js", "findings.js", "page.js",
+)  # fmt: skip
+
+_WHY_NO_CAMERA = f"their views are not valid, or there are more than {_MOST_CAMERAS}"
 
 _AtRest = SceneIntersections | SceneProximities
 
@@ -52,21 +54,18 @@ class ReportPage(RecordFile):
             OSError: If it cannot be written.
         """
         super().__init__(path)
-        names = "blocks.js", "rows.js", "elements.js", "view3d.js", "viewer.js", "table.js", "page.js"
-        page = fill_page(shared_part("page.html"), map(shared_part, names), _title(scene))
+        page = fill_page(shared_part("page.html"), map(shared_part, _SCRIPTS), report_title(scene))
         self._before, self._between, self._after = page
-        self._most_faces = int(np.clip(_ALL_FACES // len(scene), _FEWEST_FACES, _MOST_FACES))
         self._most_rows = int(np.clip(_ALL_ROWS // (2 * len(scene)), _FEWEST_ROWS, _MOST_ROWS))
-        self._view_bytes = 0
+        self._views = ViewBlocks(len(scene))
+        self._depth_finder = DepthFinder()
+        self._depths: list[tuple[float, dict[tuple[str, str], float]]] = []  # time and depths at each interval's start
         self._meshes: dict[str, int] = {}  # number of each mesh, by its name
-        self._moves: list[bool] = []  # whether each moves
-        self._faces: tuple[Any, int] | None = None  # the segment whose faces are all in the page, and their block
+        self._facts: list[dict] = []  # name of each, whether it moves, and the prim's path if that is another one
         self._center: np.ndarray | None = None  # of all positions in the page
         # Numbers of rows by interval: collisions, and intersections and proximities at its start.
         self._rows: list[tuple[int, int, int]] = []
         self._last: list[tuple[str, _AtRest]] = []  # intersections and proximities at the end of the last interval
-        self._without_view = 0
-        self._some_strands = 0  # number of views without all curves and points
 
     def head(self) -> str:
         """Returns the page up to the first interval."""
@@ -76,11 +75,13 @@ class ReportPage(RecordFile):
         """Yields the blocks of an interval: collisions, intersections and proximities at its start, and the view."""
         interval, contacts = result.contacts.interval, result.contacts
         index = interval.index
-        if self._center is None:
+        center = self._center
+        if center is None:
             x = interval.x0.astype(np.float64)
-            self._center = (x.min(axis=0) + x.max(axis=0)) / 2 if len(x) else np.zeros(3)
+            center = self._center = (x.min(axis=0) + x.max(axis=0)) / 2 if len(x) else np.zeros(3)
         numbers = self._number_meshes(contacts)
         rows = _choose_rows(contacts, self._most_rows)
+        rows = rows[np.argsort(contacts.toi[rows], kind="stable")]
         if len(rows):
             arrays = self._pairs(contacts, rows, numbers)
             arrays |= {"kind": contacts.kind[rows], "toi": contacts.toi[rows].astype(np.float32)}
@@ -93,7 +94,9 @@ class ReportPage(RecordFile):
         yield text + more
         positions = [contacts.position, *(found.position for found in (*at_rest, *near))]
         if index == 0 or sum(map(len, positions)):
-            yield from self._view(result, np.concatenate(positions), numbers)
+            yield from self._views.of(result, np.concatenate(positions), numbers, center)
+        at_start = result.summary.intersections[0] if result.summary.intersections else None
+        self._depths[index:] = [(interval.start, self._find_depths(at_rest[0], at_start) if at_rest else {})]
         self._rows[index:] = [(len(rows), rest_rows, near_rows)]
         self._last = [(name, found[1]) for name, found in (("rest", at_rest), ("near", near)) if found]
 
@@ -106,11 +109,15 @@ class ReportPage(RecordFile):
                 numbers = np.array([self._meshes[mesh.name] for mesh in last.segment.meshes])
                 counts[name], more = self._at_rest(name, len(intervals), last, numbers)
                 text += more
-        data = _data(summary)
+        data = report_data(summary, self._largest_depths(summary))
         data["rows"] = [*self._rows[: len(intervals)], (0, counts["rest"], counts["near"])]
-        data["meshes"] = [{"name": name, "moves": moves} for name, moves in zip(self._meshes, self._moves, strict=True)]
-        data["center"] = self._center.tolist() if self._center is not None else [0, 0, 0]
+        data["meshes"] = self._facts
+        data["center"] = self._center.tolist() if self._center is not None else [0.0, 0.0, 0.0]
         data["notes"] += self._notes(summary, data["rows"])
+        cameras, data["cameras"], left_out = self._cameras(summary, data["center"])
+        text += cameras
+        if left_out:
+            data["notes"].append(f"{left_out:,} cameras cannot be chosen: {_WHY_NO_CAMERA}.")
         return text + self._between + inert(data) + self._after
 
     def shrink(self) -> bool:
@@ -121,8 +128,9 @@ class ReportPage(RecordFile):
     def _number_meshes(self, contacts: SceneContacts) -> np.ndarray:
         """Returns the numbers in the page of a segment's meshes, shape [len(segment.meshes)]."""
         for mesh in contacts.segment.meshes:
-            if self._meshes.setdefault(mesh.name, len(self._meshes)) == len(self._moves):
-                self._moves.append(mesh.moves)
+            if self._meshes.setdefault(mesh.name, len(self._meshes)) == len(self._facts):
+                path = {"path": mesh.path} if mesh.path != mesh.name else {}
+                self._facts.append({"name": mesh.name, "moves": mesh.moves, **path})
         return np.array([self._meshes[mesh.name] for mesh in contacts.segment.meshes], dtype=np.int64)
 
     def _pairs(self, pairs: ScenePairs, rows: np.ndarray, numbers: np.ndarray) -> dict[str, np.ndarray]:
@@ -143,57 +151,60 @@ class ReportPage(RecordFile):
             arrays |= {"kind": np.full(len(rows), _PROXIMITY), "distance": found.distance[rows]}
         else:
             kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
-            curves = found.cuts.points
+            cuts = spread(len(found.cuts.points), self._most_rows)
+            step, points = moving_points(*(self._from_center(found.cuts.points[cuts])).transpose(1, 0, 2))
             arrays |= {
                 "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
-                "curves": self._placed(curves[spread(len(curves), self._most_rows)]),
-                "through": self._placed(found.position[np.intersect1d(rows, found.of_curves)]),
+                "curve_start": points["start"],
+                "curve_end": points["end"],
+                "curve_meshes": numbers[found.cuts.meshes[cuts]] if len(cuts) else cuts,
+                "through": np.flatnonzero(np.isin(rows, found.of_curves)),
             }
-            facts["curves"] = len(curves)
+            facts |= {"curves": len(found.cuts.points), "curve_step": step}
         return len(rows), block(f"{name}-{index}", facts, arrays)
 
-    def _view(self, result: IntervalResult, positions: np.ndarray, numbers: np.ndarray) -> Iterator[str]:
-        """Yields the blocks of the triangles that move in an interval: all, or those around the given positions.
+    def _find_depths(self, found: SceneIntersections, counted: IntersectionSummary | None) -> dict:
+        """Returns the depths of meshes at a time; none where a limit leaves some of the intersections out."""
+        assert counted is not None
+        count = counted.crossings + counted.touches + sum(counted.inside.values())
+        return self._depth_finder.find(found) if len(found) == count else {}
 
-        Edges of curves, and points, are included, each up to the largest number of triangles.
-        """
-        interval, segment = result.contacts.interval, result.contacts.segment
-        if not len(segment.faces) and not segment.has_strands:
-            return
-        if self._view_bytes > _VIEW_BYTES:
-            self._without_view += 1
-            return
-        lit = result.contacts.colliding_faces
-        shown = choose_faces(interval.x0[segment.faces[:, 0]], positions, lit, self._most_faces)
+    def _largest_depths(self, summary: Summary) -> Depths:
+        """Returns the largest depth of each two meshes and the first time with it, of the intervals in the page."""
+        at_end = [found for _, found in self._last if isinstance(found, SceneIntersections)]
+        last = [(found.time, self._find_depths(found, summary.intersections[-1])) for found in at_end]
+        largest: Depths = {}
+        for time, depths in [*self._depths[: len(summary.intervals)], *last]:
+            for meshes, depth in depths.items():
+                if meshes not in largest or depth > largest[meshes][0]:
+                    largest[meshes] = depth, time
+        return largest
+
+    def _cameras(self, summary: Summary, center: list[float]) -> tuple[str, list[dict], int]:
+        """Returns the blocks of the scene's cameras, their facts, and the number of cameras left out."""
+        from ..usd.cameras import find_cameras, read_camera  # noqa: PLC0415 (imports pxr)
+
+        scene = summary.scene
+        found = find_cameras(scene.stage)
+        times = list(scene.times[: len(summary.intervals) + 1])
+        most = min(_MOST_CAMERAS, max(1, _MOST_CAMERA_TIMES // len(times)))
+        read = [camera for own in found[:most] if (camera := read_camera(own, times))]
         texts = []
-        self._some_strands += max(len(segment.free_edges), len(segment.points)) > self._most_faces
-        if len(shown) == len(segment.faces) and self._faces and self._faces[0] is segment:
-            vertices, number = np.arange(segment.vertex_count), self._faces[1]
-        else:
-            elements = [segment.faces[shown]]
-            if segment.has_strands:
-                elements += [own[spread(len(own), self._most_faces)] for own in (segment.free_edges, segment.points)]
-            vertices, corners = np.unique(np.concatenate([own.reshape(-1) for own in elements]), return_inverse=True)
-            parts = np.split(corners, np.cumsum([own.size for own in elements])[:-1])
-            number = interval.index
-            arrays: dict[str, np.ndarray] = dict(zip(("faces", "edges", "points"), parts, strict=False))
-            arrays["mesh_of_vertex"] = numbers[segment.locate_vertices(vertices)[0]]
-            texts.append(block(f"faces-{number}", {}, arrays))
-            if len(shown) == len(segment.faces) and len(vertices) == segment.vertex_count:
-                self._faces = segment, number
-        arrays = {
-            "start": self._placed(interval.x0[vertices]),
-            "end": self._placed(interval.x1[vertices]),
-            "lit": np.searchsorted(shown, np.intersect1d(lit, shown)),
-        }
-        texts.append(block(f"view-{interval.index}", {"faces": number, "of": len(segment.faces)}, arrays))
-        self._view_bytes += sum(map(len, texts))
-        yield from texts
+        for number, camera in enumerate(read):
+            axes = camera.axes.copy()
+            axes[:, 3] -= center
+            texts.append(block(f"camera-{number}", {}, {"axes": axes, "window": camera.window}))
+        facts = [{"path": camera.path, "perspective": camera.is_perspective} for camera in read]
+        return "".join(texts), facts, len(found) - len(read)
+
+    def _from_center(self, positions: np.ndarray) -> np.ndarray:
+        """Returns positions relative to the page's center."""
+        assert self._center is not None  # since the first interval
+        return positions.astype(np.float64) - self._center
 
     def _placed(self, positions: np.ndarray) -> np.ndarray:
         """Returns positions relative to the page's center, in single precision."""
-        assert self._center is not None  # since the first interval
-        return (positions.astype(np.float64) - self._center).astype(np.float32)
+        return self._from_center(positions).astype(np.float32)
 
     def _notes(self, summary: Summary, rows: list[tuple[int, int, int]]) -> list[str]:
         """Returns sentences on what the page omits."""
@@ -208,127 +219,26 @@ class ReportPage(RecordFile):
         limited = (missing.collisions[0], missing.intersections[0], missing.proximities[0]) if missing else (0, 0, 0)
         if missing and any(limited):
             notes.append(f"{missing} This holds for other files of the replay, and the views in 3D, as well.")
+        if limited[1]:
+            notes.append("Meshes have no depth at times at which intersections are not listed.")
         found = summary.hits - limited[0], rest - limited[1], near - limited[2]
         for name, listed, shown in zip(names, found, zip(*rows, strict=True), strict=True):
             if sum(shown) < listed:
                 notes.append(f"The table has {sum(shown):,} of {listed:,} {name}: {most}. JSON and CSV files have all.")
-        if self._some_strands:
-            notes.append(f"{self._some_strands:,} views in 3D have only some of the curves or points, spread evenly.")
-        if self._without_view:
-            notes.append(f"{self._without_view:,} intervals have no view in 3D, as the page is full.")
+        if self._views.partial_strands:
+            notes.append(
+                f"{self._views.partial_strands:,} views in 3D have only some of the curves or points, spread evenly."
+            )
+        if self._views.without_view:
+            notes.append(f"{self._views.without_view:,} intervals have no view in 3D, as the page is full.")
         spans = [*summary.collision_spans, *summary.intersection_spans, *summary.proximity_spans]
         pairs = len({tuple(sorted(span.meshes)) for span in spans})
-        if pairs > _MAX_PAIRS:
-            notes.append(f"The page has {_MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
+        if pairs > MAX_PAIRS:
+            notes.append(f"The page has {MAX_PAIRS:,} of {pairs:,} pairs of meshes, those with the most collisions.")
         if ignored := summary.ignored:
             hits = sum(hits for _, hits in ignored)
             notes.append(f"{hits:,} collisions of {len(ignored):,} ignored pairs of meshes are left out.")
         return notes
-
-
-def _data(summary: Summary) -> dict:
-    """Returns the data of the whole replay that the page's script shows."""
-    scene = summary.scene
-    displayed = scene.display_names
-    looked = bool(summary.intersections)
-    intersecting = sum(not at.is_empty for at in summary.intersections)
-    tiles = [
-        (f"{summary.hits:,}", "collisions"),
-        (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
-    ]
-    if first := summary.first_contact:
-        tiles.append((f"{first.time:.6g}", "time code of the first"))
-    if looked:
-        tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
-    if summary.clearance is not None:
-        nearest = summary.nearest
-        tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.clearance:g}", "smallest distance"))
-    tiles += [
-        (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
-        (f"{scene.face_count:,}", "triangles"),
-        ("yes" if summary.certified else "no", f"certified for {CERTIFIED_FOR}"),
-    ]
-    data = {
-        "title": _title(scene),
-        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {summary.method} on "
-        f"{summary.device}",
-        "partial": "",
-        "tiles": tiles,
-        "intervals": [
-            (
-                interval.start,
-                interval.end,
-                interval.vertex_face_hits,
-                interval.edge_edge_hits,
-                *([interval.vertex_edge_hits + interval.vertex_vertex_hits] * scene.has_strands),
-            )
-            for interval in summary.intervals
-        ],
-        "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
-        "near": [(at.time, at.pairs) for at in summary.proximities],
-        "toi": summary.toi_counts,
-        "pairs": _pairs_of_meshes(summary),
-        "up_axis": scene.up_axis,
-        "facts": [
-            ("File", scene.path),
-            *scene.comments,
-            ("Up axis", scene.up_axis),
-            ("Metres per unit", f"{scene.meters_per_unit:g}"),
-            ("Time codes per second", f"{scene.time_codes_per_second:g}"),
-            ("Vertices", f"{scene.vertex_count:,}"),
-            *((f"Mesh {name}", displayed[name] or "no display name") for name in scene.names[:_MAX_ROWS]),
-        ],
-        "notes": [summary.motion, *scene.warnings],
-        "validation": None,
-    }
-    if not summary.is_complete:
-        data["partial"] = (
-            f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
-        )
-    if found := summary.validation:
-        wrong = len(found.disagreements)
-        text = (
-            f"The exact checker decided {found.hits:,} collisions and {found.others:,} other pairs again: "
-            f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
-            f"{found.certified:,} of all {found.decided:,} pairs."
-        )
-        data["validation"] = {"text": text, "disagreements": found.disagreements[:_MAX_DISAGREEMENTS]}
-    return data
-
-
-def _pairs_of_meshes(summary: Summary) -> list[dict]:
-    """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
-
-    A pair has at most :data:`_MAX_ROWS` spans of each kind; the numbers ``more`` count the others.
-    """
-    hits = {tuple(sorted(meshes)): count for meshes, count in summary.mesh_pairs}
-    spans: dict[tuple[str, ...], tuple[tuple[str, str], list, list, list]] = {}
-
-    def spans_of(meshes: tuple[str, str]) -> tuple[tuple[str, str], list, list, list]:
-        return spans.setdefault(tuple(sorted(meshes)), (meshes, [], [], []))
-
-    for span in summary.collision_spans:
-        spans_of(span.meshes)[1].append((span.since, span.until, span.hits))
-    for span in summary.intersection_spans:
-        inner = span.meshes[0] if span.inside else ""
-        spans_of(span.meshes)[2].append((span.since, span.until, span.most, span.trend, inner))
-    for span in summary.proximity_spans:
-        spans_of(span.meshes)[3].append((span.since, span.until, span.distance))
-    return [
-        {
-            "meshes": meshes,
-            "hits": hits.get(key, 0),
-            "spans": collisions[:_MAX_ROWS],
-            "more": max(0, len(collisions) - _MAX_ROWS),
-            "rest": at_rest[:_MAX_ROWS],
-            "more_rest": max(0, len(at_rest) - _MAX_ROWS),
-            "near": near[:_MAX_ROWS],
-            "more_near": max(0, len(near) - _MAX_ROWS),
-        }
-        for key, (meshes, collisions, at_rest, near) in sorted(spans.items(), key=lambda item: -hits.get(item[0], 0))[
-            :_MAX_PAIRS
-        ]
-    ]
 
 
 def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
@@ -338,7 +248,3 @@ def _choose_rows(pairs: ScenePairs, most: int) -> np.ndarray:
     firsts = np.unique(pairs.mesh_keys(), return_index=True)[1][:most]
     others = np.delete(np.arange(len(pairs)), firsts)
     return np.union1d(firsts, others[spread(len(others), most - len(firsts))])
-
-
-def _title(scene):
-    return f"Collisions in {Path(scene.path).name}"

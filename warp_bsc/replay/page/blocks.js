@@ -28,3 +28,18 @@ async function unpack(name) {
   }
   return result;
 }
+
+// Returns points at the start and the end of an interval, [x, y, z, x, ...], from columns of differences.
+function addUp(starts, ends, step) {
+  const length = starts.length / 3, start = new Float32Array(3 * length), end = new Float32Array(3 * length);
+  const signed = (value) => (value & 1 ? -(value + 1) / 2 : value / 2);
+  for (let axis = 0; axis < 3; axis += 1) {
+    let at = 0;
+    for (let i = 0; i < length; i += 1) {
+      at += signed(starts[axis * length + i]);
+      start[3 * i + axis] = step * at;
+      end[3 * i + axis] = step * (at + signed(ends[axis * length + i]));
+    }
+  }
+  return [start, end];
+}

@@ -15,10 +15,14 @@ function add(parent, name, attributes = {}, text = null) {
   return parent.appendChild(element);
 }
 
+function addSwatch(parent, style) {
+  const icon = add(parent, "svg", { viewBox: "0 0 10 10", class: "swatch" });
+  add(icon, "rect", { width: 10, height: 10, rx: 2, ...style });
+}
+
 function addKey(parent, style, text) {
   const key = add(parent, "span", { class: "key" });
-  const icon = add(key, "svg", { viewBox: "0 0 10 10" });
-  add(icon, "rect", { width: 10, height: 10, rx: 2, ...style });
+  addSwatch(key, style);
   add(key, "span", {}, text);
 }
 
@@ -69,16 +73,45 @@ function addTip(element, text) {
   element.addEventListener("pointerleave", () => { tip.hidden = true; });
 }
 
+// Opens a download of a file, given its text in parts.
+function download(name, type, parts) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob(parts, { type }));
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+}
+
+// Copies a text, and says so on the button for a moment.
+async function copy(text, button) {
+  let isCopied = true;
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch {
+    // Not permitted, for example in a frame: the older way needs a selection.
+    const area = add(document.body, "textarea", { class: "copied" });
+    area.value = text;
+    area.select();
+    isCopied = document.execCommand("copy");
+    area.remove();
+  }
+  const label = button.dataset.label ?? (button.dataset.label = button.textContent);
+  button.textContent = isCopied ? "Copied" : "Not permitted";
+  setTimeout(() => { button.textContent = label; }, 1500);
+}
+
 function niceStep(range, parts) {
   const raw = Math.max(range / parts, 1e-12);
   const power = 10 ** Math.floor(Math.log10(raw));
   return power * [1, 2, 5, 10].find((factor) => power * factor >= raw * 0.999);
 }
 
+const labelWidth = (most) => 8 * count(most).length + 14; // of the labels of an axis
+
 // Bars: {from, to, parts: [numbers, one a class], tip}.
 function addBars(parent, bars, classes, width, xLabel, height = 230, least = 46) {
   const most = Math.max(1, ...bars.map((bar) => bar.parts.reduce((a, b) => a + b, 0)));
-  const left = Math.max(least, 8 * count(most).length + 14), bottom = xLabel ? 40 : 6, top = 8, right = 20;
+  const left = Math.max(least, labelWidth(most)), bottom = xLabel ? 40 : 6, top = 8, right = 20;
   const low = bars[0].from, high = bars[bars.length - 1].to;
   const x = (value) => left + ((value - low) / (high - low || 1)) * (width - left - right);
   const y = (value) => height - bottom - (value / most) * (height - bottom - top);

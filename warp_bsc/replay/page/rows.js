@@ -5,7 +5,7 @@ const KINDS = ["vertex-face", "edge-edge", "vertex-edge", "vertex-vertex", "edge
 const AT_REST = 4, INSIDE = 6, PROXIMITY = 7; // AT_REST is the first kind that is not of collisions
 const ELEMENTS = ["vertex", "face", "edge", "diagonal"];
 
-// Returns all rows of the table as columns: collisions by interval, intersections and proximities by time.
+// Returns all rows of the table as columns, in order of time: those at the start of an interval, then its collisions.
 async function loadRows() {
   const total = data.rows.reduce((sum, counts) => sum + counts[0] + counts[1] + counts[2], 0);
   const rows = {
@@ -17,12 +17,13 @@ async function loadRows() {
     time: new Float64Array(total),
     toi: new Float32Array(total), // 0 or 1 for rows at a time
     distance: new Float32Array(total), // of proximities
+    position: new Float32Array(3 * total), // from the page's center
     phase: new Int8Array(total).fill(-1),
     separate: new Int8Array(total).fill(-1),
   };
   const numbers = ["first", "second", "first_0", "first_1", "second_0", "second_1"];
   for (const key of numbers) rows[key] = new Int32Array(total);
-  const names = data.rows.flatMap((counts, index) => ["hits", "rest", "near"].filter((_, which) => counts[which]).map((name) => ({ name, index })));
+  const names = data.rows.flatMap((counts, index) => [["rest", 1], ["near", 2], ["hits", 0]].filter(([, which]) => counts[which]).map(([name]) => ({ name, index })));
   let at = 0;
   const together = 64; // blocks that are unpacked at the same time
   for (let first = 0; first < names.length; first += together) {
@@ -42,6 +43,7 @@ async function loadRows() {
         rows.toi[at + i] = isRest ? index - interval : block.toi[i];
         rows.time[at + i] = start + rows.toi[at + i] * (end - start);
       }
+      rows.position.set(block.position, 3 * at);
       if (block.distance) rows.distance.set(block.distance, at);
       if (block.phase) rows.phase.set(block.phase, at);
       if (block.separate) rows.separate.set(block.separate, at);

@@ -2,9 +2,10 @@
 "use strict";
 
 class LongTable {
-  // columns: {title, width, number, fill(cell, row), key(row)}; key returns a number or a text to sort by.
-  constructor(parent, columns, rowHeight, select) {
-    Object.assign(this, { parent, columns, rowHeight, select, rows: [], sorted: null, selected: -1, drawn: null });
+  // columns: {title, width, number, fill(cell, row), key(row)}; key returns a number or a text to sort by. Rows are shown
+  // in the order in which they are given, which is that of the column `natural.index`; `natural.way` is -1 if it descends.
+  constructor(parent, columns, rowHeight, select, natural = { index: 0, way: 1 }) {
+    Object.assign(this, { parent, columns, rowHeight, select, natural, rows: [], sorted: natural, selected: -1, drawn: null, given: [], isPrinting: false });
     const table = add(parent, "table");
     const head = add(add(table, "thead"), "tr");
     this.heads = columns.map((column, index) => {
@@ -14,6 +15,10 @@ class LongTable {
     });
     this.body = add(table, "tbody");
     this.table = table;
+    this.markOrder();
+    this.note = add(parent, "p", { class: "muted small print-only" });
+    addEventListener("beforeprint", () => this.drawForPrint());
+    addEventListener("afterprint", () => { this.isPrinting = false; this.refresh(); });
     parent.addEventListener("scroll", () => this.draw());
     new ResizeObserver(() => this.draw()).observe(parent);
     this.body.addEventListener("click", (event) => {
@@ -31,28 +36,36 @@ class LongTable {
 
   // Shows other rows, numbers that the columns understand.
   show(rows) {
-    this.rows = rows;
+    this.given = rows;
     this.table.setAttribute("aria-rowcount", rows.length + 1);
-    if (this.sorted) this.order();
-    this.parent.scrollTop = 0;
-    this.draw();
-  }
-
-  sort(index) {
-    this.sorted = { index, way: this.sorted && this.sorted.index === index ? -this.sorted.way : 1 };
-    this.heads.forEach((head) => head.removeAttribute("aria-sort"));
-    this.heads[index].setAttribute("aria-sort", this.sorted.way > 0 ? "ascending" : "descending");
     this.order();
     this.parent.scrollTop = 0;
     this.draw();
   }
 
+  sort(index) {
+    this.sorted = { index, way: this.sorted.index === index ? -this.sorted.way : 1 };
+    this.markOrder();
+    this.order();
+    this.parent.scrollTop = 0;
+    this.draw();
+  }
+
+  markOrder() {
+    this.heads.forEach((head) => head.removeAttribute("aria-sort"));
+    this.heads[this.sorted.index].setAttribute("aria-sort", this.sorted.way > 0 ? "ascending" : "descending");
+  }
+
   order() {
-    const { index, way } = this.sorted;
+    const { index, way } = this.sorted, { natural } = this;
+    if (index === natural.index && way === natural.way) {
+      this.rows = this.given;
+      return;
+    }
     const keys = new Map();
-    for (const row of this.rows) keys.set(row, this.columns[index].key(row));
+    for (const row of this.given) keys.set(row, this.columns[index].key(row));
     const compare = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
-    this.rows = this.rows.slice().sort((a, b) => way * compare(keys.get(a), keys.get(b)) || a - b);
+    this.rows = this.given.slice().sort((a, b) => way * compare(keys.get(a), keys.get(b)) || a - b);
   }
 
   // Selects the row at an index, and scrolls to it.
@@ -65,7 +78,22 @@ class LongTable {
     this.select(this.selected);
   }
 
+  // Draws the visible rows again, as what they show has changed.
+  refresh() {
+    this.drawn = null;
+    this.draw();
+  }
+
+  // A print has the first rows only, and says so.
+  drawForPrint() {
+    this.isPrinting = true;
+    const shown = Math.min(this.rows.length, 50);
+    this.body.replaceChildren(this.lines(0, shown));
+    this.note.textContent = shown < this.rows.length ? `The first ${count(shown)} of ${count(this.rows.length)} rows.` : "";
+  }
+
   draw() {
+    if (this.isPrinting) return; // which changes sizes
     const { parent, rows, rowHeight } = this;
     const top = Math.floor(parent.scrollTop / rowHeight), seen = Math.ceil(parent.clientHeight / rowHeight);
     // Visible rows stay in the document: a click needs its row until it ends.
@@ -73,16 +101,22 @@ class LongTable {
     if (drawn && drawn.rows === rows && drawn.selected === this.selected && drawn.first <= Math.max(0, top - 1) && drawn.last >= Math.min(rows.length, top + seen + 1)) return;
     const first = Math.max(0, top - 20), last = Math.min(rows.length, top + seen + 20);
     this.drawn = { rows, selected: this.selected, first, last };
-    const lines = document.createDocumentFragment();
-    const space = (count) => { if (count) add(add(lines, "tr"), "td").style.height = `${count * rowHeight}px`; };
-    space(first);
+    const space = (number) => {
+      const line = document.createElement("tr");
+      if (number) add(line, "td").style.height = `${number * rowHeight}px`;
+      return line;
+    };
+    this.body.replaceChildren(space(first), this.lines(first, last), space(rows.length - last));
+  }
+
+  lines(first, last) {
+    const { rows, rowHeight } = this, lines = document.createDocumentFragment();
     for (let at = first; at < last; at += 1) {
       const line = add(lines, "tr", { "data-at": at, "aria-rowindex": at + 2, class: rows[at] === this.selected ? "chosen" : "" });
       line.style.height = `${rowHeight}px`;
       for (const column of this.columns)
         column.fill(add(line, "td", { class: `${column.class || ""} ${column.number ? "number" : ""}` }), rows[at]);
     }
-    space(rows.length - last);
-    this.body.replaceChildren(lines);
+    return lines;
   }
 }

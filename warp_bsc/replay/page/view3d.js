@@ -5,12 +5,12 @@
 const TRIANGLE_COLOR = `#version 300 es
 precision highp float;
 in vec3 place; in vec3 tint;
-uniform vec4 only;
+uniform vec4 only; uniform float transparency;
 out vec4 result;
 void main() {
   vec3 normal = normalize(cross(dFdx(place), dFdy(place)));
   float light = 0.42 + 0.5 * abs(dot(normal, normalize(vec3(0.25, 0.45, 0.85)))) + 0.08 * abs(normal.y);
-  result = vec4(mix(tint, only.rgb, only.a) * light, 1.0);
+  result = vec4(mix(tint, only.rgb, only.a) * light, 1.0 - transparency);
 }`;
 
 function multiply(a, b) {
@@ -73,13 +73,14 @@ const css = (color) => `rgb(${color.map((value) => Math.round(255 * value)).join
 const FIELD = 0.62; // of view, an angle
 
 // Makes a canvas with a camera that mouse and fingers turn, move and zoom. `draw`, given the time, is called when the
-// canvas is to be drawn: after `ask`. Without WebGL 2, `gl` is null.
-function makeCanvas(canvas, isZUp, draw) {
-  const gl = canvas.getContext("webgl2", { antialias: true });
+// canvas is to be drawn: after `ask`. Without WebGL 2, `gl` is null. `onFree` is called when somebody moves the view away
+// from the lens of `lookThrough`.
+function makeCanvas(canvas, isZUp, draw, onFree = () => {}) {
+  const gl = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true }); // to be printed
   // Up is the scene's: y in the view.
   const turned = isZUp ? ([x, y, z]) => [x, z, -y] : (point) => point;
   const camera = { yaw: 0.65, pitch: 0.42, distance: 1, center: [0, 0, 0] };
-  let isAsked = false, view = null, projection = null;
+  let isAsked = false, view = null, projection = null, lens = null;
 
   function ask() {
     if (isAsked || !gl) return;
@@ -87,24 +88,77 @@ function makeCanvas(canvas, isZUp, draw) {
     requestAnimationFrame((now) => { isAsked = false; draw(now); });
   }
 
+  // Shows what a lens sees, or the free view for null. A lens has a position, its directions right, up and backward, the
+  // window that it sees, left, right, bottom and top, at a distance of 1, and whether it is a perspective one.
+  function lookThrough(value) {
+    lens = value;
+    ask();
+  }
+
+  // Goes on with the free view, from where the lens is.
+  function free() {
+    if (!lens) return;
+    const [backward, position] = [turned(lens.backward), turned(lens.position)];
+    camera.yaw = Math.atan2(backward[0], backward[2]);
+    camera.pitch = Math.asin(Math.max(-1, Math.min(1, backward[1])));
+    camera.center = position.map((value, axis) => value - camera.distance * backward[axis]);
+    lens = null;
+    onFree();
+  }
+
   function frame(box) {
+    free();
     camera.center = turned(box.center);
     camera.distance = ((0.8 * box.radius) / Math.sin(FIELD / 2)) * Math.max(1, canvas.clientHeight / Math.max(1, canvas.clientWidth));
     ask();
   }
 
-  // Clears the canvas, and places the camera for a scene of some radius. Returns pixels by pixel of CSS, and the size.
-  function begin(radius) {
+  // The part of the canvas that a lens fills: the largest one of its shape.
+  function gate(width, height) {
+    if (!lens) return [0, 0, width, height];
+    const [left, right, bottom, top] = lens.window, shape = (right - left) / (top - bottom);
+    const size = [Math.min(width, height * shape), Math.min(height, width / shape)].map((value) => Math.max(1, Math.round(value)));
+    return [Math.floor((width - size[0]) / 2), Math.floor((height - size[1]) / 2), ...size];
+  }
+
+  // Sets the matrices to those of the lens, for a scene in a sphere around the origin.
+  function useLens(reach) {
+    const { right, up, backward, position, window: [left, r, bottom, top], isPerspective } = lens;
+    const along = position.reduce((sum, value, axis) => sum + value * backward[axis], 0); // of the origin, ahead
+    const far = Math.max(along + reach, 1e-3 * reach), near = isPerspective ? Math.max(along - reach, 1e-4 * far) : along - reach;
+    const toLens = (direction) => -direction.reduce((sum, value, axis) => sum + value * position[axis], 0);
+    view = new Float32Array([0, 1, 2].flatMap((axis) => [right[axis], up[axis], backward[axis], 0]).concat(toLens(right), toLens(up), toLens(backward), 1));
+    const [x, y] = [2 / (r - left), 2 / (top - bottom)], [dx, dy] = [(r + left) / (r - left), (top + bottom) / (top - bottom)];
+    projection = new Float32Array(isPerspective
+      ? [x, 0, 0, 0, 0, y, 0, 0, dx, dy, (near + far) / (near - far), -1, 0, 0, (2 * near * far) / (near - far), 0]
+      : [x, 0, 0, 0, 0, y, 0, 0, 0, 0, 2 / (near - far), 0, -dx, -dy, (near + far) / (near - far), 1]);
+  }
+
+  // Clears the canvas, and places the camera for a scene of some radius; `reach` is that of a sphere around the origin
+  // with all of it, for a lens. Returns pixels by pixel of CSS, and the size of the part that is drawn to.
+  function begin(radius, reach = radius) {
     const scale = Math.min(2, devicePixelRatio || 1);
     const [width, height] = [Math.round(canvas.clientWidth * scale), Math.round(canvas.clientHeight * scale)];
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    gl.viewport(0, 0, width, height);
-    gl.clearColor(0, 0, 0, 0);
+    gl.disable(gl.SCISSOR_TEST);
+    gl.clearColor(0, 0, 0, lens ? 0.12 : 0); // beside the gate
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const part = gate(width, height);
+    gl.viewport(...part);
+    if (lens) {
+      gl.enable(gl.SCISSOR_TEST);
+      gl.scissor(...part);
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+    }
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.BLEND);
     gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
 
+    if (lens) {
+      useLens(reach);
+      return { scale, width: part[2], height: part[3] };
+    }
     const { distance, yaw, pitch, center } = camera;
     const [nearest, farthest] = [Math.max(distance - 3 * radius, distance * 0.01), distance + 60 * radius];
     const focal = 1 / Math.tan(FIELD / 2);
@@ -131,12 +185,14 @@ function makeCanvas(canvas, isZUp, draw) {
   }
 
   function turn(dx, dy) {
+    free();
     camera.yaw -= 0.1 * dx;
     camera.pitch = Math.max(-1.55, Math.min(1.55, camera.pitch + 0.1 * dy));
     ask();
   }
 
   function move(dx, dy) {
+    free();
     const step = (2 * camera.distance * Math.tan(FIELD / 2)) / canvas.clientHeight;
     const [cy, sy, cp, sp] = [Math.cos(camera.yaw), Math.sin(camera.yaw), Math.cos(camera.pitch), Math.sin(camera.pitch)];
     const [right, up] = [[cy, 0, -sy], [-sy * sp, cp, -cy * sp]];
@@ -165,10 +221,11 @@ function makeCanvas(canvas, isZUp, draw) {
   });
   canvas.addEventListener("wheel", (event) => {
     event.preventDefault();
+    free();
     camera.distance *= Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * 0.0015)));
     ask();
   }, { passive: false });
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   new ResizeObserver(ask).observe(canvas);
-  return { gl, camera, turned, ask, frame, begin, set, turn };
+  return { gl, camera, turned, ask, frame, begin, set, turn, lookThrough };
 }

@@ -1,117 +1,13 @@
-// Shows an interval in 3D: triangles that move from start to end, contacts, cut curves.
+// Shows an interval in 3D: triangles that move from start to end, contacts, cut curves, and an outline of the rest.
 "use strict";
 
-const MESH_COLORS = [[0.52, 0.68, 0.86], [0.62, 0.78, 0.6], [0.8, 0.7, 0.55], [0.72, 0.62, 0.8], [0.55, 0.76, 0.76], [0.84, 0.66, 0.72]];
-const REST_COLOR = [0.62, 0.64, 0.67];
-const LIT_COLOR = [0.93, 0.28, 0.22];
-const CONTACT_COLORS = [[0.78, 0.08, 0.06], [0.98, 0.6, 0.1], [0.85, 0.75, 0.1], [0.6, 0.45, 0.2]]; // by kind
-const CURVE_COLOR = [0.55, 0.24, 0.92];
-const STRAND_SHADE = 0.7; // of curves and points, which no light falls on
-const NEAR_COLOR = [0.05, 0.6, 0.35];
-const CHOSEN_COLOR = [0.05, 0.75, 0.95];
-
-const TRIANGLE_SHADER = `#version 300 es
-in vec3 start; in vec3 end; in vec3 color;
-uniform mat4 view; uniform mat4 projection; uniform float time;
-out vec3 place; out vec3 tint;
-void main() {
-  vec4 at = view * vec4(mix(start, end, time), 1.0);
-  place = at.xyz; tint = color;
-  gl_Position = projection * at;
-}`;
-// Points of the scene.
-const STRAND_SHADER = `#version 300 es
-in vec3 start; in vec3 end; in vec3 color;
-uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size;
-out vec3 tint;
-void main() {
-  tint = color;
-  gl_Position = projection * view * vec4(mix(start, end, time), 1.0);
-  gl_PointSize = size;
-}`;
-const STRAND_COLOR = `#version 300 es
-precision highp float;
-in vec3 tint;
-out vec4 result;
-void main() { result = vec4(tint, 1.0); }`;
-const POINT_SHADER = `#version 300 es
-in vec3 start; in vec3 color; in float toi;
-uniform mat4 view; uniform mat4 projection; uniform float time; uniform float size; uniform float fade;
-out vec4 tint;
-void main() {
-  gl_Position = projection * view * vec4(start, 1.0);
-  gl_Position.z -= 1e-4 * gl_Position.w;
-  gl_PointSize = size;
-  tint = vec4(color, (toi <= time ? 1.0 : 0.3) * fade);
-}`;
-const POINT_COLOR = `#version 300 es
-precision highp float;
-in vec4 tint;
-uniform float core;
-out vec4 result;
-void main() {
-  float from = length(gl_PointCoord - 0.5) * 2.0;
-  float edge = fwidth(from);
-  float disc = 1.0 - smoothstep(1.0 - edge, 1.0, from);
-  float inner = 1.0 - smoothstep(core - edge, core, from);
-  result = vec4(mix(vec3(1.0), tint.rgb, inner), tint.a * disc);
-}`;
-
-// A segment is drawn as a rectangle of some pixels' width: two triangles, of four corners.
-const CURVE_SHADER = `#version 300 es
-in vec3 start; in vec3 end; in vec3 start_1; in vec3 end_1; // its ends at the start of the interval, and at the end
-in vec3 color;
-uniform mat4 view; uniform mat4 projection; uniform vec2 pixel; uniform float time;
-out vec3 tint;
-void main() {
-  tint = color;
-  vec4 a = projection * view * vec4(mix(start, start_1, time), 1.0), b = projection * view * vec4(mix(end, end_1, time), 1.0);
-  vec2 along = normalize((b.xy / b.w - a.xy / a.w) / pixel + vec2(1e-6, 0.0));
-  int corner = int[](0, 1, 2, 2, 1, 3)[gl_VertexID]; // two at a, two at b
-  gl_Position = corner < 2 ? a : b;
-  float side = corner % 2 == 0 ? 1.0 : -1.0;
-  gl_Position.xy += side * vec2(-along.y, along.x) * pixel * gl_Position.w;
-  gl_Position.z -= 1e-4 * gl_Position.w;
-}`;
-const CURVE_COLOR_SHADER = `#version 300 es
-precision highp float;
-in vec3 tint;
-uniform float fade;
-out vec4 result;
-void main() { result = vec4(tint, fade); }`;
-
-const NO_FLOATS = new Float32Array(0), NO_INTS = new Int32Array(0);
-const meshColor = (mesh) => (data.meshes[mesh].moves ? MESH_COLORS[mesh % MESH_COLORS.length] : REST_COLOR);
-const strandColor = (mesh) => meshColor(mesh).map((value) => STRAND_SHADE * value);
-
-// Returns the blocks of an interval as the arrays that are drawn.
-async function loadView(index) {
-  const names = [`view-${index}`, `hits-${index}`, ...["rest", "near"].flatMap((name) => [`${name}-${index}`, `${name}-${index + 1}`])];
-  const [view, hits, ...atEnds] = await Promise.all(names.map(unpack));
-  if (!view) return null;
-  const topology = await unpack(`faces-${view.faces}`);
-  const faces = topology.faces, lit = new Int32Array(3 * view.lit.length);
-  view.lit.forEach((face, place) => lit.set(faces.subarray(3 * face, 3 * face + 3), 3 * place));
-  const contacts = hits ? hits.position : NO_FLOATS;
-  return {
-    edges: topology.edges || NO_INTS, alone: topology.points || NO_INTS,
-    faces, lit, meshes: topology.mesh_of_vertex, start: view.start, end: view.end, of: view.of,
-    contacts, toi: hits ? hits.toi : NO_FLOATS, kinds: hits ? hits.kind : NO_INTS,
-    // at the start and at the end of the interval
-    rest: atEnds.slice(0, 2).map((block) => (block ? block.position : NO_FLOATS)),
-    curves: atEnds.slice(0, 2).map((block) => (block ? block.curves : NO_FLOATS)),
-    inside: atEnds.slice(0, 2).map((block) => (block ? block.position.filter((_, i) => block.kind[Math.floor(i / 3)] === INSIDE) : NO_FLOATS)),
-    through: atEnds.slice(0, 2).map((block) => (block ? block.through : NO_FLOATS)),
-    close: atEnds.slice(2).map((block) => (block ? block.position : NO_FLOATS)),
-  };
-}
-
-// Makes the view and its controls. Returns functions that show an interval and turn the view.
+// Makes the view and its controls. Returns functions that show an interval, turn the view, and choose a camera.
 function makeViewer() {
   const message = byId("viewer-message");
   const say = (text) => { message.textContent = text; message.hidden = !text; };
   const canvas = byId("canvas");
-  const { gl, camera, turned, ask, frame, begin, set, turn } = makeCanvas(canvas, data.up_axis === "Z", draw);
+  const cameras = makeCameras(() => { showTime(); onView(); });
+  const { gl, camera, turned, ask, frame, begin, set, turn, lookThrough } = makeCanvas(canvas, data.up_axis === "Z", draw, () => cameras.choose(""));
   if (!gl) say("This browser has no WebGL 2, which the view in 3D needs.");
   if (LAST < 0) say("There is nothing to show.");
 
@@ -119,7 +15,8 @@ function makeViewer() {
   const points = gl && program(gl, POINT_SHADER, POINT_COLOR);
   const strands = gl && program(gl, STRAND_SHADER, STRAND_COLOR);
   const lines = gl && program(gl, CURVE_SHADER, CURVE_COLOR_SHADER);
-  const state = { time: 0, playing: false, last: 0, index: -1, shown: null, parts: [], chosen: null, framed: false };
+  const state = { time: 0, playing: false, last: 0, index: -1, shown: null, parts: null, chosen: null, framed: false };
+  onMeshStates = () => { if (state.shown) fillParts(); onView(); };
 
   // Shows an interval. `at`, if given, is a row of the table: {from, place, time}, from "hits", "rest" or "near".
   async function show(index, at = null) {
@@ -139,137 +36,201 @@ function makeViewer() {
     if (at) choose(at);
     else if (isNew) state.time = state.shown.median;
     showTime();
-    ask();
   }
 
   function fill(shown, index) {
-    state.parts.forEach((part) => part.free());
-    [state.parts, state.shown, state.chosen] = [[], shown, null];
+    freeParts();
+    state.chosen?.free();
+    state.chosen = null;
+    state.shown = shown;
     const legend = byId("viewer-legend");
     legend.replaceChildren();
-    let title = plural(hitsIn(index), "collision");
+    let title = data.nothing ? "" : plural(hitsIn(index), "collision");
     const atEnds = (numberAt, one, how) => { title += `; ${plural(numberAt(index), one)} ${how} at the start, ${count(numberAt(index + 1))} at the end`; };
-    if (data.rest.length) atEnds(edgesAt, "edge", "in faces");
+    if (data.rest.length && !data.nothing) atEnds(edgesAt, "edge", "in faces");
     if (insideAt(index) + insideAt(index + 1)) atEnds(insideAt, "part", "inside");
-    if (data.near.length) atEnds(nearAt, "pair", "within the clearance");
+    if (data.near.length && !data.nothing) atEnds(nearAt, "pair", "within the clearance");
     const isEmpty = !shown;
-    byId("viewer-title").textContent = title;
     byId("viewer").querySelector(".controls").classList.toggle("idle", isEmpty);
+    if (shown?.outline) title += `; ${count(shown.faces.length / 3)} of ${count(shown.of)} triangles near them are shown, and a grey outline of all`;
+    byId("viewer-title").textContent = title;
     if (isEmpty) {
       say(hitsIn(index) + atStart(index) + atStart(index + 1) ? "The page is full and has no view of this interval; see the notes." : "Nothing collides or intersects here, so the page has no view of this interval.");
       gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
       return;
     }
     say("");
-    const { faces, lit, meshes, start, end, contacts, kinds, toi } = shown;
-    if (faces.length / 3 < shown.of) title += `; the ${count(faces.length / 3)} of ${count(shown.of)} triangles around them are shown`;
-    byId("viewer-title").textContent = title;
-
-    const colors = new Float32Array(start.length), pointColors = new Float32Array(contacts.length);
-    meshes.forEach((mesh, vertex) => colors.set(meshColor(mesh), 3 * vertex));
-    kinds.forEach((kind, point) => pointColors.set(CONTACT_COLORS[kind], 3 * point));
+    const { meshes, start, end, hits, rest, near } = shown;
     const present = [...new Set(meshes)];
     present.slice(0, 6).forEach((mesh) => addKey(legend, { fill: css(meshColor(mesh)) }, data.meshes[mesh].name));
-    if (present.length > 6) add(legend, "span", {}, `and ${count(present.length - 6)} more`);
-    if (lit.length) addKey(legend, { fill: css(LIT_COLOR) }, "faces that collide");
+    if (present.length > 6) {
+      const more = add(legend, "button", { type: "button", class: "link" }, `and ${count(present.length - 6)} more`);
+      more.addEventListener("click", () => { byId("mesh-list").open = true; byId("mesh-list").scrollIntoView({ block: "nearest" }); });
+    }
+    if (shown.outline) addKey(legend, { fill: css(REST_COLOR), "fill-opacity": 0.5 }, "outline of all meshes");
+    if (shown.lit.length) addKey(legend, { fill: css(LIT_COLOR) }, "faces that collide");
     CONTACT_COLORS.forEach((color, kind) => {
-      if (kinds.includes(kind)) addKey(legend, { fill: css(color), rx: 5 }, `${KINDS[kind]} contact`);
+      if (hits.kind.includes(kind)) addKey(legend, { fill: css(color), rx: 5 }, `${KINDS[kind]} contact`);
     });
-    if (shown.curves.some((curves) => curves.length)) addKey(legend, { fill: css(CURVE_COLOR), y: 3, height: 4 }, "curves where surfaces cut");
-
-    const positions = [["start", start, 3], ["end", end, 3], ["color", colors, 3]];
-    shown.all = vertexArray(gl, triangles, positions, faces);
-    shown.some = vertexArray(gl, triangles, positions, lit);
-    shown.dots = vertexArray(gl, points, [["start", contacts, 3], ["color", pointColors, 3], ["toi", toi, 1]]);
-    if (shown.inside.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
-    if (shown.through.some((places) => places.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "curve through a face");
-    if (shown.close.some((places) => places.length)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "proximity");
-    // Markers of intersections and proximities at the start, and at the end.
-    shown.marks = shown.inside.map((inside, end) => {
-      const at = [...inside, ...shown.through[end]], places = new Float32Array([...at, ...shown.close[end]]);
-      const markColors = new Float32Array(places.length);
-      for (let i = 0; i < places.length; i += 3) markColors.set(i < at.length ? CURVE_COLOR : NEAR_COLOR, i);
-      return { count: places.length / 3, ...vertexArray(gl, points, [["start", places, 3], ["color", markColors, 3], ["toi", new Float32Array(places.length / 3), 1]]) };
-    });
-    const segments = (values, stride, places, more = []) => vertexArray(gl, lines, [...["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]), ...more]);
-    shown.cuts = shown.curves.map((curves) => segments(curves, 24, [0, 12, 0, 12]));
-    const ropes = new Float32Array(6 * shown.edges.length), ropeColors = new Float32Array(1.5 * shown.edges.length);
-    for (let i = 0; i < shown.edges.length; i += 2) ropeColors.set(strandColor(meshes[shown.edges[i]]), 1.5 * i);
-    shown.edges.forEach((vertex, i) => [start, end].forEach((values, when) => ropes.set(values.subarray(3 * vertex, 3 * vertex + 3), 12 * (i >> 1) + 6 * when + 3 * (i % 2))));
-    shown.ropes = segments(ropes, 48, [0, 12, 24, 36], [["color", ropeColors, 3, [12, 0]]]);
-    shown.dust = vertexArray(gl, strands, [...positions.slice(0, 2), ["color", colors.map((value) => STRAND_SHADE * value), 3]], shown.alone);
-    state.parts = [shown.all, shown.some, shown.dots, ...shown.cuts, ...shown.marks, shown.ropes, shown.dust];
+    if (rest.some((block) => block?.from.length)) addKey(legend, { fill: css(CURVE_COLOR), y: 3, height: 4 }, "curves where surfaces cut");
+    if (rest.some((block) => block?.kind.includes(INSIDE))) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "part of a mesh inside another");
+    if (rest.some((block) => block?.through.length)) addKey(legend, { fill: css(CURVE_COLOR), rx: 5 }, "curve through a face");
+    if (near.some((block) => block)) addKey(legend, { fill: css(NEAR_COLOR), rx: 5 }, "proximity");
 
     const moving = [start, end].map((values) => values.filter((_, i) => data.meshes[meshes[Math.floor(i / 3)]].moves));
-    shown.whole = boxOf(moving.some((values) => values.length) ? moving : [start]);
-    const places = [contacts, ...shown.rest, ...shown.close].filter((values) => values.length);
-    shown.near = places.length ? boxOf(places) : { ...shown.whole };
-    shown.near.radius = Math.max(shown.near.radius * 1.2, shown.whole.radius * 0.12);
-    shown.median = toi.length ? Array.from(toi).sort((a, b) => a - b)[toi.length >> 1] : 0;
+    const everything = boxOf(shown.outline ? [start, end, shown.outline.start, shown.outline.end] : [start, end]);
+    shown.reach = everything.radius + Math.hypot(...everything.center);
+    shown.whole = shown.outline ? everything : boxOf(moving.some((values) => values.length) ? moving : [start]);
+    const places = [hits, ...rest, ...near].filter((block) => block?.position.length).map((block) => block.position);
+    shown.close = places.length ? boxOf(places) : { ...shown.whole };
+    shown.close.radius = Math.max(shown.close.radius * 1.2, shown.whole.radius * 0.12);
+    shown.median = hits.toi.length ? Array.from(hits.toi).sort((a, b) => a - b)[hits.toi.length >> 1] : 0;
     byId("frame-contacts").hidden = !places.length;
+    fillParts();
     if (!state.framed) {
-      const { near, whole } = shown;
-      frame(places.length ? { center: near.center, radius: Math.max(near.radius, 0.6 * whole.radius) } : { center: whole.center, radius: 1.15 * whole.radius });
+      const { close, whole } = shown;
+      frame(places.length ? { center: close.center, radius: Math.max(close.radius, 0.6 * whole.radius) } : { center: whole.center, radius: 1.15 * whole.radius });
       state.framed = true;
     }
   }
 
+  function freeParts() {
+    if (state.parts) Object.values(state.parts).flat().forEach((part) => part.free());
+    state.parts = null;
+  }
+
+  // Uploads what is visible of the interval.
+  function fillParts() {
+    freeParts();
+    const { shown } = state, { meshes, start, end, faces, hits, outline } = shown;
+    const colors = new Float32Array(start.length);
+    meshes.forEach((mesh, vertex) => colors.set(meshColor(mesh), 3 * vertex));
+    const positions = [["start", start, 3], ["end", end, 3], ["color", colors, 3]];
+    const surface = (attributes, corners, rows) => ({ length: 3 * rows.length, ...vertexArray(gl, triangles, attributes, pick(corners, 3, rows)) });
+    const solid = inState(faces, 3, meshes, (mesh) => meshStates[mesh] === SOLID), isSolid = new Set(solid);
+    const ghosts = inState(faces, 3, meshes, (mesh) => meshStates[mesh] === GHOST);
+    const dots = (place, color, toi) => ({ count: place.length / 3, ...vertexArray(gl, points, [["start", place, 3], ["color", color, 3], ["toi", toi, 1]]) });
+    const rows = visibleRows(hits), pointColors = new Float32Array(3 * rows.length);
+    rows.forEach((row, place) => pointColors.set(CONTACT_COLORS[hits.kind[row]], 3 * place));
+    const segments = (values, stride, places, more = []) => vertexArray(gl, lines, [...["start", "end", "start_1", "end_1"].map((name, i) => [name, values, 3, [stride, places[i]]]), ...more]);
+    const free = inState(shown.edges, 2, meshes, (mesh) => !isHidden(mesh)), ropes = new Float32Array(12 * free.length), ropeColors = new Float32Array(3 * free.length);
+    free.forEach((edge, place) => {
+      const ends = shown.edges.subarray(2 * edge, 2 * edge + 2);
+      [start, end].forEach((values, when) => ends.forEach((vertex, i) => ropes.set(values.subarray(3 * vertex, 3 * vertex + 3), 12 * place + 6 * when + 3 * i)));
+      ropeColors.set(meshColor(meshes[ends[0]]).map((value) => STRAND_SHADE * value), 3 * place);
+    });
+    const alone = shown.points.filter((vertex) => !isHidden(meshes[vertex]));
+    const shades = colors.map((value) => STRAND_SHADE * value);
+    state.parts = {
+      solid: surface(positions, faces, solid),
+      ghosts: surface(positions, faces, ghosts),
+      lit: surface(positions, faces, shown.lit.filter((face) => isSolid.has(face))),
+      outline: outline ? surface([["start", outline.start, 3], ["end", outline.end, 3]], outline.faces, inState(outline.faces, 3, outline.meshes, (mesh) => !isHidden(mesh))) : [],
+      dots: dots(pick(hits.position, 3, rows), pointColors, pick(hits.toi, 1, rows)),
+      // of intersections and proximities at the start, and at the end
+      cuts: shown.rest.map((block) => cutsOf(block, segments)),
+      marks: [0, 1].map((end_) => marksOf(shown.rest[end_], shown.near[end_], dots)),
+      ropes: { count: free.length, ...segments(ropes, 48, [0, 12, 24, 36], [["color", ropeColors, 3, [12, 0]]]) },
+      dust: { count: alone.length, ...vertexArray(gl, strands, [...positions.slice(0, 2), ["color", shades, 3]], alone) },
+    };
+    ask();
+  }
+
+  // The curves in which visible meshes cut each other.
+  function cutsOf(block, segments) {
+    const rows = [], length = block ? block.from.length / 3 : 0;
+    for (let i = 0; i < length; i += 1) if (!isHidden(block.curve_meshes[2 * i]) && !isHidden(block.curve_meshes[2 * i + 1])) rows.push(i);
+    const values = new Float32Array(6 * rows.length);
+    rows.forEach((row, place) => [block.from, block.to].forEach((ends, i) => values.set(ends.subarray(3 * row, 3 * row + 3), 6 * place + 3 * i)));
+    return { count: rows.length, ...segments(values, 24, [0, 12, 0, 12]) };
+  }
+
+  // Markers of parts inside others, curves through faces, and proximities.
+  function marksOf(rest, near, dots) {
+    const through = new Set(rest?.through);
+    const atRest = visibleRows(rest).filter((row) => rest.kind[row] === INSIDE || through.has(row)), atNear = visibleRows(near);
+    const places = new Float32Array([...(rest ? pick(rest.position, 3, atRest) : []), ...(near ? pick(near.position, 3, atNear) : [])]);
+    const colors = [...atRest.flatMap(() => CURVE_COLOR), ...atNear.flatMap(() => NEAR_COLOR)];
+    return dots(places, new Float32Array(colors), new Float32Array(places.length / 3));
+  }
+
   // Marks the position of a row, and moves the view to it.
   function choose({ from, place, time }) {
-    const { contacts, rest, close } = state.shown;
-    const places = from === "hits" ? contacts : (from === "rest" ? rest : close)[Math.round(time)];
-    const point = places.slice(3 * place, 3 * place + 3);
+    const { hits, rest, near } = state.shown;
+    const block = from === "hits" ? hits : (from === "rest" ? rest : near)[Math.round(time)];
     state.time = time;
-    if (point.length < 3) return;
+    if (!block) return;
+    const point = block.position.slice(3 * place, 3 * place + 3);
     state.chosen?.free();
-    state.parts = state.parts.filter((part) => part !== state.chosen);
     state.chosen = vertexArray(gl, points, [["start", point, 3], ["color", new Float32Array(CHOSEN_COLOR), 3], ["toi", new Float32Array([0]), 1]]);
-    state.parts.push(state.chosen);
     camera.center = turned([...point]);
     camera.distance = Math.min(camera.distance, 0.5 * state.shown.whole.radius);
   }
 
+  function drawSurface(part, values) {
+    if (!part.length) return;
+    set(triangles, { time: state.time, only: [0, 0, 0, 0], transparency: 0, ...values });
+    gl.bindVertexArray(part.array);
+    gl.drawElements(gl.TRIANGLES, part.length, gl.UNSIGNED_INT, 0);
+  }
+
   function draw(now) {
-    const { shown } = state;
+    const { shown, parts } = state;
     if (!shown) return;
     if (state.playing) {
       state.time = (state.time + (now - (state.last || now)) / 2500) % 1;
       showTime();
     }
     state.last = now;
-    const { scale, width, height } = begin(shown.whole.radius);
+    const { scale, width, height } = begin(shown.whole.radius, shown.reach);
+    if (parts.outline.length) {
+      // The nearest faces of the outline alone, and behind all that is shown in full.
+      gl.colorMask(false, false, false, false);
+      drawSurface(parts.outline, {});
+      gl.colorMask(true, true, true, true);
+      gl.depthFunc(gl.LEQUAL);
+      drawSurface(parts.outline, { only: [...REST_COLOR, 1], transparency: 0.55 });
+      gl.depthFunc(gl.LESS);
+      gl.clear(gl.DEPTH_BUFFER_BIT);
+    }
     gl.enable(gl.POLYGON_OFFSET_FILL);
-    for (const [part, length, only, offset] of [[shown.some, shown.lit.length, [...LIT_COLOR, 0.85], 0], [shown.all, shown.faces.length, [0, 0, 0, 0], 1]]) {
+    for (const [part, only, offset] of [[parts.lit, [...LIT_COLOR, 0.85], 0], [parts.solid, [0, 0, 0, 0], 1]]) {
       gl.polygonOffset(offset, offset);
-      set(triangles, { time: state.time, only });
-      gl.bindVertexArray(part.array);
-      gl.drawElements(gl.TRIANGLES, length, gl.UNSIGNED_INT, 0);
+      drawSurface(part, { only });
     }
     gl.disable(gl.POLYGON_OFFSET_FILL);
     const pixel = [(2 * scale) / width, (2 * scale) / height];
     set(lines, { pixel, time: state.time, fade: 1 });
-    gl.bindVertexArray(shown.ropes.array);
-    gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.edges.length / 2);
+    gl.bindVertexArray(parts.ropes.array);
+    gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, parts.ropes.count);
     set(strands, { time: state.time, size: 5 * scale });
-    gl.bindVertexArray(shown.dust.array);
-    gl.drawElements(gl.POINTS, shown.alone.length, gl.UNSIGNED_INT, 0);
+    gl.bindVertexArray(parts.dust.array);
+    gl.drawElements(gl.POINTS, parts.dust.count, gl.UNSIGNED_INT, 0);
     gl.depthMask(false);
-    // Contacts behind a surface are drawn faintly over it. Cut curves belong to one end of the interval.
-    const end = state.time < 0.5 ? 0 : 1;
+    drawSurface(parts.ghosts, { transparency: 0.85 });
+    drawMarks(parts, scale, pixel);
+    gl.depthFunc(gl.LESS);
+    gl.depthMask(true);
+    if (state.playing) ask();
+  }
+
+  // Contacts behind a surface are drawn faintly over it. Cut curves belong to one end of the interval.
+  function drawMarks(parts, scale, pixel) {
+    const end = state.time < 0.5 ? 0 : 1, marks = parts.marks[end], cuts = parts.cuts[end];
     // Large markers of many contacts would hide one another and the surfaces.
-    const marks = shown.marks[end], dots = shown.toi.length + marks.count;
-    const size = Math.max(4, 15 - 2.2 * Math.log10(Math.max(1, dots)) ** 1.4) * scale;
-    for (const [test, fade] of [[gl.GREATER, 0.45], [gl.LEQUAL, 1]]) {
+    const number = parts.dots.count + marks.count, isCrowded = number > 20000;
+    const size = Math.max(isCrowded ? 2.5 : 4, 15 - 2.2 * Math.log10(Math.max(1, number)) ** 1.4) * scale;
+    for (const [test, fade] of [[gl.GREATER, isCrowded ? 0.12 : 0.45], [gl.LEQUAL, 1]]) {
       gl.depthFunc(test);
-      set(lines, { pixel, time: 0, fade });
+      set(lines, { pixel, time: 0, fade: test === gl.LEQUAL ? 1 : 0.45 });
       gl.vertexAttrib3fv(gl.getAttribLocation(lines, "color"), CURVE_COLOR); // cut curves have one colour
-      gl.bindVertexArray(shown.cuts[end].array);
-      gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, shown.curves[end].length / 6);
-      set(points, { time: state.time, fade, size, core: dots > 300 ? 2 : 0.68 });
-      gl.bindVertexArray(marks.array);
-      gl.drawArrays(gl.POINTS, 0, marks.count);
-      gl.bindVertexArray(shown.dots.array);
-      gl.drawArrays(gl.POINTS, 0, shown.toi.length);
+      gl.bindVertexArray(cuts.array);
+      gl.drawArraysInstanced(gl.TRIANGLES, 0, 6, cuts.count);
+      set(points, { time: state.time, fade, size, core: number > 300 ? 2 : 0.68 });
+      for (const part of [marks, parts.dots]) {
+        gl.bindVertexArray(part.array);
+        gl.drawArrays(gl.POINTS, 0, part.count);
+      }
     }
     if (state.chosen) {
       gl.depthFunc(gl.ALWAYS);
@@ -277,18 +238,17 @@ function makeViewer() {
       gl.bindVertexArray(state.chosen.array);
       gl.drawArrays(gl.POINTS, 0, 1);
     }
-    gl.depthFunc(gl.LESS);
-    gl.depthMask(true);
-    if (state.playing) ask();
   }
 
   function showTime() {
+    if (state.index < 0) return;
     const [from, to] = data.intervals[state.index];
     byId("time").value = Math.round(1000 * state.time);
     byId("time-label").textContent = `time ${short(from + state.time * (to - from))}`;
+    lookThrough(cameras.at(state.index, state.time));
   }
 
-  byId("time").addEventListener("input", (event) => { state.time = event.target.value / 1000; showTime(); ask(); });
+  byId("time").addEventListener("input", (event) => { state.time = event.target.value / 1000; showTime(); });
   byId("play").addEventListener("click", () => {
     state.playing = !state.playing;
     state.last = 0;
@@ -296,6 +256,6 @@ function makeViewer() {
     ask();
   });
   byId("frame-all").addEventListener("click", () => { if (state.shown) frame({ center: state.shown.whole.center, radius: 1.15 * state.shown.whole.radius }); });
-  byId("frame-contacts").addEventListener("click", () => { if (state.shown) frame(state.shown.near); });
-  return { show, turn };
+  byId("frame-contacts").addEventListener("click", () => { if (state.shown) frame(state.shown.close); });
+  return { show, turn, chooseCamera: cameras.choose, cameraPath: cameras.path };
 }

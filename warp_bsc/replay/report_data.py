@@ -1,0 +1,176 @@
+"""The data of a replay's page beside its blocks: title, numbers, charts, pairs of meshes, facts."""
+
+from pathlib import Path
+
+from ..usd.scene import Scene
+from .summary import CERTIFIED_FOR, Summary
+
+__all__ = ["MAX_PAIRS", "Depths", "report_data", "report_title"]
+
+MAX_PAIRS = 10_000
+"""Largest number of pairs of meshes in the page."""
+
+_MAX_ROWS = 10  # of the small tables
+_MAX_DISAGREEMENTS = 200
+
+Depths = dict[tuple[str, str], tuple[float, float]]
+"""The largest depth of two meshes and its time, by their sorted names."""
+
+
+def report_title(scene: Scene) -> str:
+    """Returns the title of the page."""
+    return f"Collisions in {Path(scene.path).name}"
+
+
+def report_data(summary: Summary, depths: Depths) -> dict:
+    """Returns the data of the whole replay that the page's script shows.
+
+    Args:
+        summary: The replay.
+        depths: The depth of each two meshes that intersect.
+    """
+    scene = summary.scene
+    named = [(f"Mesh {name}", shown) for name in scene.names if (shown := scene.display_names[name])]
+    looked = bool(summary.intersections)
+    intersecting = sum(not at.is_empty for at in summary.intersections)
+    tiles = [
+        (f"{summary.hits:,}", "collisions"),
+        (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
+    ]
+    if first := summary.first_contact:
+        tiles.append((f"{first.time:.6g}", "time code of the first"))
+    if looked:
+        tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
+    if depths:
+        tiles.append((f"{max(depth for depth, _ in depths.values()):.4g}", "largest depth"))
+    if summary.clearance is not None:
+        nearest = summary.nearest
+        tiles.append((f"{nearest[0].distance:.4g}" if nearest else f"> {summary.clearance:g}", "smallest distance"))
+    tiles += [
+        (f"{len(scene.names):,}", "meshes" if len(scene.names) != 1 else "mesh"),
+        (f"{scene.face_count:,}", "triangles"),
+        ("yes" if summary.certified else "no", f"certified for {CERTIFIED_FOR}"),
+    ]
+    data = {
+        "title": report_title(scene),
+        "subtitle": f"{scene.path}, time {scene.times[0]:g} to {scene.times[-1]:g}; method {summary.method} on "
+        f"{summary.device}",
+        "partial": "",
+        "nothing": _nothing_found(summary),
+        "tiles": tiles,
+        "intervals": [
+            (
+                interval.start,
+                interval.end,
+                interval.vertex_face_hits,
+                interval.edge_edge_hits,
+                *([interval.vertex_edge_hits + interval.vertex_vertex_hits] * scene.has_strands),
+            )
+            for interval in summary.intervals
+        ],
+        "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
+        "near": [(at.time, at.pairs) for at in summary.proximities],
+        "toi": summary.toi_counts,
+        "pairs": _pairs_of_meshes(summary, depths),
+        "up_axis": scene.up_axis,
+        "facts": [
+            ("File", scene.path),
+            *scene.comments,
+            ("Up axis", scene.up_axis),
+            ("Metres per unit", f"{scene.meters_per_unit:g}"),
+            ("Time codes per second", f"{scene.time_codes_per_second:g}"),
+            ("Vertices", f"{scene.vertex_count:,}"),
+            *named[:_MAX_ROWS],
+            *([("Other display names", f"{len(named) - _MAX_ROWS:,}")] if len(named) > _MAX_ROWS else ()),
+        ],
+        "notes": [summary.motion, *scene.warnings],
+        "validation": None,
+    }
+    if not summary.is_complete:
+        data["partial"] = (
+            f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
+        )
+    if found := summary.validation:
+        wrong = len(found.disagreements)
+        text = (
+            f"The exact checker decided {found.hits:,} collisions and {found.others:,} other pairs again: "
+            f"{wrong:,} {'disagreement' if wrong == 1 else 'disagreements'}. Floating point had certified "
+            f"{found.certified:,} of all {found.decided:,} pairs."
+        )
+        data["validation"] = {"text": text, "disagreements": found.disagreements[:_MAX_DISAGREEMENTS]}
+    return data
+
+
+def _nothing_found(summary: Summary) -> str:
+    """Returns a sentence on what was checked if nothing was found in a whole replay, else an empty text."""
+    found = summary.hits or any(at.pairs for at in summary.proximities)
+    if found or not summary.is_complete or not all(at.is_empty for at in summary.intersections):
+        return ""
+    if summary.scene.is_still and not summary.intersections:
+        return ""  # nothing was checked
+    scene, at_rest = summary.scene, len(summary.intersections)
+    what = ["Nothing collides"] * (not scene.is_still) + ["nothing intersects"] * bool(at_rest)
+    if summary.clearance is not None:
+        what.append(f"nothing is within {summary.clearance:g} of another")
+    times = f"time {scene.times[0]:g}" if scene.is_still else f"time {scene.times[0]:g} to {scene.times[-1]:g}"
+    sentence = ", ".join(what)
+    checked = [f"{len(summary.intervals):,} {_plural('interval', len(summary.intervals))}"] * (not scene.is_still)
+    checked += [f"{at_rest:,} {_plural('time', at_rest)}"] * bool(at_rest)
+    text = (
+        f"{sentence[:1].upper()}{sentence[1:]}: {' and '.join(checked)} of {len(scene.names):,} "
+        f"{_plural('mesh', len(scene.names), 'es')} and {scene.face_count:,} "
+        f"{_plural('triangle', scene.face_count)} were checked, {times}"
+    )
+    text += f", certified for {CERTIFIED_FOR}." if summary.certified else ", not certified: collisions may be missing."
+    if not at_rest:
+        text += " Intersections at rest were not checked."
+    if hits := sum(hits for _, hits in summary.ignored):
+        text += f" Left out: {hits:,} {_plural('collision', hits)} of ignored pairs."
+    if parts := len(scene.left_out):
+        text += f" Not checked: {parts:,} {_plural('part', parts)} that cannot be read; see the notes."
+    selection = scene.selection
+    if selection.between or selection.ignore or selection.ignored_names or not selection.self_collisions:
+        text += " Only some pairs of meshes were checked, as options say."
+    return text
+
+
+def _plural(word: str, count: int, ending: str = "s") -> str:
+    return word if count == 1 else word + ending
+
+
+def _pairs_of_meshes(summary: Summary, depths: Depths) -> list[dict]:
+    """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
+
+    The deepest come first, then those with the most collisions. A pair has at most :data:`_MAX_ROWS` spans of each
+    kind; the numbers ``more`` count the others.
+    """
+    hits = {(min(meshes), max(meshes)): count for meshes, count in summary.mesh_pairs}
+    spans: dict[tuple[str, str], tuple[tuple[str, str], list, list, list]] = {}
+
+    def spans_of(meshes: tuple[str, str]) -> tuple[tuple[str, str], list, list, list]:
+        return spans.setdefault((min(meshes), max(meshes)), (meshes, [], [], []))
+
+    for span in summary.collision_spans:
+        spans_of(span.meshes)[1].append((span.since, span.until, span.hits))
+    for span in summary.intersection_spans:
+        inner = span.meshes[0] if span.inside else ""
+        spans_of(span.meshes)[2].append((span.since, span.until, span.most, span.trend, inner))
+    for span in summary.proximity_spans:
+        spans_of(span.meshes)[3].append((span.since, span.until, span.distance))
+    order = sorted(spans, key=lambda key: (-depths.get(key, (0.0, 0.0))[0], -hits.get(key, 0)))
+    return [_pair(spans[key], hits.get(key, 0), depths.get(key)) for key in order[:MAX_PAIRS]]
+
+
+def _pair(spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tuple[float, float] | None) -> dict:
+    meshes, collisions, at_rest, near = spans
+    return {
+        "meshes": meshes,
+        "hits": hits,
+        "depth": depth,
+        "spans": collisions[:_MAX_ROWS],
+        "more": max(0, len(collisions) - _MAX_ROWS),
+        "rest": at_rest[:_MAX_ROWS],
+        "more_rest": max(0, len(at_rest) - _MAX_ROWS),
+        "near": near[:_MAX_ROWS],
+        "more_near": max(0, len(near) - _MAX_ROWS),
+    }
