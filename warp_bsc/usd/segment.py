@@ -1,6 +1,6 @@
 """A span of a scene's time over which the same meshes, curves and points exist and keep their topology."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -103,6 +103,8 @@ class Segment:
             face_count += len(triangles)
         self._vertex_ends = np.array([mesh.vertices.stop for mesh in self.meshes])
         self._face_ends = np.array([mesh.faces.stop for mesh in self.meshes])
+        self._points = _ByElement([mesh.points for mesh in self.meshes], [mesh.vertices.start for mesh in self.meshes])
+        self._polygons = _ByElement([mesh.polygons for mesh in self.meshes], [mesh.faces.start for mesh in self.meshes])
         self._corners = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
         self._unwelded_edges = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
         curve_of_vertex, radii = (np.concatenate([[], *arrays]) for arrays in (curves, radius))
@@ -213,18 +215,13 @@ class Segment:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
         faces = np.asarray(faces)
         meshes = np.searchsorted(self._face_ends, faces, side="right")
-        polygons = np.zeros(faces.shape, dtype=np.int64)
-        for number in np.unique(meshes):
-            members = meshes == number
-            polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
-        return meshes, polygons
+        return meshes, self._polygons.at(faces, meshes)
 
     def triangles_in_polygons(self, faces: np.ndarray) -> np.ndarray:
         """Returns the number of each face among the triangles of its polygon, from 0, shape [n]."""
         triangles = np.zeros(len(faces), dtype=np.int64)
-        meshes = np.searchsorted(self._face_ends, faces, side="right")
-        for number in np.unique(meshes):
-            mesh, members = self.meshes[number], meshes == number
+        for number, members in _groups(np.searchsorted(self._face_ends, faces, side="right")):
+            mesh = self.meshes[number]
             own = faces[members] - mesh.faces.start
             triangles[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
         return triangles
@@ -232,16 +229,16 @@ class Segment:
     def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """Returns faces, shape [n]: the inverse of :meth:`locate_faces` and :meth:`triangles_in_polygons`."""
         faces = np.zeros(len(meshes), dtype=np.int64)
-        for number in np.unique(meshes):
-            mesh, members = self.meshes[number], meshes == number
+        for number, members in _groups(meshes):
+            mesh = self.meshes[number]
             faces[members] = mesh.faces.start + np.searchsorted(mesh.polygons, polygons[members]) + triangles[members]
         return faces
 
     def find_vertices(self, meshes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Returns vertices, given meshes and the indices of points of their prims, shape [n]."""
         vertices = np.zeros(len(meshes), dtype=np.int64)
-        for number in np.unique(meshes):
-            mesh, members = self.meshes[number], meshes == number
+        for number, members in _groups(meshes):
+            mesh = self.meshes[number]
             vertices[members] = mesh.vertices.start + np.searchsorted(mesh.points, points[members])
         return np.searchsorted(self._kept, self._welded_to[vertices])
 
@@ -405,11 +402,7 @@ class Segment:
 
     def _locate(self, unwelded):
         meshes = np.searchsorted(self._vertex_ends, unwelded, side="right")
-        points = np.zeros(unwelded.shape, dtype=np.int64)
-        for number in np.unique(meshes):
-            members = meshes == number
-            points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
-        return meshes, points
+        return meshes, self._points.at(unwelded, meshes)
 
     def _reader(self, vertices, numbers) -> PositionReader:
         """Returns a reader of some vertices, numbered before welding, ascending, in the meshes of some numbers."""
@@ -442,6 +435,33 @@ class Segment:
             groups = split_by_position(groups, positions)
         welded_to[crowded] = crowded[groups]
         return welded_to
+
+
+class _ByElement:
+    """A number for each vertex or face of all meshes, such as the point of the prim; instances share theirs."""
+
+    def __init__(self, numbers: list[np.ndarray], firsts: list[int]):
+        """Joins the numbers of the meshes.
+
+        Args:
+            numbers: Those of the elements of each mesh; the same array for meshes that share them.
+            firsts: The first element of each mesh.
+        """
+        distinct = {id(array): array for array in numbers}
+        self._numbers = np.concatenate([np.zeros(0, dtype=np.int64), *distinct.values()])
+        starts = dict(zip(distinct, np.cumsum([0, *map(len, distinct.values())]).tolist(), strict=False))
+        self._shifts = np.array([starts[id(array)] for array in numbers]) - np.array(firsts)
+
+    def at(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
+        """Returns the numbers of elements, given the mesh of each."""
+        return self._numbers[elements + self._shifts[meshes]]
+
+
+def _groups(meshes: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yields each of the given meshes with its rows."""
+    order = np.argsort(meshes, kind="stable")
+    numbers, starts = np.unique(meshes[order], return_index=True)
+    yield from zip(numbers.tolist(), np.split(order, starts[1:]), strict=False)
 
 
 def _renumber(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
