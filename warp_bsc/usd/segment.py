@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._sorted_keys import distinct, search, search_ranges
 from .position_reader import PositionReader
 from .scene_mesh import SceneMesh
 from .welding import group_by_position, split_by_position
@@ -197,9 +198,7 @@ class Segment:
     def meshes_at_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``vertices`` and a mesh with that vertex, welded or not, in two arrays."""
         unwelded, order = self._unwelded
-        kept = self._kept[vertices]
-        first, last = np.searchsorted(unwelded, kept), np.searchsorted(unwelded, kept, side="right")
-        rows, indices = _expand(first, last)
+        rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
         return rows, np.searchsorted(self._vertex_ends, order[indices], side="right")
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -245,8 +244,7 @@ class Segment:
     def find_points(self, meshes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """Returns the indices of vertices among the points of given meshes' prims, the first if welded, shape [n]."""
         unwelded, order = self._unwelded
-        kept = self._kept[vertices]
-        rows, indices = _expand(np.searchsorted(unwelded, kept), np.searchsorted(unwelded, kept, side="right"))
+        rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
         own_meshes, points = self._locate(order[indices])
         (own,) = np.nonzero(own_meshes == meshes[rows])
         return points[own[np.unique(rows[own], return_index=True)[1]]]
@@ -263,7 +261,7 @@ class Segment:
         """
         keys, sides = self._sides
         own = self._side_keys(ends)
-        first = np.searchsorted(keys, own)
+        first = search(keys, own)
         # The face's own corners, as the welded ends may belong to an earlier mesh.
         meshes, points = self._locate(self._ends_of_sides(sides[first]))
 
@@ -332,13 +330,12 @@ class Segment:
     def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
         """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
         keys, sides = self._sides
-        own = self._side_keys(ends)
-        first, last = np.searchsorted(keys, own), np.searchsorted(keys, own, side="right")
+        first, last = search_ranges(keys, self._side_keys(ends))
         marked = np.zeros(len(keys) + 1, dtype=np.int64)
         np.add.at(marked, first, 1)
         np.add.at(marked, last, -1)
         found = sides[np.cumsum(marked[:-1]) > 0]
-        return np.unique(found[found < self._corners.size] // 3)
+        return distinct(found[found < self._corners.size] // 3)
 
     @cached_property
     def _unwelded(self):
@@ -362,17 +359,15 @@ class Segment:
     def _find_sides(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a side, in two arrays."""
         keys, sides = self._sides
-        own = self._side_keys(ends)
-        rows, indices = _expand(np.searchsorted(keys, own), np.searchsorted(keys, own, side="right"))
+        rows, indices = _expand(*search_ranges(keys, self._side_keys(ends)))
         return rows, sides[indices]
 
     def _ends_of_sides(self, sides: np.ndarray) -> np.ndarray:
         """Returns the vertices at both ends of sides, numbered before welding, shape [n, 2]."""
-        face, corner = np.divmod(sides, 3)
-        of_faces = sides < self._corners.size
+        corners, of_faces = self._corners.reshape(-1), sides < self._corners.size
         ends = np.zeros((len(sides), 2), dtype=np.int64)
-        rows = face[of_faces], corner[of_faces]
-        ends[of_faces] = np.stack([self._corners[rows], self._corners[rows[0], (rows[1] + 1) % 3]], axis=1)
+        own = sides[of_faces]
+        ends[of_faces] = np.stack([corners[own], corners[np.where(own % 3 == 2, own - 2, own + 1)]], axis=1)
         ends[~of_faces] = self._unwelded_edges[sides[~of_faces] - self._corners.size]
         return ends
 
