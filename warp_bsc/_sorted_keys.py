@@ -1,4 +1,4 @@
-"""Distinct integers, and integers sought in sorted arrays, by sorting: many times faster than NumPy if they are many."""
+"""Distinct integers, and integers sought in sorted arrays, by sorting: if many, many times faster than in NumPy."""
 
 import numpy as np
 
