@@ -6,16 +6,19 @@
 import copy
 import math
 import os
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
 from .instancers import (
+    Instance,
     are_finite,
     is_shown,
     masking_attributes,
     transform_attributes,
+    transform_ops,
     transform_times,
     visibility_times,
 )
@@ -367,6 +370,20 @@ class UsdMesh:
             if len(points) != point_count or not are_there[instances].all() or not np.isfinite(transforms).all():
                 return None
             return points @ transforms[:, :3, :3] + transforms[:, 3:, :3]
+
+    @property
+    def instance(self) -> Instance | None:
+        """The instance that it is, None for a mesh without an instancer."""
+        return self._instance
+
+    def transform_ops(self) -> Iterator[UsdGeom.XformOp]:
+        """Yields the operations of its transform to the world, except those of instancers on their instances."""
+        yield from transform_ops(self._frame, self._root)
+        instance = self._instance
+        while instance:
+            instancer = instance.instancer
+            instance = instancer.parent
+            yield from transform_ops(instancer.prim, instance.root if instance else None)
 
     @property
     def index(self) -> int:
