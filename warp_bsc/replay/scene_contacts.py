@@ -11,7 +11,7 @@ from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
-from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements
+from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
 
 __all__ = ["PHASES", "SceneContacts", "compare_contacts", "find_contacts", "find_strand_contacts", "join_contacts"]
 
@@ -130,7 +130,7 @@ def find_contacts(
     }
     return SceneContacts(
         segment,
-        **{name: array[counted] for name, array in arrays.items()},
+        **take_rows(arrays, counted),
         interval=interval,
         counted=counted,
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
@@ -200,7 +200,7 @@ def find_strand_contacts(
     }
     return SceneContacts(
         segment,
-        **{name: array[counted] for name, array in arrays.items()},
+        **take_rows(arrays, counted),
         interval=interval,
         counted=counted,
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},

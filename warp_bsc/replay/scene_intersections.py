@@ -12,7 +12,7 @@ from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, take_rows
 
 __all__ = ["Cuts", "SceneIntersections", "name_intersections"]
 
@@ -165,7 +165,7 @@ def name_intersections(
         "position": _meeting_points(x[ends].astype(np.float64), x[mesh.faces[faces]].astype(np.float64)),
         "crosses": found.crosses,
     }
-    arrays = {name: array[counted] for name, array in arrays.items()}
+    arrays = take_rows(arrays, counted)
     if len(inside.bodies):
         of_inside = _name_inside(segment, inside, x)
         arrays = {name: np.concatenate([array, of_inside[name]]) for name, array in arrays.items()}

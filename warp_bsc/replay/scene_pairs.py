@@ -18,6 +18,7 @@ __all__ = [
     "are_stiff_pairs",
     "count_by_meshes",
     "name_elements",
+    "take_rows",
 ]
 
 KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex")
@@ -204,6 +205,11 @@ def name_elements(
         "vertices": all_vertices,
         "faces": all_faces,
     }
+
+
+def take_rows(arrays: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns some rows of arrays, given which, bool; the arrays themselves for all rows."""
+    return arrays if which.all() else {name: array[which] for name, array in arrays.items()}
 
 
 def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -445,7 +445,9 @@ class _ByElement:
         distinct = {id(array): array for array in numbers}
         self._numbers = np.concatenate([np.zeros(0, dtype=np.int64), *distinct.values()])
         starts = dict(zip(distinct, np.cumsum([0, *map(len, distinct.values())]).tolist(), strict=False))
-        self._shifts = np.array([starts[id(array)] for array in numbers]) - np.array(firsts)
+        self._shifts = np.array([starts[id(array)] for array in numbers], dtype=np.int64) - np.array(
+            firsts, dtype=np.int64
+        )
 
     def at(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
         """Returns the numbers of elements, given the mesh of each."""
