@@ -102,10 +102,8 @@ class Segment:
             )
             vertex_count += len(used)
             face_count += len(triangles)
-        self._vertex_ends = np.array([mesh.vertices.stop for mesh in self.meshes])
-        self._face_ends = np.array([mesh.faces.stop for mesh in self.meshes])
-        self._points = _ByElement([mesh.points for mesh in self.meshes], [mesh.vertices.start for mesh in self.meshes])
-        self._polygons = _ByElement([mesh.polygons for mesh in self.meshes], [mesh.faces.start for mesh in self.meshes])
+        self._points = _InPrims([mesh.points for mesh in self.meshes])  # of vertices, numbered before welding
+        self._polygons = _InPrims([mesh.polygons for mesh in self.meshes])  # of faces
         self._corners = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
         self._unwelded_edges = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
         curve_of_vertex, radii = (np.concatenate([[], *arrays]) for arrays in (curves, radius))
@@ -184,27 +182,27 @@ class Segment:
     @property
     def face_meshes(self) -> np.ndarray:
         """Mesh of each face, shape [face_count]."""
-        return np.searchsorted(self._face_ends, np.arange(len(self.faces)), side="right")
+        return self._polygons.meshes(np.arange(len(self.faces)))
 
     @property
     def vertex_meshes(self) -> np.ndarray:
         """Mesh of each vertex, the first of those welded there, shape [vertex_count]."""
-        return np.searchsorted(self._vertex_ends, self._kept, side="right")
+        return self._points.meshes(self._kept)
 
     def locate_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each vertex, the first of those welded there, and its index among the prim's points."""
-        return self._locate(self._kept[vertices])
+        return self._points.locate(self._kept[vertices])
 
     def meshes_at_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``vertices`` and a mesh with that vertex, welded or not, in two arrays."""
         unwelded, order = self._unwelded
         rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
-        return rows, np.searchsorted(self._vertex_ends, order[indices], side="right")
+        return rows, self._points.meshes(order[indices])
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a mesh with it, in two arrays."""
         rows, sides = self._find_sides(ends)
-        return rows, np.searchsorted(self._vertex_ends, self._ends_of_sides(sides)[:, 0], side="right")
+        return rows, self._points.meshes(self._ends_of_sides(sides)[:, 0])
 
     def vertices_of(self, number: int) -> np.ndarray:
         """Returns the vertices of a mesh, in the order of :attr:`SceneMesh.points`, shape [n]."""
@@ -212,14 +210,12 @@ class Segment:
 
     def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
-        faces = np.asarray(faces)
-        meshes = np.searchsorted(self._face_ends, faces, side="right")
-        return meshes, self._polygons.at(faces, meshes)
+        return self._polygons.locate(np.asarray(faces))
 
     def triangles_in_polygons(self, faces: np.ndarray) -> np.ndarray:
         """Returns the number of each face among the triangles of its polygon, from 0, shape [n]."""
         triangles = np.zeros(len(faces), dtype=np.int64)
-        for number, members in _groups(np.searchsorted(self._face_ends, faces, side="right")):
+        for number, members in _groups(self._polygons.meshes(faces)):
             mesh = self.meshes[number]
             own = faces[members] - mesh.faces.start
             triangles[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
@@ -245,7 +241,7 @@ class Segment:
         """Returns the indices of vertices among the points of given meshes' prims, the first if welded, shape [n]."""
         unwelded, order = self._unwelded
         rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
-        own_meshes, points = self._locate(order[indices])
+        own_meshes, points = self._points.locate(order[indices])
         (own,) = np.nonzero(own_meshes == meshes[rows])
         return points[own[np.unique(rows[own], return_index=True)[1]]]
 
@@ -263,7 +259,7 @@ class Segment:
         own = self._side_keys(ends)
         first = search(keys, own)
         # The face's own corners, as the welded ends may belong to an earlier mesh.
-        meshes, points = self._locate(self._ends_of_sides(sides[first]))
+        meshes, points = self._points.locate(self._ends_of_sides(sides[first]))
 
         # Triangles of one polygon are neighbours in the list.
         following = np.minimum(first + 1, max(0, len(keys) - 1))
@@ -395,10 +391,6 @@ class Segment:
     def _side_keys(self, ends):
         return np.asarray(ends, dtype=np.int64) @ np.array([self.vertex_count, 1])
 
-    def _locate(self, unwelded):
-        meshes = np.searchsorted(self._vertex_ends, unwelded, side="right")
-        return meshes, self._points.at(unwelded, meshes)
-
     def _reader(self, vertices, numbers) -> PositionReader:
         """Returns a reader of some vertices, numbered before welding, ascending, in the meshes of some numbers."""
         ends = np.searchsorted(vertices, [0, *(mesh.vertices.stop for mesh in self.meshes)]).tolist()
@@ -413,7 +405,7 @@ class Segment:
         """Returns for each vertex the first one that has the same position at every time, shape [vertex_count]."""
         welded_to = split_by_position(group_by_position(self._start), self._start)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
-        owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right")).tolist()
+        owners = distinct(self._points.meshes(crowded)).tolist()
         moving = [number for number in owners if self.meshes[number].moves]
         if not moving:
             return welded_to
@@ -432,26 +424,28 @@ class Segment:
         return welded_to
 
 
-class _ByElement:
-    """A number for each vertex or face of all meshes, such as the point of the prim; instances share theirs."""
+class _InPrims:
+    """The mesh of each vertex or face, and its index among the points or polygons of the prim; instances share these."""
 
-    def __init__(self, numbers: list[np.ndarray], firsts: list[int]):
-        """Joins the numbers of the meshes.
+    def __init__(self, indices: list[np.ndarray]):
+        """Joins the indices of the elements of each mesh, given the same array for meshes that share them."""
+        counts = [len(array) for array in indices]
+        self._mesh_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        distinct_arrays = {id(array): array for array in indices}
+        self._indices = np.concatenate([np.zeros(0, dtype=np.int64), *distinct_arrays.values()])
+        starts = np.cumsum([0, *map(len, distinct_arrays.values())])
+        start_of = dict(zip(distinct_arrays, starts.tolist(), strict=False))
+        starts = np.array([start_of[id(array)] for array in indices], dtype=np.int64)
+        self._shifts = starts - np.cumsum([0, *counts])[:-1]
 
-        Args:
-            numbers: Those of the elements of each mesh; the same array for meshes that share them.
-            firsts: The first element of each mesh.
-        """
-        distinct = {id(array): array for array in numbers}
-        self._numbers = np.concatenate([np.zeros(0, dtype=np.int64), *distinct.values()])
-        starts = dict(zip(distinct, np.cumsum([0, *map(len, distinct.values())]).tolist(), strict=False))
-        self._shifts = np.array([starts[id(array)] for array in numbers], dtype=np.int64) - np.array(
-            firsts, dtype=np.int64
-        )
+    def meshes(self, elements: np.ndarray) -> np.ndarray:
+        """Returns the mesh of each element, int64."""
+        return self._mesh_of[elements].astype(np.int64)
 
-    def at(self, elements: np.ndarray, meshes: np.ndarray) -> np.ndarray:
-        """Returns the numbers of elements, given the mesh of each."""
-        return self._numbers[elements + self._shifts[meshes]]
+    def locate(self, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the mesh of each element, and its index in the prim."""
+        meshes = self.meshes(elements)
+        return meshes, self._indices[elements + self._shifts[meshes]]
 
 
 def _groups(meshes: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
