@@ -425,7 +425,7 @@ class Segment:
 
 
 class _InPrims:
-    """The mesh of each vertex or face, and its index among the points or polygons of the prim; instances share these."""
+    """The mesh of each vertex or face, and its index among the points or polygons of its prim, shared by instances."""
 
     def __init__(self, indices: list[np.ndarray]):
         """Joins the indices of the elements of each mesh, given the same array for meshes that share them."""
