@@ -40,7 +40,8 @@ hold geometry are left out as a whole; :attr:`Scene.left_out` names them. The re
 moves. A scene in which nothing ever moves is read at one time.
 
 :attr:`Scene.warnings` names the contents that are not read (other curves and shapes without polygons, unselected
-meshes) and the changes to the motion.
+meshes), the changes to the motion, turns by half a turn or more from one time to the next, which straight paths do not
+show, and meshes that a scale of 0 hides.
 """
 
 # pyright: reportAttributeAccessIssue=false
