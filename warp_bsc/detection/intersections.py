@@ -10,6 +10,7 @@ import warp as wp
 from .. import checker
 from .._arguments import check_finite, check_instance
 from .._one_thread import one_at_a_time
+from .._sorted_keys import distinct
 from ..kernels.crossing import edge_beside_face, edge_crosses_face
 from ..kernels.exact.edge_face import BITS, edge_meets_face_in
 from ..kernels.motion import double
@@ -361,7 +362,7 @@ class IntersectionFinder:
         for one, other in (collisions.edge_edge.T, collisions.edge_edge[:, ::-1].T):
             rows, faces = self._faces_of_edges.of(other)
             pairs.append(np.stack([one[rows], faces], axis=1))
-        keys = np.unique(np.concatenate(pairs).astype(np.int64) @ np.array([len(mesh.faces), 1]))
+        keys = distinct(np.concatenate(pairs).astype(np.int64) @ np.array([len(mesh.faces), 1]))
         edges, faces = np.divmod(keys, max(1, len(mesh.faces)))
         apart = (mesh.edges[edges][:, :, None] != mesh.faces[faces][:, None, :]).all(axis=(1, 2))
         return np.stack([edges[apart], faces[apart]], axis=1).astype(np.int32)

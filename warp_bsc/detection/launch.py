@@ -209,8 +209,24 @@ def launch_over(
         command.set_param_at_index(0, first)
         command.set_dim(min(chunk, count - first))
         commands.append(command)
-    run = map if len(commands) < 2 else _pool(threads).map
-    list(run(wp.Launch.launch, commands))
+    _run(commands, threads)
+
+
+def _run(commands: list[wp.Launch], threads: int) -> None:
+    """Runs commands in this thread and, as soon as they are free, in others, so that short ones wait for none."""
+    waiting = iter(commands)
+
+    def work() -> None:
+        for command in waiting:
+            command.launch()
+
+    others = [_pool(threads).submit(work) for _ in range(min(threads, len(commands)) - 1)]
+    try:
+        work()
+    finally:
+        for other in others:
+            if not other.cancel():
+                other.result()
 
 
 def launch_over_queue(

@@ -6,12 +6,13 @@ from typing import ClassVar
 
 import numpy as np
 
+from .._sorted_keys import search
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
 from ..usd.interval import Interval
 from ..usd.selection import Selection
 from .scene_intersections import SceneIntersections
-from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements
+from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
 
 __all__ = ["PHASES", "SceneContacts", "compare_contacts", "find_contacts", "find_strand_contacts", "join_contacts"]
 
@@ -132,7 +133,7 @@ def find_contacts(
     }
     return SceneContacts(
         segment,
-        **{name: array[counted] for name, array in arrays.items()},
+        **take_rows(arrays, counted),
         interval=interval,
         counted=counted,
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
@@ -202,7 +203,7 @@ def find_strand_contacts(
     }
     return SceneContacts(
         segment,
-        **{name: array[counted] for name, array in arrays.items()},
+        **take_rows(arrays, counted),
         interval=interval,
         counted=counted,
         ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
@@ -230,18 +231,12 @@ def compare_contacts(contacts: SceneContacts, start: SceneIntersections, end: Sc
         phase[rows] = 0
         firsts, others = contacts.vertices[rows, 0], contacts.vertices[rows, 1][:, [0, 1, 1]]
         seconds = np.where((contacts.kind[rows] == 0)[:, None], segment.faces[contacts.faces[rows, 1]], others)
-        pairs = np.concatenate(
-            [
-                np.stack([np.where(first < 0, firsts[:, 0], first), second], axis=1)
-                for first in firsts.T
-                for second in seconds.T
-            ]
-        )
+        firsts = np.where(firsts < 0, firsts[:, :1], firsts)
         for weight, intersections in ((2, start), (1, end)):
             if len(tangled := intersections.tangled_vertices):
-                keys = intersections.pair_keys(pairs).reshape(6, -1)
-                found = np.searchsorted(tangled, keys)
-                phase[rows] += weight * (tangled[np.minimum(found, len(tangled) - 1)] == keys).any(axis=0)
+                keys = intersections.pair_keys(firsts[:, :, None], seconds[:, None, :]).reshape(-1)
+                found = np.minimum(search(tangled, keys), len(tangled) - 1)
+                phase[rows] += weight * (tangled[found] == keys).reshape(-1, 6).any(axis=1)
     return replace(contacts, separate=separate, phase=phase)
 
 

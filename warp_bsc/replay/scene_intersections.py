@@ -6,12 +6,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from .._sorted_keys import distinct
 from ..detection.containment import Containment
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs
+from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, take_rows
 
 __all__ = ["Cuts", "SceneIntersections", "name_intersections"]
 
@@ -97,7 +98,7 @@ class SceneIntersections(ScenePairs):
         corners = of_pair[shared[:, 0], 0, shared[:, 1]]
         points = np.concatenate([self.position[rows], self.x[corners].astype(np.float64)])
         keys = first.astype(np.int64) * len(segment.faces) + second
-        crossed = np.unique(keys[self.crosses[rows]])
+        crossed = distinct(keys[self.crosses[rows]])
         keys = np.concatenate([keys, keys[shared[:, 0]]])
         kept = np.isin(keys, crossed)
         ends = _farthest(keys[kept], points[kept])
@@ -115,12 +116,11 @@ class SceneIntersections(ScenePairs):
         others = np.concatenate([self.faces[self.crosses, 1][rows], self.faces[self.of_curves, 1]])
         of_curves = self.vertices[self.of_curves, 0][:, [0, 1, 1]]
         first, second = np.concatenate([self.segment.faces[sides], of_curves]), self.segment.faces[others]
-        pairs = np.stack(np.broadcast_arrays(first[:, :, None], second[:, None, :]), axis=-1).reshape(-1, 2)
-        return np.unique(self.pair_keys(pairs))
+        return distinct(self.pair_keys(first[:, :, None], second[:, None, :]))
 
-    def pair_keys(self, vertices: np.ndarray) -> np.ndarray:
-        """Returns a number for each pair of vertices, shape [n], the same for both orders, given shape [n, 2]."""
-        first, second = vertices.astype(np.int64).T
+    def pair_keys(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Returns a number for each pair of vertices, given in two arrays, the same for both orders."""
+        first, second = first.astype(np.int64), second.astype(np.int64)
         return np.minimum(first, second) * self.segment.vertex_count + np.maximum(first, second)
 
 
@@ -167,7 +167,7 @@ def name_intersections(
         "position": _meeting_points(x[ends].astype(np.float64), x[mesh.faces[faces]].astype(np.float64)),
         "crosses": found.crosses,
     }
-    arrays = {name: array[counted] for name, array in arrays.items()}
+    arrays = take_rows(arrays, counted)
     if len(inside.bodies):
         of_inside = _name_inside(segment, inside, x)
         arrays = {name: np.concatenate([array, of_inside[name]]) for name, array in arrays.items()}

@@ -19,6 +19,7 @@ __all__ = [
     "are_stiff_pairs",
     "count_by_meshes",
     "name_elements",
+    "take_rows",
 ]
 
 KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex")
@@ -153,10 +154,10 @@ def count_by_meshes(
     """
     if not len(meshes):
         return {}
-    numbers: np.ndarray = np.ones((len(meshes), 1), dtype=int) if weights is None else weights
-    pairs, groups = np.unique(np.sort(meshes, axis=1) @ np.array([len(segment.meshes), 1]), return_inverse=True)
-    sums = np.zeros((len(pairs), numbers.shape[1]), dtype=np.int64)
-    np.add.at(sums, groups, numbers)
+    keys = np.minimum(*meshes.T) * len(segment.meshes) + np.maximum(*meshes.T)
+    pairs, groups = np.unique(keys, return_inverse=True)
+    columns = [None] if weights is None else weights.T
+    sums = np.stack([np.bincount(groups, column, len(pairs)) for column in columns], axis=1).astype(np.int64)
     names = [mesh.name for mesh in segment.meshes]
     return {
         (names[pair // len(names)], names[pair % len(names)]): tuple(row)
@@ -213,6 +214,11 @@ def name_elements(
         "vertices": all_vertices,
         "faces": all_faces,
     }
+
+
+def take_rows(arrays: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
+    """Returns some rows of arrays, given which, bool; the arrays themselves for all rows."""
+    return arrays if which.all() else {name: array[which] for name, array in arrays.items()}
 
 
 def are_stiff_pairs(segment: Segment, vertices: np.ndarray, face_meshes: np.ndarray, ends: np.ndarray) -> np.ndarray:

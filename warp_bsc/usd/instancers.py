@@ -21,6 +21,7 @@ __all__ = [
     "is_shown",
     "masking_attributes",
     "transform_attributes",
+    "transform_ops",
     "transform_times",
     "visibility_times",
 ]
@@ -170,6 +171,19 @@ class Instancer:
             self._last_prototypes = times, prototypes
         return self._last_prototypes[1]
 
+    def zero_scales(self, times: list[float]) -> dict[int, float]:
+        """Returns the first time at which an instance has a scale of 0, by instances that do between times of a scene.
+
+        Args:
+            times: The scene's times, ascending.
+        """
+        scales = self._instancer.GetScalesAttr()
+        found: dict[int, float] = {}
+        for time in (times[0], *(time for time in scales.GetTimeSamples() if times[0] < time <= times[-1])):
+            are_zero = ~np.array(scales.Get(time) or np.ones((1, 3))).any(axis=1)
+            found = {index: time for index in np.flatnonzero(are_zero).tolist()} | found
+        return found
+
     def _read_placed(self, time) -> np.ndarray:
         """Returns the matrices of the instances in the instancer, shape [n, 4, 4], for the length of its shortest list.
 
@@ -246,7 +260,7 @@ def find_instances(
 
 def transform_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> Iterator[Usd.Attribute]:
     """Yields the attributes of the transforms from a prim to the world, or up to and including a root."""
-    return (op.GetAttr() for op in _transform_ops(prim, root))
+    return (op.GetAttr() for op in transform_ops(prim, root))
 
 
 def masking_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> tuple[Usd.Attribute, ...]:
@@ -254,7 +268,7 @@ def masking_attributes(prim: Usd.Prim, root: Usd.Prim | None = None) -> tuple[Us
 
     OpenUSD turns a quaternion that is not a number into the identity, and the inverse of an infinite scale into 0.
     """
-    ops = _transform_ops(prim, root)
+    ops = transform_ops(prim, root)
     return tuple(op.GetAttr() for op in ops if op.GetOpType() == UsdGeom.XformOp.TypeOrient or op.IsInverseOp())
 
 
@@ -271,7 +285,8 @@ def are_finite(attributes: Iterable[Usd.Attribute], time: Usd.TimeCode) -> bool:
     return True
 
 
-def _transform_ops(prim, root) -> Iterator[UsdGeom.XformOp]:
+def transform_ops(prim: Usd.Prim, root: Usd.Prim | None = None) -> Iterator[UsdGeom.XformOp]:
+    """Yields the operations of the transforms from a prim to the world, or up to and including a root."""
     while prim:
         if xformable := UsdGeom.Xformable(prim):
             yield from xformable.GetOrderedXformOps()

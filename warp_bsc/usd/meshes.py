@@ -6,16 +6,19 @@
 import copy
 import math
 import os
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 from pxr import Usd, UsdGeom
 
 from .instancers import (
+    Instance,
     are_finite,
     is_shown,
     masking_attributes,
     transform_attributes,
+    transform_ops,
     transform_times,
     visibility_times,
 )
@@ -129,6 +132,8 @@ class UsdMesh:
             appears = are_there & ~were_there
             first[appears] = transforms[appears]
             were_there |= are_there
+            if (self._moved & were_there).all():
+                break
         self._stays: np.ndarray = (first == np.eye(4)).all(axis=(1, 2))
         self._is_finite: np.ndarray = np.isfinite(first).all(axis=(1, 2))
         self._bent: dict[tuple[float, float], np.ndarray] = {}
@@ -264,7 +269,7 @@ class UsdMesh:
         """
         if self.is_placed:
             return positions.astype(np.float32)
-        code = self._time_code(time, before)
+        code = self.time_code(time, before)
         inverse = np.linalg.inv(np.array(UsdGeom.Imageable(self._prim).ComputeLocalToWorldTransform(code)))
         return (positions @ inverse[:3, :3] + inverse[3, :3]).astype(np.float32)
 
@@ -279,7 +284,7 @@ class UsdMesh:
             UnreadableError: If there are no points, or the binding to the skeleton is broken.
         """
         with reading(self._where, self.name, time):
-            code = self._time_code(time, before)
+            code = self.time_code(time, before)
             key = code.GetValue(), code.IsPreTime(), before and time not in self.states
             if key in self._last_points:
                 return self._last_points[key]
@@ -316,13 +321,8 @@ class UsdMesh:
         Raises:
             UnreadableError: If the number of points differs, or a position is not finite.
         """
-        points = self.read_points(time, before=before)
+        positions = self.read_used_points(time, before=before, used=used, point_count=point_count, dtype=dtype)
         with reading(self._where, self.name, time):
-            if len(points) != point_count:
-                raise UnreadableError(
-                    f"{self._where}: {len(points)} points at time {time:g}, but {point_count} at first"
-                )
-            positions = points[used].astype(dtype)
             if not self.is_placed:
                 transform = self._transform(time, before=before)
                 positions = positions @ transform[:3, :3] + transform[3, :3]
@@ -332,6 +332,18 @@ class UsdMesh:
                     f"{self._where}: vertex {used[first]} is not finite at time {time:g}: {positions[first].tolist()}"
                 )
             return positions
+
+    def read_used_points(
+        self, time: float, *, before: bool = False, used: np.ndarray, point_count: int, dtype: np.dtype
+    ) -> np.ndarray:
+        """Returns some points as :meth:`read_points` does; arguments and errors are those of :meth:`read_positions`."""
+        points = self.read_points(time, before=before)
+        with reading(self._where, self.name, time):
+            if len(points) != point_count:
+                raise UnreadableError(
+                    f"{self._where}: {len(points)} points at time {time:g}, but {point_count} at first"
+                )
+            return points[used].astype(dtype)
 
     def read_instances(
         self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
@@ -353,11 +365,25 @@ class UsdMesh:
         """
         points = self.read_points(time, before=before).astype(np.float64)
         with reading(self._where, self.name, time):
-            transforms, are_there = self._read_transforms(self._instance, self._time_code(time, before))
+            transforms, are_there = self._read_transforms(self._instance, self.time_code(time, before))
             transforms = transforms[instances]
             if len(points) != point_count or not are_there[instances].all() or not np.isfinite(transforms).all():
                 return None
             return points @ transforms[:, :3, :3] + transforms[:, 3:, :3]
+
+    @property
+    def instance(self) -> Instance | None:
+        """The instance that it is, None for a mesh without an instancer."""
+        return self._instance
+
+    def transform_ops(self) -> Iterator[UsdGeom.XformOp]:
+        """Yields the operations of its transform to the world, except those of instancers on their instances."""
+        yield from transform_ops(self._frame, self._root)
+        instance = self._instance
+        while instance:
+            instancer = instance.instancer
+            instance = instancer.parent
+            yield from transform_ops(instancer.prim, instance.root if instance else None)
 
     @property
     def index(self) -> int:
@@ -382,7 +408,7 @@ class UsdMesh:
             return np.zeros((0, 3), dtype=np.int64), np.zeros(0, dtype=np.int64), 0
         with reading(self._where, self.name, time):
             is_mirrored = bool(np.linalg.det(self._transform(time)[:3, :3]) < 0)
-            code = self._time_code(time, False)
+            code = self.time_code(time, False)
             if not self.group:
                 return self._find_triangles(code, points, is_mirrored)
             if any(value != code.GetValue() for value, _ in self._last_triangles):
@@ -409,19 +435,19 @@ class UsdMesh:
         if not self._strands:
             return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1), np.zeros(point_count)
         with reading(self._where, self.name, times[0]):
-            topology = self._read_topology(self._time_code(times[0], False))
+            topology = self._read_topology(self.time_code(times[0], False))
             edges, curves = self._strands.read_edges(topology.counts, point_count, self._where)
         own = sample_times(self._strands.width_attribute)
         radius = np.zeros(point_count)
         for time in sorted({*times, *(time for time in own if times[0] < time < times[-1])}) if own else times[:1]:
             with reading(self._where, self.name, time):
-                code = self._time_code(time, time == times[-1] > times[0])
+                code = self.time_code(time, time == times[-1] > times[0])
                 radius = np.maximum(radius, 0.5 * self._strands.read_widths(code, curves, self._where))
         return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
 
     def _scales(self, times: list[float]) -> list[float]:
         """Returns the largest stretch of the transform at each time, to nine digits; [1] without times."""
-        found = [self._find_transform(self._time_code(time, False)) for time in times if not self.is_placed]
+        found = [self._find_transform(self.time_code(time, False)) for time in times if not self.is_placed]
         scales = [
             np.linalg.norm(transform[:3, :3], 2)
             for transform in found
@@ -438,7 +464,7 @@ class UsdMesh:
             triangles = triangles[:, ::-1]
         return triangles, polygons, len(topology.counts)
 
-    def _time_code(self, time, before) -> Usd.TimeCode:
+    def time_code(self, time: float, before: bool) -> Usd.TimeCode:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""
         first, last = self._own_times.get(time, (time, time))
         # Reading the moment before a time takes twice as long, as USD interpolates from the previous sample.
@@ -446,7 +472,7 @@ class UsdMesh:
 
     def _transform(self, time, *, before=False) -> np.ndarray:
         """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]."""
-        transform = self._find_transform(self._time_code(time, before))
+        transform = self._find_transform(self.time_code(time, before))
         if transform is None:
             raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
         if not np.isfinite(transform).all():
@@ -475,10 +501,14 @@ class UsdMesh:
         """Returns the result of :meth:`Instancer.transforms`, or one matrix for a mesh without an instancer."""
         if instance:
             return instance.instancer.transforms(self._frame, instance.root, time)
-        transform = np.array(UsdGeom.Imageable(self._frame).ComputeLocalToWorldTransform(time))
-        if not are_finite(self._masking, time):
+        return self.compute_transform(UsdGeom.XformCache(time))[None], np.ones(1, dtype=bool)
+
+    def compute_transform(self, cache: UsdGeom.XformCache) -> np.ndarray:
+        """Returns the matrix of a mesh without an instancer, finite or not, at the time of a cache, shape [4, 4]."""
+        transform = np.array(cache.GetLocalToWorldTransform(self._frame))
+        if not are_finite(self._masking, cache.GetTime()):
             transform[:] = np.nan
-        return transform[None], np.ones(1, dtype=bool)
+        return transform
 
     def _read_topology(self, time) -> Topology:
         return read_topology(self._polygons, time, self._where)

@@ -11,7 +11,7 @@ __all__ = ["PositionReader"]
 
 
 class PositionReader:
-    """Reads positions of some vertices of meshes, those of instances of one prim together."""
+    """Reads positions of some vertices of meshes, those of instances of one prim and of rigid meshes together."""
 
     def __init__(self, parts: "list[tuple[UsdMesh, int, slice, np.ndarray]]", dtype: np.dtype):
         """Makes a reader.
@@ -21,7 +21,12 @@ class PositionReader:
                 indices of these among its points.
             dtype: Type of the positions.
         """
+        from .rigid_meshes import RigidMeshes, is_rigid  # noqa: PLC0415 (imports pxr)
+
         self._dtype = dtype
+        self._rigid_parts = [part for part in parts if is_rigid(part[0])]
+        self._rigid = RigidMeshes(self._rigid_parts, dtype)
+        parts = [part for part in parts if not is_rigid(part[0])]
         groups: dict[tuple, list] = {}
         self._single = []
         for part in parts:
@@ -48,6 +53,8 @@ class PositionReader:
                 positions[rows] = found
             else:
                 singles += members  # one of them is broken; reading it raises the error
+        if not self._rigid.read(positions, time, before):
+            singles += self._rigid_parts
         for mesh, count, rows, points in singles:
             positions[rows] = mesh.read_positions(
                 time, before=before, used=points, point_count=count, dtype=self._dtype

@@ -40,7 +40,8 @@ hold geometry are left out as a whole; :attr:`Scene.left_out` names them. The re
 moves. A scene in which nothing ever moves is read at one time.
 
 :attr:`Scene.warnings` names the contents that are not read (other curves and shapes without polygons, unselected
-meshes) and the changes to the motion.
+meshes), the changes to the motion, turns by half a turn or more from one time to the next, which straight paths do not
+show, and meshes that a scale of 0 hides.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -203,6 +204,7 @@ class Scene:
 
         from .find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
         from .stage import check_stage, open_stage  # noqa: PLC0415
+        from .transform_warnings import transform_warnings  # noqa: PLC0415
         from .unreadable import LeftOut, UnreadableError, collecting  # noqa: PLC0415
 
         self._lock = threading.RLock()
@@ -234,7 +236,7 @@ class Scene:
             own_start = self.stage.GetStartTimeCode()
             found = find_times(self._usd_meshes, frames, options.subdivide, options.sample_turns, own_start)
             self.times = found.times
-            self._warnings += found.warnings
+            self._warnings += found.warnings + transform_warnings(self._usd_meshes, self.times)
             inner = [index for index, time in enumerate(self.times[:-1]) if index and time in found.changes]
             self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
             self._segment: Segment | None = None

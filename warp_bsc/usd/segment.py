@@ -1,11 +1,12 @@
 """A span of a scene's time over which the same meshes, curves and points exist and keep their topology."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._sorted_keys import distinct, search, search_ranges
 from .position_reader import PositionReader
 from .scene_mesh import SceneMesh
 from .welding import group_by_position, split_by_position
@@ -101,8 +102,8 @@ class Segment:
             )
             vertex_count += len(used)
             face_count += len(triangles)
-        self._vertex_ends = np.array([mesh.vertices.stop for mesh in self.meshes])
-        self._face_ends = np.array([mesh.faces.stop for mesh in self.meshes])
+        self._points = _InPrims([mesh.points for mesh in self.meshes])  # of vertices, numbered before welding
+        self._polygons = _InPrims([mesh.polygons for mesh in self.meshes])  # of faces
         self._corners = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
         self._unwelded_edges = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
         curve_of_vertex, radii = (np.concatenate([[], *arrays]) for arrays in (curves, radius))
@@ -181,29 +182,27 @@ class Segment:
     @property
     def face_meshes(self) -> np.ndarray:
         """Mesh of each face, shape [face_count]."""
-        return np.searchsorted(self._face_ends, np.arange(len(self.faces)), side="right")
+        return self._polygons.meshes(np.arange(len(self.faces)))
 
     @property
     def vertex_meshes(self) -> np.ndarray:
         """Mesh of each vertex, the first of those welded there, shape [vertex_count]."""
-        return np.searchsorted(self._vertex_ends, self._kept, side="right")
+        return self._points.meshes(self._kept)
 
     def locate_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each vertex, the first of those welded there, and its index among the prim's points."""
-        return self._locate(self._kept[vertices])
+        return self._points.locate(self._kept[vertices])
 
     def meshes_at_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``vertices`` and a mesh with that vertex, welded or not, in two arrays."""
         unwelded, order = self._unwelded
-        kept = self._kept[vertices]
-        first, last = np.searchsorted(unwelded, kept), np.searchsorted(unwelded, kept, side="right")
-        rows, indices = _expand(first, last)
-        return rows, np.searchsorted(self._vertex_ends, order[indices], side="right")
+        rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
+        return rows, self._points.meshes(order[indices])
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a mesh with it, in two arrays."""
         rows, sides = self._find_sides(ends)
-        return rows, np.searchsorted(self._vertex_ends, self._ends_of_sides(sides)[:, 0], side="right")
+        return rows, self._points.meshes(self._ends_of_sides(sides)[:, 0])
 
     def vertices_of(self, number: int) -> np.ndarray:
         """Returns the vertices of a mesh, in the order of :attr:`SceneMesh.points`, shape [n]."""
@@ -211,20 +210,13 @@ class Segment:
 
     def locate_faces(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the mesh of each face, and the index of the prim's polygon that it is a part of."""
-        faces = np.asarray(faces)
-        meshes = np.searchsorted(self._face_ends, faces, side="right")
-        polygons = np.zeros(faces.shape, dtype=np.int64)
-        for number in np.unique(meshes):
-            members = meshes == number
-            polygons[members] = self.meshes[number].polygons[faces[members] - self.meshes[number].faces.start]
-        return meshes, polygons
+        return self._polygons.locate(np.asarray(faces))
 
     def triangles_in_polygons(self, faces: np.ndarray) -> np.ndarray:
         """Returns the number of each face among the triangles of its polygon, from 0, shape [n]."""
         triangles = np.zeros(len(faces), dtype=np.int64)
-        meshes = np.searchsorted(self._face_ends, faces, side="right")
-        for number in np.unique(meshes):
-            mesh, members = self.meshes[number], meshes == number
+        for number, members in _groups(self._polygons.meshes(faces)):
+            mesh = self.meshes[number]
             own = faces[members] - mesh.faces.start
             triangles[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
         return triangles
@@ -232,25 +224,24 @@ class Segment:
     def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """Returns faces, shape [n]: the inverse of :meth:`locate_faces` and :meth:`triangles_in_polygons`."""
         faces = np.zeros(len(meshes), dtype=np.int64)
-        for number in np.unique(meshes):
-            mesh, members = self.meshes[number], meshes == number
+        for number, members in _groups(meshes):
+            mesh = self.meshes[number]
             faces[members] = mesh.faces.start + np.searchsorted(mesh.polygons, polygons[members]) + triangles[members]
         return faces
 
     def find_vertices(self, meshes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Returns vertices, given meshes and the indices of points of their prims, shape [n]."""
         vertices = np.zeros(len(meshes), dtype=np.int64)
-        for number in np.unique(meshes):
-            mesh, members = self.meshes[number], meshes == number
+        for number, members in _groups(meshes):
+            mesh = self.meshes[number]
             vertices[members] = mesh.vertices.start + np.searchsorted(mesh.points, points[members])
         return np.searchsorted(self._kept, self._welded_to[vertices])
 
     def find_points(self, meshes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """Returns the indices of vertices among the points of given meshes' prims, the first if welded, shape [n]."""
         unwelded, order = self._unwelded
-        kept = self._kept[vertices]
-        rows, indices = _expand(np.searchsorted(unwelded, kept), np.searchsorted(unwelded, kept, side="right"))
-        own_meshes, points = self._locate(order[indices])
+        rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
+        own_meshes, points = self._points.locate(order[indices])
         (own,) = np.nonzero(own_meshes == meshes[rows])
         return points[own[np.unique(rows[own], return_index=True)[1]]]
 
@@ -266,9 +257,9 @@ class Segment:
         """
         keys, sides = self._sides
         own = self._side_keys(ends)
-        first = np.searchsorted(keys, own)
+        first = search(keys, own)
         # The face's own corners, as the welded ends may belong to an earlier mesh.
-        meshes, points = self._locate(self._ends_of_sides(sides[first]))
+        meshes, points = self._points.locate(self._ends_of_sides(sides[first]))
 
         # Triangles of one polygon are neighbours in the list.
         following = np.minimum(first + 1, max(0, len(keys) - 1))
@@ -335,13 +326,12 @@ class Segment:
     def faces_at_edges(self, ends: np.ndarray) -> np.ndarray:
         """Returns the faces that have any of the edges, shape [n, 2], smaller vertex first, as a side, ascending."""
         keys, sides = self._sides
-        own = self._side_keys(ends)
-        first, last = np.searchsorted(keys, own), np.searchsorted(keys, own, side="right")
+        first, last = search_ranges(keys, self._side_keys(ends))
         marked = np.zeros(len(keys) + 1, dtype=np.int64)
         np.add.at(marked, first, 1)
         np.add.at(marked, last, -1)
         found = sides[np.cumsum(marked[:-1]) > 0]
-        return np.unique(found[found < self._corners.size] // 3)
+        return distinct(found[found < self._corners.size] // 3)
 
     @cached_property
     def _unwelded(self):
@@ -365,17 +355,15 @@ class Segment:
     def _find_sides(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a side, in two arrays."""
         keys, sides = self._sides
-        own = self._side_keys(ends)
-        rows, indices = _expand(np.searchsorted(keys, own), np.searchsorted(keys, own, side="right"))
+        rows, indices = _expand(*search_ranges(keys, self._side_keys(ends)))
         return rows, sides[indices]
 
     def _ends_of_sides(self, sides: np.ndarray) -> np.ndarray:
         """Returns the vertices at both ends of sides, numbered before welding, shape [n, 2]."""
-        face, corner = np.divmod(sides, 3)
-        of_faces = sides < self._corners.size
+        corners, of_faces = self._corners.reshape(-1), sides < self._corners.size
         ends = np.zeros((len(sides), 2), dtype=np.int64)
-        rows = face[of_faces], corner[of_faces]
-        ends[of_faces] = np.stack([self._corners[rows], self._corners[rows[0], (rows[1] + 1) % 3]], axis=1)
+        own = sides[of_faces]
+        ends[of_faces] = np.stack([corners[own], corners[np.where(own % 3 == 2, own - 2, own + 1)]], axis=1)
         ends[~of_faces] = self._unwelded_edges[sides[~of_faces] - self._corners.size]
         return ends
 
@@ -403,14 +391,6 @@ class Segment:
     def _side_keys(self, ends):
         return np.asarray(ends, dtype=np.int64) @ np.array([self.vertex_count, 1])
 
-    def _locate(self, unwelded):
-        meshes = np.searchsorted(self._vertex_ends, unwelded, side="right")
-        points = np.zeros(unwelded.shape, dtype=np.int64)
-        for number in np.unique(meshes):
-            members = meshes == number
-            points[members] = self.meshes[number].points[unwelded[members] - self.meshes[number].vertices.start]
-        return meshes, points
-
     def _reader(self, vertices, numbers) -> PositionReader:
         """Returns a reader of some vertices, numbered before welding, ascending, in the meshes of some numbers."""
         ends = np.searchsorted(vertices, [0, *(mesh.vertices.stop for mesh in self.meshes)]).tolist()
@@ -425,7 +405,7 @@ class Segment:
         """Returns for each vertex the first one that has the same position at every time, shape [vertex_count]."""
         welded_to = split_by_position(group_by_position(self._start), self._start)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
-        owners = np.unique(np.searchsorted(self._vertex_ends, crowded, side="right")).tolist()
+        owners = distinct(self._points.meshes(crowded)).tolist()
         moving = [number for number in owners if self.meshes[number].moves]
         if not moving:
             return welded_to
@@ -442,6 +422,37 @@ class Segment:
             groups = split_by_position(groups, positions)
         welded_to[crowded] = crowded[groups]
         return welded_to
+
+
+class _InPrims:
+    """The mesh of each vertex or face, and its index among the points or polygons of its prim, shared by instances."""
+
+    def __init__(self, indices: list[np.ndarray]):
+        """Joins the indices of the elements of each mesh, given the same array for meshes that share them."""
+        counts = [len(array) for array in indices]
+        self._mesh_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        distinct_arrays = {id(array): array for array in indices}
+        self._indices = np.concatenate([np.zeros(0, dtype=np.int64), *distinct_arrays.values()])
+        starts = np.cumsum([0, *map(len, distinct_arrays.values())])
+        start_of = dict(zip(distinct_arrays, starts.tolist(), strict=False))
+        starts = np.array([start_of[id(array)] for array in indices], dtype=np.int64)
+        self._shifts = starts - np.cumsum([0, *counts])[:-1]
+
+    def meshes(self, elements: np.ndarray) -> np.ndarray:
+        """Returns the mesh of each element, int64."""
+        return self._mesh_of[elements].astype(np.int64)
+
+    def locate(self, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the mesh of each element, and its index in the prim."""
+        meshes = self.meshes(elements)
+        return meshes, self._indices[elements + self._shifts[meshes]]
+
+
+def _groups(meshes: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yields each of the given meshes with its rows."""
+    order = np.argsort(meshes, kind="stable")
+    numbers, starts = np.unique(meshes[order], return_index=True)
+    yield from zip(numbers.tolist(), np.split(order, starts[1:]), strict=False)
 
 
 def _renumber(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

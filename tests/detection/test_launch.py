@@ -1,0 +1,38 @@
+"""Launches on several cores of the CPU."""
+
+import threading
+
+import numpy as np
+import pytest
+import warp as wp
+
+from warp_bsc.detection.launch import _pool, cores, launch_over
+
+
+@wp.kernel
+def add_one(first: int, values: wp.array[int]):
+    i = first + wp.tid()
+    wp.atomic_add(values, i, 1)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 1000, 100_001])
+def test_every_entry_is_reached_once(threads, count):
+    values = wp.zeros(max(1, count), dtype=int, device="cpu")
+    with cores(threads):
+        launch_over(add_one, count, inputs=[], outputs=[values], device=values.device, chunk=64)
+    assert np.array_equal(values.numpy()[:count], np.ones(count))
+
+
+def test_a_launch_does_not_wait_for_threads_that_are_busy():
+    free = threading.Event()
+    waiting = threading.Timer(20.0, free.set)
+    waiting.start()
+    busy = [_pool(2).submit(free.wait) for _ in range(2)]
+    values = wp.zeros(10_000, dtype=int, device="cpu")
+    with cores(2):
+        launch_over(add_one, len(values), inputs=[], outputs=[values], device=values.device, chunk=64)
+    assert values.numpy().all() and not free.is_set()
+    free.set()
+    waiting.cancel()
+    assert all(thread.result() for thread in busy)

@@ -1,0 +1,40 @@
+"""Distinct integers, and integers sought in sorted arrays, by sorting: if many, many times faster than in NumPy."""
+
+import numpy as np
+
+__all__ = ["distinct", "search", "search_ranges"]
+
+_FEW = 1000
+
+
+def distinct(values: np.ndarray) -> np.ndarray:
+    """Returns the distinct ones of some integers, ascending, as :func:`numpy.unique` does, which hashes them."""
+    values = np.sort(values, axis=None)
+    is_first = np.ones(len(values), dtype=bool)
+    np.not_equal(values[1:], values[:-1], out=is_first[1:])
+    return values[is_first]
+
+
+def search(keys: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Returns where values would be inserted in ascending keys, before equal ones, as :func:`numpy.searchsorted` does.
+
+    In ascending order, most of the keys that are compared are those of the value before, and in the cache.
+    """
+    if len(values) < _FEW:
+        return np.searchsorted(keys, values)
+    order = np.argsort(values)
+    places = np.empty(len(values), dtype=np.int64)
+    places[order] = np.searchsorted(keys, values[order])
+    return places
+
+
+def search_ranges(keys: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the first of the ascending keys that equals each value, and the one after the last."""
+    if len(values) < _FEW:
+        return np.searchsorted(keys, values), np.searchsorted(keys, values, side="right")
+    order = np.argsort(values)
+    ascending = values[order]
+    first, last = np.empty((2, len(values)), dtype=np.int64)
+    first[order] = np.searchsorted(keys, ascending)
+    last[order] = np.searchsorted(keys, ascending, side="right")
+    return first, last

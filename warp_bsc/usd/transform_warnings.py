@@ -1,0 +1,111 @@
+"""Warns of transforms that straight paths hide: large turns between two times, and scales of 0. Imports pxr."""
+
+# pyright: reportAttributeAccessIssue=false
+# (OpenUSD's stubs leave out the classes of its modules.)
+
+import math
+
+import numpy as np
+from pxr import Sdf, UsdGeom
+
+from .instancers import Instancer
+from .interval import times_in_words
+from .meshes import UsdMesh
+
+__all__ = ["transform_warnings"]
+
+_LARGE_TURN = 180.0  # degrees; from there on a straight path goes through the axis, or the other way round
+_FINE_TURN = 45.0
+_ROUNDING = 1e-6  # of angles, which USD interpolates in single precision
+_NAMED = 5
+_AXES = ("X", "Y", "Z", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+_ROTATIONS = tuple(getattr(UsdGeom.XformOp, f"TypeRotate{axes}") for axes in _AXES)
+"""Only by angles a prim can turn by more than half a turn from one sample to the next: USD interpolates quaternions the
+shorter way, and matrices number by number."""
+
+
+def transform_warnings(meshes: list[UsdMesh], times: list[float]) -> list[str]:
+    """Returns sentences on the prims that turn by half a turn or more between two times, and one on scales of 0.
+
+    Args:
+        meshes: The meshes of a scene.
+        times: Its times, ascending.
+    """
+    ops_of: dict[tuple | str, list[UsdGeom.XformOp]] = {}  # all instances of a mesh share theirs
+    placed: dict[Sdf.Path, tuple[UsdGeom.XformOp, list[str]]] = {}  # operation and meshes by the operation's attribute
+    zero_scales: dict[Instancer, dict[int, float]] = {}
+    hidden: dict[str, float] = {}  # first time by mesh
+    for mesh in meshes:
+        key = mesh.group or mesh.name
+        if key not in ops_of:
+            ops_of[key] = list(mesh.transform_ops())
+        for op in ops_of[key]:
+            placed.setdefault(op.GetAttr().GetPath(), (op, []))[1].append(mesh.name)
+        if instance := mesh.instance:
+            if instance.instancer not in zero_scales:
+                zero_scales[instance.instancer] = instance.instancer.zero_scales(times)
+            if instance.index in zero_scales[instance.instancer]:
+                hidden[mesh.name] = zero_scales[instance.instancer][instance.index]
+    turns = []
+    for op, names in placed.values():
+        if op.GetOpType() in _ROTATIONS:
+            turns += _turn_warning(op, names, times)
+        elif op.GetOpType() in (UsdGeom.XformOp.TypeScale, UsdGeom.XformOp.TypeTransform):
+            time = _first_zero(op, times)
+            if time is not None:
+                hidden |= {name: min(time, hidden.get(name, time)) for name in names}
+    if len(turns) > _NAMED:
+        turns[_NAMED:] = [f"subdivide: {len(turns) - _NAMED} more prims turn by half a turn or more between two times"]
+    if not hidden:
+        return turns
+    first = min(hidden, key=lambda name: hidden[name])
+    if len(hidden) == 1:
+        return [*turns, f"{first} is hidden by a scale of 0 at time {hidden[first]:g}: all of it is at one point there"]
+    return [
+        *turns,
+        f"{len(hidden)} meshes are hidden by a scale of 0, all of each is at one point there; the first is {first} at "
+        f"time {hidden[first]:g}",
+    ]
+
+
+def _moments(own_times: list[float], times: list[float]) -> list[float]:
+    """Returns the first time of a scene, and the samples of an attribute up to the last, ascending."""
+    return [times[0], *(time for time in own_times if times[0] < time <= times[-1])]
+
+
+def _turn_warning(op: UsdGeom.XformOp, names: list[str], times: list[float]) -> list[str]:
+    """Returns a sentence on the large turns of an operation between two times, if there are any."""
+    if not op.MightBeTimeVarying():
+        return []
+    attribute = op.GetAttr()
+    within = sorted({*_moments(op.GetTimeSamples(), times), *times})
+    values = [attribute.Get(time) for time in within]
+    if None in values:  # reading positions reports it
+        return []
+    angles = np.array(values, dtype=np.float64).reshape(len(within), -1)
+    with np.errstate(invalid="ignore"):  # angles that are not finite are found where positions are read
+        turned = np.cumsum(np.abs(np.diff(angles, axis=0, prepend=angles[:1])), axis=0)[np.searchsorted(within, times)]
+        degrees = np.diff(turned, axis=0).max(axis=1)
+        (large,) = np.nonzero((degrees >= _LARGE_TURN * (1.0 - _ROUNDING)) & np.isfinite(degrees))
+    if not len(large):
+        return []
+    most = degrees[large].max()
+    moved = names[0] if len(names) == 1 else f"{attribute.GetPrimPath()} with {len(names)} meshes"
+    when = times_in_words([times[index] for index in large])
+    parts = math.ceil(most / _FINE_TURN * (1.0 - _ROUNDING))
+    return [
+        f"subdivide: {moved} turns by up to {most:.4g} degrees to the next time, {when}: its vertices move straight, "
+        f"and what it turns through is not checked; in {parts} parts it turns by {_FINE_TURN:g} degrees or less"
+    ]
+
+
+def _first_zero(op: UsdGeom.XformOp, times: list[float]) -> float | None:
+    """Returns the first time at which a scale or the linear part of a matrix is 0."""
+    for time in _moments(op.GetTimeSamples(), times):
+        value = op.GetAttr().Get(time)
+        if value is None:
+            continue
+        linear = np.array(value, dtype=np.float64)
+        if not linear[..., :3][:3].any():
+            return time
+    return None
