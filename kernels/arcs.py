@@ -1,7 +1,7 @@
 """Points of bodies that turn at a constant rate while one of their points moves straight: their paths are arcs.
 
-With R(t) the rotation by t times the whole turn, about an axis whose direction does not change, a point of such a body is
-at
+With R(t) the rotation by t times the whole turn, about an axis whose direction does not change, a point of such a body
+is at
 
     x(t) = (1 - t) x0 + t x1 + (R(t) - t R(1) - (1 - t) I) r,    r = x0 - centre,
 
@@ -11,19 +11,20 @@ whole turn, p = k x r and q = k x p,
 
     x(t) = (1 - t) x0 + t x1 + (sin ta - t sin a) p + (vers ta - t vers a) q,    vers a = 1 - cos a = 2 sin^2(a / 2).
 
-**Chords.** Of a part of the motion that lasts h, the chord from its start to its end, with the same parameter, differs
-from x only by the interpolation of R(t) r, whose second derivative has the norm a^2 |p|. A linear interpolation over h
-differs from a function by at most h^2 / 8 times the largest norm of its second derivative: here by (ha)^2 |p| / 8, the
-sagitta to leading order, never less. As R(t) r and its interpolation stay within a ball of radius |p|, apart from the
-same vector along k, it is also at most 2 |p|. A point of an edge or a face is a convex combination of its corners with
-weights that do not change, on arcs as on chords, and so is its deviation: it is at most the largest one of its corners.
+**Chords.** In a part of the motion that lasts h, the chord from its start to its end, with the same parameter, differs
+from x by what the linear interpolation of R(t) r differs from R(t) r, whose second derivative has the norm a^2 |p|. The
+linear interpolation of a function over h differs from it by at most h^2 / 8 times the largest norm of its second
+derivative (componentwise along the difference, Lagrange's remainder): here by (ha)^2 |p| / 8, the sagitta to leading
+order and never less. As R(t) r stays on a circle of radius |p|, and its interpolation in the disc, they are at most
+2 |p| apart. A point of an edge or a face is a convex combination of its corners with weights that do not change, on
+arcs as on chords, and so is its deviation: it is at most the largest one of its corners.
 
-**Bounds.** u is half an ulp of 1, X a bound of |x0| and |x1|. Of k, components have a relative error of 4u; of r, 1u; so
-p has an error of 13u |r|, q of 26u |r|. a and a / 2 have relative errors of 3u, with t 4u; a sine has 2 ulp, 4u: its
-value has an error of (4 + 4a) u, and vers of (18 + 8a) u. The two factors, of at most 2 and 4, have errors of (12 + 8a) u
-and (44 + 16a) u; with the errors of p and q, and products and sums, the last two terms have at most
-(204 + 24a) u |r|. The straight part and the last sum have 2u X and u (X + 6 |r|). :data:`POSITION_ERROR` and the other
-two are more than twice these.
+**Bounds.** u is half an ulp of 1, X a bound of |x0| and |x1|. Of k, components have a relative error of 4u, of r, 1u:
+p has an error of 13u |r|, q of 26u |r|. a and a / 2 have relative errors of 3u, with t 4u; a sine has 2 ulp, at most
+4u: its value has an error of (4 + 4a) u, and vers of (18 + 8a) u. The two factors, of at most 2 and 4, have errors of
+(12 + 8a) u and (44 + 16a) u. With the errors of p and q, and of products and sums, the last two terms have at most
+(204 + 24a) u |r|; the straight part and the last sum have 2u X and u (X + 6 |r|). The constants below are more than
+twice these.
 """
 
 from typing import Any

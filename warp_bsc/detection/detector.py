@@ -6,7 +6,7 @@ import warp as wp
 from .._arguments import as_numpy, check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
-from .arcs import ArcSearch, join_contacts, straight_mesh
+from .arc_search import ArcSearch, join_contacts, straight_mesh
 from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
 from .differentiable import CollisionArrays

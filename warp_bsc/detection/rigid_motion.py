@@ -55,7 +55,7 @@ def _place_on_arcs(dtype: type) -> wp.Kernel:
 
 
 class RigidMotion:
-    """Bodies that turn at a constant rate about an axis of constant direction, while one of their points moves straight.
+    """Bodies that turn at a constant rate about an axis of constant direction, while a point of each moves straight.
 
     A vertex of such a body begins at its position x0 at the start of the step and ends at x1 at the end. In between it
     is at x(t) = (1 - t) x0 + t x1 + (R(t) - t R(1) - (1 - t) I)(x0 - centre), where R(t) is the rotation by t times the
@@ -129,7 +129,7 @@ class RigidMotion:
         *,
         tolerance: float | None = None,
     ) -> "RigidMotion":
-        """Returns the motion of bodies from one pose to another: their origins move straight, they turn the shorter way.
+        """Returns the motion of bodies from one pose to another, the shorter way: their origins move straight.
 
         Half a turn has no shorter way: give the turn itself.
 
@@ -193,7 +193,7 @@ class RigidMotion:
 
 
 def _levers(r: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k x r and k x (k x r) for points and turns about unit axes k, each of shape [..., 3]; 0 without a turn."""
+    """Returns k x r and k x (k x r), with k the unit vector of a turn, each of shape [..., 3]; 0 without a turn."""
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     axis = turn / np.where(angle == 0.0, 1.0, angle)
     across = np.cross(axis, r)
@@ -250,14 +250,14 @@ class ArcBounds:
         error = POSITION_ERROR * size + (LEVER_ERROR + TURN_ERROR * angle) * distance
         self._rounding[vertices] = roundoff * _UP * error + _TINY
         self._check_fit(body, start, end, distance)
-        self.tolerance = motion.tolerance
-        if self.tolerance is None:
-            self.tolerance = max(_DEFAULT_TOLERANCE * float(self.lever.max(initial=0.0)), self._least_tolerance)
-        elif self.tolerance < self._least_tolerance:
+        least = 8.0 * float(self._rounding.max(initial=0.0))  # that parts of the step can reach
+        if motion.tolerance is not None and motion.tolerance < least:
             raise ValueError(
-                f"arcs.tolerance must be at least {self._least_tolerance:g}, as positions between the ends are "
-                f"rounded, not {self.tolerance:g}"
+                f"arcs.tolerance must be at least {least:g}, as positions between the ends are rounded, not "
+                f"{motion.tolerance:g}"
             )
+        largest = float(self.lever.max(initial=0.0))
+        self.tolerance: float = motion.tolerance or max(_DEFAULT_TOLERANCE * largest, least)
 
     def deviation(self, level: int) -> np.ndarray:
         """Returns how far each vertex is from its chord at most, in parts of the step that last 2^-level.
@@ -278,11 +278,6 @@ class ArcBounds:
         inputs = [x0, x1, *self._arrays, wp.float64(time)]
         launch(_place_on_arcs(x0.dtype), len(x), inputs=inputs, outputs=[x], device=x0.device, record_tape=False)
         return x
-
-    @property
-    def _least_tolerance(self) -> float:
-        """Smallest tolerance that parts of the step can reach."""
-        return 8.0 * float(self._rounding.max(initial=0.0))
 
     def _check_fit(self, body: np.ndarray, start: np.ndarray, end: np.ndarray, distance: np.ndarray) -> None:
         """Raises a ValueError if the positions of a body at the end are not those of its turn and a translation."""

@@ -54,7 +54,14 @@ class ArcSearch:
     """Finds the pairs with a turning body that collide, or come near, along arcs. It reuses its buffers."""
 
     def __init__(
-        self, mesh: CollisionMesh, body: np.ndarray, *, method: Method, tolerance: float, min_distance: float, rings: int
+        self,
+        mesh: CollisionMesh,
+        body: np.ndarray,
+        *,
+        method: Method,
+        tolerance: float,
+        min_distance: float,
+        rings: int,
     ):
         """Allocates the buffers on the mesh's device.
 
@@ -147,9 +154,7 @@ class ArcSearch:
             lambda: pipeline.find_contacts(start, end, changed=changed, timer=timer), pipeline, self._mesh.device
         )
         # what floating point has left to exact arithmetic stays as it is
-        pairs = {
-            kind.label: dataclasses.replace(counts, for_exact=0) for kind, counts in pipeline.counts.pairs.items()
-        }
+        pairs = {kind.label: dataclasses.replace(counts, for_exact=0) for kind, counts in pipeline.counts.pairs.items()}
         counts = dataclasses.replace(pipeline.counts, **pairs)
         self._counts = counts if self._counts is None else add_counts(self._counts, counts)
         with timer.stage("sort"):
