@@ -297,6 +297,19 @@ def test_a_strip_that_is_tied_to_a_body_is_found_on_its_own_arc(device):
     assert len(crossing) and found.earliest_toi < 0.5
 
 
+def test_a_body_collides_with_what_is_tied_to_it(device, broad_phase):
+    """A sheet from its hub to two points that do not move, through which its tip passes after an eighth of a turn."""
+    out = rotation(0.25 * np.pi * Z) @ X
+    x0 = np.stack([2.0 * out - Z, 2.0 * out + Z, 0.1 * X, X, 0.8 * X, 0.8 * X + 0.1 * Z])
+    x1 = x0.copy()
+    x1[2:] = moved(x0[2:], 0.0, 0.5 * np.pi * Z)
+    arcs = bsc.RigidMotion([-1, -1, 0, 0, 0, 0], [[0.0, 0, 0]], [0.5 * np.pi * Z])
+    found = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)).detect(x0, x1, arcs=arcs)
+    assert [3, 0] in found.vertex_face.tolist()
+    assert found.vertex_face[:, 1].max() == 0
+    np.testing.assert_allclose(found.vertex_face_toi, 0.5, atol=0.02)
+
+
 def test_poses_give_the_turn_between_them():
     rng = np.random.default_rng(4)
     turn = rng.standard_normal((5, 3))

@@ -134,7 +134,7 @@ class ArcSearch:
             is_new = contacts.hit & ~np.isin(keys, self._keys[kind])
             corners, within = pair_distances(kind, self._elements[kind], contacts.pairs, self._deviation(level))
             ends = within <= self._bounds.tolerance
-            left[corners[is_new & ~ends]] = True
+            left[corners[is_new & ~ends, 0]] = True  # one vertex of a pair suffices to find it again
             found = contacts.rows(is_new & ends)
             # a sum that is rounded up would be late
             found.toi = np.maximum(np.nextafter((part + found.toi) * 2.0**-level, -np.inf), part * 2.0**-level)
