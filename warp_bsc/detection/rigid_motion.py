@@ -5,12 +5,12 @@ import math
 import numpy as np
 import warp as wp
 
-from .._arguments import as_numpy, checked_coordinates, checked_distance
+from .._arguments import as_numpy, checked_coordinates, checked_distance, checked_number
 from ..kernels.arcs import LEVER_ERROR, POSITION_ERROR, TURN_ERROR, on_arc
 from .launch import launch, made_once
 from .settings import NO_GRADIENTS
 
-__all__ = ["ArcBounds", "RigidMotion"]
+__all__ = ["ArcBounds", "RigidMotion", "points_on_arcs"]
 
 _LARGEST_TURN = 4096.0
 _SMALLEST_TURN = 2.0**-400
@@ -166,30 +166,50 @@ class RigidMotion:
         turn = np.where(still, 0.0, vector / np.where(still, 1.0, sine) * angle)
         return cls(body, poses[0][:, :3], turn, tolerance=tolerance)
 
-    def positions(self, x0: np.ndarray, x1: np.ndarray, vertices: np.ndarray, time: float | np.ndarray) -> np.ndarray:
-        """Returns positions of vertices at times, rounded, float64.
+    def positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, time: float) -> np.ndarray:
+        """Returns the positions of all vertices at a time, rounded, float64, shape [vertex_count, 3].
 
         Args:
-            x0: Positions at the start, shape [vertex_count, 3], NumPy array.
-            x1: Positions at the end.
-            vertices: Indices of vertices, of any shape.
-            time: Time of each, 0 at the start and 1 at the end; a number, or of a shape that broadcasts to theirs.
+            x0: Positions at the start, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
+            x1: Positions at the end, of the same shape.
+            time: Time in [0, 1].
 
-        Returns:
-            Positions, of the shape of the vertices and 3.
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If the positions have another shape or are not finite, or the time is out of range.
         """
-        start, end = x0[vertices].astype(np.float64), x1[vertices].astype(np.float64)
-        body = self.body[vertices]
-        time = np.broadcast_to(np.asarray(time, dtype=np.float64), body.shape)[..., None]
-        straight = (1.0 - time) * start + time * end
-        if not len(self.turn):
-            return straight
-        turn = np.where(body[..., None] >= 0, self.turn[body], 0.0)
-        across, inward = _levers(start - self.centre[body], turn)
-        angle = np.linalg.norm(turn, axis=-1, keepdims=True)
-        sine = np.sin(time * angle) - time * np.sin(angle)
-        versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
-        return straight + sine * across + versine * inward
+        ends = []
+        for name, x in (("x0", x0), ("x1", x1)):
+            ends.append(checked_coordinates(x, (3,), name))
+            if len(ends[-1]) != len(self.body):
+                raise ValueError(f"{name} must have {len(self.body)} rows, one a vertex, not {len(ends[-1])}")
+        return points_on_arcs(self, *ends, np.arange(len(self.body)), checked_number(time, "time", 0.0, 1.0))
+
+
+def points_on_arcs(
+    motion: RigidMotion, x0: np.ndarray, x1: np.ndarray, vertices: np.ndarray, time: float | np.ndarray
+) -> np.ndarray:
+    """Returns positions of vertices at times, rounded, float64, of the shape of the vertices and 3.
+
+    Args:
+        motion: The motion.
+        x0: Positions at the start, shape [vertex_count, 3].
+        x1: Positions at the end.
+        vertices: Indices of vertices, of any shape.
+        time: Time of each, 0 at the start and 1 at the end; a number, or of a shape that broadcasts to theirs.
+    """
+    start, end = x0[vertices].astype(np.float64), x1[vertices].astype(np.float64)
+    time = np.asarray(time, dtype=np.float64)[..., None]
+    straight = (1.0 - time) * start + time * end
+    body = motion.body[vertices]
+    if not (body >= 0).any():
+        return straight
+    turn = np.where(body[..., None] >= 0, motion.turn[body], 0.0)
+    across, inward = _levers(start - motion.centre[body], turn)
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    sine = np.sin(time * angle) - time * np.sin(angle)
+    versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
+    return straight + sine * across + versine * inward
 
 
 def _levers(r: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
