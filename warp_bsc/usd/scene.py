@@ -406,8 +406,10 @@ class Scene:
         self.files.check_stage()
         segment, x0, x1, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
+        with self._collecting(self._messages, self.path):
+            turns = segment.turns(start, end) if self.turning else {}
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
-        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps))
+        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), turns)
 
     @one_at_a_time
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
