@@ -178,12 +178,11 @@ class RigidMotion:
             TypeError: If an argument has another type.
             ValueError: If the positions have another shape or are not finite, or the time is out of range.
         """
-        ends = []
-        for name, x in (("x0", x0), ("x1", x1)):
-            ends.append(checked_coordinates(x, (3,), name))
-            if len(ends[-1]) != len(self.body):
-                raise ValueError(f"{name} must have {len(self.body)} rows, one a vertex, not {len(ends[-1])}")
-        return points_on_arcs(self, *ends, np.arange(len(self.body)), checked_number(time, "time", 0.0, 1.0))
+        start, end = checked_coordinates(x0, (3,), "x0"), checked_coordinates(x1, (3,), "x1")
+        for name, x in (("x0", start), ("x1", end)):
+            if len(x) != len(self.body):
+                raise ValueError(f"{name} must have {len(self.body)} rows, one a vertex, not {len(x)}")
+        return points_on_arcs(self, start, end, np.arange(len(self.body)), checked_number(time, "time", 0.0, 1.0))
 
 
 def points_on_arcs(

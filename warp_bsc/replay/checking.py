@@ -24,8 +24,8 @@ from ..usd.interval import Interval
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .arcs import arcs_of
 from .results import IntervalResult, Work, summarize, summarize_intersections
+from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, find_strand_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities

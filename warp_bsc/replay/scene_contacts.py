@@ -10,7 +10,7 @@ from ..detection.mesh import CollisionMesh
 from ..detection.rigid_motion import RigidMotion
 from ..usd.interval import Interval
 from ..usd.selection import Selection
-from .arcs import positions_at
+from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements
 
