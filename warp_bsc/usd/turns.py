@@ -1,6 +1,6 @@
 """The turns of meshes that only their transforms move: at a constant rate about one axis, from one time to the next.
 
-A turn is found from the transforms that the stage itself has at 16 times between the two, so that it makes no
+A turn is found from the transforms that the stage itself has at six times between the two, so that it makes no
 difference which operations, parents, pivots or instancers move the mesh, nor how many times it turns. Between samples
 OpenUSD interpolates the angles of rotations and the quaternions of orientations, so that they turn at a constant rate;
 matrices move points straight, and have no turn.
@@ -15,16 +15,18 @@ __all__ = ["Turn", "find_turns"]
 
 _FIRST = 0.382
 """Where between the two times a transform is first tested for a turn; halfway, two whole turns look like none."""
-_HALVINGS = 10
-"""At 2^-10 of the time a turn must be less than a half, so that its direction is known: 512 turns in all."""
-_DOUBLED = [2.0**-n for n in range(_HALVINGS, 0, -1)]
-_OTHERS = [0.146, 0.236, 0.618, 0.707, 0.854]
-"""Where else the stage's transforms must be those of the turn."""
+_COUNTED = [2.0**-10, 2.0**-5, 1.0]
+"""Where turns are counted: at the first a turn must be less than a half, 512 turns in all, so that its direction is
+known; each angle tells the next up to rounding, and so how many whole turns that has."""
+_OTHERS = [0.146, 0.618, 0.854]
+"""Where else the stage's transforms must be those of the turn; so many turns that they would be miscounted are not."""
 _FIT = 1e-5
 """Largest difference from the turn, as a share of the distance from its axis: USD interpolates in single precision."""
 _SINGLE = 1e-6
 """Rounding of coordinates in single precision, and of transforms that are straight."""
 _SMALL = 1e-9
+_LARGEST_CONDITION = 1e6
+"""Of transforms that are inverted."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class Turn:
         )
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def find_turns(transforms: Callable[[int, float], np.ndarray | None], numbers: list[int]) -> dict[int, Turn]:
     """Returns the turns of those meshes that turn at a constant rate about one axis, by their numbers.
 
@@ -60,88 +63,92 @@ def find_turns(transforms: Callable[[int, float], np.ndarray | None], numbers: l
         numbers: Numbers of the meshes.
     """
 
-    def read(share: float, numbers: list[int]) -> dict[int, np.ndarray]:
-        # all meshes at one time before the next time, since instancers keep those of the last time
-        found = {number: transforms(number, share) for number in numbers}
-        return {number: value for number, value in found.items() if value is not None and np.isfinite(value).all()}
+    def read(share: float, numbers: list[int]) -> np.ndarray:
+        """Returns matrices at one time, NaN for none: instancers keep those of the last time."""
+        found = [transforms(number, share) for number in numbers]
+        return np.array([np.full((4, 4), np.nan) if matrix is None else matrix for matrix in found]).reshape(-1, 4, 4)
 
     ends = [read(share, numbers) for share in (0.0, 1.0, _FIRST)]
-    bent = [number for number in numbers if all(number in end for end in ends) and not _is_straight(*_at(ends, number))]
-    if not bent:
+    bent = ~_are_straight(*ends)
+    for matrices in ends:
+        bent &= np.isfinite(matrices).all(axis=(1, 2))
+    bent &= np.linalg.cond(np.where(bent[:, None, None], ends[0][:, :3, :3], np.eye(3))) < _LARGEST_CONDITION
+    some = [number for number, is_bent in zip(numbers, bent.tolist(), strict=True) if is_bent]
+    if not some:
         return {}
-    shares = sorted({*_DOUBLED, *_OTHERS})
-    between = [read(share, bent) for share in shares]
-    turns = {}
-    for number in bent:
-        if all(number in found for found in between):
-            matrices = dict(zip([0.0, 1.0, _FIRST, *shares], _at([*ends, *between], number), strict=True))
-            if turn := _turn_of(matrices):
-                turns[number] = turn
-    return turns
+    shares = [0.0, 1.0, _FIRST, *_COUNTED[:-1], *_OTHERS]
+    matrices = [end[bent] for end in ends] + [read(share, some) for share in shares[len(ends) :]]
+    centres, vectors, fit = _fit_turns(np.array(shares), np.stack(matrices, axis=1))
+    rows = zip(some, centres, vectors, fit.tolist(), strict=True)
+    return {number: Turn(centre, vector) for number, centre, vector, fits in rows if fits}
 
 
-def _at(found: list[dict[int, np.ndarray]], number: int) -> list[np.ndarray]:
-    return [matrices[number] for matrices in found]
-
-
-def _is_straight(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> bool:
-    """Returns whether a transform between two others moves points on the straight paths from one to the other."""
+def _are_straight(start: np.ndarray, end: np.ndarray, between: np.ndarray) -> np.ndarray:
+    """Returns which transforms between two others move points on the straight paths from one to the other, bool."""
     off = np.abs(between - start - _FIRST * (end - start))
     size = np.maximum(np.abs(start), np.abs(end))
-    return all(off[rows].max() <= _SINGLE * size[rows].max() for rows in (slice(0, 3), slice(3, 4)))
+    parts = [
+        off[:, rows].max(axis=(1, 2)) <= _SINGLE * size[:, rows].max(axis=(1, 2)) for rows in (slice(3), slice(3, 4))
+    ]
+    return parts[0] & parts[1]
 
 
-def _turn_of(matrices: dict[float, np.ndarray]) -> Turn | None:
-    """Returns the turn that has the given transforms, by the time; None if there is none."""
-    start = matrices[0.0]
-    if abs(np.linalg.det(start[:3, :3])) < 1e-30 or np.linalg.cond(start[:3, :3]) > 1e6:
-        return None
-    inverse = np.linalg.inv(start[:3, :3])
-    rotations = {share: (inverse @ matrix[:3, :3]).T for share, matrix in matrices.items()}  # of columns
-    vector = _rotation_vector(rotations)
-    if vector is None:
-        return None
-    size = 1.0 + np.linalg.norm(vector) * 1e-2  # angles in degrees are rounded in proportion
-    if any(np.abs(rotations[share] - _rotation(share * vector)).max() > _FIT * size for share in rotations):
-        return None
+def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the turns of meshes: centres and vectors, each of shape [n, 3], and whether they fit, bool, shape [n].
+
+    Args:
+        shares: The times, those of :data:`_COUNTED` among them; the first two are 0 and 1; shape [k].
+        matrices: Transforms of the meshes at these times, shape [n, k, 4, 4].
+    """
+    finite = np.isfinite(matrices).all(axis=(1, 2, 3))
+    matrices = np.where(finite[:, None, None, None], matrices, np.eye(4))
+    inverse = np.linalg.inv(matrices[:, :1, :3, :3])
+    rotations = np.swapaxes(inverse @ matrices[:, :, :3, :3], 2, 3)  # of columns
+    vectors = _rotation_vectors(shares, rotations)
+    modelled = _rotations(shares[:, None] * vectors[:, None])
+    angles = np.linalg.norm(vectors, axis=1)
+    relative = _FIT * (1.0 + 0.01 * angles)  # angles in degrees are rounded in proportion
+    fit = finite & (angles > 0.0) & (np.abs(rotations - modelled).max(axis=(1, 2, 3)) <= relative)
     # origin(t) = (1 - t) origin(0) + t origin(1) + bend(t) (origin(0) - centre)
-    origins = {share: matrix[3, :3] for share, matrix in matrices.items()}
-    whole = _rotation(vector)
-    bends = {share: _rotation(share * vector) - share * whole - (1.0 - share) * np.eye(3) for share in matrices}
-    straight = {share: (1.0 - share) * origins[0.0] + share * origins[1.0] for share in matrices}
-    factors = np.concatenate([bends[share] for share in matrices])
-    deviations = np.concatenate([origins[share] - straight[share] for share in matrices])
-    lever = np.linalg.lstsq(factors, deviations, rcond=1e-9)[0]
-    allowed = _FIT * size * np.linalg.norm(lever) + _SINGLE * max(np.abs(origin).max() for origin in origins.values())
-    if np.abs(factors @ lever - deviations).max() > allowed:
-        return None
-    return Turn(origins[0.0] - lever, vector)
+    origins, share = matrices[:, :, 3, :3], shares[:, None]
+    bends = modelled - share[..., None] * modelled[:, 1:2] - (1.0 - share[..., None]) * np.eye(3)
+    deviations = origins - (1.0 - share) * origins[:, :1] - share * origins[:, 1:2]
+    n = len(matrices)
+    factors, deviations = bends.reshape(n, -1, 3), deviations.reshape(n, -1, 1)
+    levers = np.linalg.pinv(factors, rcond=1e-9) @ deviations
+    allowed = relative * np.linalg.norm(levers[..., 0], axis=1) + _SINGLE * np.abs(origins).max(axis=(1, 2))
+    fit &= np.abs(factors @ levers - deviations).max(axis=(1, 2)) <= allowed
+    return origins[:, 0] - levers[..., 0], vectors, fit
 
 
-def _rotation_vector(rotations: dict[float, np.ndarray]) -> np.ndarray | None:
-    """Returns the axis times the angle of the whole rotation, from rotations after shares of it; None without one."""
-    skews = {
-        share: 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-        for share, r in rotations.items()
-    }
-    sines = {share: np.linalg.norm(skew) for share, skew in skews.items()}
-    best = max(sines, key=lambda share: sines[share])
-    if sines[best] < _SMALL:
-        return None
-    axis = skews[best] / sines[best]
-    angle = 0.0
-    for share in (*_DOUBLED, 1.0):
-        r = rotations[share]
-        measured = np.arctan2(skews[share] @ axis, 0.5 * (np.trace(r) - 1.0))
-        angle = measured + 2.0 * np.pi * np.round((2.0 * angle - measured) / (2.0 * np.pi))
-    return angle * axis
+def _rotation_vectors(shares: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Returns the axis times the angle of whole rotations, from rotations after shares of them; 0 without an axis.
+
+    Args:
+        shares: The shares, shape [k].
+        rotations: The rotations, shape [n, k, 3, 3].
+    """
+    r = rotations
+    skews = [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]]
+    skews = 0.5 * np.stack(skews, axis=-1)
+    sines = np.linalg.norm(skews, axis=2)
+    rows = np.arange(len(r))
+    best = sines.argmax(axis=1)
+    axes = skews[rows, best] / np.maximum(sines[rows, best], _SMALL)[:, None]
+    angles, before = np.zeros(len(r)), 1.0
+    for share in _COUNTED:
+        at = int(np.flatnonzero(shares == share)[0])
+        cosines = 0.5 * (np.trace(r[:, at], axis1=1, axis2=2) - 1.0)
+        measured = np.arctan2(np.einsum("ni,ni->n", skews[:, at], axes), cosines)
+        whole = np.round((share / before * angles - measured) / (2.0 * np.pi))
+        angles, before = measured + 2.0 * np.pi * whole, share
+    return np.where((sines[rows, best] > _SMALL)[:, None], angles[:, None] * axes, 0.0)
 
 
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Returns the matrix that rotates columns by a rotation vector [rad]."""
-    angle = np.linalg.norm(vector)
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + 2.0 * np.sin(0.5 * angle) ** 2 * cross @ cross
+def _rotations(vectors: np.ndarray) -> np.ndarray:
+    """Returns the matrices that rotate columns by rotation vectors [rad], shape [..., 3, 3]."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(vectors / np.where(angle[..., 0] == 0.0, 1.0, angle[..., 0]), -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*x.shape, 3, 3)
+    return np.eye(3) + np.sin(angle) * cross + 2.0 * np.sin(0.5 * angle) ** 2 * (cross @ cross)
