@@ -47,6 +47,17 @@ def test_a_blade_that_spins_between_two_samples_strikes_a_pin(stage, angles, tim
     assert min(times) == pytest.approx(time, abs=1e-4)  # there is nothing left for it to find
 
 
+def test_places_are_on_the_arcs(stage):
+    """A spike whose tip passes through the blade, and one that the edge of the blade meets."""
+    add_mesh(stage, "/World/Spike", [(0.0, 1.0, 0.0), (-0.01, 1.2, -1.0), (0.01, 1.2, -1.0)])
+    spinning(stage, 0, 360)
+    found = hits(find(stage))
+    assert any(hit[1] == "vertex 0" and hit[0] == "/World/Spike" for hit in found)
+    for hit in found:
+        x, y, z = hit[5].expected
+        assert abs(x) < 2e-2 and 1.0 - 1e-3 <= y <= 1.2 and -0.1 <= z <= 1e-3, hit
+
+
 def test_a_pin_that_the_tip_does_not_reach_is_not_struck(stage):
     """The chord of a small turn is inside the arc: the pin just outside of the chord is struck, outside the arc not."""
     for name, y, struck in (("Near", 2.0 - 1e-4, True), ("Far", 2.0 + 1e-4, False)):
