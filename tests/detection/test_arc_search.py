@@ -200,6 +200,20 @@ def test_a_tip_that_reaches_a_wall_in_the_middle_of_a_turn_only(depth, device, b
     assert len(detector.detect(x0, x1, arcs=arcs).vertex_face) == 0
 
 
+def test_inside_of_an_arc_no_pair_is_reported_beyond_the_tolerance(device):
+    """In the middle of a part whose chord is 0.95 of the tolerance inside of the arc."""
+    deviation = (1.0 / 8.0) ** 2 / 8.0
+    tolerance = deviation / 0.95
+    for distance, hits in ((0.5, [[0, 1]]), (1.02, []), (1.5, []), (1.8, [])):
+        at = rotation(5.5 / 8.0 * Z) @ ((1.0 - distance * tolerance) * X)
+        x0 = np.stack([X - Z, X + Z, at - 0.5 * Z, at + 0.5 * Z])
+        x1 = x0.copy()
+        x1[:2] = moved(x0[:2], 0.0, Z)
+        arcs = bsc.RigidMotion([0, 0, -1, -1], [[0.0, 0, 0]], [Z], tolerance=tolerance)
+        mesh = bsc.CollisionMesh([], 4, edges=[[0, 1], [2, 3]])
+        assert bsc.CollisionDetector(mesh).detect(x0, x1, arcs=arcs).edge_edge.tolist() == hits
+
+
 def test_a_screw_reaches_the_obstacle_in_its_third_turn(device):
     x0 = np.array([[1, 0, 0], [0.5, 0, 0], [0.5, 0, 0.01], [0.8, -0.2, 0.5], [0.8, 0.2, 0.5], [1.4, 0.0, 0.5]], float)
     turn, rise = 4.0 * 2.0 * np.pi * Z, 0.8 * Z

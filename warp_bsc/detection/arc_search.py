@@ -2,7 +2,7 @@
 
 In a part of the step, no pair collides on its arcs whose chords stay farther apart than the bounds of their deviations
 together, see :mod:`warp_bsc.kernels.arcs`. Parts are halved for the vertices of the other pairs, until these bounds are
-at most the tolerance: then the pair is reported. Pairs without a turning body are those of :mod:`.detector` alone, and
+at most half of the tolerance: then the pair is reported, whose arcs come within twice the bounds of each other. Pairs without a turning body are those of :mod:`.detector` alone, and
 pairs within a body stay as they are.
 """
 
@@ -115,7 +115,7 @@ class ArcSearch:
         """Returns the number of halvings after which deviations are small against edges, or within the tolerance."""
         mesh, lever = self._mesh, self._bounds.lever
         of_bodies = mesh.edges[(lever[mesh.edges] > 0.0).any(axis=1)]
-        most = 0.5 * self._bounds.tolerance
+        most = 0.25 * self._bounds.tolerance
         if len(of_bodies):
             ends = x0.numpy()[of_bodies].astype(np.float64)
             most = max(most, _COARSE * float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean()))
@@ -133,7 +133,7 @@ class ArcSearch:
             keys = contacts.pairs.astype(np.int64) @ np.array([2**31, 1])
             is_new = contacts.hit & ~_are_among(keys, self._keys[kind])
             corners, within = pair_distances(kind, self._elements[kind], contacts.pairs, self._deviation(level))
-            ends = within <= self._bounds.tolerance
+            ends = 2.0 * within <= self._bounds.tolerance  # arcs are that much farther apart than their chords
             left[corners[is_new & ~ends, 0]] = True  # one vertex of a pair suffices to find it again
             found = contacts.rows(is_new & ends)
             # a sum that is rounded up would be late

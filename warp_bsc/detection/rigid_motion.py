@@ -269,7 +269,7 @@ class ArcBounds:
         error = POSITION_ERROR * size + (LEVER_ERROR + TURN_ERROR * angle) * distance
         self._rounding[vertices] = roundoff * _UP * error + _TINY
         self._check_fit(body, start, end, distance)
-        least = 8.0 * float(self._rounding.max(initial=0.0))  # that parts of the step can reach
+        least = 16.0 * float(self._rounding.max(initial=0.0))  # that parts of the step can reach
         if motion.tolerance is not None and motion.tolerance < least:
             raise ValueError(
                 f"arcs.tolerance must be at least {least:g}, as positions between the ends are rounded, not "
