@@ -69,10 +69,9 @@ def find_turns(transforms: Callable[[int, float], np.ndarray | None], numbers: l
         return np.array([np.full((4, 4), np.nan) if matrix is None else matrix for matrix in found]).reshape(-1, 4, 4)
 
     ends = [read(share, numbers) for share in (0.0, 1.0, _FIRST)]
-    bent = ~_are_straight(*ends)
-    for matrices in ends:
-        bent &= np.isfinite(matrices).all(axis=(1, 2))
-    bent &= np.linalg.cond(np.where(bent[:, None, None], ends[0][:, :3, :3], np.eye(3))) < _LARGEST_CONDITION
+    bent = ~_are_straight(*ends) & np.isfinite(np.stack(ends)).all(axis=(0, 2, 3))
+    invertible = np.where(bent[:, None, None], ends[0][:, :3, :3], np.eye(3))
+    bent = bent & (np.linalg.cond(invertible) < _LARGEST_CONDITION)
     some = [number for number, is_bent in zip(numbers, bent.tolist(), strict=True) if is_bent]
     if not some:
         return {}
@@ -100,7 +99,7 @@ def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np
         shares: The times, those of :data:`_COUNTED` among them; the first two are 0 and 1; shape [k].
         matrices: Transforms of the meshes at these times, shape [n, k, 4, 4].
     """
-    finite = np.isfinite(matrices).all(axis=(1, 2, 3))
+    finite: np.ndarray = np.isfinite(matrices).all(axis=(1, 2, 3))
     matrices = np.where(finite[:, None, None, None], matrices, np.eye(4))
     inverse = np.linalg.inv(matrices[:, :1, :3, :3])
     rotations = np.swapaxes(inverse @ matrices[:, :, :3, :3], 2, 3)  # of columns
