@@ -99,7 +99,7 @@ def _fit_turns(shares: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np
         shares: The times, those of :data:`_COUNTED` among them; the first two are 0 and 1; shape [k].
         matrices: Transforms of the meshes at these times, shape [n, k, 4, 4].
     """
-    finite = np.isfinite(matrices).reshape(len(matrices), -1).all(axis=1)
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2, 3)))
     matrices = np.where(finite[:, None, None, None], matrices, np.eye(4))
     inverse = np.linalg.inv(matrices[:, :1, :3, :3])
     rotations = np.swapaxes(inverse @ matrices[:, :, :3, :3], 2, 3)  # of columns
