@@ -27,6 +27,7 @@ def test_python_code_runs_as_printed(tmp_path, capsys):
     assert names["c"].vertex_face.tolist() == [[3, 0], [4, 0], [5, 0]]
     np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
     assert names["c"].certified
+    assert names["found"].certified and 0.48 < names["found"].earliest_toi < 0.49
     assert names["r"].hit.tolist() == [True]
     assert (names["solver"].report.totals.steps, names["solver"].report.totals.uncertified_steps) == (20, 0)
     gradient = names["states"][0].particle_qd.grad.numpy()
@@ -36,6 +37,7 @@ def test_python_code_runs_as_printed(tmp_path, capsys):
     assert (result.crossings_before, result.crossings, result.certified) == (60, 0, True)
     output = capsys.readouterr().out
     assert "[[3, 0], [4, 0], [5, 0]]" in output and "72 0 True" in output and "42 0 60 0" in output
+    assert "2.0\n0.48" in output
 
 
 def test_the_scene_of_the_readme_replays_with_its_figures(capsys):

@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
         query_vertex_vertex,
     )
     from .detection.query_points import query_points
+    from .detection.rigid_motion import RigidMotion
     from .implicit.solver import SolverImplicitAdjoint
     from .repair.repair import repair
     from .repair.results import RepairResult, UnresolvedContour
@@ -76,6 +77,7 @@ _MODULES = {
     "IntervalSummary": "replay.results",
     "QueryResult": "detection.query",
     "RepairResult": "repair.results",
+    "RigidMotion": "detection.rigid_motion",
     "Scene": "usd.scene",
     "SceneContacts": "replay.scene_contacts",
     "SceneIntersections": "replay.scene_intersections",
@@ -113,6 +115,7 @@ __all__ = [
     "IntervalSummary",
     "QueryResult",
     "RepairResult",
+    "RigidMotion",
     "Scene",
     "SceneContacts",
     "SceneIntersections",

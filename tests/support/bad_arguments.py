@@ -106,6 +106,7 @@ def not_finite(good: np.ndarray) -> dict[str, Any]:
 
 FACES = np.array([[0, 1, 2], [3, 4, 5]])
 X = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]], dtype=float)
+ORIGIN = np.zeros((1, 3))
 POINTS = {name: np.zeros((2, 2 * n, 3)) for name, n in (("vertex_face", 4), ("edge_edge", 4), ("vertex_edge", 3))}
 POINTS["vertex_vertex"] = np.zeros((2, 4, 3))
 
@@ -225,7 +226,40 @@ def calls() -> dict[str, Call]:
             "x0": COORDINATES,
             "x1": COORDINATES,
             "only": without(bad_arrays(np.ones(6, dtype=bool)), "None", "bools") | {"rows": np.ones(5, dtype=bool)},
+            "arcs": without(OBJECTS, "None") | {"rows": bsc.RigidMotion(np.zeros(5, int), ORIGIN, ORIGIN)},
         },
+    )
+    body = np.array([0, 0, 0, -1, -1, -1])
+    bodies = without(bad_arrays(body, index=True), "negative") | {"below -1": body - 1, "no such body": body + 1}
+    rows = bad_arrays(ORIGIN) | not_finite(ORIGIN) | {"rows": np.zeros((2, 3))}
+    found["RigidMotion"] = Call(
+        bsc.RigidMotion,
+        {"body": body, "centre": ORIGIN, "turn": ORIGIN},
+        {
+            "body": bodies,
+            "centre": without(rows, "rows") | {"huge": ORIGIN + 1e200},
+            "turn": rows | {"huge": ORIGIN + 5000.0, "tiny": ORIGIN + 1e-150},
+            "tolerance": without(POSITIVE, "None"),
+        },
+        raises=bsc.RigidMotion.__init__,
+    )
+    pose = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    poses = bad_arrays(pose) | not_finite(pose) | {"no quaternion": np.zeros((1, 7))}
+    found["RigidMotion.between"] = Call(
+        bsc.RigidMotion.between,
+        {"body": body, "pose_0": pose, "pose_1": pose},
+        {
+            "body": bodies,
+            "pose_0": poses,
+            "pose_1": poses | {"rows": np.repeat(pose, 2, axis=0)},
+            "tolerance": without(POSITIVE, "None"),
+        },
+    )
+    still = bsc.RigidMotion(body, ORIGIN, ORIGIN)
+    found["RigidMotion.positions"] = Call(
+        still.positions,
+        {"x0": X, "x1": X, "time": 0.5},
+        {"x0": COORDINATES, "x1": COORDINATES, "time": NUMBERS | {"early": -0.1, "late": 1.1}},
     )
 
     def capture(x0, x1):

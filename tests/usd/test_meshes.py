@@ -411,14 +411,14 @@ def test_topology_that_changes_at_the_same_number_of_points_moves_until_then(sta
     assert len(found["intervals"]) == 2
 
 
-def test_subdivision_follows_a_turn(stage):
-    # A blade on an arm of length 1 that makes half a turn: straight through the middle, or around.
+def test_subdivision_follows_turns_about_two_axes(stage):
+    # A blade on an arm of length 1 that makes half a turn, and rolls: straight through the middle, or around.
     for name, y in (("Middle", 0), ("Around", 1)):
         add_mesh(stage, f"/World/{name}", moved([(0, -0.5, -1), (0, 0.5, -1), (0, 0, 1)], (0, y, 0)))
     blade = add_mesh(stage, "/World/Blade", [(1, 0, 0), (1.01, 0, 3), (1, 0.01, 3)])
-    turn = blade.AddRotateZOp()
-    for time, angle in ((0, -10), (1, 190)):
-        turn.Set(angle, time)
+    turn = blade.AddRotateXYZOp()
+    for time, roll, angle in ((0, -10, -10), (1, 10, 190)):
+        turn.Set((roll, 0, angle), time)
 
     def struck(*options):
         return {name for hit in hits(find(stage, *options)) for name in (hit[0], hit[2])} - {"/World/Blade"}
@@ -429,6 +429,8 @@ def test_subdivision_follows_a_turn(stage):
     assert [interval["start"] for interval in found["intervals"]] == [0, 0.25, 0.5, 0.75]
     assert "Motion between time samples is taken to be linear." in found["motion"]
     assert "1 mesh is moved by transforms" in found["motion"]
+    turn.Set((-10, 0, 190), 1)  # about one axis
+    assert struck() == struck("--subdivide", "16") == {"/World/Around"}
 
 
 def test_instances_are_where_usd_has_them(stage):

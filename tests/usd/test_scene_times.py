@@ -393,7 +393,7 @@ def test_what_is_certified_is_said_with_what_it_is_about(stage, capsys, method, 
     add_propeller(stage, {0: 0, 1: 360})
     page = tmp_path / "page.html"
     found = find(stage, "--method", method, "--report", str(page))
-    assert found["certified_for"] == "vertices that move straight between the times checked"
+    assert found["certified_for"] == "vertices that move straight or turn about one axis between the times checked"
     assert "1 mesh is moved by transforms" in found["motion"]
     said = [
         line for line in capsys.readouterr().out.splitlines() if line.startswith(("Certified for", "Not certified"))

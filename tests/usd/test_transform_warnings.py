@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import Gf, UsdGeom
-from stages import FALLING, add_floor, add_instancer, add_mesh, animate, new_stage, save
+from stages import FALLING, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save
 
 import warp_bsc as bsc
 
@@ -16,10 +16,12 @@ def stage(tmp_path):
 
 
 def add_turning(stage, path="/World/Fan", angles=None):
-    """A mesh whose transform has an angle at each of some times."""
-    operation = UsdGeom.Xformable(add_mesh(stage, path, FALLING)).AddRotateZOp()
-    for time, angle in (angles or {0: 0.0, 1: 360.0}).items():
+    """A mesh whose transform has an angle at each of some times, and tilts as well, so that it is on no arc."""
+    mesh, angles = UsdGeom.Xformable(add_mesh(stage, path, FALLING)), angles or {0: 0.0, 1: 360.0}
+    operation, tilt = mesh.AddRotateZOp(), mesh.AddRotateXOp()
+    for number, (time, angle) in enumerate(angles.items()):
         operation.Set(angle, time)
+        tilt.Set(10.0 * (number % 2), time)
 
 
 def warnings(stage, word, **options):
@@ -28,13 +30,25 @@ def warnings(stage, word, **options):
 
 def test_a_whole_turn_between_two_times_is_named(stage):
     add_turning(stage)
-    scene = bsc.Scene(save(stage))
-    np.testing.assert_allclose(scene.interval(0).x0, scene.interval(0).x1, atol=1e-12)  # it seems to stand still
     assert warnings(stage, "turns") == [
         "subdivide: /World/Fan turns by up to 360 degrees to the next time, at time 0: its vertices move straight, and "
         "what it turns through is not checked; in 8 parts it turns by 45 degrees or less"
     ]
     assert warnings(stage, "turns", subdivide=2) and not warnings(stage, "turns", subdivide=8)
+
+
+def test_turns_that_are_checked_on_their_arcs_are_not_named(stage):
+    operation = UsdGeom.Xformable(add_mesh(stage, "/World/Fan", FALLING)).AddRotateZOp()
+    for time, angle in ((0, 0.0), (1, 360.0), (2, 100.0)):
+        operation.Set(angle, time)
+    scene = bsc.Scene(save(stage))
+    np.testing.assert_allclose(scene.interval(0).x0, scene.interval(0).x1, atol=1e-12)  # it seems to stand still
+    assert len(scene.interval(0).turns) == 1 and not warnings(stage, "turns")
+    deforming = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Fan"))
+    for time in (0, 1):
+        deforming.GetPointsAttr().Set(moved(FALLING, (0, 0, 0.1 * time)), time)
+    (warning,) = warnings(stage, "turns")
+    assert "2 times, first at time 0" in warning
 
 
 @pytest.mark.parametrize(("angle", "is_named"), [(179.0, False), (180.0, True), (-270.0, True), (5 * 360.0, True)])
@@ -56,7 +70,7 @@ def test_turns_that_are_sampled_at_whole_times_are_named_only_where_a_step_skips
 def test_a_group_that_turns_is_named_once(stage):
     operation = UsdGeom.Xform.Define(stage, "/World/Group").AddRotateXYZOp()
     for time, angle in ((0, 0.0), (1, 360.0)):
-        operation.Set(Gf.Vec3f(0.0, angle, 10.0), time)
+        operation.Set(Gf.Vec3f(0.1 * angle, angle, 10.0), time)
     for name in ("A", "B"):
         add_mesh(stage, f"/World/Group/{name}", FALLING)
     (warning,) = warnings(stage, "turns")

@@ -95,8 +95,8 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         type=positive,
         default=1,
         metavar="N",
-        help="divide the time from each sample to the next into N intervals, for motion that is not linear, such as "
-        "rotations (default: 1)",
+        help="divide the time from each sample to the next into N intervals, for motion that is neither linear nor a "
+        "turn about one axis, such as that of skeletons (default: 1)",
     )
     which.add_argument(
         "--validate",

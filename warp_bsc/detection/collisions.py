@@ -10,7 +10,7 @@ import numpy as np
 from .contact_buffer import ContactRows, HostContacts, empty_contacts
 from .differentiable import CollisionArrays
 from .settings import Counts, DistanceKind, Method, PairCounts
-from .stage_timer import StageTimer
+from .stage_timer import StageTimer, StageTimers
 
 __all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts", "add_stats"]
 
@@ -116,7 +116,7 @@ class Collisions:
     _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
-    _timer: StageTimer = field(repr=False)
+    _timer: StageTimer | StageTimers = field(repr=False)
 
     @functools.cached_property
     def _vertex_face_contacts(self) -> HostContacts:

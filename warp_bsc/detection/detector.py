@@ -6,6 +6,7 @@ import warp as wp
 from .._arguments import as_numpy, check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
+from .arc_search import ArcSearch, join_contacts, straight_mesh
 from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
 from .differentiable import CollisionArrays
@@ -18,8 +19,9 @@ from .mesh import CollisionMesh
 from .narrow_phase import decide_on_host
 from .pipeline import DetectionPipeline
 from .proximities import Proximities, ProximityFinder
-from .settings import TOLERANCE, Counts, DistanceKind, Method, PairKind
-from .stage_timer import StageTimer
+from .rigid_motion import ArcBounds, RigidMotion
+from .settings import TOLERANCE, Counts, DistanceKind, Method, PairKind, add_counts
+from .stage_timer import StageTimer, StageTimers
 
 __all__ = ["CollisionDetector"]
 
@@ -91,12 +93,25 @@ class CollisionDetector:
         self._result_buffers = ContactBufferPool(mesh.device)
         self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._has_run = False
+        self._rings = rings
+        self._arcs: tuple[ArcSearch, CollisionDetector | None] | None = None
 
     @one_at_a_time
     def detect(
-        self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, *, only: np.ndarray | None = None
+        self,
+        x0: np.ndarray | wp.array,
+        x1: np.ndarray | wp.array,
+        *,
+        only: np.ndarray | None = None,
+        arcs: RigidMotion | None = None,
     ) -> Collisions:
         """Returns all collisions of a motion.
+
+        With ``arcs``, the vertices of turning bodies move along arcs, and no collision on these is missed. A pair with
+        such a vertex may be reported that does not collide, if it comes within ``arcs.tolerance`` of that, whatever the
+        method. Its time of impact is a lower bound, before which it does not collide; its coordinates and normal are
+        those of points within that distance. Pairs within one body are not looked at, as they stay as they are; pairs
+        without a turning body are those found without ``arcs``. Counts are those of all parts of the step together.
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
@@ -105,17 +120,22 @@ class CollisionDetector:
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
             only: Vertices of interest, bool, shape [vertex_count]: collisions that have none of them may be missing, at
                 less cost. None for all.
+            arcs: The bodies that turn and how; None if all vertices move straight.
 
         Raises:
-            TypeError: If the positions are no arrays of numbers.
+            TypeError: If the positions are no arrays of numbers, or ``arcs`` is no :class:`.RigidMotion`.
             ValueError: If they or ``only`` have another shape or type, if the positions differ in type, or if they are
-                not finite.
+                not finite; with ``arcs``, also if it is for another number of vertices, ``x1`` is not where it takes
+                its bodies, coordinates are more than 2^500, its tolerance is too small for the rounding of positions,
+                or the positions require gradients.
             RuntimeError: If the device captures a graph, see :meth:`capture`.
         """
         if self.mesh.device.is_capturing:
             raise RuntimeError(f"{self.mesh.device} captures a graph: call capture(x0, x1) there instead of detect")
         x0, x1 = self._checked_positions(x0, x1)
         changed = None if only is None else self._checked_vertices(only)
+        if arcs is not None:
+            return self._detect_arcs(x0, x1, only, changed, self._checked_arcs(arcs, x0, x1))
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
@@ -248,6 +268,41 @@ class CollisionDetector:
     def intersection_finder(self) -> IntersectionFinder:
         """Returns a finder of intersections that shares trees with this detector on a CPU, and its lock."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
+
+    def _checked_arcs(self, arcs: RigidMotion, x0: wp.array, x1: wp.array) -> ArcBounds:
+        """Returns the motion of turning bodies from one configuration to another, with bounds."""
+        check_instance(arcs, "arcs", RigidMotion, "a RigidMotion")
+        if len(arcs.body) != self.mesh.vertex_count:
+            raise ValueError(f"arcs must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}")
+        if x0.requires_grad or x1.requires_grad:
+            raise ValueError("arcs: x0 and x1 must not require gradients")
+        for name, x in (("x0", x0), ("x1", x1)):
+            check_finite(x.numpy(), name, self.mesh.vertices)
+        return ArcBounds(arcs, self.mesh.vertices, x0, x1)
+
+    def _detect_arcs(
+        self, x0: wp.array, x1: wp.array, only: np.ndarray | None, changed: wp.array | None, bounds: ArcBounds
+    ) -> Collisions:
+        """Returns the collisions of a motion in which bodies turn."""
+        body, options = bounds.motion.body, {"method": self.method, "tolerance": self.tolerance}
+        options |= {"min_distance": self.min_distance, "rings": self._rings}
+        if self._arcs is None or not np.array_equal(self._arcs[0].body, body):
+            straight = None
+            if (body[self.mesh.vertices] < 0).any():
+                straight = CollisionDetector(straight_mesh(self.mesh, body >= 0), **options)
+            self._arcs = ArcSearch(self.mesh, body, **options), straight
+        search, straight = self._arcs
+        timer = StageTimer(self.mesh.device)
+        contacts, counts = search.find(bounds, x0, changed, timer)
+        if straight is not None:
+            others = straight.detect(x0, x1, only=only)
+            timer = StageTimers(timer, others._timer)
+            for kind, rows in others._rows.items():
+                contacts[kind] = join_contacts([contacts[kind], rows.read()])
+            counts = add_counts(counts, others._counts.without_filtered())
+        buffers = {kind: contacts_from_host(rows, self.mesh.device) for kind, rows in contacts.items()}
+        found = {kind: ContactRows(buffer, len(buffer.pairs)) for kind, buffer in buffers.items()}
+        return Collisions(self.method != "float", (), None, self.method, counts, found, timer)
 
     def _checked_vertices(self, only: np.ndarray) -> wp.array:
         """Returns which vertices are given, on the device, array of int."""

@@ -49,6 +49,13 @@ _SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
 
 
 @wp.func
+def _are_of_one_body(corners: wp.vec4i, body: wp.array[int]) -> bool:
+    """Returns whether all points of a pair belong to one body."""
+    of_first = body[corners[0]]
+    return body[corners[1]] == of_first and body[corners[2]] == of_first and body[corners[3]] == of_first
+
+
+@wp.func
 def _enqueue_contact(pair: wp.vec2i, stages: PairStages) -> int:
     """Returns the index of a new contact, -1 if it does not fit."""
     slot = take_slot(stages.counts, _CONTACTS)
@@ -114,6 +121,7 @@ def _kernels(dtype: type) -> _Kernels:
         x1: wp.array[dtype],
         radius: wp.array[wp.float64],
         rings: Rings,
+        body: wp.array[int],
         kind: int,
         roundoff: wp.float64,
         # in and out
@@ -124,6 +132,8 @@ def _kernels(dtype: type) -> _Kernels:
             return
         pair = stages.queue[i]
         v = points_of_pair(kind, stages.elements, pair)
+        if body and _are_of_one_body(v, body):
+            return
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
@@ -260,6 +270,7 @@ def run_distance_phases(
     rings: Rings,
     *,
     method: Method,
+    body: wp.array | None = None,
     timed: bool = True,
     tolerance: float = TOLERANCE,
     timer: StageTimer,
@@ -274,6 +285,7 @@ def run_distance_phases(
         rings: Vertices whose elements are excluded.
         method: One of :data:`METHODS`; with "exact", pairs that stay UNSURE are left to
             :func:`decide_distances_on_host`.
+        body: Body of each vertex, array of int: pairs whose vertices are all of one body are excluded. None for none.
         timed: Whether to find times of impact within the tolerance.
         tolerance: Tolerance of the times of impact, as a share of the step.
         timer: Measures the stages.
@@ -282,7 +294,7 @@ def run_distance_phases(
     roundoff = 0.0 if method == "float" else ROUNDOFF
     with timer.stage("cull"):
         for phase, elements in phases:
-            inputs = [x0, x1, radius, rings, int(phase.kind), roundoff]
+            inputs = [x0, x1, radius, rings, body, int(phase.kind), roundoff]
             stages = phase.stages(elements)
             launch_over_queue(kernels.cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
     device = x0.device

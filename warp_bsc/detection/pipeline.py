@@ -32,6 +32,9 @@ MIN_CAPACITY = 4096
 _LARGEST_RADIUS = 2.0**1000
 """The sum of two is finite."""
 
+_ABOVE_SUM = 1.0 + 2.0**-50
+"""Raises a radius so that the rounded sum of two is at least the sum of what they were raised from."""
+
 _UNTIMED = StageTimer(None)
 
 
@@ -112,6 +115,7 @@ class DetectionPipeline:
         min_distance: float = 0.0,
         rings: int = 1,
         min_distances: "MinDistances | None" = None,
+        body: np.ndarray | None = None,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
     ):
@@ -125,6 +129,8 @@ class DetectionPipeline:
             rings: Pairs within this number of edges are excluded, see :class:`CollisionDetector`.
             min_distances: Minimum distances of a response, see :mod:`.approach_phase`, in place of those from radii and
                 ``min_distance``; None for these.
+            body: Body of each vertex, int, shape [vertex_count]: pairs whose vertices are all of one body are excluded,
+                and :meth:`add_to_radius` must be called before each run. None for none.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`MIN_CAPACITY` together;
@@ -154,11 +160,15 @@ class DetectionPipeline:
         else:
             self.radius = min_distances.radius.numpy() + 0.5 * min_distances.reach
         self._rings = Rings() if self.radius is None or min_distances is not None else make_rings(mesh, rings)
-        self.device_radius = padding = None
+        self._body: wp.array | None = None
+        if body is not None:
+            self._body = wp.array(body, dtype=int, device=mesh.device)
+            self.radius = np.zeros(vertices) if self.radius is None else self.radius
+        self.device_radius = self._padding = None
         if self.radius is not None:
-            self.device_radius = wp.array(self.radius, dtype=wp.float64, device=mesh.device)
-            # the minimum distance of a pair, a rounded sum, is at most the sum of these
-            padding = wp.array(np.nextafter(self.radius, np.inf), dtype=wp.float64, device=mesh.device)
+            self.device_radius = wp.empty(vertices, dtype=wp.float64, device=mesh.device)
+            self._padding = wp.empty_like(self.device_radius)
+            self._set_radius(self.radius)
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs_per_face is not None:
@@ -170,7 +180,7 @@ class DetectionPipeline:
             capacity=face_pairs,
             not_finite=self.counters.not_finite,
             checked_vertices=mesh.vertices if only_used_vertices else None,
-            padding=padding,
+            padding=self._padding,
         )
         self.vertex_face = NarrowPhase(
             PairKind.VERTEX_FACE, self.counters.vertex_face, vertex_face, elements=(vertices, faces)
@@ -194,6 +204,21 @@ class DetectionPipeline:
         """
         self._filtered_of_worlds = counts
         self._broad_phase.count_filtered_by_world(counts)
+
+    def add_to_radius(self, deviation: np.ndarray) -> None:
+        """Sets the minimum distance of each pair, for the next runs, to at least what it is with larger radii.
+
+        Args:
+            deviation: What is added to the radius of each vertex, float64, shape [vertex_count].
+        """
+        assert self.radius is not None
+        self._set_radius(_ABOVE_SUM * (self.radius + deviation))
+
+    def _set_radius(self, radius: np.ndarray) -> None:
+        assert self.device_radius is not None and self._padding is not None
+        self.device_radius.assign(radius)
+        # the minimum distance of a pair, a rounded sum, is at most the sum of these
+        self._padding.assign(np.nextafter(radius, np.inf))
 
     @property
     def narrow_phases(self) -> tuple[NarrowPhase, ...]:
@@ -242,6 +267,7 @@ class DetectionPipeline:
         elif self.device_radius is None:
             run_narrow_phases(narrow_phases, x0, x1, **options)
         else:
+            options["body"] = self._body
             run_distance_phases(narrow_phases, x0, x1, self.device_radius, self._rings, **options)
         if not sort:
             return

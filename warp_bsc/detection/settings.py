@@ -1,7 +1,7 @@
 """Settings and counters that all parts of the detection share: kinds of pairs, methods, tolerances, kernel options."""
 
 import enum
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -24,6 +24,7 @@ __all__ = [
     "Method",
     "PairCounts",
     "PairKind",
+    "add_counts",
     "capacity_for",
     "checked_tolerance",
 ]
@@ -219,6 +220,10 @@ class Counts:
         """The counts of each kind of pair."""
         return {kind: getattr(self, kind.label) for kind in DistanceKind}
 
+    def without_filtered(self) -> "Counts":
+        """Returns the counts with no pair that is filtered."""
+        return replace(self, **{kind.label: replace(counts, filtered=0) for kind, counts in self.pairs.items()})
+
     def values(self) -> list[int]:
         """Returns all counts in the order of :class:`Counters`."""
         return [self.not_finite, self.face_pairs, *(v for counts in self.pairs.values() for v in counts.values())]
@@ -230,6 +235,16 @@ class Counts:
             faces = [f"face pairs: {self.face_pairs} do not fit in the capacity {capacities.face_pairs}"]
         others = capacities.pairs
         return [*faces, *(line for kind, counts in self.pairs.items() for line in counts.overflows(others[kind], kind))]
+
+
+def add_counts(first: Counts, second: Counts) -> Counts:
+    """Returns the counts of two detections together."""
+
+    def add_pairs(one: PairCounts, other: PairCounts) -> PairCounts:
+        return PairCounts(*(a + b for a, b in zip(one.values(), other.values(), strict=True)))
+
+    pairs = {kind.label: add_pairs(counts, second.pairs[kind]) for kind, counts in first.pairs.items()}
+    return Counts(first.not_finite + second.not_finite, first.face_pairs + second.face_pairs, **pairs)
 
 
 class Counters:

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["StageTimer"]
+__all__ = ["StageTimer", "StageTimers"]
 
 
 class StageTimer:
@@ -49,3 +49,19 @@ class StageTimer:
         event = wp.Event(self._device, enable_timing=True)
         wp.get_stream(self._device).record_event(event)
         return event
+
+
+class StageTimers:
+    """The times of several timers together."""
+
+    def __init__(self, *timers: "StageTimer | StageTimers"):
+        """Takes the timers."""
+        self._timers = timers
+
+    def read(self) -> dict[str, float]:
+        """Returns the time by stage [ms], the sum of all timers."""
+        milliseconds: dict[str, float] = {}
+        for timer in self._timers:
+            for name, passed in timer.read().items():
+                milliseconds[name] = milliseconds.get(name, 0.0) + passed
+        return milliseconds

@@ -17,6 +17,7 @@ from ..detection.detector import CollisionDetector
 from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import Proximities, ProximityFinder
+from ..detection.rigid_motion import RigidMotion
 from ..detection.settings import Method
 from ..detection.start import is_cpu
 from ..usd.interval import Interval
@@ -24,6 +25,7 @@ from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .results import IntervalResult, Work, summarize, summarize_intersections
+from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, find_strand_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
@@ -121,6 +123,7 @@ class _Detection:
 
     Attributes:
         interval: The interval.
+        arcs: The motion of vertices on arcs; None if all move straight.
         collisions: Collisions of meshes.
         of_strands: Collisions of curves and points; None without any.
         intersections: Intersections at the start and at the end; None if they are not checked.
@@ -129,6 +132,7 @@ class _Detection:
     """
 
     interval: Interval
+    arcs: RigidMotion | None
     collisions: Collisions
     of_strands: Collisions | None
     intersections: tuple[Intersections, Intersections] | None
@@ -176,25 +180,25 @@ class _SegmentDetector:
 
     def detect(self, interval: Interval) -> _Detection:
         """Returns the detected collisions, intersections and proximities of an interval."""
-        detector = self._detector
+        detector, arcs = self._detector, arcs_of(interval)
         start = self.find_intersections(interval.x0, interval.start) if self._finder else None
         if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
             nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self.mesh.device)
             detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
-            collisions = detector.detect(interval.x0, interval.x1)
-        of_strands = self.strands.detect(interval) if self.strands and not self._is_still else None
+            collisions = detector.detect(interval.x0, interval.x1, arcs=arcs)
+        of_strands = self.strands.detect(interval, arcs) if self.strands and not self._is_still else None
         intersections = None
         if start:
-            motion = None if self._is_still else collisions
+            motion = None if self._is_still or arcs else collisions
             intersections = start, self.find_intersections(interval.x1, interval.end, motion)
         proximities = None
         if self._proximity_finder:
             at_start = self._find_proximities(interval.x0, interval.start)
             proximities = at_start, self._find_proximities(interval.x1, interval.end)
         return _Detection(
-            interval, collisions, of_strands, intersections, proximities, detector if self._is_validated else None
+            interval, arcs, collisions, of_strands, intersections, proximities, detector if self._is_validated else None
         )
 
     def find_intersections(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> Intersections:
@@ -251,11 +255,11 @@ class _SegmentNamer:
         if detection.proximities:
             start, end = detection.proximities
             proximities = self._name_proximities(start, interval.start), self._name_proximities(end, interval.end)
-        contacts = find_contacts(interval, self._mesh, collisions, selection)
+        contacts = find_contacts(interval, self._mesh, collisions, selection, detection.arcs)
         certified, stats = collisions.certified, collisions.stats
         if detection.of_strands:
             assert self._strand_mesh
-            more = find_strand_contacts(interval, self._strand_mesh, detection.of_strands, selection)
+            more = find_strand_contacts(interval, self._strand_mesh, detection.of_strands, selection, detection.arcs)
             contacts, stats = join_contacts(contacts, more), add_stats(stats, detection.of_strands.stats)
             certified &= detection.of_strands.certified
         if intersections:
@@ -270,6 +274,7 @@ class _SegmentNamer:
                 most=None if self._checks.validate == "all" else self._checks.validate,
                 seed=interval.index,
                 counted=contacts.counted,
+                turns=None if detection.arcs is None else detection.arcs.body >= 0,
             )
         summary = summarize(
             contacts,
@@ -341,9 +346,9 @@ class _StrandChecker:
         ends = self.mesh.edges[self.mesh.free_edges].astype(np.int64)
         return np.concatenate([self._segment.face_meshes, self._segment.locate_edges(ends)[0]])
 
-    def detect(self, interval: Interval) -> Collisions:
-        """Returns the collisions of curves and points in an interval."""
-        return self._detector.detect(interval.x0, interval.x1)
+    def detect(self, interval: Interval, arcs: RigidMotion | None) -> Collisions:
+        """Returns the collisions of curves and points in an interval, some of whose vertices may move on arcs."""
+        return self._detector.detect(interval.x0, interval.x1, arcs=arcs)
 
     def with_intersections(self, found: Intersections, x: np.ndarray, *, is_end: bool) -> Intersections:
         """Returns intersections of meshes followed by those of curves, with the edges numbered as in :attr:`mesh`.

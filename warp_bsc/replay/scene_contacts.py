@@ -9,8 +9,10 @@ import numpy as np
 from .._sorted_keys import search
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
+from ..detection.rigid_motion import RigidMotion
 from ..usd.interval import Interval
 from ..usd.selection import Selection
+from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
 
@@ -73,21 +75,24 @@ def find_contacts(
     mesh: CollisionMesh,
     collisions: Collisions,
     selection: Selection,
+    arcs: RigidMotion | None = None,
 ) -> SceneContacts:
     """Names the detected pairs that are checked by prims and elements.
 
     Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, and pairs of a mesh with
     itself if only its transform moves it. Elements that are apart in such a mesh stay apart; elements that touch, at
-    T-junctions or in coplanar faces, would collide by rounding alone. (If a transform turns by half a circle from one
-    sample to the next, or scales by zero, the straight paths of the vertices meet although the mesh does not.)
+    T-junctions or in coplanar faces, would collide by rounding alone. (If a transform that has no turn at a constant
+    rate turns by half a circle from one sample to the next, or scales by zero, the straight paths of the vertices meet
+    although the mesh does not.)
 
     Args:
         interval: The interval.
         mesh: The detector's mesh, made of the interval's segment.
         collisions: Collisions of that mesh in the interval.
         selection: The pairs of meshes that are checked.
+        arcs: The motion of the vertices on arcs; None if all move straight.
     """
-    segment, x0, x1 = interval.segment, interval.x0, interval.x1
+    segment = interval.segment
     vertices, faces = collisions.vertex_face.T.astype(np.int64)
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
     n_vertex_face = len(vertices)
@@ -110,14 +115,10 @@ def find_contacts(
     toi = np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi])
     normal = np.concatenate([collisions.vertex_face_normal, collisions.edge_edge_normal])
 
-    def at_impact(corners, times):
-        times = times[:, None, None]
-        return (1.0 - times) * x0[corners].astype(np.float64) + times * x1[corners].astype(np.float64)
-
-    corners = at_impact(mesh.faces[faces], toi[:n_vertex_face])
+    corners = positions_at(interval, arcs, mesh.faces[faces], toi[:n_vertex_face])
     on_faces = np.einsum("ni,nij->nj", collisions.vertex_face_coordinates, corners)
     s = collisions.edge_edge_coordinates[:, :1]
-    first = at_impact(ends[:, 0], toi[n_vertex_face:])
+    first = positions_at(interval, arcs, ends[:, 0], toi[n_vertex_face:])
     position = np.concatenate([on_faces, (1.0 - s) * first[:, 0] + s * first[:, 1]])
 
     moves = np.array([part.moves for part in segment.meshes])
@@ -141,7 +142,11 @@ def find_contacts(
 
 
 def find_strand_contacts(
-    interval: Interval, mesh: CollisionMesh, collisions: Collisions, selection: Selection
+    interval: Interval,
+    mesh: CollisionMesh,
+    collisions: Collisions,
+    selection: Selection,
+    arcs: RigidMotion | None = None,
 ) -> SceneContacts:
     """Names the detected pairs with curves or points that are checked by prims and elements.
 
@@ -154,8 +159,9 @@ def find_strand_contacts(
             two elements of faces are excluded.
         collisions: Collisions of that mesh in the interval.
         selection: The pairs of meshes that are checked.
+        arcs: The motion of the vertices on arcs; None if all move straight.
     """
-    segment, x0, x1 = interval.segment, interval.x0, interval.x1
+    segment = interval.segment
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)
     of_curves = np.isin(collisions.edge_edge, mesh.free_edges)
     apart = ~(of_curves.all(axis=1) & segment.are_neighbours(ends[:, 0], ends[:, 1]))
@@ -172,8 +178,7 @@ def find_strand_contacts(
     )
 
     def at_impact(corners: np.ndarray, times: np.ndarray) -> np.ndarray:
-        times = times[:, None, None]
-        return (1.0 - times) * x0[corners].astype(np.float64) + times * x1[corners].astype(np.float64)
+        return positions_at(interval, arcs, corners, times)
 
     on_edge = np.concatenate([collisions.edge_edge_coordinates[apart, :1], collisions.vertex_edge_coordinates[:, :1]])
     edges = np.concatenate([at_impact(ends[:, 0], tois[1]), at_impact(point_ends, tois[2])])

@@ -9,7 +9,7 @@ from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Ne
 
 __all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "ProximitySpan", "Summary", "ValidationSummary"]
 
-CERTIFIED_FOR = "vertices that move straight between the times checked"
+CERTIFIED_FOR = "vertices that move straight or turn about one axis between the times checked"
 """The motion that a certificate holds for."""
 
 
@@ -248,7 +248,7 @@ class Summary:
 
     @property
     def certified(self) -> bool:
-        """Whether the finished intervals contain every collision of vertices that move straight."""
+        """Whether the finished intervals contain every collision, see :data:`CERTIFIED_FOR`."""
         return all(interval.certified for interval in self.intervals)
 
     @cached_property
@@ -301,8 +301,9 @@ class Summary:
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"
             text += (
-                f" {which} moved by transforms or skeletons, which need not be linear: turning meshes are sampled at "
-                "every whole time code too, unless the frames have a step; subdividing the intervals samples finer."
+                f" {which} moved by transforms or skeletons, which need not be linear: what turns about one axis at a "
+                "constant rate is checked on its arcs. Turning meshes are sampled at every whole time code too, unless "
+                "the frames have a step; for other turns, subdividing the intervals samples finer."
             )
         return text
 

@@ -46,6 +46,7 @@ def validate(
     most: int | None,
     seed: int,
     counted: np.ndarray | None = None,
+    turns: np.ndarray | None = None,
 ) -> Validation:
     """Compares a detection with the exact checker.
 
@@ -60,6 +61,8 @@ def validate(
         most: Number of reported pairs, and of others, that the checker decides, chosen at random; None for all.
         seed: Seed of the random choice.
         counted: Whether each reported pair may be chosen, vertex-face before edge-edge, bool; default: all.
+        turns: Vertices that move on arcs, of which the checker decides nothing, bool, shape [vertex_count]; default:
+            none.
     """
     mesh = detector.mesh
     random = np.random.default_rng(seed)
@@ -69,9 +72,15 @@ def validate(
     for kind, first, second in (("vertex_face", vertices, faces), ("edge_edge", edges, edges)):
         found, toi = getattr(collisions, kind), getattr(collisions, f"{kind}_toi")
 
+        def are_straight(pairs, first=first, second=second):
+            if turns is None:
+                return np.ones(len(pairs), dtype=bool)
+            return ~(turns[first[pairs[:, 0]]].any(axis=1) | turns[second[pairs[:, 1]]].any(axis=1))
+
         rows = np.arange(len(found))
         if counted is not None:
             rows, counted = np.flatnonzero(counted[: len(found)]), counted[len(found) :]
+        rows = rows[are_straight(found[rows])]
         if most is not None and len(rows) > most:
             rows = np.sort(random.choice(rows, most, replace=False))
         decided_hits += len(rows)
@@ -87,7 +96,7 @@ def validate(
             elif detector.method == "exact" and toi[row] < earliest - detector.tolerance:
                 disagreements.append(f"{pair} was reported at {toi[row]!r} and collides at {earliest!r} only")
 
-        others = _unreported(mesh, kind, first, second, found, x0, x1)
+        others = (p[are_straight(p)] for p in _unreported(mesh, kind, first, second, found, x0, x1))
         for pairs in _merged(others) if most is None else [_choose(others, most, random)]:
             decided_others += len(pairs)
             collides = getattr(checker, kind)(query_points(second, pairs, x0, x1))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .segment import Segment
+from .turns import Turn
 
 __all__ = ["Interval", "LeftOutMesh", "ReadingNotes", "jump_warning", "left_out_warning", "message_warning"]
 
@@ -42,7 +43,7 @@ class ReadingNotes:
 
 @dataclass(frozen=True)
 class Interval:
-    """The motion of a scene from one of its times to the next, in which every vertex moves straight.
+    """The motion of a scene from one of its times to the next: straight, but for the meshes that turn.
 
     Attributes:
         index: Number of the interval, from 0.
@@ -55,6 +56,7 @@ class Interval:
         is_joined: Whether the next interval surely starts where this one ends, with the same meshes. False for the last
             interval, and where a mesh may jump at the end.
         notes: The left-out meshes, messages and jumps that reading it revealed.
+        turns: The turns of meshes at a constant rate, by their indices in ``segment.meshes``.
     """
 
     index: int
@@ -65,6 +67,7 @@ class Interval:
     x1: np.ndarray = field(repr=False)
     is_joined: bool
     notes: ReadingNotes
+    turns: dict[int, Turn] = field(default_factory=dict)
 
     @property
     def jumps(self) -> tuple[str, ...]:

@@ -345,6 +345,15 @@ class UsdMesh:
                 )
             return points[used].astype(dtype)
 
+    def read_transform(self, time: float, *, before: bool = False) -> np.ndarray | None:
+        """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]; None if it has none then.
+
+        Args:
+            time: Time code, of the scene or between its times.
+            before: As of :meth:`read_positions`.
+        """
+        return self._find_transform(self.time_code(time, before))
+
     def read_instances(
         self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
     ) -> np.ndarray | None:

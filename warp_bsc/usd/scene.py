@@ -19,8 +19,9 @@ The points, the transforms and the skeleton of a mesh may all have time samples.
 meshes together; at a time that is not a mesh's own sample, USD interpolates. Rotating transforms and skeletons do not
 move points straight from one sample to the next: they are sampled at every whole time code between as well, and splines
 as :func:`~warp_bsc.usd.samples.sample_times` describes. From one time to the next, each vertex moves straight from its
-position at the first time to its position just before the second. A mesh that jumps at the second time, from one value
-clip to the next or because a value was held, ends at its position before the jump.
+position at the first time to its position just before the second; a mesh that only its transform moves turns instead,
+if :mod:`~warp_bsc.usd.turns` finds that it does. A mesh that jumps at the second time, from one value clip to the next
+or because a value was held, ends at its position before the jump.
 
 Times that differ by less than a millionth of a time code, or of the whole time if that is shorter, count as one:
 rounding produces them in files, and OpenUSD uses them to separate the end of a value clip from the start of the next.
@@ -410,8 +411,10 @@ class Scene:
         self.files.check_stage()
         segment, x0, x1, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
+        with self._collecting(self._messages, self.path):
+            turns = segment.turns(start, end) if self.turning else {}
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
-        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps))
+        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), turns)
 
     @one_at_a_time
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:

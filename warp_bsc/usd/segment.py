@@ -9,6 +9,7 @@ import numpy as np
 from .._sorted_keys import distinct, search, search_ranges
 from .position_reader import PositionReader
 from .scene_mesh import SceneMesh
+from .turns import Turn, find_turns
 from .welding import group_by_position, split_by_position
 
 if TYPE_CHECKING:
@@ -162,6 +163,20 @@ class Segment:
         positions = (self._start if last is None else last).copy()
         reader.read(positions, time, before)
         return positions
+
+    def turns(self, start: float, end: float) -> dict[int, Turn]:
+        """Returns the turns from one time to the next of the meshes that only their transforms move, by their numbers.
+
+        Args:
+            start: Time code of the first time.
+            end: Time code of the second one; of a mesh that jumps then, the turn ends before the jump.
+        """
+
+        def transform(number: int, share: float) -> np.ndarray | None:
+            return self._usd_meshes[number].read_transform(start + share * (end - start), before=share == 1.0)
+
+        meshes = enumerate(self.meshes)
+        return find_turns(transform, [number for number, mesh in meshes if mesh.moves and not mesh.deforms])
 
     @property
     def has_strands(self) -> bool:

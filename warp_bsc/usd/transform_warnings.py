@@ -11,6 +11,7 @@ from pxr import Sdf, UsdGeom
 from .instancers import Instancer
 from .interval import times_in_words
 from .meshes import UsdMesh
+from .turns import Turn, find_turns
 
 __all__ = ["transform_warnings"]
 
@@ -25,14 +26,17 @@ shorter way, and matrices number by number."""
 
 
 def transform_warnings(meshes: list[UsdMesh], times: list[float]) -> list[str]:
-    """Returns sentences on the prims that turn by half a turn or more between two times, and one on scales of 0.
+    """Returns sentences on prims that turn by half a turn or more between two times, and one on scales of 0.
+
+    Turns about one axis at a constant rate, of meshes that nothing else moves, are not named: they are checked on their
+    arcs, see :mod:`.turns`.
 
     Args:
         meshes: The meshes of a scene.
         times: Its times, ascending.
     """
     ops_of: dict[tuple | str, list[UsdGeom.XformOp]] = {}  # all instances of a mesh share theirs
-    placed: dict[Sdf.Path, tuple[UsdGeom.XformOp, list[str]]] = {}  # operation and meshes by the operation's attribute
+    placed: dict[Sdf.Path, tuple[UsdGeom.XformOp, list[UsdMesh]]] = {}  # an operation and its meshes by its attribute
     zero_scales: dict[Instancer, dict[int, float]] = {}
     hidden: dict[str, float] = {}  # first time by mesh
     for mesh in meshes:
@@ -40,20 +44,20 @@ def transform_warnings(meshes: list[UsdMesh], times: list[float]) -> list[str]:
         if key not in ops_of:
             ops_of[key] = list(mesh.transform_ops())
         for op in ops_of[key]:
-            placed.setdefault(op.GetAttr().GetPath(), (op, []))[1].append(mesh.name)
+            placed.setdefault(op.GetAttr().GetPath(), (op, []))[1].append(mesh)
         if instance := mesh.instance:
             if instance.instancer not in zero_scales:
                 zero_scales[instance.instancer] = instance.instancer.zero_scales(times)
             if instance.index in zero_scales[instance.instancer]:
                 hidden[mesh.name] = zero_scales[instance.instancer][instance.index]
     turns = []
-    for op, names in placed.values():
+    for op, moved in placed.values():
         if op.GetOpType() in _ROTATIONS:
-            turns += _turn_warning(op, names, times)
+            turns += _turn_warning(op, moved, times)
         elif op.GetOpType() in (UsdGeom.XformOp.TypeScale, UsdGeom.XformOp.TypeTransform):
             time = _first_zero(op, times)
             if time is not None:
-                hidden |= {name: min(time, hidden.get(name, time)) for name in names}
+                hidden |= {mesh.name: min(time, hidden.get(mesh.name, time)) for mesh in moved}
     if len(turns) > _NAMED:
         turns[_NAMED:] = [f"subdivide: {len(turns) - _NAMED} more prims turn by half a turn or more between two times"]
     if not hidden:
@@ -73,7 +77,7 @@ def _moments(own_times: list[float], times: list[float]) -> list[float]:
     return [times[0], *(time for time in own_times if times[0] < time <= times[-1])]
 
 
-def _turn_warning(op: UsdGeom.XformOp, names: list[str], times: list[float]) -> list[str]:
+def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]) -> list[str]:
     """Returns a sentence on the large turns of an operation between two times, if there are any."""
     if not op.MightBeTimeVarying():
         return []
@@ -87,16 +91,28 @@ def _turn_warning(op: UsdGeom.XformOp, names: list[str], times: list[float]) -> 
         turned = np.cumsum(np.abs(np.diff(angles, axis=0, prepend=angles[:1])), axis=0)[np.searchsorted(within, times)]
         degrees = np.diff(turned, axis=0).max(axis=1)
         (large,) = np.nonzero((degrees >= _LARGE_TURN * (1.0 - _ROUNDING)) & np.isfinite(degrees))
+    if not any(mesh.deforms for mesh in meshes):
+        on_arcs = [_on_arcs(mesh, large.tolist(), times) for mesh in meshes]
+        large = large[[any(index not in turns for turns in on_arcs) for index in large.tolist()]]
     if not len(large):
         return []
     most = degrees[large].max()
-    moved = names[0] if len(names) == 1 else f"{attribute.GetPrimPath()} with {len(names)} meshes"
+    moved = meshes[0].name if len(meshes) == 1 else f"{attribute.GetPrimPath()} with {len(meshes)} meshes"
     when = times_in_words([times[index] for index in large])
     parts = math.ceil(most / _FINE_TURN * (1.0 - _ROUNDING))
     return [
         f"subdivide: {moved} turns by up to {most:.4g} degrees to the next time, {when}: its vertices move straight, "
         f"and what it turns through is not checked; in {parts} parts it turns by {_FINE_TURN:g} degrees or less"
     ]
+
+
+def _on_arcs(mesh: UsdMesh, intervals: list[int], times: list[float]) -> dict[int, Turn]:
+    """Returns the turns of a mesh in intervals in which it turns about one axis at a constant rate."""
+
+    def transform(index: int, share: float) -> np.ndarray | None:
+        return mesh.read_transform(times[index] + share * (times[index + 1] - times[index]), before=share == 1.0)
+
+    return find_turns(transform, intervals)
 
 
 def _first_zero(op: UsdGeom.XformOp, times: list[float]) -> float | None:

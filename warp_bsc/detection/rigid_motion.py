@@ -1,0 +1,326 @@
+"""The motion of bodies that turn: vertices move along arcs, whose distance from their chords has a proven bound."""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from .._arguments import as_numpy, checked_coordinates, checked_distance, checked_number
+from ..kernels.arcs import LEVER_ERROR, POSITION_ERROR, TURN_ERROR, on_arc
+from .launch import launch, made_once
+from .settings import NO_GRADIENTS
+
+__all__ = ["ArcBounds", "RigidMotion", "points_on_arcs"]
+
+_LARGEST_TURN = 4096.0
+_SMALLEST_TURN = 2.0**-400
+_LARGEST_COORDINATE = 2.0**500
+_DEFAULT_TOLERANCE = 2.0**-12
+"""Tolerance as a share of the largest distance of a vertex from its axis."""
+_MISFIT = 2.0**-10
+"""Largest distance of a vertex from where its body would put it at the end, as a share of the distance from the
+centre; and, for positions that were rounded, this share of it of the coordinates."""
+_ROUNDED_MISFIT = 2.0**-8
+_UP = 1.0 + 2.0**-40
+"""Raises a few rounded operations above their exact result."""
+_TINY = 2.0**-1000
+"""More than the underflow of all operations."""
+
+
+@made_once
+def _place_on_arcs(dtype: type) -> wp.Kernel:
+    """Returns the kernel that computes positions at a time, for one type of position."""
+
+    @wp.kernel(**NO_GRADIENTS)
+    def place_on_arcs(
+        # in
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        body: wp.array[int],
+        centre: wp.array[wp.vec3d],
+        turn: wp.array[wp.vec3d],
+        time: wp.float64,
+        # out
+        x: wp.array[wp.vec3d],
+    ):
+        i = wp.tid()
+        axis = wp.vec3d()
+        origin = wp.vec3d()
+        if body[i] >= 0:
+            axis = turn[body[i]]
+            origin = centre[body[i]]
+        x[i] = on_arc(x0[i], x1[i], origin, axis, time)
+
+    return place_on_arcs
+
+
+class RigidMotion:
+    """Bodies that turn at a constant rate about an axis of constant direction, while a point of each moves straight.
+
+    A vertex of such a body begins at its position x0 at the start of the step and ends at x1 at the end. In between it
+    is at x(t) = (1 - t) x0 + t x1 + (R(t) - t R(1) - (1 - t) I)(x0 - centre), where R(t) is the rotation by t times the
+    turn: if x1 is where the turn and a translation put it, the centre moves straight and the body turns about it. A
+    screw has its centre on its own axis. All other vertices move straight.
+
+    Attributes:
+        body: Body of each vertex, -1 for those that move straight, int32, shape [vertex_count].
+        centre: A point of each body's axis at the start, float64, shape [body_count, 3].
+        turn: Axis of each body times the angle of its turn [rad], float64, shape [body_count, 3].
+        tolerance: Distance within which pairs may be reported that do not collide, in the unit of the positions, or
+            None for 2^-12 of the largest distance of a vertex from its axis.
+    """
+
+    def __init__(
+        self,
+        body: np.ndarray | wp.array,
+        centre: np.ndarray | wp.array,
+        turn: np.ndarray | wp.array,
+        *,
+        tolerance: float | None = None,
+    ):
+        """Checks the motion.
+
+        Args:
+            body: Body of each vertex, -1 for those that move straight, integers, shape [vertex_count].
+            centre: A point of each body's axis at the start, in the unit of the positions, float32 or float64, shape
+                [body_count, 3].
+            turn: Axis of each body times the angle of its turn over the step [rad], of the same shape. It may be any
+                number of turns up to 4096 rad; an angle is 0 or at least 2^-400.
+            tolerance: Distance within which pairs may be reported that do not collide, more than 0, in the unit of the
+                positions; None for 2^-12 of the largest distance of a vertex from its axis.
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If it has another shape, is not finite or out of range, or a body has no centre.
+        """
+        self.centre = checked_coordinates(centre, (3,), "centre").astype(np.float64)
+        self.turn = checked_coordinates(turn, (3,), "turn").astype(np.float64)
+        if len(self.turn) != len(self.centre):
+            raise ValueError(f"turn must have {len(self.centre)} rows, one a body, not {len(self.turn)}")
+        largest = np.abs(self.centre).max(initial=0.0)
+        if largest > _LARGEST_COORDINATE:
+            raise ValueError(f"centre must have coordinates of at most 2^500, not {largest:g}")
+        angle = np.linalg.norm(self.turn, axis=1)
+        bad = ~((self.turn == 0.0).all(axis=1) | ((angle >= _SMALLEST_TURN) & (angle <= _LARGEST_TURN)))
+        if bad.any():
+            raise ValueError(
+                f"turn[{np.argmax(bad)}] must be 0, or from 2^-400 to {_LARGEST_TURN:g} rad, not {angle[bad][0]:g}"
+            )
+        bodies = as_numpy(body, "body", "an array of integers")
+        if bodies.dtype.kind not in "iu":
+            raise TypeError(f"body must be an array of integers, not of {bodies.dtype}")
+        if bodies.ndim != 1:
+            raise ValueError(f"body must have shape (vertex_count,), not {bodies.shape}")
+        bad = (bodies < -1) | (bodies >= len(self.centre))
+        if bad.any():
+            which = int(np.argmax(bad))
+            raise ValueError(
+                f"body[{which}] must be -1 or one of {len(self.centre)} bodies from 0, not {bodies[which]}"
+            )
+        self.body = bodies.astype(np.int32)
+        self.tolerance = None if tolerance is None else checked_distance(tolerance, "tolerance", zero=False)
+
+    @classmethod
+    def between(
+        cls,
+        body: np.ndarray | wp.array,
+        pose_0: np.ndarray | wp.array,
+        pose_1: np.ndarray | wp.array,
+        *,
+        tolerance: float | None = None,
+    ) -> "RigidMotion":
+        """Returns the motion of bodies from one pose to another, the shorter way: their origins move straight.
+
+        Half a turn has no shorter way: give the turn itself.
+
+        Args:
+            body: As of :class:`RigidMotion`.
+            pose_0: Position of each body and the quaternion of its orientation at the start, x y z qx qy qz qw, as
+                Warp's transforms, float32 or float64, shape [body_count, 7].
+            pose_1: The same at the end.
+            tolerance: As of :class:`RigidMotion`.
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: As of :class:`RigidMotion`, or if a quaternion is not of length 1, to a thousandth.
+        """
+        poses = []
+        for name, pose in (("pose_0", pose_0), ("pose_1", pose_1)):
+            values = checked_coordinates(pose, (7,), name).astype(np.float64)
+            with np.errstate(over="ignore"):
+                length = np.linalg.norm(values[:, 3:], axis=1)
+            bad = ~(np.abs(length - 1.0) < 1e-3)
+            if bad.any():
+                which = int(np.argmax(bad))
+                raise ValueError(f"{name}[{which}] must have a quaternion of length 1, not {length[which]:g}")
+            poses.append(values)
+        if len(poses[1]) != len(poses[0]):
+            raise ValueError(f"pose_1 must have {len(poses[0])} rows, one a body, not {len(poses[1])}")
+        v0, w0, v1, w1 = poses[0][:, 3:6], poses[0][:, 6:], poses[1][:, 3:6], poses[1][:, 6:]
+        # q1 times the conjugate of q0, of the sign that turns the shorter way
+        vector, scalar = w0 * v1 - w1 * v0 - np.cross(v1, v0), w1 * w0 + (v1 * v0).sum(axis=1, keepdims=True)
+        vector = np.where(scalar < 0.0, -vector, vector)
+        sine = np.linalg.norm(vector, axis=1, keepdims=True)
+        still = sine < _SMALLEST_TURN
+        angle = 2.0 * np.arctan2(sine, np.abs(scalar))
+        turn = np.where(still, 0.0, vector / np.where(still, 1.0, sine) * angle)
+        return cls(body, poses[0][:, :3], turn, tolerance=tolerance)
+
+    def positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, time: float) -> np.ndarray:
+        """Returns the positions of all vertices at a time, rounded, float64, shape [vertex_count, 3].
+
+        Args:
+            x0: Positions at the start, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
+            x1: Positions at the end, of the same shape.
+            time: Time in [0, 1].
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If the positions have another shape or are not finite, or the time is out of range.
+        """
+        start, end = checked_coordinates(x0, (3,), "x0"), checked_coordinates(x1, (3,), "x1")
+        for name, x in (("x0", start), ("x1", end)):
+            if len(x) != len(self.body):
+                raise ValueError(f"{name} must have {len(self.body)} rows, one a vertex, not {len(x)}")
+        return points_on_arcs(self, start, end, np.arange(len(self.body)), checked_number(time, "time", 0.0, 1.0))
+
+
+def points_on_arcs(
+    motion: RigidMotion, x0: np.ndarray, x1: np.ndarray, vertices: np.ndarray, time: float | np.ndarray
+) -> np.ndarray:
+    """Returns positions of vertices at times, rounded, float64, of the shape of the vertices and 3.
+
+    Args:
+        motion: The motion.
+        x0: Positions at the start, shape [vertex_count, 3].
+        x1: Positions at the end.
+        vertices: Indices of vertices, of any shape.
+        time: Time of each, 0 at the start and 1 at the end; a number, or of a shape that broadcasts to theirs.
+    """
+    start, end = x0[vertices].astype(np.float64), x1[vertices].astype(np.float64)
+    time = np.asarray(time, dtype=np.float64)[..., None]
+    straight = (1.0 - time) * start + time * end
+    body = motion.body[vertices]
+    if not (body >= 0).any():
+        return straight
+    turn = np.where(body[..., None] >= 0, motion.turn[body], 0.0)
+    across, inward = _levers(start - motion.centre[body], turn)
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    sine = np.sin(time * angle) - time * np.sin(angle)
+    versine = 2.0 * (np.sin(0.5 * time * angle) ** 2 - time * np.sin(0.5 * angle) ** 2)
+    return straight + sine * across + versine * inward
+
+
+def _levers(r: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns k x r and k x (k x r), with k the unit vector of a turn, each of shape [..., 3]; 0 without a turn."""
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    axis = turn / np.where(angle == 0.0, 1.0, angle)
+    across = np.cross(axis, r)
+    return across, np.cross(axis, across)
+
+
+class ArcBounds:
+    """The motion of a mesh's vertices by a :class:`RigidMotion` in parts of the step, with bounds of their deviation.
+
+    Attributes:
+        motion: The motion.
+        lever: Bound of the distance of each vertex from its axis, 0 for those that move straight, float64, shape
+            [vertex_count].
+        tolerance: Distance within which pairs may be reported that do not collide.
+    """
+
+    def __init__(self, motion: RigidMotion, vertices: np.ndarray, x0: wp.array, x1: wp.array):
+        """Bounds the motion from one configuration to another.
+
+        Args:
+            motion: The motion.
+            vertices: The vertices that have elements; positions of others may be anything.
+            x0: Positions at the start, finite for these vertices, Warp array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+
+        Raises:
+            ValueError: If a coordinate is more than 2^500, the positions at the end are not those of the motion, or
+                the tolerance is too small for their rounding.
+        """
+        self.motion = motion
+        self._ends, device = (x0, x1), x0.device
+        self._arrays = [
+            wp.array(motion.body, dtype=int, device=device),
+            *(wp.array(v, dtype=wp.vec3d, device=device) for v in (motion.centre, motion.turn)),
+        ]
+        count = len(motion.body)
+        self.lever, self._lever_angle, self._rounding = np.zeros(count), np.zeros(count), np.zeros(count)
+        start, end = (x.numpy()[vertices].astype(np.float64) for x in (x0, x1))
+        for name, x in (("x0", start), ("x1", end)):
+            if np.abs(x).max(initial=0.0) > _LARGEST_COORDINATE:
+                raise ValueError(f"{name} must have coordinates of at most 2^500 with arcs, not {np.abs(x).max():g}")
+        size = math.sqrt(3.0) * np.maximum(np.abs(start), np.abs(end)).max(axis=1, initial=0.0)
+        body = motion.body[vertices]
+        r, angle = np.zeros_like(start), np.zeros(len(start))
+        turns = body >= 0
+        turn = np.zeros_like(start)
+        r[turns], turn[turns] = (start - motion.centre[body])[turns], motion.turn[body[turns]]
+        angle = np.linalg.norm(turn, axis=1)
+        distance = _UP * np.linalg.norm(r, axis=1)
+        roundoff = 2.0**-53
+        lever = np.linalg.norm(_levers(r, turn)[0], axis=1) + 32.0 * roundoff * distance
+        self.lever[vertices] = np.where(angle > 0.0, _UP * lever, 0.0)
+        self._lever_angle[vertices] = _UP * angle
+        error = POSITION_ERROR * size + (LEVER_ERROR + TURN_ERROR * angle) * distance
+        self._rounding[vertices] = roundoff * _UP * error + _TINY
+        self._check_fit(body, start, end, distance)
+        least = 16.0 * float(self._rounding.max(initial=0.0))  # that parts of the step can reach
+        if motion.tolerance is not None and motion.tolerance < least:
+            raise ValueError(
+                f"arcs.tolerance must be at least {least:g}, as positions between the ends are rounded, not "
+                f"{motion.tolerance:g}"
+            )
+        largest = float(self.lever.max(initial=0.0))
+        self.tolerance: float = motion.tolerance or max(_DEFAULT_TOLERANCE * largest, least)
+
+    def deviation(self, level: int) -> np.ndarray:
+        """Returns how far each vertex is from its chord at most, in parts of the step that last 2^-level.
+
+        The chord is between positions as of :meth:`place`, whose rounding is included. Float64, shape [vertex_count].
+        """
+        sagitta = np.minimum((self._lever_angle * 2.0**-level) ** 2 / 8.0, 2.0) * self.lever
+        return _UP * (sagitta + self._rounding)
+
+    def place(self, time: float) -> wp.array:
+        """Returns the positions at a time, Warp array of vec3d on the device of the positions.
+
+        Args:
+            time: A multiple of 2^-52 in [0, 1].
+        """
+        x0, x1 = self._ends
+        x = wp.empty(len(x0), dtype=wp.vec3d, device=x0.device)
+        inputs = [x0, x1, *self._arrays, wp.float64(time)]
+        launch(_place_on_arcs(x0.dtype), len(x), inputs=inputs, outputs=[x], device=x0.device, record_tape=False)
+        return x
+
+    def _check_fit(self, body: np.ndarray, start: np.ndarray, end: np.ndarray, distance: np.ndarray) -> None:
+        """Raises a ValueError if the positions of a body at the end are not those of its turn and a translation."""
+        turns = np.flatnonzero(body >= 0)
+        if not len(turns):
+            return
+        body, start, end, distance = body[turns], start[turns], end[turns], distance[turns]
+        motion, r = self.motion, start - self.motion.centre[body]
+        turn = motion.turn[body]
+        across, inward = _levers(r, turn)
+        angle = np.linalg.norm(turn, axis=1, keepdims=True)
+        moved = end - start - np.sin(angle) * across - 2.0 * np.sin(0.5 * angle) ** 2 * inward
+        count = len(motion.turn)
+        members = np.maximum(np.bincount(body, minlength=count), 1)
+        mean = np.stack([np.bincount(body, column, minlength=count) / members for column in moved.T], axis=1)
+        misfit = np.linalg.norm(moved - mean[body], axis=1)
+        largest, size = np.zeros(count), np.zeros(count)
+        np.maximum.at(largest, body, distance)
+        np.maximum.at(size, body, np.abs(np.concatenate([start, end], axis=1)).max(axis=1))
+        allowed = _MISFIT * largest + _MISFIT * _ROUNDED_MISFIT * size
+        bad = misfit > allowed[body]
+        if bad.any():
+            worst = int(np.argmax(misfit - allowed[body]))
+            raise ValueError(
+                f"x1 must be where arcs take body {body[worst]}, up to a translation: a vertex is {misfit[worst]:g} "
+                "away from there"
+            )
