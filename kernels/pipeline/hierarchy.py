@@ -61,20 +61,6 @@ def union_of_warp(found: wp.uint32) -> wp.uint32:
     snippet="""
 #if defined(__CUDA_ARCH__)
     for (int step = 16; step > 0; step /= 2)
-        bits |= __shfl_xor_sync(0xffffffffu, bits, step);
-#endif
-    return bits;
-"""
-)
-def bits_of_warp(bits: wp.uint32) -> wp.uint32:
-    """Returns the bits that any thread of a warp has; those of the thread on the CPU."""
-    ...
-
-
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    for (int step = 16; step > 0; step /= 2)
         for (int axis = 0; axis < 3; ++axis)
             x[axis] = fminf(x[axis], __shfl_xor_sync(0xffffffffu, x[axis], step));
 #endif

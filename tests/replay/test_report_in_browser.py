@@ -198,7 +198,7 @@ def test_clean_scene_is_one_sentence(tmp_path, browser):
     page = replay(stage)[3]
     sentence = (
         "Nothing collides, nothing intersects: 1 interval and 2 times of 1 mesh and 1 triangle were checked, "
-        "time 0 to 1, certified for vertices that move straight between the times checked."
+        "time 0 to 1, certified for vertices that move straight or turn about one axis between the times checked."
     )
     assert Page(page.read_text()).data["nothing"] == sentence
     browser.open(page)

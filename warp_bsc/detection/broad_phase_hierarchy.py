@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..kernels.pipeline.boxes import read_box
-from ..kernels.pipeline.hierarchy import WIDTH, bits_of_warp, count_set_bits, lowest_set_bit
+from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
 from .element_pairs import are_apart, pair_edges_with_faces, pair_elements, pair_points
 from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
@@ -36,18 +36,18 @@ class _FacePairs:
 def _not_apart(place: int, first: int, found: wp.uint32, boxes: wp.array2d[wp.vec3]) -> wp.uint32:
     """Returns which of the faces at some places no axis separates from another at the start and at the end.
 
-    All threads of a warp go through the same faces, so that each of these is read once for all. The box of a face with
-    a position that is not finite is empty, and says nothing of the elements that it represents.
+    The box of a face with a position that is not finite is empty, and says nothing of the elements that it represents.
     """
     box = read_box(boxes, place)
-    has_box = box[0][0] <= box[1][0]
-    left = bits_of_warp(found)
+    left = found
+    if box[0][0] > box[1][0]:
+        left = wp.uint32(0)
     while left != wp.uint32(0):
         bit = left & (~left + wp.uint32(1))
         left = left ^ bit
         other = read_box(boxes, first + lowest_set_bit(bit))
-        if has_box and other[0][0] <= other[1][0] and are_apart(box, other):
-            found = found & ~bit
+        if other[0][0] <= other[1][0] and are_apart(box, other):
+            found = found ^ bit
     return found
 
 

@@ -10,9 +10,9 @@ from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 @wp.func
 def unseparated_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
     """Returns the pairs of elements that two faces represent and that no axis separates over the motion, as bits."""
-    left = (overlapping_vertices(mesh, place, other, False) >> 3) & 7
-    left = left | (overlapping_vertices(mesh, other, place, False) & 56)
-    return left | (((overlapping_edges(mesh, place, other, False) >> 9) & 511) << 6)
+    left = overlapping_vertices(mesh, place, other, False) & 7
+    left = left | ((overlapping_vertices(mesh, other, place, False) & 7) << 3)
+    return left | ((overlapping_edges(mesh, place, other, False) & 511) << 6)
 
 
 @wp.func
