@@ -10,6 +10,7 @@ checker decides it. It is a failure if two certain answers contradict each other
 import os
 import time
 import zlib
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -43,6 +44,10 @@ SHOWN = 16
 """Failures of a batch that are printed; all are counted."""
 COPIES = 256
 """Copies of the counts, so that threads seldom wait for one another."""
+MAX_PENDING = 1000
+"""Batches whose checks on the host may be behind."""
+BLOCK = 64
+"""Threads of a block on a GPU: few, as those of a block that work long keep the others' place."""
 LATTICE_SHARE, DISTANCE_SHARE, WIDE_SHARE = 20.0, 0.1, 0.02
 """Queries of cheap jobs, of those with distances and of those in eight limbs, as a share of the count."""
 WIDE = (Generator.MIXED_SCALES, Generator.SUBNORMAL_AND_HUGE)
@@ -124,7 +129,7 @@ class Judge:
 
     def launch(self, kernel, n, inputs, outputs):
         """Launches a kernel over the first n queries."""
-        wp.launch(kernel, n, inputs=inputs, outputs=outputs, device=self.device)
+        wp.launch(kernel, n, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
 
     def run(self, job, first, n):
         """Makes, answers and compares queries.
@@ -288,7 +293,7 @@ class _AtDistances:
             inputs = [int(generator), form, self.single, self.seed, first + start]
             if end > start:
                 judge.launch(make_queries, end - start, inputs, [judge.points[start:end]])
-        judge.launch(choose_distances, n, [self.kind, self.seed, first], [judge.points, judge.distance])
+        judge.launch(choose_distances, n, [self.kind, self.seed ^ 1, first], [judge.points, judge.distance])
 
 
 def jobs_of(count, seed, lattice=None):
@@ -327,7 +332,42 @@ def jobs_of(count, seed, lattice=None):
 # --- Runs ---
 
 
-def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, workers=None, console=None):
+class _HostChecks:
+    """Checks of the host that run while the device goes on, and the results that they are added to."""
+
+    def __init__(self, pool, console):
+        self.pool, self.console, self.pending = pool, console, deque()
+
+    def submit(self, result, *arguments):
+        """Starts a check; waits where too many have not ended, so that memory suffices."""
+        self.pending.append((result, self.pool.submit(check_on_host, *arguments)))
+        while self.pending[0][1].done() or len(self.pending) > MAX_PENDING:
+            self.collect()
+            if not self.pending:
+                break
+
+    def collect(self):
+        """Adds the results of the oldest check, and prints its failures."""
+        result, check = self.pending.popleft()
+        found = check.result()
+        result.add(found)
+        show(found, self.console)
+
+
+def show(result, console):
+    """Prints failures."""
+    for failure in result.failures:
+        console.print(failure, style="red", highlight=False, soft_wrap=True)
+
+
+def _batches(jobs, size):
+    """Yields each job, the number of the first query of a batch, and how many are in it."""
+    for job in jobs:
+        for first in range(0, job.count, size):
+            yield job, first, min(size, job.count - first)
+
+
+def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, pool=None, console=None):
     """Runs jobs, prints tables, the rate and all failures.
 
     Args:
@@ -335,11 +375,11 @@ def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, workers=None, c
         device: Warp device.
         one_in: One in so many queries goes to the checker.
         size: Queries of a batch; default: by the device.
-        workers: Processes in which the checker runs; default: as many as cores.
+        pool: Executor in which the checker runs; default: as many processes as there are cores.
         console: Where to print; default: the standard output, 120 columns wide.
 
     Returns:
-        The number of failures.
+        The number of failures. A query may fail on the device and on the host.
     """
     console = console or Console(width=120)
     judge = Judge(device, size or (2**22 if wp.get_device(device).is_cuda else 2**14))
@@ -348,36 +388,27 @@ def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, workers=None, c
             judge.run(job, 0, 1)
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[rate]}"), TimeRemainingColumn())
     results = {(job.name, job.single): Result() for job in jobs}
-    total = sum(job.count for job in jobs)
-    with (
-        ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool,
-        Progress(*columns, console=console) as progress,
-    ):
-        checks = []
-        task = progress.add_task("certifying", total=total, rate="")
+    pool = pool or ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn"))
+    with pool, Progress(*columns, console=console) as progress:
+        checks = _HostChecks(pool, console)
+        task = progress.add_task("certifying", total=sum(job.count for job in jobs), rate="")
         began = time.perf_counter()
-        for job in jobs:
+        for job, first, n in _batches(jobs, judge.size):
             result = results[job.name, job.single]
-            for first in range(0, job.count, judge.size):
-                n = min(judge.size, job.count - first)
-                found = judge.run(job, first, n)
-                result.add(found)
-                for failure in found.failures:
-                    console.print(failure, style="red", highlight=False, soft_wrap=True)
-                start = -first % one_in
-                if start < n:
-                    sample = judge.read(slice(start, n, one_in))
-                    checks.append((result, pool.submit(check_on_host, job, first + start, one_in, *sample)))
-                progress.advance(task, n)
-                done = progress.tasks[task].completed
-                progress.update(task, rate=f"{done / (time.perf_counter() - began):,.0f} queries/s")
-        seconds = time.perf_counter() - began
-        task = progress.add_task("checking on the host", total=len(checks), rate="")
-        for result, check in checks:
-            found = check.result()
+            found = judge.run(job, first, n)
             result.add(found)
-            for failure in found.failures:
-                console.print(failure, style="red", highlight=False, soft_wrap=True)
+            show(found, console)
+            start = -first % one_in
+            if start < n:
+                sample = judge.read(slice(start, n, one_in))
+                checks.submit(result, job, first + start, one_in, *sample)
+            progress.advance(task, n)
+            rate = progress.tasks[task].completed / (time.perf_counter() - began)
+            progress.update(task, rate=f"{rate:,.0f} queries/s")
+        seconds = time.perf_counter() - began
+        task = progress.add_task("checking on the host", total=len(checks.pending), rate="")
+        while checks.pending:
+            checks.collect()
             progress.advance(task)
     return _report(results, seconds, console)
 

@@ -93,12 +93,14 @@ def make_reached_queries(
     degenerate = integer(random, 0, 2) == 0
     parallel = degenerate and kind == EDGE_EDGE and integer(random, 0, 2) > 0
     moves = integer(random, 0, 9) > 0
+    # small numbers, with which floating point hardly rounds, or large ones, still exact in the precision when turned
+    size = wp.where(integer(random, 0, 1) == 0, 8, wp.where(single, 512, 67108864))
     for k in range(4):
         depth = _0
         if k != 0 and k != second and integer(random, 0, 1) > 0 and not parallel:
-            depth = wp.float64(integer(random, 1, 4))
-        x[k] = _in_plane(random, 8, depth)
-        x[4 + k] = wp.where(moves, _in_plane(random, 2, _0), wp.vec3d())
+            depth = wp.float64(integer(random, 1, size))
+        x[k] = _in_plane(random, size, depth)
+        x[4 + k] = wp.where(moves, _in_plane(random, size // 4, _0), wp.vec3d())
     if parallel:
         x[3] = x[2] + x[1] - x[0]
     elif degenerate:
@@ -107,10 +109,10 @@ def make_reached_queries(
     _as_kind(kind, 4, x)
     # the second feature above the first
     shift = _touching_point(random, 0, second, x) - _touching_point(random, second, 4, x)
-    height = wp.float64(integer(random, 1, 8))
+    height = wp.float64(integer(random, 1, size))
     when = integer(random, 0, 4)
     time = wp.where(when == 0, _0, wp.where(when == 1, _1, wp.float64(when) * wp.float64(0.25) - wp.float64(0.125)))
-    rise = wp.float64(integer(random, 0, 8)) * wp.where(when == 0, _1, wp.where(when == 1, -_1, _0))
+    rise = wp.float64(integer(random, 0, size)) * wp.where(when == 0, _1, wp.where(when == 1, -_1, _0))
     for k in range(4):
         position = x[k]
         velocity = x[4 + k]
