@@ -3,6 +3,7 @@
 import argparse
 import io
 import itertools
+import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -14,7 +15,7 @@ import exact_queries
 import numpy as np
 import pytest
 import warp as wp
-from certify_device import KINDS, ROWS, Judge, certify_on_device, jobs_of
+from certify_device import KINDS, METHODS, ROWS, Judge, certify_on_device, jobs_of
 from device_queries import LATTICE, Generator, make_lattice_queries
 from lattice_truth import LARGEST, decide_lattice
 from rich.console import Console
@@ -38,7 +39,7 @@ def run(jobs, device, one_in=10_000):
 # --- Truth on lattices ---
 
 
-def lattices(rng, n, kind):
+def lattices(rng, n):
     """Queries of small integers: any, at the limit, with few moving points, with equal points, in lines and planes."""
     anything = rng.integers(-LARGEST, LARGEST + 1, (n, 8, 3))
     ternary = rng.integers(-1, 2, (n, 8, 3))
@@ -48,13 +49,16 @@ def lattices(rng, n, kind):
     repeated = ternary[np.arange(n)[:, None], rng.integers(0, 4, (n, 8))]
     flat = anything * (rng.random((n, 1, 3)) < 0.6)
     turning = ternary.copy()
-    turning[:, 3::4] = turning[:, 1::4] + turning[:, 2::4] - turning[:, 0::4]  # four points in one plane at all times
-    return np.concatenate([anything, ternary, extreme, resting, repeated, flat, turning]).astype(np.float64)
+    # four points in one plane at all times, differences still at most 4
+    turning[:, 3::4] = turning[:, 1::4] + turning[:, 2::4] - turning[:, 0::4]
+    line = rng.integers(-1, 2, (n, 8, 1)) * rng.integers(-1, 2, (n, 1, 3))  # all points on one line at all times
+    parts = [anything, ternary, extreme, resting, repeated, flat, turning, line]
+    return np.concatenate(parts).astype(np.float64)
 
 
 @pytest.mark.parametrize("kind", [0, 1])
 def test_the_truth_on_lattices_is_that_of_the_checker(kind, device):
-    points = lattices(np.random.default_rng(kind), 500, kind)
+    points = lattices(np.random.default_rng(kind), 500)
     truth = wp.empty(len(points), dtype=int, device=device)
     inputs = [kind, wp.array(points, dtype=wp.vec3d, device=device)]
     wp.launch(decide_lattice, len(points), inputs=inputs, outputs=[truth], device=device)
@@ -84,6 +88,11 @@ def test_nothing_contradicts_the_truth(all_jobs, device):
     failures, printed = run(all_jobs, device, one_in=50)
     assert failures == 0, printed
     assert "0 failures" in printed
+    wrong = dict(
+        re.findall(r"^ (float|conservative|user's kernel|exact) .* ([\d,]+ +[\d,]+) *$", printed, re.MULTILINE)
+    )
+    assert [method for method, numbers in wrong.items() if numbers.split() == ["0", "0"]] == list(METHODS)[1:]
+    assert len(wrong) == len(METHODS)
     for name in ("lattice", "reached", "at_distances", *(generator.name.lower() for generator in Generator)):
         assert name in printed
 
@@ -163,6 +172,7 @@ def test_a_wrong_sign_in_a_kernel_is_found(module, name, mutant, monkeypatch, de
     failures, printed = run(jobs, device)
     assert failures > 10
     assert "conservative FREE" in printed
+    assert printed.count("; minimum distance") + sum(map(int, re.findall(r": (\d+) more", printed))) == failures
 
 
 @wp.func(inline=False)
@@ -226,3 +236,19 @@ def test_numbers_of_the_lattice(text, numbers):
 def test_numbers_that_are_none(text):
     with pytest.raises(argparse.ArgumentTypeError, match="FIRST:LAST"):
         certify.lattice_range(text)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--count", "0"], "--count must be at least 1"),
+        (["--lattice", "0:9"], "--lattice needs --device"),
+        (["--device", "cpu", "--method", "user"], "omit --method"),
+        (["--device", "cpu", "--lattice", "9"], "not numbers FIRST:LAST"),
+    ],
+)
+def test_wrong_use(arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["certify.py", *arguments])
+    with pytest.raises(SystemExit, match="2"):
+        certify.main()
+    assert message in capsys.readouterr().err

@@ -246,6 +246,12 @@ def main():
         "--lattice", type=lattice_range, help="on the device: numbers of {-1, 0, 1}^24, FIRST:LAST:STRIDE"
     )
     arguments = parser.parse_args()
+    if arguments.count < 1:
+        parser.error(f"--count must be at least 1, not {arguments.count}")
+    if arguments.lattice and not arguments.device:
+        parser.error("--lattice needs --device")
+    if arguments.device and arguments.method != "all":
+        parser.error("--device runs every method: omit --method")
     wp.config.log_level = wp.LOG_WARNING
     if arguments.device:
         jobs = jobs_of(arguments.count, arguments.seed, arguments.lattice)

@@ -164,15 +164,15 @@ def _sturm(v: _vec4l) -> Sturm:
         side = wp.int64(_sign(v[3]))
         slope = side * (_2 * v[2] * v[2] - wp.int64(6) * v[1] * v[3])
         f.s2 = _vec4l(side * (v[1] * v[2] - wp.int64(9) * v[0] * v[3]), slope, _0, _0)
-        if slope != _0:
-            discriminant = (
-                wp.int64(18) * v[0] * v[1] * v[2] * v[3]
-                - _4 * v[2] * v[2] * v[2] * v[0]
-                + v[1] * v[1] * v[2] * v[2]
-                - _4 * v[3] * v[1] * v[1] * v[1]
-                - wp.int64(27) * v[3] * v[3] * v[0] * v[0]
-            )
-            f.s3 = _vec4l(side * wp.int64(_sign(discriminant)), _0, _0, _0)
+        # where the slope is zero, the sequence ends before: two constant members change nothing
+        discriminant = (
+            wp.int64(18) * v[0] * v[1] * v[2] * v[3]
+            - _4 * v[2] * v[2] * v[2] * v[0]
+            + v[1] * v[1] * v[2] * v[2]
+            - _4 * v[3] * v[1] * v[1] * v[1]
+            - wp.int64(27) * v[3] * v[3] * v[0] * v[0]
+        )
+        f.s3 = _vec4l(side * wp.int64(_sign(discriminant)), _0, _0, _0)
     elif v[2] != _0:
         f.degree = 2
         f.s2 = _vec4l(wp.int64(_sign(v[2])) * (v[1] * v[1] - _4 * v[0] * v[2]), _0, _0, _0)
