@@ -119,6 +119,21 @@ def test_queries_aim_at_trouble(all_jobs, device):
             assert result.counts[:, :, UNSURE].any() or nearly_double  # floats are too few to be so near
 
 
+@pytest.mark.parametrize("single", [True, False])
+def test_one_coordinate_is_moved_to_the_next_number(all_jobs, single, device):
+    judge = Judge(device, 300)
+    dtype = np.float32 if single else np.float64
+    for job in (job for job in all_jobs if job.name == "one_ulp_apart" and job.single == single):
+        judge.run(job, 0, judge.size)
+        x = judge.read(slice(0, judge.size))[0].reshape(judge.size, 24).astype(dtype)
+        moved = 32 * x != np.round(32 * x)  # the others are multiples of 1/32
+        assert (moved.sum(axis=1) == 1).all()
+        back = [np.nextafter(x[moved], dtype(limit)) for limit in (-np.inf, np.inf)]
+        were = np.stack([32 * y == np.round(32 * y) for y in back])
+        assert were.any(axis=0).all()
+        assert 0.3 < were[0].mean() < 0.7
+
+
 def test_distances_are_reached_exactly(all_jobs, device):
     judge = Judge(device, 200)
     for job in (job for job in all_jobs if job.name == "reached"):
@@ -162,16 +177,19 @@ def wrong_verdict(signs: wp.vec4i) -> int:
 
 
 @pytest.mark.parametrize(
-    ("module", "name", "mutant"),
-    [(ccd, "coplanarity", wrong_coplanarity), (classification, "verdict", wrong_verdict)],
+    ("kernel", "module", "name", "mutant", "method"),
+    [
+        ("answer_kernel", ccd, "coplanarity", wrong_coplanarity, "conservative"),
+        ("user_kernel", classification, "verdict", wrong_verdict, "user's kernel"),
+    ],
 )
-def test_a_wrong_sign_in_a_kernel_is_found(module, name, mutant, monkeypatch, device):
+def test_a_wrong_sign_in_a_kernel_is_found(kernel, module, name, mutant, method, monkeypatch, device):
     monkeypatch.setattr(module, name, mutant)
-    monkeypatch.setattr(certify_device, "answer_kernel", device_methods.answer_kernel.__wrapped__)
+    monkeypatch.setattr(certify_device, kernel, getattr(device_methods, kernel).__wrapped__)
     jobs = [job for job in jobs_of(200, 0) if job.name == "integer_lattice"]
     failures, printed = run(jobs, device)
     assert failures > 10
-    assert "conservative FREE" in printed
+    assert f"{method} FREE" in printed
     assert printed.count("; minimum distance") + sum(map(int, re.findall(r": (\d+) more", printed))) == failures
 
 
