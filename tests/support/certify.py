@@ -10,7 +10,7 @@ the default options, with tolerances in their range and out of it.
 also what floating point could decide, and leaves out the generators whose queries it nearly always can.
 
 ``python tests/support/certify.py --device cuda:0 --count 100000000`` makes, answers and compares ten billion queries on
-a GPU, see certify_device.py; ``--lattice 0:1000000000`` those numbers of {-1, 0, 1}^24.
+a GPU, see certify_device.py; with ``--lattice 5::1000`` these numbers of {-1, 0, 1}^24 among them.
 """
 
 import argparse

@@ -5,7 +5,7 @@
 device. The truth is known for small integers (lattice_truth.py) and for minimum distances that are reached exactly
 (device_distances.py); elsewhere exact arithmetic stands for it. One in 10,000 queries goes to the host, where the
 checker decides it. It is a failure if two certain answers contradict each other, or the truth; those of "float" are not
-certain. ``--count 1 --lattice 0:1000000000`` runs over a part of {-1, 0, 1}^24 and little else.
+certain. ``--count 1 --lattice 5::1000`` runs over a thousandth of {-1, 0, 1}^24, and little else.
 
 Of the tables, "unsure" are queries that "conservative" does not certify, "unknown" those that exact arithmetic on the
 device leaves to the host. With minimum distances these are many, see :mod:`warp_bsc.kernels.exact.distance`.

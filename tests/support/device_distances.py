@@ -2,7 +2,7 @@
 
 import warp as wp
 from compilation import QUICK
-from device_queries import integer, real, seeded
+from device_random import integer, real, seeded
 
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
 from warp_bsc.kernels.signs import FREE, HIT
@@ -69,6 +69,22 @@ def _frame(number: int):
     return wp.vec3d(_1, _0, _0), wp.vec3d(_0, _1, _0), wp.vec3d(_0, _0, _1), _1
 
 
+@wp.func
+def _nudged(random: wp.array[wp.uint32], reached: wp.float64) -> wp.float64:
+    """Returns a distance, or the next number, or one that differs by 2^-40 of it, either way."""
+    least = reached
+    how = integer(random, 0, 4)
+    if how == 1:
+        least = wp.cast(wp.cast(reached, wp.uint64) + _NEXT, wp.float64)
+    elif how == 2:
+        least = wp.cast(wp.cast(reached, wp.uint64) - _NEXT, wp.float64)
+    elif how == 3:
+        least = reached + _SHARE * reached
+    elif how == 4:
+        least = reached - _SHARE * reached
+    return least
+
+
 @wp.kernel
 def make_reached_queries(
     kind: int,
@@ -126,16 +142,7 @@ def make_reached_queries(
     # nudged, turned and scaled
     along, across, up, length = _frame(integer(random, 0, 3))
     reached = height * length
-    least = reached
-    how = integer(random, 0, 4)
-    if how == 1:
-        least = wp.cast(wp.cast(reached, wp.uint64) + _NEXT, wp.float64)
-    elif how == 2:
-        least = wp.cast(wp.cast(reached, wp.uint64) - _NEXT, wp.float64)
-    elif how == 3:
-        least = reached + _SHARE * reached
-    elif how == 4:
-        least = reached - _SHARE * reached
+    least = _nudged(random, reached)
     exponent = wp.where(single, integer(random, -100, 100), integer(random, -950, 950))
     scale = wp.cast(wp.uint64(exponent + 1023) << wp.uint64(52), wp.float64)
     for k in range(8):

@@ -12,10 +12,11 @@ import enum
 
 import warp as wp
 from compilation import QUICK
+from device_random import chance, eighths, integer, lattice, next_number, power, power_of_two, real, seeded, vector
 
 from warp_bsc.kernels.polynomials import VERTEX_FACE
 
-__all__ = ["LATTICE", "Generator", "integer", "make_lattice_queries", "make_queries", "real", "seeded"]
+__all__ = ["LATTICE", "Generator", "make_lattice_queries", "make_queries"]
 
 LATTICE = 3**24
 """Number of queries with coordinates in {-1, 0, 1}."""
@@ -24,76 +25,10 @@ wp.set_module_options({"enable_backward": False} | QUICK)
 
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
-_UPPER = wp.constant(wp.float64(2.0**-27))
-_LOWER = wp.constant(wp.float64(2.0**-53))
 _DIGIT = wp.constant(wp.uint64(3))
-_NEXT = wp.constant(wp.uint64(1))
-
-# --- Random numbers ---
 
 
-@wp.func
-def seeded(seed: int, number: wp.int64) -> wp.uint32:
-    """Returns the state of the random numbers of one query, another one for each of 2^32 consecutive numbers."""
-    return wp.rand_init(seed + int(number >> wp.int64(32)), int(number & wp.int64(0xFFFFFFFF)))
-
-
-@wp.func
-def _bits(random: wp.array[wp.uint32]) -> wp.uint32:
-    state = random[0]
-    drawn = wp.randu(state)
-    random[0] = state
-    return drawn
-
-
-@wp.func
-def integer(random: wp.array[wp.uint32], low: int, high: int) -> int:
-    """Returns an integer from low to high."""
-    return low + int((_bits(random) >> wp.uint32(1)) % wp.uint32(high - low + 1))
-
-
-@wp.func
-def real(random: wp.array[wp.uint32], low: wp.float64, high: wp.float64) -> wp.float64:
-    """Returns a number from low to high, uniform, of 53 bits."""
-    upper = wp.float64(_bits(random) >> wp.uint32(5))
-    lower = wp.float64(_bits(random) >> wp.uint32(6))
-    return low + (high - low) * (upper * _UPPER + lower * _LOWER)
-
-
-@wp.func
-def _chance(random: wp.array[wp.uint32], percent: int) -> bool:
-    return integer(random, 0, 99) < percent
-
-
-@wp.func
-def _power(exponent: wp.float64) -> wp.float64:
-    return wp.pow(wp.float64(2.0), exponent)
-
-
-@wp.func
-def _vector(random: wp.array[wp.uint32]) -> wp.vec3d:
-    """Returns a vector uniform in [-1, 1]^3."""
-    return wp.vec3d(real(random, -_1, _1), real(random, -_1, _1), real(random, -_1, _1))
-
-
-@wp.func
-def _lattice(random: wp.array[wp.uint32], size: int) -> wp.vec3d:
-    """Returns a vector of integers up to size."""
-    return wp.vec3d(
-        wp.float64(integer(random, -size, size)),
-        wp.float64(integer(random, -size, size)),
-        wp.float64(integer(random, -size, size)),
-    )
-
-
-@wp.func
-def _time(random: wp.array[wp.uint32]) -> wp.float64:
-    """Returns a time in [0, 1], a multiple of 1/8, the ends as often as all others."""
-    eighths = wp.where(_chance(random, 50), 8 * integer(random, 0, 1), integer(random, 1, 7))
-    return wp.float64(eighths) / wp.float64(8.0)
-
-
-# --- Floating point ---
+# --- Points, weights and motions ---
 
 
 @wp.func
@@ -106,46 +41,13 @@ def _rounded(x: wp.array[wp.vec3d], single: bool):
 
 
 @wp.func
-def _next_number(x: wp.float64, up: bool, single: bool) -> wp.float64:
-    """Returns the next number of the precision, from a finite one that is not the last."""
-    if single:
-        bits = wp.cast(wp.float32(x), wp.uint32)
-        if x == _0:
-            bits = wp.uint32(1) + wp.where(up, wp.uint32(0), wp.uint32(1) << wp.uint32(31))
-        elif up == (x > _0):
-            bits += wp.uint32(1)
-        else:
-            bits -= wp.uint32(1)
-        return wp.float64(wp.cast(bits, wp.float32))
-    wide = wp.cast(x, wp.uint64)
-    if x == _0:
-        wide = _NEXT + wp.where(up, wp.uint64(0), _NEXT << wp.uint64(63))
-    elif up == (x > _0):
-        wide += _NEXT
-    else:
-        wide -= _NEXT
-    return wp.cast(wide, wp.float64)
-
-
-@wp.func
 def _move_by_an_ulp(random: wp.array[wp.uint32], single: bool, x: wp.array[wp.vec3d]):
     """Moves one coordinate to the next number, up or down; the points are of the precision already."""
     k = integer(random, 0, 7)
     axis = integer(random, 0, 2)
     p = x[k]
-    p[axis] = _next_number(p[axis], _chance(random, 50), single)
+    p[axis] = next_number(p[axis], chance(random, 50), single)
     x[k] = p
-
-
-@wp.func
-def _power_of_two(exponent: int) -> wp.float64:
-    """Returns a power of two that may be subnormal."""
-    if exponent >= -1022:
-        return wp.cast(wp.uint64(exponent + 1023) << wp.uint64(52), wp.float64)
-    return wp.cast(_NEXT << wp.uint64(exponent + 1074), wp.float64)
-
-
-# --- Weights, gaps and motions ---
 
 
 @wp.func
@@ -179,7 +81,7 @@ def _weights(random: wp.array[wp.uint32], kind: int, touching: bool) -> wp.vec4d
     j = integer(random, 0, 4)
     if touching:
         j = 4 * integer(random, 0, 1)
-    if _chance(random, 50):
+    if chance(random, 50):
         return _edge_weights(quarter * wp.float64(i), quarter * wp.float64(j))
     return _edge_weights(quarter * wp.float64(j), quarter * wp.float64(i))
 
@@ -233,9 +135,9 @@ def _fill(random: wp.array[wp.uint32], first: int, last: int, size: int, x: wp.a
     """Fills points with integers up to size, or uniform in [-1, 1]^3 if size is 0."""
     for k in range(first, last):
         if size == 0:
-            x[k] = _vector(random)
+            x[k] = vector(random)
         else:
-            x[k] = _lattice(random, size)
+            x[k] = lattice(random, size)
 
 
 # --- Generators ---
@@ -246,7 +148,7 @@ def _mostly_hits(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d]):
     """Pairs that pass through each other well inside both features."""
     _fill(random, 0, 8, 0, x)
     weights = _inner_weights(random, kind)
-    offset = _vector(random)
+    offset = vector(random)
     _set_gap(kind, 0, weights, offset, x)
     _set_gap(kind, 4, weights, -real(random, wp.float64(0.2), wp.float64(2.0)) * offset, x)
 
@@ -254,16 +156,16 @@ def _mostly_hits(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d]):
 @wp.func
 def _near_degenerate(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d]):
     """Sliver triangles and nearly parallel edges, by 2^-1 to 2^-60, at both ends of a step through each other."""
-    thickness = _power(real(random, wp.float64(-60.0), -_1))
+    thickness = power(real(random, wp.float64(-60.0), -_1))
     weights = _weights(random, kind, False)
-    offset = _vector(random)
+    offset = vector(random)
     _fill(random, 0, 8, 0, x)
     for end in range(2):
         first = 4 * end
         base = wp.where(kind == VERTEX_FACE, first + 1, first)
         side = x[base + 1] - x[base]
         origin = x[wp.where(kind == VERTEX_FACE, first + 1, first + 2)]
-        x[first + 3] = origin + thickness * _vector(random) + real(random, -_1, _1) * side
+        x[first + 3] = origin + thickness * vector(random) + real(random, -_1, _1) * side
         _set_gap(kind, first, weights, wp.where(end == 0, offset, -offset), x)
 
 
@@ -271,19 +173,19 @@ def _near_degenerate(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3
 def _coplanar(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d]):
     """Motion in one plane exactly, parallel to axes or oblique; every other query touches at some time."""
     _fill(random, 0, 8, 8, x)
-    if _chance(random, 50):
+    if chance(random, 50):
         _set_gap(kind, 0, _weights(random, kind, False), wp.vec3d(), x)
-    _move(_time(random), x)
-    along = _lattice(random, 3)
-    across = _lattice(random, 3)
+    _move(eighths(random), x)
+    along = lattice(random, 3)
+    across = lattice(random, 3)
     shift = wp.vec3d()
-    if _chance(random, 50):
+    if chance(random, 50):
         axis = integer(random, 0, 2)
         along = wp.vec3d()
         across = wp.vec3d()
         along[axis] = _1
         across[(axis + 1) % 3] = _1
-        shift = _lattice(random, 8)
+        shift = lattice(random, 8)
     for k in range(8):
         p = x[k]
         x[k] = p[0] * along + p[1] * across + shift
@@ -294,10 +196,10 @@ def _sliding(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d]):
     """Features that slide in one plane parallel to axes, with any coordinates in it; most nearly touch at some time."""
     _fill(random, 0, 8, 0, x)
     weights = _weights(random, kind, True)
-    if _chance(random, 50):
+    if chance(random, 50):
         weights = _inner_weights(random, kind)
-    _set_gap(kind, 0, weights, _power(real(random, wp.float64(-60.0), _0)) * _vector(random), x)
-    _move(wp.where(_chance(random, 50), _time(random), real(random, _0, _1)), x)
+    _set_gap(kind, 0, weights, power(real(random, wp.float64(-60.0), _0)) * vector(random), x)
+    _move(wp.where(chance(random, 50), eighths(random), real(random, _0, _1)), x)
     axis = integer(random, 0, 2)
     height = real(random, -_1, _1)
     for k in range(8):
@@ -311,7 +213,7 @@ def _exact_contact(random: wp.array[wp.uint32], kind: int, touching: bool, x: wp
     """Exact contact at a known time; if touching, of a vertex with a vertex or an edge."""
     _fill(random, 0, 8, 8, x)
     _set_gap(kind, 0, _weights(random, kind, touching), wp.vec3d(), x)
-    _move(_time(random), x)
+    _move(eighths(random), x)
 
 
 @wp.func
@@ -321,13 +223,13 @@ def _mixed_scales(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d])
     low = wp.float64(-100.0)
     high = wp.float64(100.0)
     how = integer(random, 0, 2)
-    scale = wp.vec3d(_power(real(random, low, high)))
+    scale = wp.vec3d(power(real(random, low, high)))
     for k in range(8):
         if how == 1:
-            scale = wp.vec3d(_power(real(random, low, high)))
+            scale = wp.vec3d(power(real(random, low, high)))
         elif how == 2:
             scale = wp.vec3d(
-                _power(real(random, low, high)), _power(real(random, low, high)), _power(real(random, low, high))
+                power(real(random, low, high)), power(real(random, low, high)), power(real(random, low, high))
             )
         x[k] = wp.cw_mul(x[k], scale)
 
@@ -343,9 +245,9 @@ def _shared_coordinates(random: wp.array[wp.uint32], x: wp.array[wp.vec3d]):
         other = x[integer(random, 0, 7)]
         p[axis] = other[axis]
         x[k] = p
-    if _chance(random, 50):
+    if chance(random, 50):
         x[integer(random, 0, 7)] = x[integer(random, 0, 7)]
-    if _chance(random, 30):
+    if chance(random, 30):
         target = integer(random, 0, 3)
         source = integer(random, 0, 3)
         x[target] = x[source]
@@ -357,13 +259,13 @@ def _resting_contact(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3
     """One plane at t = 0: held, carried along, lifting or sliding; two thirds of them touch there."""
     _fill(random, 0, 4, 8, x)
     weights = _weights(random, kind, False)
-    if _chance(random, 33):
+    if chance(random, 33):
         # weights out of range put the pair in one plane without contact
         out = wp.float64(integer(random, 1, 2))
         weights += out * wp.where(kind == VERTEX_FACE, wp.vec4d(_0, -_1, _1, _0), wp.vec4d(-_1, _1, _0, _0))
     _set_gap(kind, 0, weights, wp.vec3d(), x)
     how = integer(random, 0, 3)
-    velocity = _lattice(random, 4)
+    velocity = lattice(random, 4)
     if how == 3:
         velocity = wp.float64(integer(random, -1, 1)) * (x[1] - x[2])
     for k in range(4):
@@ -381,8 +283,8 @@ def _grazing(random: wp.array[wp.uint32], kind: int, single: bool, x: wp.array[w
     first, second = _sides(kind, 0, x)
     slide = wp.float64(integer(random, -1, 1)) * first + wp.float64(integer(random, -1, 1)) * second
     _set_gap(kind, 4, weights, slide, x)
-    _move(_time(random), x)
-    if _chance(random, 50):
+    _move(eighths(random), x)
+    if chance(random, 50):
         _move_by_an_ulp(random, single, x)
 
 
@@ -391,14 +293,14 @@ def _near_double_roots(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.ve
     """Relative velocity that is nearly in the plane of a near contact at any time: two roots nearby, or none."""
     _fill(random, 0, 8, 0, x)
     weights = _inner_weights(random, kind)
-    if _chance(random, 30):
+    if chance(random, 30):
         weights = _weights(random, kind, True)
-    off = _power(real(random, wp.float64(-56.0), wp.float64(-4.0)))
-    _set_gap(kind, 0, weights, off * _vector(random), x)
+    off = power(real(random, wp.float64(-56.0), wp.float64(-4.0)))
+    _set_gap(kind, 0, weights, off * vector(random), x)
     first, second = _sides(kind, 0, x)
     slide = real(random, -_1, _1) * first + real(random, -_1, _1) * second
-    off = _power(real(random, wp.float64(-56.0), wp.float64(-4.0)))
-    _set_gap(kind, 4, weights, slide + off * _vector(random), x)
+    off = power(real(random, wp.float64(-56.0), wp.float64(-4.0)))
+    _set_gap(kind, 4, weights, slide + off * vector(random), x)
     _move(real(random, _0, _1), x)
 
 
@@ -419,14 +321,14 @@ def _collapse(kind: int, first: int, ratio: int, to_point: bool, x: wp.array[wp.
 def _collapsing(random: wp.array[wp.uint32], kind: int, x: wp.array[wp.vec3d]):
     """Triangles that are segments or points, edges that are parallel or points, once or always; most touch then."""
     _fill(random, 0, 8, 4, x)
-    to_point = _chance(random, 40)
+    to_point = chance(random, 40)
     ratio = integer(random, -2, 2)
     _collapse(kind, 0, ratio, to_point, x)
-    if _chance(random, 30):
+    if chance(random, 30):
         _collapse(kind, 4, ratio, to_point, x)
-    if _chance(random, 70):
+    if chance(random, 70):
         _set_gap(kind, 0, _weights(random, kind, False), wp.vec3d(), x)
-    _move(_time(random), x)
+    _move(eighths(random), x)
 
 
 @wp.func
@@ -434,15 +336,15 @@ def _subnormal_and_huge(random: wp.array[wp.uint32], kind: int, single: bool, x:
     """Exact contacts, half of them an ulp apart, scaled to subnormal or huge numbers, by query or by point."""
     _exact_contact(random, kind, False, x)
     # the points are multiples of 2^-3 below 2^6
-    small = _power_of_two(wp.where(single, -146, -1071))
-    huge = _power_of_two(wp.where(single, 122, 1018))
-    by_point = _chance(random, 30)
-    is_small = _chance(random, 50)
+    small = power_of_two(wp.where(single, -146, -1071))
+    huge = power_of_two(wp.where(single, 122, 1018))
+    by_point = chance(random, 30)
+    is_small = chance(random, 50)
     for k in range(8):
         if by_point:
-            is_small = _chance(random, 50)
+            is_small = chance(random, 50)
         x[k] = wp.where(is_small, small, huge) * x[k]
-    if _chance(random, 50):
+    if chance(random, 50):
         _move_by_an_ulp(random, single, x)
 
 
