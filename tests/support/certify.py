@@ -8,6 +8,9 @@ the default options, with tolerances in their range and out of it.
 
 ``python tests/support/certify.py --method exact --count 4000`` asks exact arithmetic in every width about every query,
 also what floating point could decide, and leaves out the generators whose queries it nearly always can.
+
+``python tests/support/certify.py --device cuda:0 --count 100000000`` makes, answers and compares ten billion queries on
+a GPU, see certify_device.py; with ``--lattice 5::1000`` these numbers of {-1, 0, 1}^24 among them.
 """
 
 import argparse
@@ -16,6 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from certify_device import certify_on_device, jobs_of
+from device_queries import LATTICE
 from exact_queries import decide_exactly
 from generators import GENERATORS
 from impacts import impact_kernel
@@ -219,14 +224,38 @@ def certify_user(count, seed):
     return failures
 
 
+def lattice_range(text):
+    """Returns the numbers of queries that FIRST:LAST or FIRST:LAST:STRIDE stands for."""
+    try:
+        numbers = range(LATTICE)[slice(*(int(part) if part else None for part in text.split(":")))]
+    except (TypeError, ValueError):
+        numbers = range(0)
+    if not numbers or numbers.step < 1 or ":" not in text:
+        raise argparse.ArgumentTypeError(f"not numbers FIRST:LAST or FIRST:LAST:STRIDE in 0:{LATTICE}: {text!r}")
+    return numbers
+
+
 def main():
     """Judges every generator and prints a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=1000, help="queries for each generator, kind and type")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--method", choices=["all", "exact", "user"], default="all")
+    parser.add_argument("--device", help="make and check queries by every method on this Warp device")
+    parser.add_argument(
+        "--lattice", type=lattice_range, help="on the device: numbers of {-1, 0, 1}^24, FIRST:LAST:STRIDE"
+    )
     arguments = parser.parse_args()
+    if arguments.count < 1:
+        parser.error(f"--count must be at least 1, not {arguments.count}")
+    if arguments.lattice and not arguments.device:
+        parser.error("--lattice needs --device")
+    if arguments.device and arguments.method != "all":
+        parser.error("--device runs every method: omit --method")
     wp.config.log_level = wp.LOG_WARNING
+    if arguments.device:
+        jobs = jobs_of(arguments.count, arguments.seed, arguments.lattice)
+        return 1 if certify_on_device(jobs, arguments.device) else 0
     if arguments.method != "all":
         certify = certify_exact if arguments.method == "exact" else certify_user
         return 1 if certify(arguments.count, arguments.seed) else 0

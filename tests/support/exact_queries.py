@@ -9,9 +9,14 @@ from compilation import QUICK
 from warp_bsc.kernels.exact.first_contact import decide_in
 from warp_bsc.kernels.exact.polygon import spread
 
+__all__ = ["decide_exactly", "exact_kernel"]
+
+_0 = wp.constant(wp.float64(0.0))
+
 
 @functools.cache
-def _kernel(limbs):
+def exact_kernel(limbs):
+    """The kernel that decides, in so many limbs, those queries whose time is negative: too wide for fewer."""
     decide = decide_in(limbs)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=QUICK)
@@ -24,6 +29,8 @@ def _kernel(limbs):
         bits: wp.array[int],
     ):
         i = wp.tid()
+        if time[i] >= _0:
+            return
         a0 = points[i, 0]
         b0 = points[i, 1]
         c0 = points[i, 2]
@@ -55,9 +62,9 @@ def decide_exactly(kind, points, limbs, *, timed=False, digits=20, device=None):
         query's coordinates take, int of shape [n].
     """
     n = len(points)
-    time = wp.zeros(n, dtype=wp.float64, device=device)
+    time = wp.full(n, -1.0, dtype=wp.float64, device=device)
     bits = wp.zeros(n, dtype=int, device=device)
     points = wp.array(np.asarray(points, dtype=np.float64), dtype=wp.vec3d, device=device)
     inputs = [int(kind == "edge_edge"), points, timed, digits]
-    wp.launch(_kernel(limbs), n, inputs=inputs, outputs=[time, bits], device=device)
+    wp.launch(exact_kernel(limbs), n, inputs=inputs, outputs=[time, bits], device=device)
     return time.numpy(), bits.numpy()
