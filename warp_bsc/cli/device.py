@@ -3,6 +3,7 @@
 import contextlib
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -34,14 +35,31 @@ def find_device(name: str | None) -> wp.Device:
 
 @contextlib.contextmanager
 def loading_kernels(device: wp.Device) -> Iterator[None]:
-    """Prints a message on standard error if the block, which may compile kernels, takes more than two seconds."""
-    message = f"Compiling kernels for {device}, once for each version: up to a few minutes."
-    timer = threading.Timer(_SILENT_SECONDS, Console(stderr=True).print, [message])
-    timer.start()
+    """Prints a message on standard error if kernels are compiled in the block, and it takes more than two seconds."""
+    console, folder, finished = Console(stderr=True), Path(wp.config.kernel_cache_dir or ""), threading.Event()
+    before = _changed_at(folder)
+
+    def watch() -> None:
+        while not finished.wait(_SILENT_SECONDS):
+            if _changed_at(folder) != before:  # Warp compiles a module in a new folder there
+                console.print(f"Compiling kernels for {device}, once for each version: up to a few minutes.")
+                return
+
+    watching = threading.Thread(target=watch, daemon=True)
+    watching.start()
     try:
         yield
     finally:
-        timer.cancel()
+        finished.set()
+        watching.join()
+
+
+def _changed_at(folder: Path) -> int:
+    """Returns when something was added to a folder or removed [ns], 0 if there is none."""
+    try:
+        return folder.stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def load_detector(
