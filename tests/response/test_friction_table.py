@@ -132,11 +132,12 @@ def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
             solver.step(*states, model.control(), None, 1.0 / 60.0 if inner == "style3d" else DT)
             states.reverse()
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
-    atol = 1e-4 if inner == "style3d" and device.is_cuda else 0.0
+    of_order = 5e-4  # by which ten steps of Style3D differ on a GPU
+    atol = of_order if inner == "style3d" and device.is_cuda else 0.0
     np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=atol)
     apart = np.abs(ends[0][1] - ends[2][1]).max(axis=1)
     if inner == "style3d":
-        assert apart.max() > 20.0 * 1e-4
+        assert apart.max() > 20.0 * of_order
     else:
         assert (apart[:27].reshape(3, 9).max(axis=1) > 0.1).all()
 
