@@ -197,6 +197,17 @@ def test_polish_does_not_leave_the_planes_of_self_contact_and_the_residual_says_
 
 
 @pytest.mark.filterwarnings("ignore:.*of the weight")
+@pytest.mark.parametrize(("size", "expected"), [(1.0, 0), (0.7, 1)])
+def test_solves_whose_matrix_is_not_positive_definite_are_counted(size, expected, device):
+    model = hanging_cloth(device, n=4)
+    model.particle_q.assign((model.particle_q.numpy() * (size, size, 1.0)).astype(np.float32))  # compressed
+    rollout = Rollout(model, steps=1, polish=0)
+    rollout.backward()
+    report = rollout.adjoint.report
+    assert (report.solves, report.failed_solves, report.indefinite_solves) == (1, 0, expected)
+
+
+@pytest.mark.filterwarnings("ignore:.*of the weight")
 def test_pairs_that_self_contact_dropped_give_nan_in_their_world_and_are_counted(device):
     model = colliding_cloths(device, heights=(0.012, 0.1))  # those of the second world are not near each other
     options = {"steps": 1, "particle_vertex_contact_buffer_size": 1}

@@ -35,7 +35,8 @@ SELF_CONTACT = {
 """Options of VBD by which :func:`colliding_cloths` collide."""
 
 
-def _add_cloth(builder, n, at, rotation=None, **options):
+def add_cloth(builder, n, at, rotation=None, **options):
+    """Adds a cloth of ``n`` by ``n`` cells of 5 cm."""
     rotation = wp.quat_identity() if rotation is None else rotation
     builder.add_cloth_grid(
         pos=wp.vec3(*at),
@@ -61,7 +62,7 @@ def hanging_cloth(device, n=3, worlds=1):
     scene = newton.ModelBuilder()
     for world in range(worlds):
         builder = newton.ModelBuilder()
-        _add_cloth(builder, n + world, (0.0, 0.0, 1.0), fix_left=True)
+        add_cloth(builder, n + world, (0.0, 0.0, 1.0), fix_left=True)
         if worlds == 1:
             return _finished(builder, device)
         scene.add_world(builder)
@@ -75,7 +76,7 @@ def cloth_on_slope(device):
     config = newton.ModelBuilder.ShapeConfig(ke=300.0, kd=0.0, mu=0.3)
     builder.add_shape_plane(xform=wp.transform(wp.vec3(), tilt), width=0.0, length=0.0, cfg=config)
     turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.2, 1.0, 0.1)), 0.45)
-    _add_cloth(builder, 3, (0.0, 0.0, 0.06), turned)
+    add_cloth(builder, 3, (0.0, 0.0, 0.06), turned)
     model = _finished(builder, device)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
     return model
@@ -120,7 +121,7 @@ def attached_cloth(device, stiffness=30.0):
     """A cloth of which one side hangs on damped attachments to a kinematic body."""
     builder = newton.ModelBuilder()
     body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()), is_kinematic=True)
-    _add_cloth(builder, 3, (0.0, 0.0, 1.0))
+    add_cloth(builder, 3, (0.0, 0.0, 1.0))
     for row in range(4):
         point = wp.vec3(-0.002, 0.05 * row, 0.001)
         builder.add_attachment_particle_body(4 * row, body, body_point=point, stiffness=stiffness, damping=0.1)
@@ -140,8 +141,8 @@ def colliding_cloths(device, heights=(0.012,)):
     held = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
     for height in heights:
         builder = newton.ModelBuilder()
-        _add_cloth(builder, 2, (0.04, 0.0, height), turned)
-        _add_cloth(builder, 3, (0.0, 0.0, 0.0), **held)
+        add_cloth(builder, 2, (0.04, 0.0, height), turned)
+        add_cloth(builder, 3, (0.0, 0.0, 0.0), **held)
         scene.add_world(builder)
     model = _finished(scene, device)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4

@@ -12,7 +12,7 @@ import time
 import newton
 import numpy as np
 import warp as wp
-from implicit_scenes import CLOTH
+from implicit_scenes import CLOTH, add_cloth
 from rich.console import Console
 from rich.table import Table
 
@@ -21,26 +21,10 @@ import warp_bsc as bsc
 DT, ITERATIONS = 1.0 / 60.0, 20
 
 
-def _cloth(builder, n, height, **options):
-    side = 0.05 * n
-    builder.add_cloth_grid(
-        pos=wp.vec3(-0.5 * side, -0.5 * side, height),
-        rot=wp.quat_identity(),
-        vel=wp.vec3(),
-        dim_x=n,
-        dim_y=n,
-        cell_x=0.05,
-        cell_y=0.05,
-        mass=0.002,
-        **CLOTH,
-        **options,
-    )
-
-
 def hanging(n, worlds=1):
     """Returns worlds with a cloth of ``2 n n`` triangles that one side holds."""
     world = newton.ModelBuilder()
-    _cloth(world, n, 1.0, fix_left=True)
+    add_cloth(world, n, (0.0, 0.0, 1.0), fix_left=True)
     return _in_worlds(world, worlds)
 
 
@@ -49,7 +33,8 @@ def on_sphere(n, worlds=1):
     world = newton.ModelBuilder()
     config = newton.ModelBuilder.ShapeConfig(ke=300.0, kd=0.0, mu=0.3)
     world.add_shape_sphere(-1, radius=0.5, xform=wp.transform(wp.vec3(0.0, 0.0, -0.5), wp.quat_identity()), cfg=config)
-    _cloth(world, n, CLOTH["particle_radius"])
+    side = 0.05 * n
+    add_cloth(world, n, (-0.5 * side, -0.5 * side, CLOTH["particle_radius"]))
     return _in_worlds(world, worlds)
 
 

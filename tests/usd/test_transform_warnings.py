@@ -77,6 +77,18 @@ def test_a_group_that_turns_is_named_once(stage):
     assert warning.startswith("subdivide: /World/Group with 2 meshes turns by up to 360 degrees")
 
 
+def test_a_group_is_named_if_one_of_its_meshes_is_on_no_arc(stage):
+    operation = UsdGeom.Xform.Define(stage, "/World/Group").AddRotateYOp()
+    tilt = UsdGeom.Xformable(add_mesh(stage, "/World/Group/A", FALLING)).AddRotateXOp()
+    UsdGeom.Xformable(add_mesh(stage, "/World/Group/B", FALLING)).AddTranslateOp().Set(Gf.Vec3d(1.0, 0.0, 0.0))
+    for time, angle in ((0, 0.0), (1, 360.0)):
+        operation.Set(angle, time)
+    assert not warnings(stage, "turns")
+    for time in (0, 1):
+        tilt.Set(20.0 * time, time)
+    assert len(warnings(stage, "turns")) == 1
+
+
 def test_many_turning_prims_are_counted(stage):
     for number in range(8):
         add_turning(stage, f"/World/Fan{number}")

@@ -6,11 +6,12 @@ import numpy as np
 import warp as wp
 
 from .launch import launch
+from .settings import NO_GRADIENTS
 
 __all__ = ["ClosestPointFinder", "ClosestPoints"]
 
 
-@wp.kernel
+@wp.kernel(**NO_GRADIENTS)
 def find_closest(
     # mesh
     surface: wp.uint64,

@@ -1,4 +1,4 @@
-"""Linear solves with the matrix of a step, for all worlds at once, without synchronizing with the device."""
+"""Linear solves with the matrix of a step, for all worlds at once; in a CUDA graph the host reads nothing."""
 
 import math
 
@@ -24,8 +24,8 @@ class LinearSolver:
     """Solves A x = b, preconditioned by the blocks of the diagonal.
 
     Compression can make A indefinite, and friction makes it unsymmetric. Where it is symmetric, conjugate residuals
-    solve it with half of the products that BiCGSTAB takes; BiCGSTAB solves the rest, and what those did not solve.
-    Worlds are independent systems, each of which stops when its residual is small enough.
+    solve it, with one product an iteration; BiCGSTAB, with two, solves the rest, and what those did not solve. Worlds
+    are independent systems, each of which stops when its residual is small enough.
 
     Attributes:
         failed: 1 for worlds whose last system was not solved, int32, shape [world_count].

@@ -92,7 +92,9 @@ def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]
         degrees = np.diff(turned, axis=0).max(axis=1)
         (large,) = np.nonzero((degrees >= _LARGE_TURN * (1.0 - _ROUNDING)) & np.isfinite(degrees))
     if not any(mesh.deforms for mesh in meshes):
-        on_arcs = [_on_arcs(mesh, large.tolist(), times) for mesh in meshes]
+        # what does not vary below a turn makes no difference to it
+        alike = {mesh.name if mesh.instance else _varying(mesh): mesh for mesh in meshes}
+        on_arcs = [_on_arcs(mesh, large.tolist(), times) for mesh in alike.values()]
         large = large[[any(index not in turns for turns in on_arcs) for index in large.tolist()]]
     if not len(large):
         return []
@@ -104,6 +106,11 @@ def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]
         f"subdivide: {moved} turns by up to {most:.4g} degrees to the next time, {when}: its vertices move straight, "
         f"and what it turns through is not checked; in {parts} parts it turns by {_FINE_TURN:g} degrees or less"
     ]
+
+
+def _varying(mesh: UsdMesh) -> tuple[Sdf.Path, ...]:
+    """Returns the attributes of the operations of a mesh's transform that vary."""
+    return tuple(op.GetAttr().GetPath() for op in mesh.transform_ops() if op.MightBeTimeVarying())
 
 
 def _on_arcs(mesh: UsdMesh, intervals: list[int], times: list[float]) -> dict[int, Turn]:
