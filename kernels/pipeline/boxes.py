@@ -42,16 +42,9 @@ def raised(x: Any, padding: wp.float64) -> wp.vec3:
 
 
 @wp.func
-def boxes_overlap(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3) -> bool:
-    """Returns whether two closed boxes overlap."""
-    return (
-        low[0] <= other_high[0]
-        and low[1] <= other_high[1]
-        and low[2] <= other_high[2]
-        and other_low[0] <= high[0]
-        and other_low[1] <= high[1]
-        and other_low[2] <= high[2]
-    )
+def union_of_boxes(a: BoxRows, b: BoxRows) -> BoxRows:
+    """Returns the smallest box around two."""
+    return wp.matrix_from_rows(wp.min(a[0], b[0]), wp.max(a[1], b[1]), wp.min(a[2], b[2]), wp.max(a[3], b[3]))
 
 
 @wp.func

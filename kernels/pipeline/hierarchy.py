@@ -7,7 +7,7 @@ order, and each tests all children.
 
 import warp as wp
 
-from .boxes import boxes_overlap
+from .boxes import BoxRows, boxes_apart, read_box, write_box
 
 WIDTH = 32
 """Children of a node, and threads of a warp."""
@@ -119,35 +119,44 @@ class HierarchyLevel:
     """The nodes of one level: faces by place, clusters or groups.
 
     Attributes:
-        lowers: Lowest coordinates over the time of the motion; higher than ``uppers`` where there is no face.
-        uppers: Highest coordinates over the time of the motion.
+        boxes: Box of each node, shape [n, 4], with lowest coordinates higher than the highest where there is no face.
         changed: Nonzero where a face has pairs that are sought.
         first_world: Lowest world of the faces below; no array if all faces are in one world.
         last_world: Highest world of the faces below.
     """
 
-    lowers: wp.array[wp.vec3]
-    uppers: wp.array[wp.vec3]
+    boxes: wp.array2d[wp.vec3]
     changed: wp.array[int]
     first_world: wp.array[int]
     last_world: wp.array[int]
 
 
 @wp.func
-def fit_parent(child: int, low: wp.vec3, high: wp.vec3, changed: int, parents: HierarchyLevel):
+def fit_parent(child: int, box: BoxRows, changed: int, parents: HierarchyLevel):
     """Writes the box of the parent of a child, from the boxes of all 32 children, one a thread."""
-    lower = _min_of_warp(low)
-    upper = -_min_of_warp(-high)
+    low0 = _min_of_warp(box[0])
+    high0 = -_min_of_warp(-box[1])
+    low1 = _min_of_warp(box[2])
+    high1 = -_min_of_warp(-box[3])
     any_changed = _any_of_warp(changed)
     parent = child / _WIDTH
-    if child % _WIDTH == 0:
-        parents.lowers[parent] = lower
-        parents.uppers[parent] = upper
-        parents.changed[parent] = any_changed
-    elif child_step() == 1:
-        parents.lowers[parent] = wp.min(parents.lowers[parent], lower)
-        parents.uppers[parent] = wp.max(parents.uppers[parent], upper)
-        parents.changed[parent] = parents.changed[parent] | any_changed
+    if child % _WIDTH != 0:
+        if child_step() != 1:
+            return
+        before = read_box(parents.boxes, parent)
+        low0 = wp.min(low0, before[0])
+        high0 = wp.max(high0, before[1])
+        low1 = wp.min(low1, before[2])
+        high1 = wp.max(high1, before[3])
+        any_changed = any_changed | parents.changed[parent]
+    write_box(wp.matrix_from_rows(low0, high0, low1, high1), parents.boxes, parent)
+    parents.changed[parent] = any_changed
+
+
+@wp.func
+def are_apart(a: BoxRows, b: BoxRows) -> bool:
+    """Returns whether an axis separates two boxes at the start and at the end, on one side."""
+    return boxes_apart(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3])
 
 
 @wp.func
@@ -159,19 +168,17 @@ def same_world(level: HierarchyLevel, i: int, other_level: HierarchyLevel, j: in
 
 
 @wp.func
-def overlapping_children(
-    clusters: HierarchyLevel, cluster: int, low: wp.vec3, high: wp.vec3, level: HierarchyLevel, first: int
-):
-    """Returns which of 32 nodes of a level, from the first on, overlap a cluster with a box, as bits.
+def unseparated_children(clusters: HierarchyLevel, cluster: int, box: BoxRows, level: HierarchyLevel, first: int):
+    """Returns which of 32 nodes of a level, from the first on, no axis separates from a cluster with a box, as bits.
 
-    Nodes in other worlds, and nodes without a change if the cluster has none, do not overlap.
+    Nodes in other worlds are left out, as are nodes without a change if the cluster has none.
     """
     found = wp.uint32(0)
     changed = clusters.changed[cluster]
-    count = wp.min(_WIDTH, level.lowers.shape[0] - first)
+    count = wp.min(_WIDTH, level.boxes.shape[0] - first)
     for child in range(first_child(), count, child_step()):
         node = first + child
-        if boxes_overlap(low, high, level.lowers[node], level.uppers[node]):
+        if not are_apart(box, read_box(level.boxes, node)):
             if (changed | level.changed[node]) != 0 and same_world(clusters, cluster, level, node):
                 found = found | (wp.uint32(1) << wp.uint32(child))
     return union_of_warp(found)
@@ -181,7 +188,7 @@ def overlapping_children(
 def changed_children(level: HierarchyLevel, first: int):
     """Returns which of 32 nodes of a level, from the first on, have changed, as bits."""
     found = wp.uint32(0)
-    count = wp.min(_WIDTH, level.lowers.shape[0] - first)
+    count = wp.min(_WIDTH, level.boxes.shape[0] - first)
     for child in range(first_child(), count, child_step()):
         if level.changed[first + child] != 0:
             found = found | (wp.uint32(1) << wp.uint32(child))
@@ -195,18 +202,19 @@ def bits_from(first: int):
 
 
 @wp.func
-def overlapping_faces(faces: HierarchyLevel, place: int, first: int, candidates: wp.uint32, changed: wp.uint32):
-    """Returns which faces of a cluster overlap a face at a place, as bits, each pair of faces once.
+def unseparated_faces(
+    faces: HierarchyLevel, place: int, box: BoxRows, first: int, candidates: wp.uint32, changed: wp.uint32
+):
+    """Returns which faces of a cluster no axis separates from a face at a place, as bits, each pair of faces once.
 
     Args:
         faces: The level of faces.
         place: Place of the face.
+        box: Its box.
         first: First place of the cluster, which is that of the face or a later one.
         candidates: Places of the cluster to test, the same for all threads of a warp.
         changed: Places of the cluster whose faces have changed.
     """
-    low = faces.lowers[place]
-    high = faces.uppers[place]
     sought = candidates
     if faces.changed[place] == 0:
         sought = sought & changed
@@ -219,7 +227,7 @@ def overlapping_faces(faces: HierarchyLevel, place: int, first: int, candidates:
         bit = left & (~left + wp.uint32(1))
         left = left ^ bit
         other = first + lowest_set_bit(bit)
-        if boxes_overlap(low, high, faces.lowers[other], faces.uppers[other]):
+        if not are_apart(box, read_box(faces.boxes, other)):
             if (sought & bit) != wp.uint32(0) and same_world(faces, place, faces, other):
                 found = found | bit
     return found

@@ -122,13 +122,14 @@ def test_few_faces_and_many_alike(faces):
     assert find_pairs(BroadPhaseHierarchy, mesh, x0, x1) == all_pairs(mesh, x0, x1)
 
 
-def face_pairs(mesh, x0, x1, changed=None):
+def face_pairs(mesh, x0, x1, changed=None, keep_separated=False):
     """Pairs of faces that a hierarchy enqueues, sorted within and among each other, shape [n, 2]."""
     device = mesh.device
     count = wp.zeros(1, dtype=wp.int64, device=device)
     finder = BroadPhaseHierarchy(mesh, count, capacity=4_000_000)
     positions = [wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1)]
-    finder._pair_faces(*positions, None if changed is None else wp.array(changed, dtype=int, device=device))
+    changed = None if changed is None else wp.array(changed, dtype=int, device=device)
+    finder._pair_faces(*positions, changed, keep_separated)
     pairs = mesh.face_order[finder._face_pairs.numpy()[: count.numpy()[0]]]
     return in_order(pairs, len(mesh.faces))
 
@@ -138,17 +139,22 @@ def in_order(pairs, count):
     return np.stack(np.divmod(np.sort(np.sort(pairs.astype(np.int64), axis=1) @ [count, 1]), count), axis=1)
 
 
-def overlapping_faces(mesh, x0, x1):
+def sorted_face_pairs(mesh, x0, x1, keep_separated=False):
     """The same from boxes sorted along an axis."""
-    points = np.concatenate([x0[mesh.faces], x1[mesh.faces]], axis=1)
-    low, high = points.min(axis=1), points.max(axis=1)
-    order = np.argsort(low[:, 0], kind="stable")
-    low, high = low[order], high[order]
+    x0, x1 = x0.astype(np.float32), x1.astype(np.float32)
+    lows = np.stack([x[mesh.faces].min(axis=1) for x in (x0, x1)])
+    highs = np.stack([x[mesh.faces].max(axis=1) for x in (x0, x1)])
+    order = np.argsort(lows.min(axis=0)[:, 0], kind="stable")
+    lows, highs = lows[:, order], highs[:, order]
+    low, high = lows.min(axis=0), highs.max(axis=0)
     world = np.zeros(len(order)) if mesh.world is None else mesh.world[mesh.faces[order, 0]]
     found = []
     for i, stop in enumerate(np.searchsorted(low[:, 0], high[:, 0], side="right")):
         others = slice(i + 1, stop)
         overlap = ((low[i] <= high[others]) & (low[others] <= high[i])).all(axis=1) & (world[others] == world[i])
+        if not keep_separated:
+            below, above = highs[:, i, None] < lows[:, others], lows[:, i, None] > highs[:, others]
+            overlap &= ~(below.all(axis=0) | above.all(axis=0)).any(axis=1)
         found.append(order[np.stack(np.broadcast_arrays(i, i + 1 + np.flatnonzero(overlap)), axis=1)])
     return in_order(np.concatenate(found), len(order))
 
@@ -165,15 +171,16 @@ def test_many_groups(worlds):
         x0, x1 = (np.tile(x, (worlds, 1)) for x in (x0, x1))
     mesh = bsc.CollisionMesh(faces, len(x0), world=world)
     assert len(mesh.face_order) > 33 * 1024 or worlds > 1
-    found = face_pairs(mesh, x0, x1)
-    assert len(found) > 10 * len(faces)
-    np.testing.assert_array_equal(found, overlapping_faces(mesh, x0, x1))
+    for keep_separated in (False, True):
+        found = face_pairs(mesh, x0, x1, keep_separated=keep_separated)
+        assert len(found) > 10 * len(faces)
+        np.testing.assert_array_equal(found, sorted_face_pairs(mesh, x0, x1, keep_separated))
 
 
 def test_pairs_of_faces_of_which_one_has_changed():
     x0, x1, faces = crumpled(0)
     mesh = bsc.CollisionMesh(faces, len(x0))
-    everything = overlapping_faces(mesh, x0, x1)
+    everything = sorted_face_pairs(mesh, x0, x1)
     random = np.random.default_rng(0)
     for share in (0.0, 0.001, 0.1, 1.0):
         changed = (random.random(len(x0)) < share).astype(np.int32) * random.integers(1, 3, len(x0)).astype(np.int32)

@@ -5,10 +5,9 @@ from typing import Any
 
 import warp as wp
 
-from ..kernels.pipeline.boxes import read_box
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
-from .element_pairs import are_apart, pair_edges_with_faces, pair_elements, pair_points
+from .element_pairs import pair_edges_with_faces, pair_elements, pair_points
 from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
 from .launch import THREADS_OF_MULTIPROCESSOR, launch
 from .mesh import CollisionMesh
@@ -29,32 +28,10 @@ class _FacePairs:
 
     pairs: wp.array[wp.vec2i]
     count: wp.array[wp.int64]
-    boxes: wp.array2d[wp.vec3]  # of faces, to leave out pairs that an axis separates; no array to keep them
-
-
-@wp.func
-def _not_apart(place: int, first: int, found: wp.uint32, boxes: wp.array2d[wp.vec3]) -> wp.uint32:
-    """Returns which of the faces at some places no axis separates from another at the start and at the end.
-
-    The box of a face with a position that is not finite is empty, and says nothing of the elements that it represents.
-    """
-    box = read_box(boxes, place)
-    left = found
-    if box[0][0] > box[1][0]:
-        left = wp.uint32(0)
-    while left != wp.uint32(0):
-        bit = left & (~left + wp.uint32(1))
-        left = left ^ bit
-        other = read_box(boxes, first + lowest_set_bit(bit))
-        if other[0][0] <= other[1][0] and are_apart(box, other):
-            found = found ^ bit
-    return found
 
 
 @wp.func
 def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
-    if queue.boxes:
-        found = _not_apart(place, first, found, queue.boxes)
     slot = take_slots(queue.count, 0, count_set_bits(found))
     while found != wp.uint32(0):
         write(wp.vec2i(place, first + lowest_set_bit(found)), queue.pairs, slot)
@@ -141,7 +118,7 @@ class BroadPhaseHierarchy:
         """Enqueues the candidates."""
         self._pair_faces(x0, x1, changed, keep_separated)
         queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
-        self._launch_over_pairs(pair_elements, keep_separated, *queues)
+        self._launch_over_pairs(pair_elements, *queues)
 
     def pair_points(
         self,
@@ -157,22 +134,24 @@ class BroadPhaseHierarchy:
     ) -> None:
         """Enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
         queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
-        self._launch_over_pairs(pair_points, keep_separated, *queues)
+        self._launch_over_pairs(pair_points, *queues)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
         self._pair_faces(x, x)
         self._launch_over_pairs(pair_edges_with_faces, counts, pairs)
 
-    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
+    def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
         """Boxes all elements of a motion, and all nodes.
 
         Args:
             x0: Positions at the start, array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all.
+            keep_separated: Whether to seek the pairs that an axis separates at both ends, too.
         """
-        inputs, outputs = [x0, x1, changed, self._checked, self._padding, self.hierarchy], [self._not_finite]
+        inputs = [x0, x1, changed, self._checked, self._padding, keep_separated, self.hierarchy]
+        outputs = [self._not_finite]
         kernel = box_elements_kernel(x0.dtype, self._padding is not None)
         launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
         if self._groups:
@@ -185,13 +164,11 @@ class BroadPhaseHierarchy:
         inputs = [self.hierarchy, self._warps_of_cluster, arguments]
         launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
-    def _pair_faces(self, x0, x1, changed=None, keep_separated=True):
-        """Enqueues the pairs of faces whose swept boxes overlap, each once, or those that no axis separates."""
-        self.fit(x0, x1, changed)
+    def _pair_faces(self, x0, x1, changed=None, keep_separated=False):
+        """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once."""
+        self.fit(x0, x1, changed, keep_separated=keep_separated)
         queue = _FacePairs()
         queue.pairs, queue.count = self._face_pairs, self._count
-        if not keep_separated:
-            queue.boxes = self.hierarchy.face_boxes
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
 
     def _launch_over_pairs(self, kernel, *arguments):

@@ -3,21 +3,14 @@
 import warp as wp
 
 from ..kernels.pipeline.bits import lowest_bit
-from ..kernels.pipeline.boxes import BoxRows, boxes_apart, boxes_overlap, read_box
-from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits
+from ..kernels.pipeline.boxes import read_box
+from ..kernels.pipeline.hierarchy import WIDTH, are_apart, count_set_bits
 from ..kernels.pipeline.pairs import is_filtered, owns_edge, owns_vertex
 from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots, write
 from .face_hierarchy import FaceHierarchy
 from .settings import NO_GRADIENTS, Count
 
-__all__ = [
-    "are_apart",
-    "overlapping_edges",
-    "overlapping_vertices",
-    "pair_edges_with_faces",
-    "pair_elements",
-    "pair_points",
-]
+__all__ = ["pair_edges_with_faces", "pair_elements", "pair_points", "unseparated_edges", "unseparated_vertices"]
 
 _FILTERED = wp.constant(int(Count.FILTERED))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -30,24 +23,6 @@ _PAIRS_AT_ONCE = wp.constant(1 << 17)
 """Pairs of faces that a GPU works on at once, each by a thread of its own."""
 _BITS_OF_PAIR = wp.constant(15)
 """Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
-
-
-@wp.func
-def _overlap(a: BoxRows, b: BoxRows):
-    """Returns whether two boxes overlap over the time of the motion."""
-    return boxes_overlap(wp.min(a[0], a[2]), wp.max(a[1], a[3]), wp.min(b[0], b[2]), wp.max(b[1], b[3]))
-
-
-@wp.func
-def are_apart(a: BoxRows, b: BoxRows) -> bool:
-    """Returns whether an axis separates two boxes at the start and at the end, on one side."""
-    return boxes_apart(a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3])
-
-
-@wp.func
-def _meet(a: BoxRows, b: BoxRows, keep_separated: bool) -> bool:
-    """Returns whether two boxes overlap over the time of the motion, and no axis separates them at both ends."""
-    return _overlap(a, b) and (keep_separated or not are_apart(a, b))
 
 
 @wp.func
@@ -84,11 +59,10 @@ def _count_filtered(mesh: FaceHierarchy, place: int, count: int):
 
 
 @wp.func
-def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
-    """Returns which corners of a face are vertices that it owns and whose boxes overlap that of another face, as bits.
+def unseparated_vertices(mesh: FaceHierarchy, face: int, other: int):
+    """Returns which corners of a face are vertices that it owns and no axis separates from another face, as bits.
 
-    Those that an axis separates are left out, unless ``keep_separated``. Those that a filter leaves out are bits 3 to 5
-    instead.
+    Those that a filter leaves out are bits 3 to 5 instead.
     """
     owned = mesh.owned[face]
     found = int(0)
@@ -100,7 +74,7 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
         if owns_vertex(owned, corner):
             box = read_box(mesh.vertex_boxes, 3 * face + corner)
             vertex = mesh.faces[face, corner]
-            if _meet(box, other_box, keep_separated) and not _has_vertex(mesh.faces, other, vertex):
+            if not are_apart(box, other_box) and not _has_vertex(mesh.faces, other, vertex):
                 if is_filtered(mesh.pair_filter, wp.vec3i(vertex), _corners(mesh.faces, other)):
                     found = found | (8 << corner)
                 else:
@@ -109,22 +83,20 @@ def overlapping_vertices(mesh: FaceHierarchy, face: int, other: int, keep_separa
 
 
 @wp.func
-def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated: bool):
-    """Returns which edges that two faces own have overlapping boxes: bit 3 i + j for sides i and j.
+def unseparated_edges(mesh: FaceHierarchy, face: int, other: int):
+    """Returns which edges that two faces own no axis separates: bit 3 i + j for sides i and j.
 
-    Those that an axis separates are left out, unless ``keep_separated``. Those that a filter leaves out are bits 9 to
-    17 instead.
+    Those that a filter leaves out are bits 9 to 17 instead.
     """
     owned = mesh.owned[face]
     other_owned = mesh.owned[other]
     found = int(0)
     sides = wp.where(owned >> 3 == 0 or other_owned >> 3 == 0, 0, 3)
+    place_box = read_box(mesh.places.boxes, other)
     for side in range(sides):
         if owns_edge(owned, side):
             box = read_box(mesh.edge_boxes, 3 * face + side)
-            if boxes_overlap(
-                wp.min(box[0], box[2]), wp.max(box[1], box[3]), mesh.places.lowers[other], mesh.places.uppers[other]
-            ):
+            if not are_apart(box, place_box):
                 a = mesh.faces[face, side]
                 b = mesh.faces[face, _next(side)]
                 for other_side in range(sides):
@@ -133,7 +105,7 @@ def overlapping_edges(mesh: FaceHierarchy, face: int, other: int, keep_separated
                         d = mesh.faces[other, _next(other_side)]
                         if a != c and a != d and b != c and b != d:
                             other_box = read_box(mesh.edge_boxes, 3 * other + other_side)
-                            if _meet(box, other_box, keep_separated):
+                            if not are_apart(box, other_box):
                                 bit = 3 * side + other_side
                                 if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), wp.vec3i(c, d, d)):
                                     found = found | (512 << bit)
@@ -149,7 +121,6 @@ def _pair_elements(
     face_pair_count: wp.array[wp.int64],
     first: int,
     turns: int,
-    keep_separated: bool,
     # counts, in and out, and queues
     vertex_face_counts: wp.array[wp.int64],
     vertex_face: wp.array[wp.vec2i],
@@ -165,9 +136,9 @@ def _pair_elements(
         if is_filled(at, face_pairs, face_pair_count, 0):
             face = face_pairs[at][0]
             other = face_pairs[at][1]
-            vertices = overlapping_vertices(mesh, face, other, keep_separated)
-            vertices = vertices | (overlapping_vertices(mesh, other, face, keep_separated) << 6)
-            edges = overlapping_edges(mesh, face, other, keep_separated)
+            vertices = unseparated_vertices(mesh, face, other)
+            vertices = vertices | (unseparated_vertices(mesh, other, face) << 6)
+            edges = unseparated_edges(mesh, face, other)
             filtered_vertices = count_set_bits(wp.uint32(vertices & 0o7070))
             filtered_edges = count_set_bits(wp.uint32(edges >> 9))
             filtered[0] += filtered_vertices
@@ -209,7 +180,6 @@ def pair_elements(
     # in
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
-    keep_separated: bool,
     # counts, in and out, and queues
     vertex_face_counts: wp.array[wp.int64],
     vertex_face: wp.array[wp.vec2i],
@@ -232,7 +202,6 @@ def pair_elements(
             face_pair_count,
             first,
             turns,
-            keep_separated,
             vertex_face_counts,
             vertex_face,
             edge_edge_counts,
@@ -258,7 +227,7 @@ def _pair_edges_with_face(
             row = 3 * face + side
             a = mesh.faces[face, side]
             b = mesh.faces[face, _next(side)]
-            if _overlap(read_box(mesh.edge_boxes, row), read_box(mesh.face_boxes, other)):
+            if not are_apart(read_box(mesh.edge_boxes, row), read_box(mesh.face_boxes, other)):
                 if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
                     if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), _corners(mesh.faces, other)):
                         take_slot(counts, _FILTERED)
@@ -291,7 +260,6 @@ def _pair_point(
     mesh: FaceHierarchy,
     place: int,
     other: int,
-    keep_separated: bool,
     # in and out
     vertex_edge_counts: wp.array[wp.int64],
     # out
@@ -302,7 +270,7 @@ def _pair_point(
     if mesh.order[place] >= mesh.point_start and cell >= mesh.face_count and cell < mesh.point_start:
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.edge_boxes, 3 * other)
-        if _meet(box, other_box, keep_separated):
+        if not are_apart(box, other_box):
             point = mesh.faces[place, 0]
             if is_filtered(mesh.pair_filter, wp.vec3i(point), _corners(mesh.faces, other)):
                 take_slot(vertex_edge_counts, _FILTERED)
@@ -316,7 +284,6 @@ def _pair_two_points(
     mesh: FaceHierarchy,
     place: int,
     other: int,
-    keep_separated: bool,
     # in and out
     vertex_vertex_counts: wp.array[wp.int64],
     vertex_vertex: wp.array[wp.vec2i],
@@ -325,7 +292,7 @@ def _pair_two_points(
     if mesh.order[place] >= mesh.point_start and mesh.order[other] >= mesh.point_start and place != other:
         box = read_box(mesh.vertex_boxes, 3 * place)
         other_box = read_box(mesh.vertex_boxes, 3 * other)
-        if _meet(box, other_box, keep_separated):
+        if not are_apart(box, other_box):
             p = mesh.faces[place, 0]
             q = mesh.faces[other, 0]
             if is_filtered(mesh.pair_filter, wp.vec3i(p), wp.vec3i(q)):
@@ -341,7 +308,6 @@ def pair_points(
     # in
     face_pairs: wp.array[wp.vec2i],
     face_pair_count: wp.array[wp.int64],
-    keep_separated: bool,
     # counts, in and out, and queues
     vertex_edge_counts: wp.array[wp.int64],
     vertex_edge: wp.array[wp.vec2i],
@@ -353,6 +319,6 @@ def pair_points(
     for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
         place = face_pairs[i][0]
         other = face_pairs[i][1]
-        _pair_point(mesh, place, other, keep_separated, vertex_edge_counts, vertex_edge)
-        _pair_point(mesh, other, place, keep_separated, vertex_edge_counts, vertex_edge)
-        _pair_two_points(mesh, place, other, keep_separated, vertex_vertex_counts, vertex_vertex)
+        _pair_point(mesh, place, other, vertex_edge_counts, vertex_edge)
+        _pair_point(mesh, other, place, vertex_edge_counts, vertex_edge)
+        _pair_two_points(mesh, place, other, vertex_vertex_counts, vertex_vertex)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.boxes import BoxRows, lowered, raised, rounded, write_box
+from ..kernels.pipeline.boxes import BoxRows, lowered, raised, read_box, rounded, union_of_boxes, write_box
 from ..kernels.pipeline.hierarchy import (
     WIDTH,
     HierarchyLevel,
@@ -20,8 +20,8 @@ from ..kernels.pipeline.hierarchy import (
     changed_children,
     fit_parent,
     lowest_set_bit,
-    overlapping_children,
-    overlapping_faces,
+    unseparated_children,
+    unseparated_faces,
 )
 from ..kernels.pipeline.pairs import PairFilter
 from ..kernels.pipeline.queues import raise_count
@@ -41,9 +41,10 @@ _UNGROUPED = 8
 class FaceHierarchy:
     """The faces in the order of their places, the boxes of elements, and the nodes above the faces.
 
-    Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end. Those of vertices and
-    edges lie beside one another where the face is that represents them: row ``3 place + corner`` or side. Other rows
-    are not set.
+    Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end; or twice those over
+    the time of the motion, if pairs that an axis separates at both ends are sought as well. Those of vertices and edges
+    lie beside one another where the face is that represents them: row ``3 place + corner`` or side. Other rows are not
+    set.
 
     Attributes:
         all_faces: Whether all cells are faces.
@@ -61,8 +62,8 @@ class FaceHierarchy:
         edge_rows: Row of each edge in ``edge_boxes``.
         vertex_boxes: Boxes of the vertices that each face represents.
         edge_boxes: Boxes of the edges that each face represents.
-        face_boxes: Box of the face at each place.
-        places: Level of the faces.
+        face_boxes: Box of the face at each place, empty where a position is not finite.
+        places: Level of the faces; where a position is not finite, boxes cover the other elements that they represent.
         clusters: Level above.
         groups: Highest level; without arrays in a small mesh, where all groups are traversed.
     """
@@ -93,6 +94,16 @@ def empty_box() -> BoxRows:
     """Returns a box that overlaps none."""
     low = wp.vec3(wp.inf, wp.inf, wp.inf)
     return wp.matrix_from_rows(low, -low, low, -low)
+
+
+@wp.func
+def box_of_motion(low0: wp.vec3, high0: wp.vec3, low1: wp.vec3, high1: wp.vec3, swept: bool) -> BoxRows:
+    """Returns the box at both ends of a motion, or twice that over its time."""
+    if swept:
+        low = wp.min(low0, low1)
+        high = wp.max(high0, high1)
+        return wp.matrix_from_rows(low, high, low, high)
+    return wp.matrix_from_rows(low0, high0, low1, high1)
 
 
 @made_once
@@ -127,18 +138,19 @@ def box_elements_kernel(dtype: type, padded: bool) -> wp.Kernel:
 
     @wp.func
     def box_of_two(
-        x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], a: int, b: int, finite: bool
+        x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], a: int, b: int, swept: bool
     ) -> BoxRows:
         """Returns the box of two vertices, an empty one if that is not finite."""
-        if finite:
-            pad = wp.max(padding_of(padding, a), padding_of(padding, b))
-            return wp.matrix_from_rows(
-                lowest(wp.min(x0[a], x0[b]), pad),
-                highest(wp.max(x0[a], x0[b]), pad),
-                lowest(wp.min(x1[a], x1[b]), pad),
-                highest(wp.max(x1[a], x1[b]), pad),
-            )
-        return empty_box()
+        if not (is_finite(x0, x1, a) and is_finite(x0, x1, b)):
+            return empty_box()
+        pad = wp.max(padding_of(padding, a), padding_of(padding, b))
+        return box_of_motion(
+            lowest(wp.min(x0[a], x0[b]), pad),
+            highest(wp.max(x0[a], x0[b]), pad),
+            lowest(wp.min(x1[a], x1[b]), pad),
+            highest(wp.max(x1[a], x1[b]), pad),
+            swept,
+        )
 
     @wp.kernel(**NO_GRADIENTS)
     def box_elements(
@@ -148,67 +160,54 @@ def box_elements_kernel(dtype: type, padded: bool) -> wp.Kernel:
         changed: wp.array[int],
         checked: wp.array[int],
         padding: wp.array[wp.float64],
+        swept: bool,
         # in and out
         mesh: FaceHierarchy,
         # out
         not_finite: wp.array[wp.int64],
     ):
         i = wp.tid()
-        finite = bool(True)  # here, as Warp selects between the values before and after a branch
         places = mesh.order.shape[0]
         if i < places:  # the same for all threads of a warp
-            low = wp.vec3(wp.inf, wp.inf, wp.inf)
-            high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+            box = empty_box()
             has_changed = int(0)
             if mesh.order[i] >= 0:
                 a = mesh.faces[i, 0]
                 b = mesh.faces[i, 1]
                 c = mesh.faces[i, 2]
                 pad = wp.max(wp.max(padding_of(padding, a), padding_of(padding, b)), padding_of(padding, c))
-                low0 = lowest(wp.min(wp.min(x0[a], x0[b]), x0[c]), pad)
-                high0 = highest(wp.max(wp.max(x0[a], x0[b]), x0[c]), pad)
-                low1 = lowest(wp.min(wp.min(x1[a], x1[b]), x1[c]), pad)
-                high1 = highest(wp.max(wp.max(x1[a], x1[b]), x1[c]), pad)
-                finite = is_finite(x0, x1, a) and is_finite(x0, x1, b) and is_finite(x0, x1, c)
-                if not finite:  # the place covers the other elements that it represents
-                    low0 = low
-                    high0 = high
-                    low1 = low
-                    high1 = high
+                if is_finite(x0, x1, a) and is_finite(x0, x1, b) and is_finite(x0, x1, c):
+                    box = box_of_motion(
+                        lowest(wp.min(wp.min(x0[a], x0[b]), x0[c]), pad),
+                        highest(wp.max(wp.max(x0[a], x0[b]), x0[c]), pad),
+                        lowest(wp.min(wp.min(x1[a], x1[b]), x1[c]), pad),
+                        highest(wp.max(wp.max(x1[a], x1[b]), x1[c]), pad),
+                        swept,
+                    )
+                    write_box(box, mesh.face_boxes, i)
+                else:  # the place covers the other elements that it represents
+                    write_box(empty_box(), mesh.face_boxes, i)
                     for corner in range(3):
                         vertex = mesh.faces[i, corner]
                         if is_finite(x0, x1, vertex):
-                            low0 = wp.min(low0, lowest(x0[vertex], pad))
-                            high0 = wp.max(high0, highest(x0[vertex], pad))
-                            low1 = wp.min(low1, lowest(x1[vertex], pad))
-                            high1 = wp.max(high1, highest(x1[vertex], pad))
-                low = wp.min(low0, low1)
-                high = wp.max(high0, high1)
-                box = wp.matrix_from_rows(low0, high0, low1, high1)
-                if not finite:
-                    box = empty_box()
-                write_box(box, mesh.face_boxes, i)
+                            box = union_of_boxes(box, box_of_two(x0, x1, padding, vertex, vertex, swept))
                 has_changed = 1
                 if changed:
                     has_changed = changed[a] | changed[b] | changed[c]
                 if mesh.only_free and mesh.order[i] < mesh.face_count:
                     has_changed = 0
-            mesh.places.lowers[i] = low
-            mesh.places.uppers[i] = high
+            write_box(box, mesh.places.boxes, i)
             mesh.places.changed[i] = has_changed
-            fit_parent(i, low, high, has_changed, mesh.clusters)
+            fit_parent(i, box, has_changed, mesh.clusters)
             return
         edge = i - places
         if edge < mesh.edges.shape[0]:
-            a = mesh.edges[edge, 0]
-            b = mesh.edges[edge, 1]
-            finite = is_finite(x0, x1, a) and is_finite(x0, x1, b)
-            write_box(box_of_two(x0, x1, padding, a, b, finite), mesh.edge_boxes, mesh.edge_rows[edge])
+            ends = box_of_two(x0, x1, padding, mesh.edges[edge, 0], mesh.edges[edge, 1], swept)
+            write_box(ends, mesh.edge_boxes, mesh.edge_rows[edge])
             return
         vertex = edge - mesh.edges.shape[0]
-        finite = is_finite(x0, x1, vertex)
         if not_finite:
-            if not finite:
+            if not is_finite(x0, x1, vertex):
                 counted = int(1)
                 if checked:
                     counted = checked[vertex]
@@ -216,7 +215,7 @@ def box_elements_kernel(dtype: type, padded: bool) -> wp.Kernel:
                     raise_count(not_finite, 0, 1)
         row = mesh.vertex_rows[vertex]
         if row >= 0:
-            write_box(box_of_two(x0, x1, padding, vertex, vertex, finite), mesh.vertex_boxes, row)
+            write_box(box_of_two(x0, x1, padding, vertex, vertex, swept), mesh.vertex_boxes, row)
 
     return box_elements
 
@@ -230,26 +229,24 @@ def box_groups(
 ):
     """Boxes the groups of clusters."""
     i = wp.tid()
-    low = wp.vec3(wp.inf, wp.inf, wp.inf)
-    high = wp.vec3(-wp.inf, -wp.inf, -wp.inf)
+    box = empty_box()
     has_changed = int(0)
-    if i < clusters.lowers.shape[0]:
-        low = clusters.lowers[i]
-        high = clusters.uppers[i]
+    if i < clusters.boxes.shape[0]:
+        box = read_box(clusters.boxes, i)
         has_changed = clusters.changed[i]
-    fit_parent(i, low, high, has_changed, groups)
+    fit_parent(i, box, has_changed, groups)
 
 
 @made_once
 def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
-    """Returns a kernel that visits the pairs of faces whose swept boxes overlap, each pair once.
+    """Returns a kernel that visits the pairs of faces whose boxes no axis separates at both ends, each pair once.
 
     Its parameters are a :class:`FaceHierarchy`, the warps of a cluster and the arguments; launch it with
     :meth:`BroadPhaseHierarchy.traverse`. The boxes must have been fitted.
 
     Args:
         visit: Device function, ``visit(place: int, first: int, found: wp.uint32, arguments)``: the face at ``place``
-            overlaps the face at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
+            is paired with that at ``first + k`` for each bit k of ``found``. On a GPU all threads of a warp call it
             together, each for its own face of one cluster, some of them with no bits. A thread may call it for many
             ``first``, or for none.
         arguments_type: Type of the last argument, a struct of Warp.
@@ -261,31 +258,31 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
         cluster = i / (_WIDTH * warps_of_cluster)
         part = (i / _WIDTH) % warps_of_cluster
         place = cluster * _WIDTH + i % _WIDTH
-        low = mesh.clusters.lowers[cluster]
-        high = mesh.clusters.uppers[cluster]
+        box = read_box(mesh.places.boxes, place)
+        cluster_box = read_box(mesh.clusters.boxes, cluster)
         own_group = cluster / _WIDTH
         turn = int(0)
-        count = (mesh.clusters.lowers.shape[0] - 1) / _WIDTH + 1
+        count = (mesh.clusters.boxes.shape[0] - 1) / _WIDTH + 1
         for first_group in range(own_group, count, _WIDTH):
             groups = wp.uint32(0)
-            if mesh.groups.lowers:
-                groups = overlapping_children(mesh.clusters, cluster, low, high, mesh.groups, first_group)
+            if mesh.groups.boxes:
+                groups = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.groups, first_group)
             else:
                 groups = ~bits_from(count - first_group)
             while groups != wp.uint32(0):
                 group = first_group + lowest_set_bit(groups)
                 groups = groups & (groups - wp.uint32(1))
-                clusters = overlapping_children(mesh.clusters, cluster, low, high, mesh.clusters, group * _WIDTH)
+                clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, group * _WIDTH)
                 if group == own_group:
                     clusters = clusters & bits_from(cluster % _WIDTH)
                 while clusters != wp.uint32(0):
                     first = (group * _WIDTH + lowest_set_bit(clusters)) * _WIDTH
                     clusters = clusters & (clusters - wp.uint32(1))
                     if turn % warps_of_cluster == part:
-                        faces = overlapping_children(mesh.clusters, cluster, low, high, mesh.places, first)
+                        faces = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.places, first)
                         if faces != wp.uint32(0):
                             changed = changed_children(mesh.places, first)
-                            found = overlapping_faces(mesh.places, place, first, faces, changed)
+                            found = unseparated_faces(mesh.places, place, box, first, faces, changed)
                             visit(place, first, found, arguments)
                     turn += 1
 
@@ -295,8 +292,7 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
 def _level(count: int, worlds: np.ndarray | None, device: wp.Device) -> HierarchyLevel:
     """Allocates a level of nodes; worlds: the lowest and the highest of each, int, shape [2, count], or None."""
     level = HierarchyLevel()
-    level.lowers = wp.empty(count, dtype=wp.vec3, device=device)
-    level.uppers = wp.empty(count, dtype=wp.vec3, device=device)
+    level.boxes = wp.empty((count, 4), dtype=wp.vec3, device=device)
     level.changed = wp.zeros(count, dtype=int, device=device)
     if worlds is not None:
         level.first_world, level.last_world = (wp.array(w.astype(np.int32), dtype=int, device=device) for w in worlds)

@@ -2,24 +2,22 @@
 
 import warp as wp
 
-from ...detection.element_pairs import overlapping_edges, overlapping_vertices
+from ...detection.element_pairs import unseparated_edges, unseparated_vertices
 from ...detection.face_hierarchy import FaceHierarchy
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
 
 @wp.func
-def unseparated_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
-    """Returns the pairs of elements that two faces represent and that no axis separates over the motion, as bits."""
-    left = overlapping_vertices(mesh, place, other, False) & 7
-    left = left | ((overlapping_vertices(mesh, other, place, False) & 7) << 3)
-    return left | ((overlapping_edges(mesh, place, other, False) & 511) << 6)
+def unseparated_vertex_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
+    """Returns the pairs of a vertex and a face that two faces represent and that no axis separates, as bits."""
+    left = unseparated_vertices(mesh, place, other) & 7
+    return left | ((unseparated_vertices(mesh, other, place) & 7) << 3)
 
 
 @wp.func
-def overlapping_vertex_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
-    """Returns the pairs of a vertex and a face whose swept boxes overlap, of those of two faces, as bits."""
-    left = overlapping_vertices(mesh, place, other, True) & 7
-    return left | ((overlapping_vertices(mesh, other, place, True) & 7) << 3)
+def unseparated_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+    """Returns the pairs of elements that two faces represent and that no axis separates over the motion, as bits."""
+    return unseparated_vertex_faces(mesh, place, other) | ((unseparated_edges(mesh, place, other) & 511) << 6)
 
 
 @wp.func

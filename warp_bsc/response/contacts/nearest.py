@@ -12,7 +12,7 @@ from ..schedule import SolveStatus
 from ..state.structs import Step
 from ..state.vectors import ZERO, corners_of, to_double
 from ..tuning import BEHIND
-from .face_pairs import overlapping_vertex_faces, pair_of_bit
+from .face_pairs import pair_of_bit, unseparated_vertex_faces
 from .queue import PairQueue, pair_count, vertices_of
 
 wp.set_module_options({"enable_backward": False})
@@ -75,7 +75,7 @@ def find_nearest_in_hierarchy() -> wp.Kernel:
         while found != wp.uint32(0):
             other = first + lowest_set_bit(found)
             found = found & (found - wp.uint32(1))
-            left = overlapping_vertex_faces(mesh, place, other)
+            left = unseparated_vertex_faces(mesh, place, other)
             while left != 0:
                 bit = lowest_set_bit(wp.uint32(left))
                 left = left & (left - 1)
