@@ -46,6 +46,16 @@ def test_measures_what_the_detector_finds(capsys, method):
     assert (found["method"], found["device"], found["repeat"]) == (method, "cpu", 2)
 
 
+def test_worlds_find_each_what_one_finds(capsys):
+    (one,), (three,) = (
+        json.loads(measure(capsys, "cloth:1000", "--json", *more))["scenes"] for more in ([], ["--worlds", 3])
+    )
+    assert three["scene"] == f"{one['scene']} in 3 worlds"
+    assert one["hits"] > 0
+    for count in ("triangles", "vertices", "candidates", "hits"):
+        assert three[count] == 3 * one[count]
+
+
 def test_times_are_consistent(capsys):
     (measured,) = json.loads(measure(capsys, "cloth:2000", "--json"))["scenes"]
     took = measured["milliseconds"]
@@ -104,6 +114,9 @@ def test_usd_scene(capsys, request):
         (["detector", "flood:5000"], "flood:5000: there is no generator flood, only cloth, crash"),
         (["detector", "cloth:many"], "'many'"),
         (["detector", "cloth:3"], "[1000, 20000000], not '3'"),
+        (["detector", "cloth:1000", "--worlds", "0"], "--worlds: must be an integer of at least 1"),
+        (["detector", "cloth:1000", "--worlds", "2000000000"], "2000000000 worlds have too many vertices"),
+        (["detector", "cloth:1000", "--worlds", "2", "--compare"], "the IPC Toolkit has no worlds"),
         (["detector", "cloth:1000", "--repeat", "0"], "--repeat: must be an integer of at least 1"),
         (["detector", "cloth:1000", "--threads", "100000"], "threads must be in [1, "),
         (["detector", "cloth:1000", "--device", "cuda:99"], "--device cuda:99"),

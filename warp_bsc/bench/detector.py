@@ -107,7 +107,7 @@ def benchmark_detector(
     dtype = wp.vec3 if scene.x0.dtype == np.float32 else wp.vec3d
     x0, x1 = (wp.array(x, dtype=dtype, device=device) for x in (scene.x0, scene.x1))
     before = wp.get_mempool_used_mem_current(device) if counts_memory else 0
-    mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
+    mesh = CollisionMesh(scene.faces, len(scene.x0), world=scene.world, device=device)
     detector = CollisionDetector(mesh, method=method)
     collisions = detector.detect(x0, x1)
     memory = wp.get_mempool_used_mem_current(device) - before if counts_memory else None

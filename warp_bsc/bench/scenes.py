@@ -33,16 +33,38 @@ class BenchmarkScene:
     """A mesh and one step of its motion.
 
     Attributes:
-        name: The name that the user gave.
+        name: The name that the user gave, and the number of worlds if there are many.
         faces: Vertex indices, int32, shape [face_count, 3].
         x0: Positions at the start of the step, float32 or float64, shape [vertex_count, 3].
         x1: Positions at its end, of the same type.
+        world: World of each vertex, int32, shape [vertex_count]; None if all are in one.
     """
 
     name: str
     faces: np.ndarray
     x0: np.ndarray
     x1: np.ndarray
+    world: np.ndarray | None = None
+
+    def in_worlds(self, count: int) -> "BenchmarkScene":
+        """Returns the scene in a number of worlds, which do not collide with each other; in one, the scene itself.
+
+        Raises:
+            ValueError: If that makes 2^31 vertices or more.
+        """
+        if count == 1:
+            return self
+        vertices = len(self.x0)
+        if vertices * count >= 2**31:
+            raise ValueError(f"{self.name}: {count} worlds have too many vertices, more than 2^31")
+        offsets = vertices * np.arange(count, dtype=np.int32)[:, None, None]
+        return BenchmarkScene(
+            name=f"{self.name} in {count:,} worlds",
+            faces=(self.faces + offsets).reshape(-1, 3),
+            x0=np.tile(self.x0, (count, 1)),
+            x1=np.tile(self.x1, (count, 1)),
+            world=np.repeat(np.arange(count, dtype=np.int32), vertices),
+        )
 
 
 def default_scenes() -> list[str]:

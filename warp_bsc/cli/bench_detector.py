@@ -20,6 +20,7 @@ from .options import (
     add_repeat,
     add_threads,
     natural,
+    positive,
 )
 from .tables import Console
 
@@ -38,6 +39,7 @@ examples:
   warp-bsc bench detector cloth.usd --interval 3
   warp-bsc bench detector first.ply,second.ply crash:1100000 --device cuda:0
   warp-bsc bench detector cloth:50000 --device cpu --threads 1 --compare
+  warp-bsc bench detector cloth:1000 --worlds 1024 --device cuda:0
   warp-bsc bench detector --json > times.json
 
 {explain_statuses()}"""
@@ -49,6 +51,13 @@ def add_to(commands: Commands, summary: str) -> None:
     command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to measure")
     command.add_argument(
         "--interval", type=natural, default=0, metavar="N", help="interval of a USD file, counted from 0 (default: 0)"
+    )
+    command.add_argument(
+        "--worlds",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="worlds with the scene, which do not collide with each other (default: 1)",
     )
     add_repeat(command, default=5)
     add_threads(command)
@@ -62,9 +71,12 @@ def add_to(commands: Commands, summary: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    if arguments.compare and arguments.worlds > 1:
+        raise ValueError("--compare and --worlds exclude each other: the IPC Toolkit has no worlds")
     if arguments.compare and importlib.util.find_spec("ipctk") is None:
         raise ValueError("--compare needs the IPC Toolkit: pip install 'warp-bsc[bench]'")
     scenes = [load_scene(name, interval=arguments.interval) for name in arguments.scenes or default_scenes()]
+    scenes = [scene.in_worlds(arguments.worlds) for scene in scenes]
     device = find_device(arguments.device)
     progress = Console(stderr=True)
     options = {"method": arguments.method, "device": device, "repeat": arguments.repeat}

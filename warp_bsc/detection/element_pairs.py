@@ -174,7 +174,8 @@ def _pair_elements(
             edge_edge_slot += wp.int64(1)
 
 
-@wp.kernel(**NO_GRADIENTS)
+# fewer registers than the 96 that the compiler takes, so that more warps hide the latency of memory
+@wp.kernel(**NO_GRADIENTS, cuda_max_registers=64)
 def pair_elements(
     mesh: FaceHierarchy,
     # in

@@ -134,7 +134,8 @@ def _decide(i: int, pair: wp.vec2i, status: int, timed: bool, stages: PairStages
 def pair_kernels(dtype: type) -> PairKernels:
     """Returns the kernels for one type of position, each in a module of its own."""
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
+    # fewer registers than the 252 that the compiler takes, so that twice as many warps hide its latency
+    @wp.kernel(**NO_FUSED_OPERATIONS, cuda_max_registers=128)
     def classify_survivors(
         first: int,
         # mesh
