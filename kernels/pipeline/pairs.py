@@ -58,6 +58,14 @@ def owns_vertex(owned: int, corner: int) -> bool:
 
 
 @wp.func
+def finite_elements(owned: int, a: bool, b: bool, c: bool) -> int:
+    """Returns what a face represents without the elements that have a corner that is not finite."""
+    finite = wp.where(a, 1, 0) | wp.where(b, 2, 0) | wp.where(c, 4, 0)
+    next = (finite >> 1) | ((finite & 1) << 2)
+    return owned & (finite | ((finite & next) << 3))
+
+
+@wp.func
 def owns_edge(owned: int, side: int) -> bool:
     """Returns whether a face is the representative of the edge from corner ``side`` to the next."""
     return (owned >> (3 + side)) & 1 == 1

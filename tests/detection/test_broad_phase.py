@@ -284,6 +284,58 @@ def test_elements_without_finite_positions_have_no_pairs(broad_phase, dtype, at_
         assert left and (len(left) < len(expected) or not moves)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("keep_separated", [False, True])
+@pytest.mark.parametrize("padded", [False, True])
+def test_both_broad_phases_find_the_same(device, dtype, keep_separated, padded):
+    """All kinds of pairs of sheets, ropes and points, with paddings that differ, a filter, and what is not finite."""
+    random = np.random.default_rng(4)
+    x, sheet = grid(7)
+    count = 3 * len(x)
+    faces = (sheet + len(x) * np.arange(3)[:, None, None]).reshape(-1, 3)
+    ropes = count + np.array([[i, i + 1] for i in range(29) if i % 10 != 9])
+    ends = np.array([[0, count], [len(x), count + 10]])  # ropes that are tied to sheets
+    vertices = count + 30 + 170
+    layers = x + np.arange(3)[:, None, None] * [0.0, 0.0, 0.1]
+    x0 = np.concatenate([*layers, random.uniform(0.0, 1.0, (200, 3)) * [1.0, 1.0, 0.4]])
+    x0 = (x0 + random.normal(scale=0.03, size=x0.shape)).astype(dtype)
+    x1 = (x0 + random.normal(scale=0.1, size=x0.shape)).astype(dtype)
+    x1[random.choice(vertices, 9, replace=False), 1] = np.nan
+    meshes = [
+        bsc.CollisionMesh(
+            faces,
+            vertices,
+            edges=np.concatenate([ropes, ends]),
+            points=np.arange(count + 30, vertices),
+            group=random.choice([1, 3], vertices),
+            mask=random.choice([1, 2, 3], vertices),
+            device=of,
+        )
+        for of in ("cpu", device)
+        for random in [np.random.default_rng(5)]
+    ]
+    padding = 0.05 * random.random(vertices) * (random.random(vertices) < 0.8)
+    found = []
+    for broad_phase, mesh in zip((BroadPhaseSimd, BroadPhaseHierarchy), meshes, strict=True):
+        type_of = wp.vec3 if dtype == np.float32 else wp.vec3d
+        ends = [wp.array(x, dtype=type_of, device=mesh.device) for x in (x0, x1)]
+        own_count = wp.zeros(1, dtype=wp.int64, device=mesh.device)
+        paddings = wp.array(padding, dtype=wp.float64, device=mesh.device) if padded else None
+        finder = broad_phase(mesh, own_count, padding=paddings)
+        finder.grow(200_000)
+        counts = [wp.zeros(len(Count), dtype=wp.int64, device=mesh.device) for _ in range(4)]
+        queues = [wp.zeros(100_000, dtype=wp.vec2i, device=mesh.device) for _ in range(4)]
+        inputs = [array for pair in zip(counts, queues, strict=True) for array in pair]
+        finder.pair_elements(*ends, *inputs[:4], keep_separated=keep_separated)
+        finder.pair_points(*ends, *inputs[4:], keep_separated=keep_separated)
+        numbers = [count.numpy() for count in counts]
+        of_kinds = [queue.numpy()[: n[Count.QUEUED]] for queue, n in zip(queues, numbers, strict=True)]
+        found.append(([in_lexicographic_order(pairs) for pairs in of_kinds], [n[Count.FILTERED] for n in numbers]))
+    assert found[0] == found[1]
+    assert [len(pairs) > n for pairs, n in zip(found[0][0], (300, 300, 5, 5), strict=True)] == [True] * 4
+    assert min(found[0][1]) > 5
+
+
 @wp.kernel
 def transpose_cells(cells: wp.array[wp.vec3i], places: wp.array[wp.vec3i]):
     places[wp.tid()] = hilbert_transpose(cells[wp.tid()])

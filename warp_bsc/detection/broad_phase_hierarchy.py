@@ -7,8 +7,8 @@ import warp as wp
 
 from ..kernels.pipeline.hierarchy import WIDTH, count_set_bits, lowest_set_bit
 from ..kernels.pipeline.queues import take_slots, write
-from .element_pairs import pair_edges_with_faces, pair_elements, pair_points
-from .face_hierarchy import box_elements_kernel, box_groups, group_count, make_hierarchy, traversal_kernel
+from .element_pairs import pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
+from .face_hierarchy import box_groups, fit_kernel, group_count, make_hierarchy, traversal_kernel
 from .launch import THREADS_OF_MULTIPROCESSOR, launch
 from .mesh import CollisionMesh
 from .settings import capacity_for
@@ -68,13 +68,13 @@ class BroadPhaseHierarchy:
             padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
         """
         self.lock = threading.RLock()
-        self._padding = padding
+        self._padding, self._swept = padding, False
         self._device = device = mesh.device
         self._count = count
         self._not_finite, self._checked = not_finite, checked
-        self.hierarchy = make_hierarchy(mesh)
+        self.hierarchy = make_hierarchy(mesh, padded=padding is not None)
         places = len(mesh.face_order)
-        self._elements = places + len(mesh.edges) + mesh.vertex_count
+        self._fitted = places + (0 if not_finite is None else mesh.vertex_count)
         self._clusters = places // WIDTH
         self._groups = group_count(places)
         self._warps_of_cluster = 1
@@ -83,6 +83,11 @@ class BroadPhaseHierarchy:
             self._warps_of_cluster = max(1, min(_MAX_WARPS_OF_CLUSTER, warps))
         capacity = 8 * len(mesh.cells) if capacity is None else capacity
         self._face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
+
+    @property
+    def is_padded(self) -> bool:
+        """Whether boxes reach beyond their elements."""
+        return self._padding is not None
 
     @property
     def buffers(self) -> list[wp.array]:
@@ -118,7 +123,7 @@ class BroadPhaseHierarchy:
         """Enqueues the candidates."""
         self._pair_faces(x0, x1, changed, keep_separated)
         queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
-        self._launch_over_pairs(pair_elements, *queues)
+        self._launch_over_pairs(pair_elements_kernel, *queues)
 
     def pair_points(
         self,
@@ -134,15 +139,15 @@ class BroadPhaseHierarchy:
     ) -> None:
         """Enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
         queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
-        self._launch_over_pairs(pair_points, *queues)
+        self._launch_over_pairs(pair_points_kernel, *queues)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
         self._pair_faces(x, x)
-        self._launch_over_pairs(pair_edges_with_faces, counts, pairs)
+        self._launch_over_pairs(pair_edges_with_faces_kernel, counts, pairs)
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
-        """Boxes all elements of a motion, and all nodes.
+        """Writes the corners and the boxes of all faces of a motion, and boxes all nodes.
 
         Args:
             x0: Positions at the start, array of vec3 or vec3d.
@@ -150,10 +155,11 @@ class BroadPhaseHierarchy:
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all.
             keep_separated: Whether to seek the pairs that an axis separates at both ends, too.
         """
+        self._swept = keep_separated
         inputs = [x0, x1, changed, self._checked, self._padding, keep_separated, self.hierarchy]
         outputs = [self._not_finite]
-        kernel = box_elements_kernel(x0.dtype, self._padding is not None)
-        launch(kernel, self._elements, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
+        kernel = fit_kernel(x0.dtype, self.is_padded)
+        launch(kernel, self._fitted, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
         if self._groups:
             inputs = [self.hierarchy.clusters, self.hierarchy.groups]
             launch(box_groups, WIDTH * self._groups, inputs=inputs, device=self._device, record_tape=False)
@@ -171,7 +177,7 @@ class BroadPhaseHierarchy:
         queue.pairs, queue.count = self._face_pairs, self._count
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
 
-    def _launch_over_pairs(self, kernel, *arguments):
+    def _launch_over_pairs(self, make_kernel, *arguments):
         threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
         inputs = [self.hierarchy, self._face_pairs, self._count, *arguments, threads]
-        launch(kernel, threads, inputs=inputs, device=self._device, record_tape=False)
+        launch(make_kernel(self.is_padded, self._swept), threads, inputs=inputs, device=self._device, record_tape=False)

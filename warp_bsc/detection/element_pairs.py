@@ -1,16 +1,38 @@
 """The pairs of elements that two faces of a hierarchy represent: kernels that enqueue those whose boxes overlap."""
 
+from typing import NamedTuple
+
 import warp as wp
 
 from ..kernels.pipeline.bits import lowest_bit
-from ..kernels.pipeline.boxes import read_box
-from ..kernels.pipeline.hierarchy import WIDTH, are_apart, count_set_bits
-from ..kernels.pipeline.pairs import is_filtered, owns_edge, owns_vertex
+from ..kernels.pipeline.boxes import BoxRows
+from ..kernels.pipeline.corners import (
+    IS_FACE,
+    Corners,
+    PaddedCorners,
+    edge_box,
+    face_box,
+    paddings_of,
+    read_corners,
+    read_label,
+    read_padded_corners,
+    read_padded_label,
+    vertex_box,
+)
+from ..kernels.pipeline.hierarchy import WIDTH, are_apart, count_set_bits, lowest_set_bit
+from ..kernels.pipeline.pairs import is_filtered
 from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots, write
 from .face_hierarchy import FaceHierarchy
+from .launch import made_once
 from .settings import NO_GRADIENTS, Count
 
-__all__ = ["pair_edges_with_faces", "pair_elements", "pair_points", "unseparated_edges", "unseparated_vertices"]
+__all__ = [
+    "filtered_pairs",
+    "pair_edges_with_faces_kernel",
+    "pair_elements_kernel",
+    "pair_functions",
+    "pair_points_kernel",
+]
 
 _FILTERED = wp.constant(int(Count.FILTERED))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -21,18 +43,9 @@ _PAIRS_OF_THREAD = wp.constant(4)
 """Most pairs of faces whose elements a thread pairs at once."""
 _PAIRS_AT_ONCE = wp.constant(1 << 17)
 """Pairs of faces that a GPU works on at once, each by a thread of its own."""
+_VERTEX_FACE_BITS = wp.constant(63)
 _BITS_OF_PAIR = wp.constant(15)
 """Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
-
-
-@wp.func
-def _next(corner: int):
-    return wp.where(corner == 2, 0, corner + 1)
-
-
-@wp.func
-def _has_vertex(faces: wp.array2d[int], face: int, vertex: int):
-    return faces[face, 0] == vertex or faces[face, 1] == vertex or faces[face, 2] == vertex
 
 
 @wp.func
@@ -41,11 +54,10 @@ def _corners(faces: wp.array2d[int], face: int) -> wp.vec3i:
 
 
 @wp.func
-def _is_face(mesh: FaceHierarchy, place: int) -> bool:
-    """Returns whether the cell at a place is a face; where all are, nothing is read."""
-    if mesh.all_faces:
-        return True
-    return mesh.order[place] < mesh.face_count
+def _side(faces: wp.array2d[int], face: int, i: int) -> wp.vec3i:
+    a = faces[face, i]
+    b = faces[face, wp.where(i == 2, 0, i + 1)]
+    return wp.vec3i(a, b, b)
 
 
 @wp.func
@@ -59,267 +71,385 @@ def _count_filtered(mesh: FaceHierarchy, place: int, count: int):
 
 
 @wp.func
-def unseparated_vertices(mesh: FaceHierarchy, face: int, other: int):
-    """Returns which corners of a face are vertices that it owns and no axis separates from another face, as bits.
-
-    Those that a filter leaves out are bits 3 to 5 instead.
-    """
-    owned = mesh.owned[face]
-    found = int(0)
-    if owned & 7 == 0 or not _is_face(mesh, other):
-        return found
-    other_box = read_box(mesh.face_boxes, other)
-    corners = int(3)  # not a constant, as the body would be repeated
-    for corner in range(corners):
-        if owns_vertex(owned, corner):
-            box = read_box(mesh.vertex_boxes, 3 * face + corner)
-            vertex = mesh.faces[face, corner]
-            if not are_apart(box, other_box) and not _has_vertex(mesh.faces, other, vertex):
-                if is_filtered(mesh.pair_filter, wp.vec3i(vertex), _corners(mesh.faces, other)):
-                    found = found | (8 << corner)
-                else:
-                    found = found | (1 << corner)
-    return found
+def _common_corners(a: wp.vec4i, b: wp.vec4i, i: int) -> int:
+    """Returns which corners of a face b are the vertex at corner i of another, from their labels, as bits."""
+    return wp.where(b[0] == a[i], 1, 0) | wp.where(b[1] == a[i], 2, 0) | wp.where(b[2] == a[i], 4, 0)
 
 
 @wp.func
-def unseparated_edges(mesh: FaceHierarchy, face: int, other: int):
-    """Returns which edges that two faces own no axis separates: bit 3 i + j for sides i and j.
-
-    Those that a filter leaves out are bits 9 to 17 instead.
-    """
-    owned = mesh.owned[face]
-    other_owned = mesh.owned[other]
-    found = int(0)
-    sides = wp.where(owned >> 3 == 0 or other_owned >> 3 == 0, 0, 3)
-    place_box = read_box(mesh.places.boxes, other)
-    for side in range(sides):
-        if owns_edge(owned, side):
-            box = read_box(mesh.edge_boxes, 3 * face + side)
-            if not are_apart(box, place_box):
-                a = mesh.faces[face, side]
-                b = mesh.faces[face, _next(side)]
-                for other_side in range(sides):
-                    if owns_edge(other_owned, other_side):
-                        c = mesh.faces[other, other_side]
-                        d = mesh.faces[other, _next(other_side)]
-                        if a != c and a != d and b != c and b != d:
-                            other_box = read_box(mesh.edge_boxes, 3 * other + other_side)
-                            if not are_apart(box, other_box):
-                                bit = 3 * side + other_side
-                                if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), wp.vec3i(c, d, d)):
-                                    found = found | (512 << bit)
-                                else:
-                                    found = found | (1 << bit)
-    return found
+def _sides_at(corners: int) -> int:
+    """Returns which sides of a face have one of some corners, as bits; side j goes from corner j to the next."""
+    return (corners | (corners >> 1) | (corners << 2)) & 7
 
 
 @wp.func
-def _pair_elements(
-    mesh: FaceHierarchy,
-    face_pairs: wp.array[wp.vec2i],
-    face_pair_count: wp.array[wp.int64],
-    first: int,
-    turns: int,
-    # counts, in and out, and queues
-    vertex_face_counts: wp.array[wp.int64],
-    vertex_face: wp.array[wp.vec2i],
-    edge_edge_counts: wp.array[wp.int64],
-    edge_edge: wp.array[wp.vec2i],
-):
-    """Enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
-    found = wp.uint64(0)
-    queued = wp.vec2i()  # vertex-face, edge-edge
-    filtered = wp.vec2i()
-    for turn in range(turns):
-        at = first + turn * _WIDTH
-        if is_filled(at, face_pairs, face_pair_count, 0):
-            face = face_pairs[at][0]
-            other = face_pairs[at][1]
-            vertices = unseparated_vertices(mesh, face, other)
-            vertices = vertices | (unseparated_vertices(mesh, other, face) << 6)
-            edges = unseparated_edges(mesh, face, other)
-            filtered_vertices = count_set_bits(wp.uint32(vertices & 0o7070))
-            filtered_edges = count_set_bits(wp.uint32(edges >> 9))
-            filtered[0] += filtered_vertices
-            filtered[1] += filtered_edges
-            _count_filtered(mesh, face, filtered_vertices + filtered_edges)
-            vertices = (vertices & 7) | ((vertices >> 3) & 56)
-            edges = edges & 511
-            queued[0] += count_set_bits(wp.uint32(vertices))
-            queued[1] += count_set_bits(wp.uint32(edges))
-            found = found | (wp.uint64(vertices | (edges << 6)) << wp.uint64(_BITS_OF_PAIR * turn))
+def filtered_pairs(mesh: FaceHierarchy, place: int, other: int, pairs: int) -> int:
+    """Returns which of some pairs of the elements of two faces a filter leaves out, as bits."""
+    filtered = int(0)
     if mesh.pair_filter.group:
-        raise_count(vertex_face_counts, _FILTERED, filtered[0])
-        raise_count(edge_edge_counts, _FILTERED, filtered[1])
-    vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
-    edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
-    while found != wp.uint64(0):
-        bit = lowest_bit(found)
-        found = found & (found - wp.uint64(1))
-        at = first + (bit / _BITS_OF_PAIR) * _WIDTH
-        bit = bit % _BITS_OF_PAIR
-        face = face_pairs[at][0]
-        other = face_pairs[at][1]
-        if bit < 3:
-            write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face, vertex_face_slot)
-            vertex_face_slot += wp.int64(1)
-        elif bit < 6:
-            write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face, vertex_face_slot)
-            vertex_face_slot += wp.int64(1)
-        else:
-            edge = mesh.face_edges[face, (bit - 6) / 3]
-            other_edge = mesh.face_edges[other, (bit - 6) % 3]
-            write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, edge_edge_slot)
-            edge_edge_slot += wp.int64(1)
+        left = pairs
+        while left != 0:
+            bit = lowest_set_bit(wp.uint32(left))
+            left = left & (left - 1)
+            element = wp.vec3i()
+            against = wp.vec3i()
+            if bit < 3:
+                element = wp.vec3i(mesh.faces[place, bit])
+                against = _corners(mesh.faces, other)
+            elif bit < 6:
+                element = wp.vec3i(mesh.faces[other, bit - 3])
+                against = _corners(mesh.faces, place)
+            else:
+                element = _side(mesh.faces, place, (bit - 6) / 3)
+                against = _side(mesh.faces, other, (bit - 6) % 3)
+            if is_filtered(mesh.pair_filter, element, against):
+                filtered = filtered | (1 << bit)
+    return filtered
 
 
-# fewer registers than the 96 that the compiler takes, so that more warps hide the latency of memory
-@wp.kernel(**NO_GRADIENTS, cuda_max_registers=64)
-def pair_elements(
-    mesh: FaceHierarchy,
-    # in
-    face_pairs: wp.array[wp.vec2i],
-    face_pair_count: wp.array[wp.int64],
-    # counts, in and out, and queues
-    vertex_face_counts: wp.array[wp.int64],
-    vertex_face: wp.array[wp.vec2i],
-    edge_edge_counts: wp.array[wp.int64],
-    edge_edge: wp.array[wp.vec2i],
-    threads: int,
-):
-    """Enqueues the candidates of pairs of faces.
+class PairFunctions(NamedTuple):
+    """Device functions for the elements of two faces, ``f(mesh: FaceHierarchy, place: int, other: int) -> int``.
+
+    They return pairs of elements that the two represent, that share no vertex and that no axis separates, as bits.
+
+    Attributes:
+        vertex_face_pairs: Bits 0 to 2: corners of the first with the second face; 3 to 5: of the second with the first.
+        element_pairs: These, and bit 6 + 3 i + j: side i of the first with side j of the second.
+        edge_face_pairs: Bits 0 to 2: sides of the first with the second face; 3 to 5: of the second with the first.
+        point_pair: Whether no axis separates a point, the first, from a point or an edge that no face has: 1 or 0.
+    """
+
+    vertex_face_pairs: wp.Function
+    element_pairs: wp.Function
+    edge_face_pairs: wp.Function
+    point_pair: wp.Function
+
+
+@made_once
+def pair_functions(padded: bool, swept: bool) -> PairFunctions:
+    """Returns the functions for boxes with a padding or without, over the time of the motion or at both ends."""
+    corners_type = PaddedCorners if padded else Corners
+    if padded:
+
+        @wp.func
+        def label_at(mesh: FaceHierarchy, place: int) -> wp.vec4i:
+            return read_padded_label(mesh.padded_corners, place)
+
+        @wp.func
+        def corners_at(mesh: FaceHierarchy, place: int) -> PaddedCorners:
+            return read_padded_corners(mesh.padded_corners, place)
+
+        @wp.func
+        def paddings_at(mesh: FaceHierarchy, place: int) -> wp.vec3d:
+            return paddings_of(mesh.padded_corners, place)
+    else:
+
+        @wp.func
+        def label_at(mesh: FaceHierarchy, place: int) -> wp.vec4i:
+            return read_label(mesh.corners, place)
+
+        @wp.func
+        def corners_at(mesh: FaceHierarchy, place: int) -> Corners:
+            return read_corners(mesh.corners, place)
+
+        @wp.func
+        def paddings_at(mesh: FaceHierarchy, place: int) -> wp.vec3d:
+            return wp.vec3d()
+
+    @wp.func
+    def unseparated_corners(corners: corners_type, paddings: wp.vec3d, box: BoxRows, sought: int) -> int:
+        """Returns which of some corners no axis separates from a box."""
+        found = int(0)
+        for i in range(3):
+            if not are_apart(vertex_box(corners, paddings, i, wp.static(swept)), box):
+                found = found | (1 << i)
+        return found & sought
+
+    @wp.func
+    def unseparated_sides(corners: corners_type, paddings: wp.vec3d, box: BoxRows, sought: int) -> int:
+        """Returns which of some sides no axis separates from a box."""
+        found = int(0)
+        for i in range(3):
+            if not are_apart(edge_box(corners, paddings, i, (i + 1) % 3, wp.static(swept)), box):
+                found = found | (1 << i)
+        return found & sought
+
+    @wp.func
+    def of_corners(
+        a: wp.vec4i,
+        b: wp.vec4i,
+        corners: corners_type,
+        paddings: wp.vec3d,
+        other_corners: corners_type,
+        other_paddings: wp.vec3d,
+    ) -> int:
+        """Returns the corners of a face a with the face b, from labels and positions."""
+        sought = a[3] & 7
+        for i in range(3):
+            if _common_corners(a, b, i) != 0:
+                sought = sought & ~(1 << i)
+        if sought == 0 or b[3] & IS_FACE == 0:
+            return 0
+        return unseparated_corners(corners, paddings, face_box(other_corners, other_paddings, wp.static(swept)), sought)
+
+    @wp.func
+    def vertex_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+        a = label_at(mesh, place)
+        b = label_at(mesh, other)
+        p = corners_at(mesh, place)
+        q = corners_at(mesh, other)
+        p_pad = paddings_at(mesh, place)
+        q_pad = paddings_at(mesh, other)
+        found = of_corners(a, b, p, p_pad, q, q_pad)
+        return found | (of_corners(b, a, q, q_pad, p, p_pad) << 3)
+
+    @wp.func
+    def element_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+        a = label_at(mesh, place)
+        b = label_at(mesh, other)
+        p = corners_at(mesh, place)
+        q = corners_at(mesh, other)
+        p_pad = paddings_at(mesh, place)
+        q_pad = paddings_at(mesh, other)
+        found = of_corners(a, b, p, p_pad, q, q_pad)
+        found = found | (of_corners(b, a, q, q_pad, p, p_pad) << 3)
+        sides = (a[3] >> 3) & 7
+        other_sides = (b[3] >> 3) & 7
+        for i in range(3):
+            common = _common_corners(a, b, i) | _common_corners(a, b, (i + 1) % 3)
+            sought = other_sides & ~_sides_at(common)
+            if (sides >> i) & 1 == 1 and sought != 0:
+                box = edge_box(p, p_pad, i, (i + 1) % 3, wp.static(swept))
+                found = found | (unseparated_sides(q, q_pad, box, sought) << (6 + 3 * i))
+        return found
+
+    @wp.func
+    def of_sides(
+        a: wp.vec4i,
+        b: wp.vec4i,
+        corners: corners_type,
+        paddings: wp.vec3d,
+        other_corners: corners_type,
+        other_paddings: wp.vec3d,
+    ) -> int:
+        """Returns the sides of a face a with the face b, from labels and positions."""
+        common = int(0)
+        for i in range(3):
+            if _common_corners(a, b, i) != 0:
+                common = common | (1 << i)
+        sought = (a[3] >> 3) & 7 & ~_sides_at(common)
+        if sought == 0 or b[3] & IS_FACE == 0:
+            return 0
+        return unseparated_sides(corners, paddings, face_box(other_corners, other_paddings, wp.static(swept)), sought)
+
+    @wp.func
+    def edge_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+        a = label_at(mesh, place)
+        b = label_at(mesh, other)
+        p = corners_at(mesh, place)
+        q = corners_at(mesh, other)
+        p_pad = paddings_at(mesh, place)
+        q_pad = paddings_at(mesh, other)
+        found = of_sides(a, b, p, p_pad, q, q_pad)
+        return found | (of_sides(b, a, q, q_pad, p, p_pad) << 3)
+
+    @wp.func
+    def point_pair(mesh: FaceHierarchy, place: int, other: int) -> int:
+        is_point = mesh.order[other] >= mesh.point_start
+        needed = wp.where(is_point, 1, 8)
+        if label_at(mesh, place)[3] & 1 == 0 or label_at(mesh, other)[3] & needed == 0:
+            return 0
+        box = vertex_box(corners_at(mesh, place), paddings_at(mesh, place), 0, wp.static(swept))
+        # the ends of a point are one vertex
+        other_box = edge_box(corners_at(mesh, other), paddings_at(mesh, other), 0, 1, wp.static(swept))
+        return wp.where(are_apart(box, other_box), 0, 1)
+
+    return PairFunctions(vertex_face_pairs, element_pairs, edge_face_pairs, point_pair)
+
+
+@made_once
+def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
+    """Returns the kernel that enqueues the candidates of pairs of faces, for boxes as of :func:`pair_functions`.
 
     A thread first finds all its pairs, then takes slots for them: where pairs of faces are many, a warp makes one
     atomic operation for 128 of them. Atomic operations on one address are serialized, so that fewer are faster.
     """
-    i = wp.tid()
-    count = filled_entries(face_pairs, face_pair_count, 0)
-    turns = wp.clamp(count / _PAIRS_AT_ONCE, 1, _PAIRS_OF_THREAD)
-    for first in range((i / _WIDTH) * turns * _WIDTH + i % _WIDTH, count, turns * threads):
-        _pair_elements(
-            mesh,
-            face_pairs,
-            face_pair_count,
-            first,
-            turns,
-            vertex_face_counts,
-            vertex_face,
-            edge_edge_counts,
-            edge_edge,
-        )
+    unseparated_pairs = pair_functions(padded, swept).element_pairs
+
+    @wp.func
+    def pair_some(
+        mesh: FaceHierarchy,
+        face_pairs: wp.array[wp.vec2i],
+        face_pair_count: wp.array[wp.int64],
+        first: int,
+        turns: int,
+        vertex_face_counts: wp.array[wp.int64],
+        vertex_face: wp.array[wp.vec2i],
+        edge_edge_counts: wp.array[wp.int64],
+        edge_edge: wp.array[wp.vec2i],
+    ):
+        """Enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
+        found = wp.uint64(0)
+        queued = wp.vec2i()  # vertex-face, edge-edge
+        filtered = wp.vec2i()
+        for turn in range(turns):
+            at = first + turn * _WIDTH
+            if is_filled(at, face_pairs, face_pair_count, 0):
+                face = face_pairs[at][0]
+                other = face_pairs[at][1]
+                pairs = unseparated_pairs(mesh, face, other)
+                if mesh.pair_filter.group:
+                    left_out = filtered_pairs(mesh, face, other, pairs)
+                    pairs = pairs & ~left_out
+                    filtered[0] += count_set_bits(wp.uint32(left_out & _VERTEX_FACE_BITS))
+                    filtered[1] += count_set_bits(wp.uint32(left_out & ~_VERTEX_FACE_BITS))
+                    _count_filtered(mesh, face, count_set_bits(wp.uint32(left_out)))
+                queued[0] += count_set_bits(wp.uint32(pairs & _VERTEX_FACE_BITS))
+                queued[1] += count_set_bits(wp.uint32(pairs & ~_VERTEX_FACE_BITS))
+                found = found | (wp.uint64(pairs) << wp.uint64(_BITS_OF_PAIR * turn))
+        if mesh.pair_filter.group:
+            raise_count(vertex_face_counts, _FILTERED, filtered[0])
+            raise_count(edge_edge_counts, _FILTERED, filtered[1])
+        vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
+        edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
+        while found != wp.uint64(0):
+            bit = lowest_bit(found)
+            found = found & (found - wp.uint64(1))
+            at = first + (bit / _BITS_OF_PAIR) * _WIDTH
+            bit = bit % _BITS_OF_PAIR
+            face = face_pairs[at][0]
+            other = face_pairs[at][1]
+            if bit < 3:
+                write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face, vertex_face_slot)
+                vertex_face_slot += wp.int64(1)
+            elif bit < 6:
+                write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face, vertex_face_slot)
+                vertex_face_slot += wp.int64(1)
+            else:
+                edge = mesh.face_edges[face, (bit - 6) / 3]
+                other_edge = mesh.face_edges[other, (bit - 6) % 3]
+                write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, edge_edge_slot)
+                edge_edge_slot += wp.int64(1)
+
+    @wp.kernel(**NO_GRADIENTS)
+    def pair_elements(
+        mesh: FaceHierarchy,
+        # in
+        face_pairs: wp.array[wp.vec2i],
+        face_pair_count: wp.array[wp.int64],
+        # counts, in and out, and queues
+        vertex_face_counts: wp.array[wp.int64],
+        vertex_face: wp.array[wp.vec2i],
+        edge_edge_counts: wp.array[wp.int64],
+        edge_edge: wp.array[wp.vec2i],
+        threads: int,
+    ):
+        i = wp.tid()
+        count = filled_entries(face_pairs, face_pair_count, 0)
+        turns = wp.clamp(count / _PAIRS_AT_ONCE, 1, _PAIRS_OF_THREAD)
+        for first in range((i / _WIDTH) * turns * _WIDTH + i % _WIDTH, count, turns * threads):
+            pair_some(
+                mesh,
+                face_pairs,
+                face_pair_count,
+                first,
+                turns,
+                vertex_face_counts,
+                vertex_face,
+                edge_edge_counts,
+                edge_edge,
+            )
+
+    return pair_elements
 
 
-@wp.func
-def _pair_edges_with_face(
-    mesh: FaceHierarchy,
-    face: int,
-    other: int,
-    # in and out
-    counts: wp.array[wp.int64],
-    # out
-    pairs: wp.array[wp.vec2i],
-):
-    """Enqueues the edges that a face owns with another face."""
-    owned = mesh.owned[face]
-    sides = wp.where(owned >> 3 == 0 or not _is_face(mesh, other), 0, 3)
-    for side in range(sides):
-        if owns_edge(owned, side):
-            row = 3 * face + side
-            a = mesh.faces[face, side]
-            b = mesh.faces[face, _next(side)]
-            if not are_apart(read_box(mesh.edge_boxes, row), read_box(mesh.face_boxes, other)):
-                if not _has_vertex(mesh.faces, other, a) and not _has_vertex(mesh.faces, other, b):
-                    if is_filtered(mesh.pair_filter, wp.vec3i(a, b, b), _corners(mesh.faces, other)):
-                        take_slot(counts, _FILTERED)
-                    else:
-                        append(wp.vec2i(mesh.face_edges[face, side], mesh.order[other]), pairs, counts, _QUEUED)
+@made_once
+def pair_edges_with_faces_kernel(padded: bool, swept: bool) -> wp.Kernel:
+    """Returns the kernel that enqueues the edges that two faces represent, each with the other face."""
+    unseparated_pairs = pair_functions(padded, swept).edge_face_pairs
+
+    @wp.kernel(**NO_GRADIENTS)
+    def pair_edges_with_faces(
+        mesh: FaceHierarchy,
+        # in
+        face_pairs: wp.array[wp.vec2i],
+        face_pair_count: wp.array[wp.int64],
+        # in and out
+        counts: wp.array[wp.int64],
+        # out
+        pairs: wp.array[wp.vec2i],
+        threads: int,
+    ):
+        for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
+            left = unseparated_pairs(mesh, face_pairs[i][0], face_pairs[i][1])
+            while left != 0:
+                bit = lowest_set_bit(wp.uint32(left))
+                left = left & (left - 1)
+                place = face_pairs[i][bit / 3]
+                other = face_pairs[i][1 - bit / 3]
+                side = bit % 3
+                if is_filtered(mesh.pair_filter, _side(mesh.faces, place, side), _corners(mesh.faces, other)):
+                    take_slot(counts, _FILTERED)
+                else:
+                    append(wp.vec2i(mesh.face_edges[place, side], mesh.order[other]), pairs, counts, _QUEUED)
+
+    return pair_edges_with_faces
 
 
-@wp.kernel(**NO_GRADIENTS)
-def pair_edges_with_faces(
-    mesh: FaceHierarchy,
-    # in
-    face_pairs: wp.array[wp.vec2i],
-    face_pair_count: wp.array[wp.int64],
-    # in and out
-    counts: wp.array[wp.int64],
-    # out
-    pairs: wp.array[wp.vec2i],
-    threads: int,
-):
-    """Enqueues the edges that two faces own, each with the other face, where their boxes overlap."""
-    for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
-        face = face_pairs[i][0]
-        other = face_pairs[i][1]
-        _pair_edges_with_face(mesh, face, other, counts, pairs)
-        _pair_edges_with_face(mesh, other, face, counts, pairs)
+@made_once
+def pair_points_kernel(padded: bool, swept: bool) -> wp.Kernel:
+    """Returns the kernel that enqueues the points among two cells, with an edge that no face has or another point."""
+    is_unseparated = pair_functions(padded, swept).point_pair
 
-
-@wp.func
-def _pair_point(
-    mesh: FaceHierarchy,
-    place: int,
-    other: int,
-    # in and out
-    vertex_edge_counts: wp.array[wp.int64],
-    # out
-    vertex_edge: wp.array[wp.vec2i],
-):
-    """Enqueues a point with an edge that no face has, if the cells at two places are that."""
-    cell = mesh.order[other]
-    if mesh.order[place] >= mesh.point_start and cell >= mesh.face_count and cell < mesh.point_start:
-        box = read_box(mesh.vertex_boxes, 3 * place)
-        other_box = read_box(mesh.edge_boxes, 3 * other)
-        if not are_apart(box, other_box):
-            point = mesh.faces[place, 0]
-            if is_filtered(mesh.pair_filter, wp.vec3i(point), _corners(mesh.faces, other)):
-                take_slot(vertex_edge_counts, _FILTERED)
-                _count_filtered(mesh, place, 1)
-                return
-            append(wp.vec2i(point, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
-
-
-@wp.func
-def _pair_two_points(
-    mesh: FaceHierarchy,
-    place: int,
-    other: int,
-    # in and out
-    vertex_vertex_counts: wp.array[wp.int64],
-    vertex_vertex: wp.array[wp.vec2i],
-):
-    """Enqueues two points, if the cells at two places are that."""
-    if mesh.order[place] >= mesh.point_start and mesh.order[other] >= mesh.point_start and place != other:
-        box = read_box(mesh.vertex_boxes, 3 * place)
-        other_box = read_box(mesh.vertex_boxes, 3 * other)
-        if not are_apart(box, other_box):
-            p = mesh.faces[place, 0]
-            q = mesh.faces[other, 0]
-            if is_filtered(mesh.pair_filter, wp.vec3i(p), wp.vec3i(q)):
+    @wp.func
+    def pair_point(
+        mesh: FaceHierarchy,
+        place: int,
+        other: int,
+        vertex_edge_counts: wp.array[wp.int64],
+        vertex_edge: wp.array[wp.vec2i],
+        vertex_vertex_counts: wp.array[wp.int64],
+        vertex_vertex: wp.array[wp.vec2i],
+    ):
+        """Enqueues a point with an edge that no face has or another point, if the cells at two places are that."""
+        cell = mesh.order[other]
+        if mesh.order[place] < mesh.point_start or cell < mesh.face_count or place == other:
+            return
+        if is_unseparated(mesh, place, other) == 0:
+            return
+        p = mesh.faces[place, 0]
+        q = mesh.faces[other, 0]
+        is_point = cell >= mesh.point_start
+        if is_filtered(mesh.pair_filter, wp.vec3i(p), _corners(mesh.faces, other)):
+            if is_point:
                 take_slot(vertex_vertex_counts, _FILTERED)
-                _count_filtered(mesh, place, 1)
-                return
+            else:
+                take_slot(vertex_edge_counts, _FILTERED)
+            _count_filtered(mesh, place, 1)
+        elif is_point:
             append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)
+        else:
+            append(wp.vec2i(p, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
 
+    @wp.kernel(**NO_GRADIENTS)
+    def pair_points(
+        mesh: FaceHierarchy,
+        # in
+        face_pairs: wp.array[wp.vec2i],
+        face_pair_count: wp.array[wp.int64],
+        # counts, in and out, and queues
+        vertex_edge_counts: wp.array[wp.int64],
+        vertex_edge: wp.array[wp.vec2i],
+        vertex_vertex_counts: wp.array[wp.int64],
+        vertex_vertex: wp.array[wp.vec2i],
+        threads: int,
+    ):
+        for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
+            place = face_pairs[i][0]
+            other = face_pairs[i][1]
+            if mesh.order[place] < mesh.point_start:
+                place = face_pairs[i][1]
+                other = face_pairs[i][0]
+            pair_point(mesh, place, other, vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex)
 
-@wp.kernel(**NO_GRADIENTS)
-def pair_points(
-    mesh: FaceHierarchy,
-    # in
-    face_pairs: wp.array[wp.vec2i],
-    face_pair_count: wp.array[wp.int64],
-    # counts, in and out, and queues
-    vertex_edge_counts: wp.array[wp.int64],
-    vertex_edge: wp.array[wp.vec2i],
-    vertex_vertex_counts: wp.array[wp.int64],
-    vertex_vertex: wp.array[wp.vec2i],
-    threads: int,
-):
-    """Enqueues the points among two cells, with an edge that no face has or with another point."""
-    for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
-        place = face_pairs[i][0]
-        other = face_pairs[i][1]
-        _pair_point(mesh, place, other, vertex_edge_counts, vertex_edge)
-        _pair_point(mesh, other, place, vertex_edge_counts, vertex_edge)
-        _pair_two_points(mesh, place, other, vertex_vertex_counts, vertex_vertex)
+    return pair_points

@@ -7,12 +7,22 @@ are in no order, and in the worst case are compared by brute force, 1,024 pairs 
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ..kernels.pipeline.boxes import BoxRows, lowered, raised, read_box, rounded, union_of_boxes, write_box
+from ..kernels.pipeline.boxes import BoxRows, read_box, union_of_boxes, write_box
+from ..kernels.pipeline.corners import (
+    IS_FACE,
+    ROW,
+    Corners,
+    PaddedCorners,
+    face_box,
+    stored,
+    vertex_box,
+    write_corners,
+    write_padded_corners,
+)
 from ..kernels.pipeline.hierarchy import (
     WIDTH,
     HierarchyLevel,
@@ -23,13 +33,13 @@ from ..kernels.pipeline.hierarchy import (
     unseparated_children,
     unseparated_faces,
 )
-from ..kernels.pipeline.pairs import PairFilter
+from ..kernels.pipeline.pairs import PairFilter, finite_elements
 from ..kernels.pipeline.queues import raise_count
 from .launch import made_once
 from .mesh import CollisionMesh
 from .settings import NO_GRADIENTS
 
-__all__ = ["FaceHierarchy", "box_elements_kernel", "box_groups", "group_count", "make_hierarchy", "traversal_kernel"]
+__all__ = ["FaceHierarchy", "box_groups", "fit_kernel", "group_count", "make_hierarchy", "traversal_kernel"]
 
 _WIDTH = wp.constant(WIDTH)
 
@@ -42,12 +52,9 @@ class FaceHierarchy:
     """The faces in the order of their places, the boxes of elements, and the nodes above the faces.
 
     Boxes are rows of four: the lowest and the highest coordinates at the start, then at the end; or twice those over
-    the time of the motion, if pairs that an axis separates at both ends are sought as well. Those of vertices and edges
-    lie beside one another where the face is that represents them: row ``3 place + corner`` or side. Other rows are not
-    set.
+    the time of the motion, if pairs that an axis separates at both ends are sought as well.
 
     Attributes:
-        all_faces: Whether all cells are faces.
         only_free: Whether pairs of two faces are left out.
         pair_filter: Pairs of elements that are left out.
         filtered_of_worlds: How many of them each world has; without an array they are not counted by world.
@@ -58,17 +65,13 @@ class FaceHierarchy:
         face_edges: Edges of the face at each place.
         owned: The elements whose representative the face at each place is.
         edges: Vertices of each edge.
-        vertex_rows: Row of each vertex in ``vertex_boxes``, -1 if no face uses it.
-        edge_rows: Row of each edge in ``edge_boxes``.
-        vertex_boxes: Boxes of the vertices that each face represents.
-        edge_boxes: Boxes of the edges that each face represents.
-        face_boxes: Box of the face at each place, empty where a position is not finite.
-        places: Level of the faces; where a position is not finite, boxes cover the other elements that they represent.
+        corners: Corners of the face at each place, see :mod:`warp_bsc.kernels.pipeline.corners`.
+        padded_corners: The same instead, if boxes have a padding.
+        places: Level of the faces; where a position is not finite, boxes cover the others.
         clusters: Level above.
         groups: Highest level; without arrays in a small mesh, where all groups are traversed.
     """
 
-    all_faces: wp.bool
     only_free: wp.bool
     pair_filter: PairFilter
     filtered_of_worlds: wp.array[wp.int64]
@@ -79,11 +82,8 @@ class FaceHierarchy:
     face_edges: wp.array2d[int]
     owned: wp.array[int]
     edges: wp.array2d[int]
-    vertex_rows: wp.array[int]
-    edge_rows: wp.array[int]
-    vertex_boxes: wp.array2d[wp.vec3]
-    edge_boxes: wp.array2d[wp.vec3]
-    face_boxes: wp.array2d[wp.vec3]
+    corners: wp.array2d[wp.float32]
+    padded_corners: wp.array2d[wp.float64]
     places: HierarchyLevel
     clusters: HierarchyLevel
     groups: HierarchyLevel
@@ -96,64 +96,38 @@ def empty_box() -> BoxRows:
     return wp.matrix_from_rows(low, -low, low, -low)
 
 
-@wp.func
-def box_of_motion(low0: wp.vec3, high0: wp.vec3, low1: wp.vec3, high1: wp.vec3, swept: bool) -> BoxRows:
-    """Returns the box at both ends of a motion, or twice that over its time."""
-    if swept:
-        low = wp.min(low0, low1)
-        high = wp.max(high0, high1)
-        return wp.matrix_from_rows(low, high, low, high)
-    return wp.matrix_from_rows(low0, high0, low1, high1)
-
-
 @made_once
-def box_elements_kernel(dtype: type, padded: bool) -> wp.Kernel:
-    """Returns the kernel that boxes moving elements and clusters, for one type of position, padded or not.
+def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
+    """Returns the kernel that writes the corners of moving faces, and the boxes of faces and clusters.
 
-    Its threads are the places of faces, then the edges, then the vertices.
+    Its threads are the places of faces, then the vertices, of which it counts those that are not finite.
+
+    Args:
+        dtype: Type of the positions.
+        padded: Whether boxes have a padding.
     """
+    corners_type = PaddedCorners if padded else Corners
 
     @wp.func
-    def padding_of(padding: wp.array[wp.float64], vertex: int) -> wp.float64:
-        """Returns the padding of a vertex; without one the array is not read."""
+    def paddings_at(padding: wp.array[wp.float64], a: int, b: int, c: int) -> wp.vec3d:
+        """Returns the paddings of three vertices; without paddings the array is not read."""
         if wp.static(padded):
-            return padding[vertex]
-        return wp.float64(0.0)
+            return wp.vec3d(padding[a], padding[b], padding[c])
+        return wp.vec3d()
 
     @wp.func
-    def lowest(x: Any, pad: wp.float64) -> wp.vec3:
+    def write_row(mesh: FaceHierarchy, i: int, label: wp.vec4i, corners: corners_type, paddings: wp.vec3d):
         if wp.static(padded):
-            return lowered(x, pad)
-        return rounded(x)
-
-    @wp.func
-    def highest(x: Any, pad: wp.float64) -> wp.vec3:
-        if wp.static(padded):
-            return raised(x, pad)
-        return rounded(x)
+            write_padded_corners(mesh.padded_corners, i, label, corners, paddings)
+        else:
+            write_corners(mesh.corners, i, label, corners, paddings)
 
     @wp.func
     def is_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertex: int) -> bool:
         return wp.isfinite(x0[vertex]) and wp.isfinite(x1[vertex])
 
-    @wp.func
-    def box_of_two(
-        x0: wp.array[dtype], x1: wp.array[dtype], padding: wp.array[wp.float64], a: int, b: int, swept: bool
-    ) -> BoxRows:
-        """Returns the box of two vertices, an empty one if that is not finite."""
-        if not (is_finite(x0, x1, a) and is_finite(x0, x1, b)):
-            return empty_box()
-        pad = wp.max(padding_of(padding, a), padding_of(padding, b))
-        return box_of_motion(
-            lowest(wp.min(x0[a], x0[b]), pad),
-            highest(wp.max(x0[a], x0[b]), pad),
-            lowest(wp.min(x1[a], x1[b]), pad),
-            highest(wp.max(x1[a], x1[b]), pad),
-            swept,
-        )
-
     @wp.kernel(**NO_GRADIENTS)
-    def box_elements(
+    def fit(
         # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
@@ -168,56 +142,57 @@ def box_elements_kernel(dtype: type, padded: bool) -> wp.Kernel:
     ):
         i = wp.tid()
         places = mesh.order.shape[0]
-        if i < places:  # the same for all threads of a warp
-            box = empty_box()
-            has_changed = int(0)
-            if mesh.order[i] >= 0:
-                a = mesh.faces[i, 0]
-                b = mesh.faces[i, 1]
-                c = mesh.faces[i, 2]
-                pad = wp.max(wp.max(padding_of(padding, a), padding_of(padding, b)), padding_of(padding, c))
-                if is_finite(x0, x1, a) and is_finite(x0, x1, b) and is_finite(x0, x1, c):
-                    box = box_of_motion(
-                        lowest(wp.min(wp.min(x0[a], x0[b]), x0[c]), pad),
-                        highest(wp.max(wp.max(x0[a], x0[b]), x0[c]), pad),
-                        lowest(wp.min(wp.min(x1[a], x1[b]), x1[c]), pad),
-                        highest(wp.max(wp.max(x1[a], x1[b]), x1[c]), pad),
-                        swept,
-                    )
-                    write_box(box, mesh.face_boxes, i)
-                else:  # the place covers the other elements that it represents
-                    write_box(empty_box(), mesh.face_boxes, i)
-                    for corner in range(3):
-                        vertex = mesh.faces[i, corner]
-                        if is_finite(x0, x1, vertex):
-                            box = union_of_boxes(box, box_of_two(x0, x1, padding, vertex, vertex, swept))
-                has_changed = 1
-                if changed:
-                    has_changed = changed[a] | changed[b] | changed[c]
-                if mesh.only_free and mesh.order[i] < mesh.face_count:
-                    has_changed = 0
-            write_box(box, mesh.places.boxes, i)
-            mesh.places.changed[i] = has_changed
-            fit_parent(i, box, has_changed, mesh.clusters)
-            return
-        edge = i - places
-        if edge < mesh.edges.shape[0]:
-            ends = box_of_two(x0, x1, padding, mesh.edges[edge, 0], mesh.edges[edge, 1], swept)
-            write_box(ends, mesh.edge_boxes, mesh.edge_rows[edge])
-            return
-        vertex = edge - mesh.edges.shape[0]
-        if not_finite:
+        if i >= places:
+            vertex = i - places
             if not is_finite(x0, x1, vertex):
                 counted = int(1)
                 if checked:
                     counted = checked[vertex]
                 if counted != 0:
                     raise_count(not_finite, 0, 1)
-        row = mesh.vertex_rows[vertex]
-        if row >= 0:
-            write_box(box_of_two(x0, x1, padding, vertex, vertex, swept), mesh.vertex_boxes, row)
+            return
+        box = empty_box()  # the same branch for all threads of a warp from here on
+        has_changed = int(0)
+        if mesh.order[i] >= 0:
+            a = mesh.faces[i, 0]
+            b = mesh.faces[i, 1]
+            c = mesh.faces[i, 2]
+            corners = corners_type()
+            corners[0] = stored(x0[a], corners)
+            corners[1] = stored(x1[a], corners)
+            corners[2] = stored(x0[b], corners)
+            corners[3] = stored(x1[b], corners)
+            corners[4] = stored(x0[c], corners)
+            corners[5] = stored(x1[c], corners)
+            paddings = paddings_at(padding, a, b, c)
+            a_finite = is_finite(x0, x1, a)
+            b_finite = is_finite(x0, x1, b)
+            c_finite = is_finite(x0, x1, c)
+            owned = mesh.owned[i]
+            if a_finite and b_finite and c_finite:
+                box = face_box(corners, paddings, swept)
+                owned = owned | wp.where(mesh.order[i] < mesh.face_count, IS_FACE, 0)
+            else:  # the place covers what it represents and is finite
+                owned = finite_elements(owned, a_finite, b_finite, c_finite)
+                largest = wp.max(wp.max(paddings[0], paddings[1]), paddings[2])
+                paddings = wp.vec3d(largest, largest, largest)
+                if a_finite:
+                    box = union_of_boxes(box, vertex_box(corners, paddings, 0, swept))
+                if b_finite:
+                    box = union_of_boxes(box, vertex_box(corners, paddings, 1, swept))
+                if c_finite:
+                    box = union_of_boxes(box, vertex_box(corners, paddings, 2, swept))
+            write_row(mesh, i, wp.vec4i(a, b, c, owned), corners, paddings)
+            has_changed = 1
+            if changed:
+                has_changed = changed[a] | changed[b] | changed[c]
+            if mesh.only_free and mesh.order[i] < mesh.face_count:
+                has_changed = 0
+        write_box(box, mesh.places.boxes, i)
+        mesh.places.changed[i] = has_changed
+        fit_parent(i, box, has_changed, mesh.clusters)
 
-    return box_elements
+    return fit
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -313,19 +288,18 @@ def group_count(places: int) -> int:
     return groups if groups > _UNGROUPED else 0
 
 
-def make_hierarchy(mesh: CollisionMesh) -> FaceHierarchy:
-    """Allocates the hierarchy of a mesh on its device."""
+def make_hierarchy(mesh: CollisionMesh, *, padded: bool) -> FaceHierarchy:
+    """Allocates the hierarchy of a mesh on its device, for boxes with a padding or without."""
     device, order, places = mesh.device, mesh.face_order, mesh.device_places
     hierarchy = FaceHierarchy()
-    hierarchy.all_faces = len(mesh.cells) == len(mesh.faces)
     hierarchy.only_free, hierarchy.pair_filter = mesh.only_free, mesh.pair_filter
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
     hierarchy.order, hierarchy.faces, hierarchy.face_edges = places.order, places.faces, places.face_edges
     hierarchy.owned, hierarchy.edges = places.owned, mesh.device_edges
-    hierarchy.vertex_rows, hierarchy.edge_rows = places.vertex_rows, places.edge_rows
-    hierarchy.vertex_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
-    hierarchy.edge_boxes = wp.empty((3 * len(order), 4), dtype=wp.vec3, device=device)
-    hierarchy.face_boxes = wp.empty((len(order), 4), dtype=wp.vec3, device=device)
+    if padded:
+        hierarchy.padded_corners = wp.empty((len(order), ROW), dtype=wp.float64, device=device)
+    else:
+        hierarchy.corners = wp.empty((len(order), ROW), dtype=wp.float32, device=device)
     worlds = None
     if mesh.world is not None and len(order):
         world = mesh.world[mesh.cells[:, 0]][order]

@@ -25,16 +25,12 @@ class DevicePlaces:
         faces: Vertices of the cell at each place, two-dimensional.
         face_edges: Edges of the cell at each place, two-dimensional.
         owned: The elements whose representative the cell at each place is.
-        vertex_rows: Row of boxes of each vertex, three a place, -1 if no cell uses it.
-        edge_rows: Row of boxes of each edge.
     """
 
     order: wp.array
     faces: wp.array
     face_edges: wp.array
     owned: wp.array
-    vertex_rows: wp.array
-    edge_rows: wp.array
 
 
 class CollisionMesh:
@@ -246,19 +242,11 @@ class CollisionMesh:
         def by_place(values: np.ndarray) -> wp.array:
             return array(values[order] if len(order) else values)
 
-        vertex_rows, edge_rows = np.full(self.vertex_count, -1), np.empty(len(self.edges), dtype=int)
-        filled = np.flatnonzero(order >= 0)
-        for i in range(3):
-            for rows, elements, bit in ((vertex_rows, self.cells, i), (edge_rows, self.cell_edges, 3 + i)):
-                representing = filled[(self.cell_owned[order[filled]] >> bit) & 1 == 1]
-                rows[elements[order[representing], i]] = 3 * representing + i
         return DevicePlaces(
             order=array(order),
             faces=by_place(self.cells),
             face_edges=by_place(self.cell_edges),
             owned=by_place(self.cell_owned),
-            vertex_rows=array(vertex_rows),
-            edge_rows=array(edge_rows),
         )
 
     @functools.cached_property

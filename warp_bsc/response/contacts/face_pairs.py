@@ -2,27 +2,13 @@
 
 import warp as wp
 
-from ...detection.element_pairs import unseparated_edges, unseparated_vertices
 from ...detection.face_hierarchy import FaceHierarchy
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
 
 @wp.func
-def unseparated_vertex_faces(mesh: FaceHierarchy, place: int, other: int) -> int:
-    """Returns the pairs of a vertex and a face that two faces represent and that no axis separates, as bits."""
-    left = unseparated_vertices(mesh, place, other) & 7
-    return left | ((unseparated_vertices(mesh, other, place) & 7) << 3)
-
-
-@wp.func
-def unseparated_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
-    """Returns the pairs of elements that two faces represent and that no axis separates over the motion, as bits."""
-    return unseparated_vertex_faces(mesh, place, other) | ((unseparated_edges(mesh, place, other) & 511) << 6)
-
-
-@wp.func
 def pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
-    """Returns kind, elements and vertices of one of the pairs of the functions above."""
+    """Returns kind, elements and vertices of a pair of :class:`warp_bsc.detection.element_pairs.PairFunctions`."""
     if bit < 6:
         of = wp.where(bit < 3, place, other)
         face = wp.where(bit < 3, other, place)

@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from ...detection.element_pairs import filtered_pairs, pair_functions
 from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.hierarchy import lowest_set_bit
@@ -12,7 +13,7 @@ from ..schedule import SolveStatus
 from ..state.structs import Step
 from ..state.vectors import ZERO, corners_of, to_double
 from ..tuning import BEHIND
-from .face_pairs import pair_of_bit, unseparated_vertex_faces
+from .face_pairs import pair_of_bit
 from .queue import PairQueue, pair_count, vertices_of
 
 wp.set_module_options({"enable_backward": False})
@@ -66,8 +67,9 @@ def find_nearest_in_queue(step: Step, vertex_face: PairQueue, nearest: wp.array2
 
 
 @functools.cache
-def find_nearest_in_hierarchy() -> wp.Kernel:
+def find_nearest_in_hierarchy(padded: bool) -> wp.Kernel:
     """The kernel that keeps the nearest face among those whose swept boxes overlap the vertex's; a GPU needs it."""
+    vertex_face_pairs = pair_functions(padded, True).vertex_face_pairs
 
     @wp.func
     def visit(place: int, first: int, found: wp.uint32, arguments: NearestArguments):
@@ -75,7 +77,8 @@ def find_nearest_in_hierarchy() -> wp.Kernel:
         while found != wp.uint32(0):
             other = first + lowest_set_bit(found)
             found = found & (found - wp.uint32(1))
-            left = unseparated_vertex_faces(mesh, place, other)
+            left = vertex_face_pairs(mesh, place, other)
+            left = left & ~filtered_pairs(mesh, place, other, left)
             while left != 0:
                 bit = lowest_set_bit(wp.uint32(left))
                 left = left & (left - 1)

@@ -174,7 +174,7 @@ def _find_nearest(work):
         arguments = NearestArguments()
         arguments.faces, arguments.step, arguments.nearest = broad_phase.hierarchy, work.step, work.nearest
         broad_phase.fit(work.step.motion.x0, work.vertices.x1, work.active, keep_separated=True)
-        broad_phase.traverse(find_nearest_in_hierarchy(), arguments)
+        broad_phase.traverse(find_nearest_in_hierarchy(broad_phase.is_padded), arguments)
         return
 
     def find() -> None:

@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from ...detection.element_pairs import filtered_pairs, pair_functions
 from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...detection.settings import TOLERANCE
 from ...kernels.ccd import impact_at_distance
@@ -22,13 +23,13 @@ from ..state.vectors import ZERO
 from .collect import mark_changed
 from .constraints import distances_at_start
 from .dividing_planes import add_dividing_plane
-from .face_pairs import pair_of_bit, unseparated_pairs
+from .face_pairs import pair_of_bit
 from .first_contact import update_first_contact
 from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
-"""The pair of a point and another cell, behind those of :func:`unseparated_pairs`."""
+"""The pair of a point and another cell, behind those of the elements of two faces."""
 
 
 @wp.struct
@@ -122,9 +123,10 @@ def _point_pair(mesh: FaceHierarchy, point: int, other: int):
 
 
 @functools.cache
-def _kernel(keep_distances: bool) -> wp.Kernel:
+def _kernel(keep_distances: bool, padded: bool) -> wp.Kernel:
     """The kernel, made where it is first needed, as it takes long to compile."""
     decide = _decide_distance if keep_distances else _decide_pair
+    element_pairs = pair_functions(padded, False).element_pairs
 
     @wp.func
     def visit(place: int, first: int, found: wp.uint32, arguments: _Arguments):
@@ -132,7 +134,8 @@ def _kernel(keep_distances: bool) -> wp.Kernel:
         while found != wp.uint32(0):
             other = first + lowest_set_bit(found)
             found = found & (found - wp.uint32(1))
-            left = unseparated_pairs(mesh, place, other)
+            left = element_pairs(mesh, place, other)
+            left = left & ~filtered_pairs(mesh, place, other, left)
             point = int(-1)
             if wp.static(keep_distances):
                 if mesh.order[place] >= mesh.point_start:
@@ -168,4 +171,5 @@ def find_contacts_without_queues(
     arguments = _Arguments()
     arguments.faces, arguments.step = broad_phase.hierarchy, step
     arguments.dividing, arguments.status = dividing, status
-    broad_phase.traverse(_kernel(bool(step.motion.distances.radius)), arguments)
+    kernel = _kernel(bool(step.motion.distances.radius), broad_phase.is_padded)
+    broad_phase.traverse(kernel, arguments)
