@@ -41,13 +41,15 @@ _READ = """
 """
 
 _WRITE = """
-    TYPE* at = rows.data + 24 * (size_t)i;
-    int* words = reinterpret_cast<int*>(at);
+    union { float4 loads[1 + LOADS]; int words[4]; TYPE values[(1 + LOADS) * 16 / sizeof(TYPE)]; } row;
     for (int k = 0; k < 4; ++k)
-        words[k] = label[k];
-    at += 16 / sizeof(TYPE);
+        row.words[k] = label[k];
     for (int k = 0; k < 18; ++k)
-        at[k] = corners.data[k / 3][k % 3];
+        row.values[16 / sizeof(TYPE) + k] = corners.data[k / 3][k % 3];
+PADDINGS
+    float4* at = reinterpret_cast<float4*>(rows.data + 24 * (size_t)i);
+    for (int k = 0; k < 1 + LOADS; ++k)
+        at[k] = row.loads[k];
 """
 
 _READ_LABEL = """
@@ -80,7 +82,7 @@ def read_padded_label(rows: wp.array2d[wp.float64], i: int) -> wp.vec4i:
     ...
 
 
-@wp.func_native(snippet=_WRITE.replace("TYPE", "float"))
+@wp.func_native(snippet=_WRITE.replace("TYPE", "float").replace("LOADS", "5").replace("PADDINGS", ""))
 def write_corners(rows: wp.array2d[wp.float32], i: int, label: wp.vec4i, corners: Corners, paddings: wp.vec3d):
     """Writes a row; in single precision it has no paddings."""
     ...
@@ -88,10 +90,8 @@ def write_corners(rows: wp.array2d[wp.float32], i: int, label: wp.vec4i, corners
 
 @wp.func_native(
     snippet=_WRITE.replace("TYPE", "double")
-    + """
-    for (int k = 0; k < 3; ++k)
-        at[18 + k] = paddings[k];
-"""
+    .replace("LOADS", "11")
+    .replace("PADDINGS", "    for (int k = 0; k < 3; ++k)\n        row.values[20 + k] = paddings[k];")
 )
 def write_padded_corners(
     rows: wp.array2d[wp.float64], i: int, label: wp.vec4i, corners: PaddedCorners, paddings: wp.vec3d

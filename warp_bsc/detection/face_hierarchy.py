@@ -175,13 +175,13 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
             else:  # the place covers what it represents and is finite
                 owned = finite_elements(owned, a_finite, b_finite, c_finite)
                 largest = wp.max(wp.max(paddings[0], paddings[1]), paddings[2])
-                paddings = wp.vec3d(largest, largest, largest)
+                of_edges = wp.vec3d(largest, largest, largest)
                 if a_finite:
-                    box = union_of_boxes(box, vertex_box(corners, paddings, 0, swept))
+                    box = union_of_boxes(box, vertex_box(corners, of_edges, 0, swept))
                 if b_finite:
-                    box = union_of_boxes(box, vertex_box(corners, paddings, 1, swept))
+                    box = union_of_boxes(box, vertex_box(corners, of_edges, 1, swept))
                 if c_finite:
-                    box = union_of_boxes(box, vertex_box(corners, paddings, 2, swept))
+                    box = union_of_boxes(box, vertex_box(corners, of_edges, 2, swept))
             write_row(mesh, i, wp.vec4i(a, b, c, owned), corners, paddings)
             has_changed = 1
             if changed:
