@@ -66,11 +66,14 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
-html_sidebars = {"index": [], "gallery": [], "changelog": []}
+html_sidebars = {
+    name: [] for name in ("index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing")
+}  # they have no subpages
 html_theme_options = {
     "logo": {"text": "warp-bsc"},
     "github_url": REPOSITORY,
     "use_edit_page_button": False,
+    "navbar_persistent": ["search-button"],
     "navbar_end": ["version-switcher", "theme-switcher", "navbar-icon-links"],
     "switcher": {"json_url": "https://warp-bsc.github.io/warp-bsc/versions.json", "version_match": VERSION},
     "check_switcher": False,  # a build reads nothing from the network

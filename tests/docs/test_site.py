@@ -1,0 +1,106 @@
+"""The site: it builds without a warning, offline, and its links and anchors lead somewhere; so do those of all pages."""
+
+import importlib.util
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import warp_bsc as bsc
+from warp_bsc import checker, kernels
+
+ROOT = Path(__file__).parents[2]
+EXTRA = ("sphinx", "myst_parser", "pydata_sphinx_theme", "sphinx_copybutton")
+needs_extra = pytest.mark.skipif(
+    not all(map(importlib.util.find_spec, EXTRA)), reason="needs the extra docs: pip install -e '.[docs]'"
+)
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+
+
+class Page(HTMLParser):
+    """The anchors of a page, and the links of its elements a, img, link and script."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.anchors, self.links = set(), set()
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        self.anchors |= {attributes[name] for name in ("id", "name") if attributes.get(name)}
+        self.links |= {attributes[name] for name in ("href", "src") if attributes.get(name)}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the built site."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@needs_extra
+def test_links_and_anchors_of_the_site_resolve(site):
+    pages = {path: Page(path) for path in site.rglob("*.html") if "_static" not in path.parts}
+    assert len(pages) > 25
+    wrong, checked = [], 0
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            checked += 1
+            if not target.exists():
+                wrong.append(f"{path.relative_to(site)}: {link}")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].anchors:
+                wrong.append(f"{path.relative_to(site)}: {link} has no anchor")
+    assert checked > 1000 and not wrong, "\n".join(wrong)
+
+
+@needs_extra
+def test_the_reference_has_every_public_name(site):
+    anchors = set().union(*(Page(path).anchors for path in (site / "api").glob("*.html")))
+    public = [f"warp_bsc.{name}" for name in bsc.__all__ if name != "checker"]
+    public += [f"warp_bsc.kernels.{name}" for name in kernels.__all__]
+    public += [f"warp_bsc.checker.{name}" for name in checker.__all__]
+    public += ["warp_bsc.torch.rollout", "warp_bsc.jax.rollout"]
+    assert not sorted(set(public) - anchors)
+
+
+@needs_extra
+def test_drafts_are_not_on_the_site(site):
+    assert (ROOT / "docs" / "upstream").is_dir() and not (site / "upstream").exists()
+
+
+def anchors_of(path):
+    """The anchors that GitHub gives the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", path.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def markdown_pages():
+    """All pages of the repository."""
+    pages = [*ROOT.glob("*.md"), *(ROOT / ".github").rglob("*.md")]
+    return pages + [path for folder in ("assets", "docs", "warp_bsc") for path in (ROOT / folder).rglob("*.md")]
+
+
+def test_links_between_pages_and_files_resolve():
+    wrong, checked = [], 0
+    for page in markdown_pages():
+        for link in LINK.findall(FENCE.sub("", page.read_text())):
+            if re.match(r"\w+:", link):
+                continue
+            name, _, anchor = link.partition("#")
+            target = (page.parent / name).resolve() if name else page
+            checked += 1
+            if not target.exists() or (anchor and anchor not in anchors_of(target)):
+                wrong.append(f"{page.relative_to(ROOT)}: {link}")
+    assert checked > 100 and not wrong, "\n".join(wrong)
