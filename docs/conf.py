@@ -30,7 +30,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
-    
 ]
 exclude_patterns = ["upstream"]  # drafts of what to ask Warp and Newton for
 
@@ -67,7 +66,8 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 html_sidebars = {
-    name: [] for name in ("index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing")
+    name: []
+    for name in ("index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing")
 }  # they have no subpages
 html_theme_options = {
     "logo": {"text": "warp-bsc"},
