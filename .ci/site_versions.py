@@ -1,7 +1,7 @@
 """Lists the versions of the site for its switcher: ``python .ci/site_versions.py FOLDER``.
 
-FOLDER holds a folder for each version, ``main`` or a tag such as ``v0.1.0``. Writes ``versions.json``, newest first, and an
-``index.html`` that leads to the newest tag, or to ``main`` if there is none.
+FOLDER holds a folder for each version, ``main`` or a tag such as ``v0.1.0``. Writes ``versions.json``, newest first,
+and an ``index.html`` that leads to the newest tag, or to ``main`` if there is none.
 """
 
 import json

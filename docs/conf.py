@@ -1,4 +1,7 @@
-"""Settings of the documentation site: ``sphinx-build -W docs build/docs`` builds it, offline."""
+"""Settings of the documentation site: ``python -m sphinx -W docs build/site`` builds it, offline.
+
+The theme is that of Newton's and NumPy's pages, with a switcher of versions; guides are Markdown, which GitHub shows too.
+"""
 
 import functools
 import importlib
@@ -25,17 +28,10 @@ project = "warp-bsc"
 author = "The warp-bsc contributors"
 copyright = author
 release = version = warp_bsc.__version__
-extensions = [
-    "myst_parser",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
-    "sphinx_copybutton",
-]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 exclude_patterns = ["upstream"]  # drafts of what to ask Warp and Newton for
 
 myst_heading_anchors = 4  # as GitHub makes them
-myst_enable_extensions = ["colon_fence"]
-suppress_warnings = ["myst.strikethrough"]
 
 napoleon_numpy_docstring = False
 autoclass_content = "both"
@@ -57,22 +53,17 @@ nitpick_ignore_regex = [
 ]
 toc_object_entries_show_parents = "hide"
 
-copybutton_exclude = ".linenos, .gp, .go"
-
 html_theme = "pydata_sphinx_theme"
 html_title = f"warp-bsc {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
-html_sidebars = {
-    name: []
-    for name in ("index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing")
-}  # they have no subpages
+_WITHOUT_SUBPAGES = ["index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing"]
+html_sidebars = dict.fromkeys(_WITHOUT_SUBPAGES, [])
 html_theme_options = {
     "logo": {"text": "warp-bsc"},
     "github_url": REPOSITORY,
-    "use_edit_page_button": False,
     "navbar_persistent": ["search-button"],
     "navbar_end": ["version-switcher", "theme-switcher", "navbar-icon-links"],
     "switcher": {"json_url": "https://warp-bsc.github.io/warp-bsc/versions.json", "version_match": VERSION},

@@ -1,4 +1,4 @@
-"""The site: it builds without a warning, offline, and its links and anchors lead somewhere; so do those of all pages."""
+"""The site builds without a warning, and its links and anchors lead somewhere, as those of all pages do on GitHub."""
 
 import importlib.util
 import re
