@@ -1,6 +1,6 @@
 """Settings of the documentation site: ``python -m sphinx -W docs build/site`` builds it, offline.
 
-The theme is that of Newton's and NumPy's pages, with a switcher of versions; guides are Markdown, which GitHub shows too.
+The theme, that of Newton's and NumPy's pages, has a switcher of versions. Guides are Markdown, which GitHub shows too.
 """
 
 import functools
@@ -60,7 +60,7 @@ html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
 _WITHOUT_SUBPAGES = ["index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing"]
-html_sidebars = dict.fromkeys(_WITHOUT_SUBPAGES, [])
+html_sidebars = {name: [] for name in _WITHOUT_SUBPAGES}
 html_theme_options = {
     "logo": {"text": "warp-bsc"},
     "github_url": REPOSITORY,
