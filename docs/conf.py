@@ -57,6 +57,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"warp-bsc {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_baseurl = f"https://warp-bsc.github.io/warp-bsc/{VERSION}/"
 html_show_sourcelink = False
 html_copy_source = False
 _WITHOUT_SUBPAGES = ["index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing"]

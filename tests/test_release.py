@@ -1,5 +1,6 @@
 """What a release names more than once: versions, dependencies and addresses."""
 
+import importlib.util
 import re
 import tomllib
 from pathlib import Path
@@ -57,3 +58,22 @@ def test_python_versions_are_those_that_continuous_integration_tests(project):
     tested = re.search(r"python: \[(.*?)\]", workflow.read_text())[1].replace('"', "").split(", ")
     named = [c.rpartition(" ")[2] for c in project["classifiers"] if re.search(r"Python :: 3\.\d+$", c)]
     assert named == tested
+
+
+def test_the_page_on_pypi_has_no_relative_link():
+    script = ROOT / ".ci" / "pypi_readme.py"
+    if not script.exists():
+        pytest.skip("not a checkout")
+    spec = importlib.util.spec_from_file_location("pypi_readme", script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    text = "[page](docs/x.md#y) ![picture](assets/p.png) [there](#limits) [doi](https://doi.org/1)"
+    changed = module.with_absolute_links(text, "v1.2.3")
+    assert changed == (
+        f"[page]({URL}/blob/v1.2.3/docs/x.md#y) "
+        "![picture](https://raw.githubusercontent.com/warp-bsc/warp-bsc/v1.2.3/assets/p.png) "
+        "[there](#limits) [doi](https://doi.org/1)"
+    )
+    readme = module.with_absolute_links((ROOT / "README.md").read_text(), "v1.2.3")
+    links = re.findall(r"\]\(([^)\s]+)\)", readme)
+    assert len(links) > 5 and all(link.startswith(("https://", "#")) for link in links)
