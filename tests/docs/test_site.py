@@ -1,6 +1,7 @@
 """The site builds without a warning, and its links and anchors lead somewhere, as those of all pages do on GitHub."""
 
 import importlib.util
+import itertools
 import re
 import subprocess
 import sys
@@ -104,3 +105,18 @@ def test_links_between_pages_and_files_resolve():
             if not target.exists() or (anchor and anchor not in anchors_of(target)):
                 wrong.append(f"{page.relative_to(ROOT)}: {link}")
     assert checked > 100 and not wrong, "\n".join(wrong)
+
+
+def test_rows_of_tables_have_as_many_cells_as_their_heads():
+    wrong, checked = [], 0
+    for page in markdown_pages():
+        lines = FENCE.sub("", page.read_text()).split("\n")
+        rows = [re.split(r"(?<!\\)\|", line.strip())[1:-1] if line.startswith("|") else [] for line in lines]
+        for head, rule, first in zip(rows, rows[1:], range(2, len(rows)), strict=False):
+            if not rule or not all(re.fullmatch(r" ?:?-+:? ?", cell) for cell in rule):
+                continue
+            for row in itertools.takewhile(bool, rows[first:]):
+                checked += 1
+                if len(row) != len(head):
+                    wrong.append(f"{page.relative_to(ROOT)}: {'|'.join(row)}")
+    assert checked > 300 and not wrong, "\n".join(wrong)
