@@ -150,9 +150,14 @@ def draw_step(path):
     plt.close(figure)
 
 
-if __name__ == "__main__":
+def main():
+    """Parses the options and draws."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folder", type=Path, help="where the pictures are written")
     folder = parser.parse_args().folder
     draw_signs(folder / "bernstein_signs.png")
     draw_step(folder / "one_step.png")
+
+
+if __name__ == "__main__":
+    main()
