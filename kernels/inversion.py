@@ -27,10 +27,15 @@ _RESTRICTION = wp.constant(wp.float64(2.0))
 
 @wp.struct
 class Inversion:
-    """When a tetrahedron inverts first; if the status is UNSURE, it does not before ``toi``."""
+    """When a tetrahedron inverts first; if the status is UNSURE, it does not before ``toi``.
+
+    Attributes:
+        status: FREE, HIT (it inverts) or UNSURE.
+        toi: Time of inversion, a lower bound in [0, 1]; 2 where the status is FREE.
+    """
 
     status: int
-    toi: wp.float64  # time of inversion, a lower bound in [0, 1]; 2 where the status is FREE
+    toi: wp.float64
 
 
 @wp.func

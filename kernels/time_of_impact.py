@@ -43,14 +43,22 @@ class Impact:
     Coordinates and normal are those at the contact, up to rounding and the square of the tolerance; if
     ``within_tolerance`` is 0, those of the closest points at ``toi``. The normal of parallel edges and of a collapsed
     triangle, which have no plane, is along the velocity; where that is zero too, it is (0, 0, 1).
+
+    Attributes:
+        status: FREE, HIT or UNSURE.
+        within_tolerance: 1 where contact certainly occurs within the tolerance after ``toi``, else 0.
+        toi: Time of impact, a lower bound in [0, 1]; 2 where the status is FREE.
+        coordinates: Of a vertex and a face, barycentric coordinates in the face; of two edges, (s, r, 0) along them.
+        normal: Unit contact normal, against the motion of the vertex or first edge relative to the other.
+        grazing: 1 where gradients are clamped, or the contact is not certain, see :mod:`.gradients`, else 0.
     """
 
     status: int
-    within_tolerance: int  # 1 where contact certainly occurs within the tolerance after ``toi``
-    toi: wp.float64  # time of impact, a lower bound in [0, 1]; 2 where the status is FREE
-    coordinates: wp.vec3d  # vertex-face: barycentric coordinates in the face; edge-edge: (s, r, 0) along the edges
-    normal: wp.vec3d  # unit contact normal, against the motion of the vertex or first edge relative to the other
-    grazing: int  # 1 where gradients are clamped, or the contact is not certain, see :mod:`.gradients`
+    within_tolerance: int
+    toi: wp.float64
+    coordinates: wp.vec3d
+    normal: wp.vec3d
+    grazing: int
 
 
 @wp.func

@@ -16,7 +16,7 @@ import warp_bsc
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("name", ["tests", "examples", "assets", "warp_bsc"])
+@pytest.mark.parametrize("name", ["tests", "examples", "assets", "docs", "conda", "warp_bsc"])
 def test_what_stands_beside_the_package_is_no_part_of_it(name):
     assert (ROOT / name).is_dir()
     assert importlib.util.find_spec(f"warp_bsc.{name}") is None

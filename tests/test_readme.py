@@ -81,11 +81,3 @@ def test_files_that_the_readme_names_exist():
     assert len(quoted) > 5 and len(linked) > 5
     for name in quoted + linked:
         assert (ROOT / name).exists(), name
-
-
-def test_pictures_of_the_measurements_exist():
-    page = ROOT / "warp_bsc" / "bench" / "README.md"
-    linked = re.findall(r"\]\((\.\./[\w./]+)\)", page.read_text())
-    assert len(linked) > 3
-    for name in linked:
-        assert (page.parent / name).exists(), name

@@ -37,7 +37,9 @@ PAPER_SCENES = {
     "crashing": "length",
 }
 """Each scene fails its test at first, with a message that contains this."""
-PRINTED = re.findall(r"^python examples/(example_\w+)\.py", (FOLDER.parent / "README.md").read_text(), re.MULTILINE)
+PRINTED = re.findall(
+    r"^python examples/(example_\w+)\.py", (FOLDER.parent / "docs" / "newton.md").read_text(), re.MULTILINE
+)
 PRINTED.append("paper/example_twisting")
 FIGURES = sorted((FOLDER / "figures").glob("*.py"))
 FRAMES = 2

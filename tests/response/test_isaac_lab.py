@@ -13,7 +13,7 @@ from newton_scenes import DT, bullet
 
 import warp_bsc as bsc
 
-PAGE = Path(bsc.__file__).parent / "response" / "isaac_lab.md"
+PAGE = Path(__file__).parents[2] / "docs" / "newton" / "isaac_lab.md"
 
 
 class NewtonManager:

@@ -1,0 +1,162 @@
+"""Settings of the documentation site: ``python -m sphinx -W docs build/site`` builds it, offline.
+
+The theme, that of Newton's and NumPy's pages, has a switcher of versions. Guides are Markdown, which GitHub shows too.
+"""
+
+import functools
+import importlib
+import os
+import re
+import sys
+from itertools import cycle
+from pathlib import Path
+from types import SimpleNamespace
+
+from docutils import nodes
+from sphinx.util.docutils import SphinxDirective
+from sphinx.util.nodes import make_refnode
+
+import warp_bsc
+from warp_bsc.cli.main import _build_parser
+
+ROOT = Path(__file__).resolve().parents[1]
+REPOSITORY = "https://github.com/warp-bsc/warp-bsc"
+VERSION = os.environ.get("WARP_BSC_DOCS_VERSION", "main")
+"""Branch or tag that is built: the folder of the site, and where links to the sources point."""
+
+project = "warp-bsc"
+author = "The warp-bsc contributors"
+copyright = author
+release = version = warp_bsc.__version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
+exclude_patterns = ["upstream"]  # drafts of what to ask Warp and Newton for
+
+myst_heading_anchors = 4  # as GitHub makes them
+
+napoleon_numpy_docstring = False
+autoclass_content = "both"
+autodoc_inherit_docstrings = False
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 80
+add_module_names = False
+nitpicky = True
+nitpick_ignore_regex = [
+    # of other projects, whose inventories would be downloaded
+    (r"py:.*", r"(warp|wp|newton|numpy|torch|jax|copy|multiprocessing|collections|os|Usd|Sdf)\b.*"),
+    # types of annotations, and words that stand where a type may
+    (r"py:class", r"(warp_bsc\..*|[^.]*|(state\.structs|contacts\.rules|inside)\.\w+)"),
+    # modules behind those that the reference cites
+    (r"py:mod", r"(substeps\.inner_contacts|contacts\.search|adjoint\.(restore|kernels)|polish|polynomials)"),
+    (r"py:(func|meth)", r"(decide|face_order\.order_faces|.*\.ProximityFinder\.find)"),
+]
+toc_object_entries_show_parents = "hide"
+
+html_theme = "pydata_sphinx_theme"
+html_title = f"warp-bsc {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_baseurl = f"https://warp-bsc.github.io/warp-bsc/{VERSION}/"
+html_show_sourcelink = False
+html_copy_source = False
+_WITHOUT_SUBPAGES = ["index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing"]
+html_sidebars = {name: [] for name in _WITHOUT_SUBPAGES}
+html_theme_options = {
+    "logo": {"text": "warp-bsc"},
+    "github_url": REPOSITORY,
+    "navbar_persistent": ["search-button"],
+    "navbar_end": ["version-switcher", "theme-switcher", "navbar-icon-links"],
+    "switcher": {"json_url": "https://warp-bsc.github.io/warp-bsc/versions.json", "version_match": VERSION},
+    "check_switcher": False,  # a build reads nothing from the network
+    "show_toc_level": 2,
+    "show_prev_next": False,
+    "header_links_before_dropdown": 7,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "pygments_light_style": "a11y-high-contrast-light",
+    "pygments_dark_style": "a11y-high-contrast-dark",
+}
+
+
+def stand_in_for_frameworks():
+    """Puts classes in place of PyTorch's and JAX's, so that the bridges are imported without them."""
+    tensor, array = type("Tensor", (), {"__module__": "torch"}), type("Array", (), {"__module__": "jax"})
+    autograd = SimpleNamespace(Function=object, function=SimpleNamespace(once_differentiable=lambda function: function))
+    sys.modules["torch"] = SimpleNamespace(Tensor=tensor, autograd=autograd)
+    sys.modules["jax"] = SimpleNamespace(Array=array, __version__="0")
+
+
+def unwrap_device_code():
+    """Puts Python functions and classes in place of those of Warp, whose docstrings and signatures autodoc reads."""
+    kernels = importlib.import_module("warp_bsc.kernels")
+    for name in kernels.__all__:
+        value = getattr(kernels, name)
+        setattr(kernels, name, getattr(value, "func", getattr(value, "cls", value)))
+
+
+def shorten_types(app, what, name, obj, options, signature, returns):
+    """Shortens the types of signatures: those of arrays are written as in a program."""
+    shorten = functools.partial(re.sub, r"~?warp\._src\.types\.array", "wp.array")
+    union = r"~numpy\._typing\.[^=]*?_NestedSequence\[complex \| bytes \| str\]"
+    return tuple(text and re.sub(union, "ArrayLike", shorten(text)) for text in (signature, returns))
+
+
+def escape_bars(app, what, name, obj, options, lines):
+    """Escapes the bars of absolute values, which are substitutions of reStructuredText."""
+    for i, line in enumerate(lines):
+        parts = line.split("``")
+        lines[i] = "``".join(part if inside else part.replace("|", r"\|") for inside, part in zip(cycle((0, 1)), parts))
+
+
+def find_by_name(app, env, node, contnode):
+    """Finds what a docstring names by the module that defines it, under its public name."""
+    python, parts = env.get_domain("py"), node.get("reftarget", "").split(".")
+    for name in (".".join(parts[-2:]), parts[-1]):
+        found = [key for key in python.objects if key.endswith(f".{name}")] if node.get("refdomain") == "py" else []
+        if found and (name[0].isupper() or "." in name):
+            target = python.objects[found[0]]
+            return make_refnode(app.builder, node["refdoc"], target.docname, target.node_id, contnode, found[0])
+    return None
+
+
+def link_sources(app, name, content):
+    """Replaces relative links that leave this folder by links to the repository; GitHub follows them as they are."""
+    folder = (Path(app.srcdir) / name).parent
+
+    def replaced(match):
+        path = (folder / match[2]).resolve()
+        if path.is_relative_to(app.srcdir):
+            return match[0]
+        if not path.exists():
+            raise ValueError(f"{name}: {match[2]} does not exist")
+        kind = "tree" if path.is_dir() else "blob"
+        return f"{match[1]}({REPOSITORY}/{kind}/{VERSION}/{path.relative_to(ROOT).as_posix()}{match[3]})"
+
+    content[0] = re.sub(r"((?<!!)\[[^\]]*\])\(([\w./-]+)((?:#[\w-]*)?)\)", replaced, content[0])
+
+
+class CommandHelp(SphinxDirective):
+    """The help text of a command of ``warp-bsc``, such as ``bench detector``, or of all."""
+
+    optional_arguments, final_argument_whitespace = 1, True
+
+    def run(self):
+        """Returns the text as a block of code."""
+        os.environ["COLUMNS"] = "80"
+        parser = _build_parser()
+        for name in " ".join(self.arguments).split():
+            parser = parser._subparsers._group_actions[0].choices[name]
+        text = parser.format_help()
+        return [nodes.literal_block(text, text, language="none")]
+
+
+def setup(app):
+    """Connects the functions above."""
+    stand_in_for_frameworks()
+    unwrap_device_code()
+    app.add_directive("command-help", CommandHelp)
+    app.connect("autodoc-process-signature", shorten_types)
+    app.connect("autodoc-process-docstring", escape_bars)
+    app.connect("missing-reference", find_by_name)
+    app.connect("source-read", link_sources)

@@ -1,0 +1,117 @@
+"""The Python code of the documentation runs, page by page, and prints what its comments say."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from warp_bsc.cli.main import main
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+SCENE = ROOT / "assets" / "cloth_twist.usd"
+PAGES = sorted(str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md") if "upstream" not in path.parts)
+BLOCK = re.compile(r"(?:<!-- not run: (?P<reason>[^>]*) -->\n)?```(?P<language>\w*)\n(?P<code>.*?)```", re.DOTALL)
+
+CLOTH = """
+import newton, warp as wp, warp_bsc as bsc
+builder = newton.ModelBuilder()
+for height in (1.0, 2.0):
+    builder.add_shape_sphere(-1, radius=0.1)
+place = {"pos": wp.vec3(0.0, 0.0, height), "rot": wp.quat_identity(), "vel": wp.vec3()}
+builder.add_cloth_grid(dim_x=2, dim_y=2, cell_x=0.1, cell_y=0.1, mass=0.1, **place)
+builder.color()
+inner = newton.solvers.SolverVBD(builder.finalize())
+"""
+BEFORE = {
+    "newton/contacts.md": CLOTH,
+    "usd/replay.md": "import json\nimport numpy as np\n",
+    "usd/programs.md": f"import warp_bsc as bsc\nfrom pxr import Usd\nstage = Usd.Stage.Open({str(SCENE)!r})\n",
+}
+"""What the code of a page takes for granted."""
+
+
+def blocks_of(page):
+    """The Python blocks of a page that run, and the reasons of those that do not."""
+    found = [match for match in BLOCK.finditer((DOCS / page).read_text()) if match["language"] == "python"]
+    return [block["code"] for block in found if block["reason"] is None], [b["reason"] for b in found if b["reason"]]
+
+
+def run(page, folder, capsys):
+    """Runs the code of a page, and returns its names and what it printed."""
+    path = folder / "page.py"  # Warp reads the source of kernels from a file
+    path.write_text("\n".join([BEFORE.get(page, ""), *blocks_of(page)[0]]))
+    names = {"__name__": f"docs_{Path(page).stem}", "__file__": str(path)}
+    exec(compile(path.read_text(), str(path), "exec"), names)
+    return names, capsys.readouterr().out
+
+
+CODE = [page for page in PAGES if blocks_of(page)[0]]
+
+
+def test_detector(tmp_path, capsys):
+    names, output = run("detector.md", tmp_path, capsys)
+    assert names["c"].vertex_face.tolist() == [[3, 0], [4, 0], [5, 0]] and names["c"].certified
+    np.testing.assert_allclose(names["c"].vertex_face_toi, [0.25, 0.5, 0.5], atol=2.0**-20)
+    assert names["r"].hit.tolist() == [True]
+    assert names["found"].earliest_toi == names["c"].earliest_toi  # of the graph
+    assert "[[3, 0], [4, 0], [5, 0]]" in output and re.search(r"\n2\.0\n0\.489\d+ True\n0\.2499995\d+ False\n", output)
+
+
+def test_kernels(tmp_path, capsys):
+    names, output = run("kernels.md", tmp_path, capsys)
+    assert names["count"].numpy().tolist() == [1] and output.strip() == "[1]"
+
+
+def test_newton(tmp_path, capsys):
+    names, output = run("newton.md", tmp_path, capsys)
+    report = names["solver"].report
+    assert (report.totals.steps, report.totals.uncertified_steps) == (10, 0) and report.totals.truncated_steps == 0
+    assert output.strip() == "10 0"
+
+
+def test_contacts(tmp_path, capsys):
+    names, _ = run("newton/contacts.md", tmp_path, capsys)
+    state, end = names["inner"].model.state(), names["inner"].model.state()
+    names["solver"].step(state, end, None, None, 0.01)
+    assert names["solver"].report.certified
+
+
+def test_gradients(tmp_path, capsys):
+    names, output = run("newton/gradients.md", tmp_path, capsys)
+    assert names["solver"].report.totals.uncertified_steps == 0
+    gradient = names["states"][0].particle_qd.grad.numpy()
+    assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.0
+    derivative, residuals = output.strip().split("\n")
+    assert np.isfinite([float(number) for number in derivative.strip("[]").split()]).all()
+    assert residuals
+
+
+def test_repair(tmp_path, capsys):
+    names, output = run("usd/repair.md", tmp_path, capsys)
+    assert (names["result"].crossings_before, names["result"].crossings, names["result"].certified) == (60, 0, True)
+    lines = output.split("\n")
+    moved, strain = map(float, lines[1].split())
+    assert lines[0] == "72 0 True" and lines[2] == "42 0 60 0"
+    assert round(moved, 2) == 0.03 and round(strain, 3) == 0.015
+
+
+def test_replay(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(SCENE), "--json", "hits.json", "--npz", "hits.npz", "--device", "cpu"]) == 0
+    capsys.readouterr()
+    names, output = run("usd/replay.md", tmp_path, capsys)
+    assert names["counts"].sum() == output.count("\n") == 33 and len(names["counts"]) == 14
+
+
+def test_programs(tmp_path, capsys):
+    with pytest.raises(AssertionError, match="meshes collide from time 246 on"):
+        run("usd/programs.md", tmp_path, capsys)
+
+
+def test_each_page_with_code_has_a_test_and_each_block_that_does_not_run_a_reason():
+    tests = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    assert {Path(page).stem for page in CODE} <= tests
+    reasons = [reason for page in PAGES for reason in blocks_of(page)[1]]
+    assert reasons and all(len(reason.split()) > 3 for reason in reasons)
