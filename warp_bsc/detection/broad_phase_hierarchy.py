@@ -18,7 +18,7 @@ __all__ = ["BroadPhaseHierarchy"]
 _WARPS_OF_MULTIPROCESSOR = 128
 """Number of warps to aim at for a multiprocessor of a GPU in a traversal."""
 _MAX_WARPS_OF_CLUSTER = 16
-_TRAVERSAL_BLOCK = 64
+_TRAVERSAL_BLOCK = 128
 """Threads of a block of a traversal."""
 
 
