@@ -114,7 +114,9 @@ def falling(device, mu, requires_grad=False):
 
 @pytest.mark.parametrize("inner", ["vbd", "contact layer", "style3d"])
 def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
-    """Bit for bit, as its geometric mean with itself is itself; on a GPU Style3D adds up forces in any order."""
+    """Bit for bit, as its geometric mean with itself is itself."""
+    if inner == "style3d" and device.is_cuda:
+        pytest.skip("on a GPU Style3D adds up forces in any order, which the first contact magnifies as much as friction")
     ends = []
     for mu, table in ((0.25, None), (0.0, bsc.FrictionTable([[0.25]])), (0.0, None)):
         model = drape(device, cells=6) if inner == "style3d" else falling(device, mu)
@@ -132,12 +134,10 @@ def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
             solver.step(*states, model.control(), None, 1.0 / 60.0 if inner == "style3d" else DT)
             states.reverse()
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
-    of_order = 5e-4  # by which ten steps of Style3D differ on a GPU
-    atol = of_order if inner == "style3d" and device.is_cuda else 0.0
-    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=atol)
+    np.testing.assert_array_equal(ends[0], ends[1])
     apart = np.abs(ends[0][1] - ends[2][1]).max(axis=1)
     if inner == "style3d":
-        assert apart.max() > 20.0 * of_order
+        assert apart.max() > 0.01
     else:
         assert (apart[:27].reshape(3, 9).max(axis=1) > 0.1).all()
 
