@@ -116,7 +116,9 @@ def falling(device, mu, requires_grad=False):
 def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
     """Bit for bit, as its geometric mean with itself is itself."""
     if inner == "style3d" and device.is_cuda:
-        pytest.skip("on a GPU Style3D adds up forces in any order, which the first contact magnifies as much as friction")
+        pytest.skip(
+            "on a GPU Style3D adds up forces in any order, which the first contact magnifies as much as friction"
+        )
     ends = []
     for mu, table in ((0.25, None), (0.0, bsc.FrictionTable([[0.25]])), (0.0, None)):
         model = drape(device, cells=6) if inner == "style3d" else falling(device, mu)
