@@ -222,7 +222,8 @@ class SolverCCD(CollisionStage):
         integrator = innermost(solver)
         moves = options.moves_bodies(mesh, integrator)
         coefficients = friction_of(mesh, self.friction, table=friction_table)
-        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
+        moving = {"moves_bodies": moves, "responds_to_bodies": separates, "watches_turns": True}
+        motion = ModelMotion(mesh, coefficients, **moving)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         self._work.watch_inversions(options.inversions)
         if options.contact_layer and self.model.requires_grad and inner is solver:

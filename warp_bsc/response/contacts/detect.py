@@ -41,6 +41,8 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     """
     detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else work.active
+    if work.turns is not None and not work.differentiable:
+        work.turns.write_arcs(work.step.motion, vertices)
 
     def find():
         ends = work.step.motion.x0, vertices.x1

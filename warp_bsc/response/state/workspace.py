@@ -101,6 +101,7 @@ class Workspace:
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
         active: 1 of each vertex that takes part in the step, None if all do.
+        turns: How bodies turn, None if no body has a shape.
         tetrahedra: The tetrahedra whose inversions are looked for, None if nobody asks.
         ends: Where particles ended before inversions were prevented; None if they are not.
         unmasked: Inverse masses of vertices and bodies while those that take no part have none.
@@ -125,7 +126,11 @@ class Workspace:
         self.particle_count, device = mesh.model.particle_count, mesh.device
         self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
+        self.turns = motion.turns
+        arcs = None if self.turns is None else self.turns.turns.arcs
+        self.detector = DetectionPipeline(
+            mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances, arcs=arcs
+        )
         self.crossing_candidates = CrossingCandidates(mesh)
         self.step = step = Step()
         step.mesh = mesh.connectivity
