@@ -186,8 +186,16 @@ def _axis_of(arcs: Arcs, vertex: int):
 
 
 @wp.func
-def _on_arc_of(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d, time: wp.float64) -> wp.vec3d:
-    """Returns the position of a vertex at a time."""
+def is_on_arc(arcs: Arcs, vertex: int) -> bool:
+    """Returns whether a vertex turns."""
+    if any_turns(arcs):
+        return arcs.deviation[vertex] > _ZERO
+    return False
+
+
+@wp.func
+def on_arc_of(arcs: Arcs, vertex: int, x0: Any, x1: Any, time: wp.float64) -> wp.vec3d:
+    """Returns the position of a vertex at a time, see :func:`on_arc`."""
     centre, turn = _axis_of(arcs, vertex)
     return on_arc(x0, x1, centre, turn, time)
 
@@ -265,10 +273,10 @@ def impact_on_arcs(
     parts = int(0)
     while searching:
         end = start + length
-        end_p = _on_arc_of(arcs, v[0], a, to_a, end)
-        end_q = _on_arc_of(arcs, v[1], b, to_b, end)
-        end_r = _on_arc_of(arcs, v[2], c, to_c, end)
-        end_s = _on_arc_of(arcs, v[3], d, to_d, end)
+        end_p = on_arc_of(arcs, v[0], a, to_a, end)
+        end_q = on_arc_of(arcs, v[1], b, to_b, end)
+        end_r = on_arc_of(arcs, v[2], c, to_c, end)
+        end_s = on_arc_of(arcs, v[3], d, to_d, end)
         deviation = sagitta_of_part(bounds, length) + sagitta_of_part(others, length) + rounding
         within = _UP * (min_distance + deviation)
         part = impact_at_distance(kind, p, q, r, s, end_p, end_q, end_r, end_s, within, ROUNDOFF, True, _TIME_TOLERANCE)
@@ -308,10 +316,10 @@ def impact_on_arcs(
                 if advance > _ZERO:
                     start += advance
                     length = wp.min(length, _ONE - start)
-                    p = _on_arc_of(arcs, v[0], a, to_a, start)
-                    q = _on_arc_of(arcs, v[1], b, to_b, start)
-                    r = _on_arc_of(arcs, v[2], c, to_c, start)
-                    s = _on_arc_of(arcs, v[3], d, to_d, start)
+                    p = on_arc_of(arcs, v[0], a, to_a, start)
+                    q = on_arc_of(arcs, v[1], b, to_b, start)
+                    r = on_arc_of(arcs, v[2], c, to_c, start)
+                    s = on_arc_of(arcs, v[3], d, to_d, start)
                 else:
                     # the first part that may be free at all
                     needed = _HALF * (found - min_distance) - rounding

@@ -15,6 +15,7 @@ from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, w
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
+from .contacts.arc_check import check_arcs
 from .forces.contact_forces import ContactForces
 from .integration.vbd_speed_limit import has_self_contact, has_speed_limit, without_speed_limit
 from .integration.wrapped_solver import innermost
@@ -426,6 +427,7 @@ class SolverCCD(CollisionStage):
                     measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
                     wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
                 resolve_inversions(self._work, dt)
+                check_arcs(self._work)
                 self._write_end(end)
 
     def _write_end(self, end):

@@ -14,7 +14,7 @@ from ...kernels.arcs import Arcs
 from .mesh import ModelMesh
 from .poses import turn_between
 from .structs import Motion, MovedBodies, Vertices, can_move
-from .vectors import HALF, ZERO, to_double
+from .vectors import HALF, to_double
 
 wp.set_module_options({"enable_backward": False})
 
