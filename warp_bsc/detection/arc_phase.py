@@ -157,7 +157,7 @@ def run_arc_phases(
     if x0.device.is_cpu and not arcs.turning.numpy()[0]:
         return
     kernels = _kernels(x0.dtype)
-    with timer.stage("arcs"):
+    with timer.stage("classify"):
         for phase, elements in phases:
             stages = phase.stages(elements)
             inputs = [x0, x1, arcs, int(phase.kind)]
