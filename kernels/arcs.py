@@ -38,7 +38,7 @@ from typing import Any
 import warp as wp
 
 from .ccd import impact_at_distance
-from .closest import contact_at
+from .closest import contact_at, contact_weights
 from .distance import closest_points
 from .motion import all_finite, double, doubles, relative_motion
 from .pipeline.pairs import firsts_of
@@ -69,8 +69,6 @@ _UNIT = wp.constant(wp.float64(2.0**-53))
 _UP = wp.constant(wp.float64(1.0 + 2.0**-40))
 """Raises a few rounded operations above their exact result."""
 _TINY = wp.constant(wp.float64(2.0**-1000))
-_GRAZING = wp.constant(wp.float64(2.0**-6))
-"""Cosine of two normals from which on they are on the same side."""
 _STEPS_OF_ROUNDING = wp.constant(wp.float64(32.0))
 _ZERO = wp.constant(wp.float64(0.0))
 _EIGHTH = wp.constant(wp.float64(0.125))
@@ -311,9 +309,10 @@ def impact_on_arcs(
                     motion = relative_motion(kind, p, q, r, s, end_p, end_q, end_r, end_s, _ZERO)
                     coordinates, normal = contact_at(motion, part.toi)
                     result.coordinates = coordinates
-                    # where the paths graze, velocities do not tell on which side the features are
-                    towards = wp.dot(normal, part.normal)
-                    result.normal = wp.where(towards < -_GRAZING, -normal, normal)
+                    # where paths graze, velocities do not tell the side, but all until the part began is free
+                    weights = contact_weights(kind, coordinates)
+                    between = weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s
+                    result.normal = wp.where(wp.dot(normal, between) < -rounding, -normal, normal)
                 searching = False
             else:
                 length = _HALF * length

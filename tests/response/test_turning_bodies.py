@@ -153,6 +153,47 @@ def test_a_propeller_throws_a_cloth(device):
     assert np.linalg.norm(states[0].particle_qd.numpy(), axis=1).max() > 2.0
 
 
+@pytest.mark.parametrize("options", [{}, {"min_distance": 0.003}], ids=["touch", "distance"])
+def test_random_bars_push_a_cloth_off_their_arcs(options, device):
+    """Turns of up to 150 degrees about any axis, of bars that the program moves and of dynamic ones."""
+    with_contacts = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        rotation = rng.standard_normal(4)
+        pose = {"pos": wp.vec3(*rng.uniform(-0.5, 0.5, 3)), "rot": wp.quat(*rotation / np.linalg.norm(rotation))}
+        grid = {"dim_x": 6, "dim_y": 6, "cell_x": 0.12, "cell_y": 0.12, "mass": 0.001}
+        builder.add_cloth_grid(**pose, **grid, vel=wp.vec3(*rng.uniform(-3.0, 3.0, 3)))
+        body = builder.add_body(xform=wp.transform_identity(), is_kinematic=bool(rng.integers(2)))
+        beside = wp.transform(wp.vec3(0.4, 0.0, 0.0), wp.quat_identity())
+        builder.add_shape_box(body, xform=beside, hx=0.4, hy=0.02, hz=0.05)
+        builder.color()
+        model = builder.finalize(device=device)
+        turn = rng.standard_normal(3)
+        turn *= np.radians(rng.uniform(5.0, 150.0)) / np.linalg.norm(turn)
+        end_of_bar = rng.uniform(-0.05, 0.05, 3), Rotation.from_rotvec(turn).as_quat()
+        solver = bsc.SolverCCD(
+            Changed(model, lambda state, pose=end_of_bar: set_pose(state, *pose)), substeps=None, **options
+        )
+        finder, count = bsc.CollisionDetector(solver.mesh), model.particle_count
+        x = np.concatenate([model.particle_q.numpy(), solver.mesh.shape_vertices.position]).astype(np.float64)
+        if len(finder.find_intersections(x)):
+            continue
+        report, _start, end = step_once(solver, model)
+        assert report.certified, seed
+        with_contacts += report.hits > 0
+        start_x, end_x = x.copy(), x.copy()
+        end_x[:count] = end.particle_q.numpy()
+        place, quaternion = end.body_q.numpy()[0, :3], end.body_q.numpy()[0, 3:]
+        end_x[count:] = Rotation.from_quat(quaternion).apply(x[count:]) + place
+        arcs = solver._work.arcs
+        motion = bsc.RigidMotion(arcs.body.numpy(), arcs.centre.numpy(), arcs.turn.numpy())
+        np.testing.assert_allclose(motion.turn[0], Rotation.from_quat(quaternion).as_rotvec(), atol=1e-6)
+        for time in np.linspace(0.0, 1.0, 17):
+            assert len(finder.find_intersections(motion.positions(start_x, end_x, time))) == 0, (seed, time)
+    assert with_contacts >= 5
+
+
 def test_a_dynamic_blade_is_stopped(device):
     """A strip that is held stops a blade that can be moved, before it on its arc."""
     model = blade_and_strip(device, kinematic=False)
