@@ -34,8 +34,10 @@ def set_pose(state, position, rotation, body=0):
     state.body_q.assign(poses)
 
 
-def blade_and_strip(device, *, kinematic=True, at=0.9, requires_grad=False, has_wall=False):
+def blade_and_strip(device, *, kinematic=True, at=0.9, first=0.0, requires_grad=False, has_wall=False):
     """A blade of 1 m along x, and a strip of cloth across the circle of its tip, an eighth of a turn ahead.
+
+    All is turned about z by a ``first`` angle.
 
     The origin is the centre of mass of a blade that can be moved, and the hinge of one that the program moves.
     """
@@ -43,9 +45,10 @@ def blade_and_strip(device, *, kinematic=True, at=0.9, requires_grad=False, has_
     corner = wp.vec3(at * np.sqrt(0.5), at * np.sqrt(0.5), -0.05)
     upright = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.5 * np.pi)
     grid = {"dim_x": 2, "dim_y": 4, "cell_x": 0.02, "cell_y": 0.025, "mass": 1e-3}
-    builder.add_cloth_grid(pos=corner, rot=upright, vel=wp.vec3(), **grid)
+    turn = wp.quat(*about_z(first))
+    builder.add_cloth_grid(pos=wp.quat_rotate(turn, corner), rot=turn * upright, vel=wp.vec3(), **grid)
     weight = {} if kinematic else {"mass": 1.0, "inertia": wp.mat33(np.eye(3)), "lock_inertia": True}
-    body = builder.add_body(xform=wp.transform_identity(), is_kinematic=kinematic, **weight)
+    body = builder.add_body(xform=wp.transform(wp.vec3(), turn), is_kinematic=kinematic, **weight)
     beside = wp.transform(wp.vec3(0.5, 0.0, 0.0), wp.quat_identity())
     config = newton.ModelBuilder.ShapeConfig(density=1000.0 if kinematic else 0.0)
     builder.add_shape_box(body, xform=beside, hx=0.5, hy=0.01, hz=0.02, cfg=config)
@@ -88,6 +91,19 @@ def test_a_blade_meets_what_its_chords_miss(make, options, device):
         assert report.certified and moved > 0.05
         solver.mesh.positions(end.particle_q, end.body_q, ends[1])
         assert crossings_on_arcs(solver.mesh, *ends, 0.5 * np.pi) == 0
+
+
+@pytest.mark.parametrize("options", [{}, {"min_distance": 0.002}], ids=["touch", "distance"])
+@pytest.mark.parametrize("broad_phase", ["simd", "hierarchy"])
+def test_boxes_reach_as_far_as_arcs(broad_phase, options, device, monkeypatch):
+    """The tip passes through the strip beyond the boxes around its positions at both ends."""
+    model = blade_and_strip(device, first=-0.25 * np.pi)
+    inner = Changed(model, turned(0.25 * np.pi))
+    if broad_phase == "simd":
+        monitor = bsc.CollisionMonitor(inner, **options)
+    else:
+        monitor = hierarchy_stage(model, monkeypatch, make=bsc.CollisionMonitor, tiny=False, inner=inner, **options)
+    assert step_once(monitor, model)[0].remaining > 20
 
 
 def crossings_on_arcs(mesh, x0, x1, angle, samples=24):
