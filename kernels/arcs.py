@@ -210,6 +210,84 @@ def distance_at(points: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d)
     return found, error
 
 
+@wp.struct
+class _PairBounds:
+    """Bounds of how far the elements of a pair are from their chords, see :func:`arc_bounds`."""
+
+    first: wp.vec3d
+    second: wp.vec3d
+    rounding: wp.float64  # of both
+    tolerance: wp.float64
+
+
+@wp.func
+def _bounds_of_pair(
+    kind: int,
+    v: wp.vec4i,
+    # points at the start
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    d: wp.vec3d,
+    # points at the end
+    to_a: wp.vec3d,
+    to_b: wp.vec3d,
+    to_c: wp.vec3d,
+    to_d: wp.vec3d,
+    arcs: Arcs,
+) -> _PairBounds:
+    """Returns the bounds of a pair: of each element, the largest ones of its vertices."""
+    bounds = _PairBounds()
+    largest = wp.float64(0.0)
+    for j in range(4):
+        x0 = wp.where(j == 0, a, wp.where(j == 1, b, wp.where(j == 2, c, d)))
+        x1 = wp.where(j == 0, to_a, wp.where(j == 1, to_b, wp.where(j == 2, to_c, to_d)))
+        centre, turn = _axis_of(arcs, v[j])
+        largest = wp.max(largest, wp.max(wp.max(wp.abs(x0)), wp.max(wp.abs(x1))))
+        if j < firsts_of(kind):
+            bounds.first = wp.max(bounds.first, arc_bounds(x0, x1, centre, turn))
+        else:
+            bounds.second = wp.max(bounds.second, arc_bounds(x0, x1, centre, turn))
+    bounds.rounding = bounds.first[2] + bounds.second[2]
+    tolerance = wp.where(arcs.tolerance > _ZERO, arcs.tolerance, DEFAULT_TOLERANCE * largest)
+    bounds.tolerance = wp.max(tolerance, _STEPS_OF_ROUNDING * bounds.rounding)
+    return bounds
+
+
+@wp.func
+def _sagittas(bounds: _PairBounds, length: wp.float64) -> wp.float64:
+    """Returns the bound of the deviation of both elements in a part of a step, without rounding."""
+    return sagitta_of_part(bounds.first, length) + sagitta_of_part(bounds.second, length)
+
+
+@wp.func
+def _first_contact(
+    kind: int,
+    part: Impact,
+    # points at the start of the part
+    p: wp.vec3d,
+    q: wp.vec3d,
+    r: wp.vec3d,
+    s: wp.vec3d,
+    # points at its end
+    end_p: wp.vec3d,
+    end_q: wp.vec3d,
+    end_r: wp.vec3d,
+    end_s: wp.vec3d,
+    rounding: wp.float64,
+) -> Impact:
+    """Returns the contact of a part with coordinates and normal as of contacts on straight paths."""
+    result = part
+    motion = relative_motion(kind, p, q, r, s, end_p, end_q, end_r, end_s, _ZERO)
+    coordinates, normal = contact_at(motion, part.toi)
+    result.coordinates = coordinates
+    # where paths graze, velocities do not tell the side, but all until the part began is free
+    weights = contact_weights(kind, coordinates)
+    between = weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s
+    result.normal = wp.where(wp.dot(normal, between) < -rounding, -normal, normal)
+    return result
+
+
 @wp.func
 def impact_on_arcs(
     kind: int,
@@ -251,22 +329,7 @@ def impact_on_arcs(
     p, q, r, s = doubles(a0, b0, c0, d0)
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    # bounds of the first element, then of the second
-    bounds = wp.vec3d()
-    others = wp.vec3d()
-    largest = _ZERO
-    for j in range(4):
-        x0 = wp.where(j == 0, a, wp.where(j == 1, b, wp.where(j == 2, c, d)))
-        x1 = wp.where(j == 0, to_a, wp.where(j == 1, to_b, wp.where(j == 2, to_c, to_d)))
-        centre, turn = _axis_of(arcs, v[j])
-        largest = wp.max(largest, wp.max(wp.max(wp.abs(x0)), wp.max(wp.abs(x1))))
-        if j < firsts_of(kind):
-            bounds = wp.max(bounds, arc_bounds(x0, x1, centre, turn))
-        else:
-            others = wp.max(others, arc_bounds(x0, x1, centre, turn))
-    rounding = bounds[2] + others[2]
-    tolerance = wp.where(arcs.tolerance > _ZERO, arcs.tolerance, DEFAULT_TOLERANCE * largest)
-    tolerance = wp.max(tolerance, _STEPS_OF_ROUNDING * rounding)
+    bounds = _bounds_of_pair(kind, v, a, b, c, d, to_a, to_b, to_c, to_d, arcs)
     start = wp.float64(0.0)
     length = wp.float64(1.0)
     searching = bool(True)
@@ -277,7 +340,7 @@ def impact_on_arcs(
         end_q = on_arc_of(arcs, v[1], b, to_b, end)
         end_r = on_arc_of(arcs, v[2], c, to_c, end)
         end_s = on_arc_of(arcs, v[3], d, to_d, end)
-        deviation = sagitta_of_part(bounds, length) + sagitta_of_part(others, length) + rounding
+        deviation = _sagittas(bounds, length) + bounds.rounding
         within = _UP * (min_distance + deviation)
         part = impact_at_distance(kind, p, q, r, s, end_p, end_q, end_r, end_s, within, ROUNDOFF, True, _TIME_TOLERANCE)
         parts += 1
@@ -297,22 +360,15 @@ def impact_on_arcs(
             found = _ZERO
             if advance == _ZERO:
                 found, _error = distance_at(points, p, q, r, s)
-            is_within = advance == _ZERO and found <= min_distance + _HALF * tolerance
-            is_within = is_within or _TWO * deviation <= tolerance
+            is_within = advance == _ZERO and found <= min_distance + _HALF * bounds.tolerance
+            is_within = is_within or _TWO * deviation <= bounds.tolerance
             if is_within or parts == MAX_PARTS or length <= _SHORTEST:
+                result = part
+                if min_distance == _ZERO and kind <= EDGE_EDGE:
+                    result = _first_contact(kind, part, p, q, r, s, end_p, end_q, end_r, end_s, bounds.rounding)
                 result.status = wp.where(is_within, HIT, UNSURE)
                 result.within_tolerance = wp.where(is_within, 1, 0)
                 result.toi = start + advance
-                result.coordinates = part.coordinates
-                result.normal = part.normal
-                if min_distance == _ZERO and kind <= EDGE_EDGE:  # as of contacts on straight paths
-                    motion = relative_motion(kind, p, q, r, s, end_p, end_q, end_r, end_s, _ZERO)
-                    coordinates, normal = contact_at(motion, part.toi)
-                    result.coordinates = coordinates
-                    # where paths graze, velocities do not tell the side, but all until the part began is free
-                    weights = contact_weights(kind, coordinates)
-                    between = weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s
-                    result.normal = wp.where(wp.dot(normal, between) < -rounding, -normal, normal)
                 searching = False
             else:
                 length = _HALF * length
@@ -325,9 +381,7 @@ def impact_on_arcs(
                     s = on_arc_of(arcs, v[3], d, to_d, start)
                 else:
                     # the first part that may be free at all
-                    needed = _HALF * (found - min_distance) - rounding
-                    while length > _SHORTEST and needed < sagitta_of_part(bounds, length) + sagitta_of_part(
-                        others, length
-                    ):
+                    needed = _HALF * (found - min_distance) - bounds.rounding
+                    while length > _SHORTEST and needed < _sagittas(bounds, length):
                         length = _HALF * length
     return result
