@@ -19,19 +19,32 @@ order and never less. As R(t) r stays on a circle of radius |p|, and its interpo
 2 |p| apart. A point of an edge or a face is a convex combination of its corners with weights that do not change, on
 arcs as on chords, and so is its deviation: it is at most the largest one of its corners.
 
+**Parts of a step.** :func:`impact_on_arcs` goes through the step from part to part. A part is free if the chords stay
+farther apart than the pair must, by more than the bounds of their deviations together. After a part that is free comes
+one twice as long. In another one, the start advances to the time before which chords are free, and the rest is halved.
+The search ends with a contact where the bounds are at most half of a tolerance: the arcs come within the tolerance of
+a collision. It ends unsure after :data:`MAX_PARTS`.
+
 **Bounds.** u is half an ulp of 1, X a bound of |x0| and |x1|. Of k, components have a relative error of 4u, of r, 1u:
 p has an error of 13u |r|, q of 26u |r|. a and a / 2 have relative errors of 3u, with t 4u; a sine has 2 ulp, at most
 4u: its value has an error of (4 + 4a) u, and vers of (18 + 8a) u. The two factors, of at most 2 and 4, have errors of
 (12 + 8a) u and (44 + 16a) u. With the errors of p and q, and of products and sums, the last two terms have at most
 (204 + 24a) u |r|; the straight part and the last sum have 2u X and u (X + 6 |r|). The constants below are more than
-twice these.
+twice these. Of the distance from the axis, |p|, the error is below 14u |r|.
 """
 
 from typing import Any
 
 import warp as wp
 
-from .motion import double
+from .ccd import impact_at_distance
+from .closest import contact_at, contact_weights
+from .distance import closest_points
+from .motion import all_finite, double, doubles, relative_motion
+from .pipeline.pairs import firsts_of
+from .polynomials import EDGE_EDGE, VERTEX_FACE
+from .signs import FREE, HIT, ROUNDOFF, UNSURE
+from .time_of_impact import Impact
 
 POSITION_ERROR = 8.0
 """Error of :func:`on_arc` for each unit of a bound of the positions, in half ulps of 1."""
@@ -40,7 +53,25 @@ LEVER_ERROR = 512.0
 TURN_ERROR = 64.0
 """The same for each unit of that distance and each radian of the turn."""
 
+MAX_PARTS = wp.constant(128)
+"""Parts of a step after which the search for a contact on arcs stops, unsure."""
+DEFAULT_TOLERANCE = wp.constant(wp.float64(2.0**-29))
+"""Tolerance of contacts on arcs, as a share of the largest coordinate, where none is given."""
+
+_SHORTEST = wp.constant(wp.float64(2.0**-40))
+"""Length of the shortest part; lengths and times are multiples of it."""
+_TIME_TOLERANCE = wp.constant(wp.float64(2.0**-20))
+_POSITION_ERROR = wp.constant(wp.float64(POSITION_ERROR))
+_LEVER_ERROR = wp.constant(wp.float64(LEVER_ERROR))
+_TURN_ERROR = wp.constant(wp.float64(TURN_ERROR))
+_LEVER_LENGTH_ERROR = wp.constant(wp.float64(32.0))
+_UNIT = wp.constant(wp.float64(2.0**-53))
+_UP = wp.constant(wp.float64(1.0 + 2.0**-40))
+"""Raises a few rounded operations above their exact result."""
+_TINY = wp.constant(wp.float64(2.0**-1000))
+_STEPS_OF_ROUNDING = wp.constant(wp.float64(32.0))
 _ZERO = wp.constant(wp.float64(0.0))
+_EIGHTH = wp.constant(wp.float64(0.125))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
@@ -70,3 +101,287 @@ def on_arc(x0: Any, x1: Any, centre: wp.vec3d, turn: wp.vec3d, time: wp.float64)
     sine = wp.sin(time * angle) - time * wp.sin(angle)
     versine = _TWO * (half * half - time * (whole_half * whole_half))
     return straight + (sine * across + versine * inward)
+
+
+@wp.struct
+class Arcs:
+    """The arcs of a mesh's vertices in a step; without arrays all vertices move straight.
+
+    Attributes:
+        turning: 1 if a vertex turns, one number; where it is 0, nothing else is read.
+        body: Body of each vertex, -1 for those that move straight.
+        group: Group of each vertex; pairs with a turning vertex within a group of 0 or more are excluded.
+        centre: A point of each body's axis at the start.
+        turn: Axis of each body times the angle of its turn [rad].
+        deviation: Bound of the distance of each vertex from its chord over the whole step, 0 for those that move
+            straight.
+        tolerance: Distance within which pairs may be reported that do not collide; 0 for :data:`DEFAULT_TOLERANCE`.
+    """
+
+    turning: wp.array[int]
+    body: wp.array[int]
+    group: wp.array[int]
+    centre: wp.array[wp.vec3d]
+    turn: wp.array[wp.vec3d]
+    deviation: wp.array[wp.float64]
+    tolerance: wp.float64
+
+
+@wp.func
+def any_turns(arcs: Arcs) -> bool:
+    """Returns whether a vertex of the mesh turns."""
+    if arcs.turning:
+        return arcs.turning[0] != 0
+    return False
+
+
+@wp.func
+def turns(arcs: Arcs, v: wp.vec4i) -> bool:
+    """Returns whether one of the vertices of a pair turns."""
+    if not any_turns(arcs):
+        return False
+    straight = arcs.deviation[v[0]] == _ZERO and arcs.deviation[v[1]] == _ZERO
+    return not (straight and arcs.deviation[v[2]] == _ZERO and arcs.deviation[v[3]] == _ZERO)
+
+
+@wp.func
+def are_of_one_group(arcs: Arcs, v: wp.vec4i) -> bool:
+    """Returns whether all vertices of a pair are of one group."""
+    group = arcs.group[v[0]]
+    return group >= 0 and arcs.group[v[1]] == group and arcs.group[v[2]] == group and arcs.group[v[3]] == group
+
+
+@wp.func
+def arc_bounds(x0: wp.vec3d, x1: wp.vec3d, centre: wp.vec3d, turn: wp.vec3d) -> wp.vec3d:
+    """Returns how far a vertex is from its chord: by sagitta over the whole step, by sagitta at most, and by rounding.
+
+    In a part of the step that lasts h it is at most the sum of the last and the lesser of h^2 times the first and of
+    the second. The ends of the chord of the whole step are exact, and so are those of a vertex that stands still.
+    """
+    angle = wp.length(turn)
+    rounding = _POSITION_ERROR * wp.sqrt(wp.float64(3.0)) * wp.max(wp.max(wp.abs(x0)), wp.max(wp.abs(x1)))
+    if angle == _ZERO:
+        return wp.vec3d(_ZERO, _ZERO, _UP * (_UNIT * rounding) + _TINY)
+    r = x0 - centre
+    size = _UP * wp.length(r)
+    lever = wp.length(wp.cross(turn / angle, r)) + _LEVER_LENGTH_ERROR * _UNIT * size
+    rounding += (_LEVER_ERROR + _TURN_ERROR * angle) * size
+    sagitta = _EIGHTH * (angle * angle) * lever
+    return _UP * wp.vec3d(sagitta, _TWO * lever, _UNIT * rounding) + wp.vec3d(_ZERO, _ZERO, _TINY)
+
+
+@wp.func
+def sagitta_of_part(bounds: wp.vec3d, length: wp.float64) -> wp.float64:
+    """Returns the bound of the deviation by sagitta in a part of a step, from bounds as of :func:`arc_bounds`."""
+    return _UP * wp.min(length * length * bounds[0], bounds[1])
+
+
+@wp.func
+def _axis_of(arcs: Arcs, vertex: int):
+    """Returns centre and turn of a vertex, without a turn if it moves straight."""
+    body = arcs.body[vertex]
+    if body < 0:
+        return wp.vec3d(), wp.vec3d()
+    return arcs.centre[body], arcs.turn[body]
+
+
+@wp.func
+def is_on_arc(arcs: Arcs, vertex: int) -> bool:
+    """Returns whether a vertex turns."""
+    if any_turns(arcs):
+        return arcs.deviation[vertex] > _ZERO
+    return False
+
+
+@wp.func
+def on_arc_of(arcs: Arcs, vertex: int, x0: Any, x1: Any, time: wp.float64) -> wp.vec3d:
+    """Returns the position of a vertex at a time, see :func:`on_arc`."""
+    centre, turn = _axis_of(arcs, vertex)
+    return on_arc(x0, x1, centre, turn, time)
+
+
+@wp.func
+def distance_at(points: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Returns the distance of the features of a pair at rest, and the bound on its error."""
+    u = wp.where(points == EDGE_EDGE, b - a, c - b)
+    v = wp.where(points == EDGE_EDGE, d - c, d - b)
+    w = wp.where(points == EDGE_EDGE, c - a, a - b)
+    _at, found, error = closest_points(points, u, v, w)
+    return found, error
+
+
+@wp.struct
+class _PairBounds:
+    """Bounds of how far the elements of a pair are from their chords, see :func:`arc_bounds`."""
+
+    first: wp.vec3d
+    second: wp.vec3d
+    rounding: wp.float64  # of both
+    tolerance: wp.float64
+
+
+@wp.func
+def _bounds_of_pair(
+    kind: int,
+    v: wp.vec4i,
+    # points at the start
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    d: wp.vec3d,
+    # points at the end
+    to_a: wp.vec3d,
+    to_b: wp.vec3d,
+    to_c: wp.vec3d,
+    to_d: wp.vec3d,
+    arcs: Arcs,
+) -> _PairBounds:
+    """Returns the bounds of a pair: of each element, the largest ones of its vertices."""
+    bounds = _PairBounds()
+    largest = wp.float64(0.0)
+    for j in range(4):
+        x0 = wp.where(j == 0, a, wp.where(j == 1, b, wp.where(j == 2, c, d)))
+        x1 = wp.where(j == 0, to_a, wp.where(j == 1, to_b, wp.where(j == 2, to_c, to_d)))
+        centre, turn = _axis_of(arcs, v[j])
+        largest = wp.max(largest, wp.max(wp.max(wp.abs(x0)), wp.max(wp.abs(x1))))
+        if j < firsts_of(kind):
+            bounds.first = wp.max(bounds.first, arc_bounds(x0, x1, centre, turn))
+        else:
+            bounds.second = wp.max(bounds.second, arc_bounds(x0, x1, centre, turn))
+    bounds.rounding = bounds.first[2] + bounds.second[2]
+    tolerance = wp.where(arcs.tolerance > _ZERO, arcs.tolerance, DEFAULT_TOLERANCE * largest)
+    bounds.tolerance = wp.max(tolerance, _STEPS_OF_ROUNDING * bounds.rounding)
+    return bounds
+
+
+@wp.func
+def _sagittas(bounds: _PairBounds, length: wp.float64) -> wp.float64:
+    """Returns the bound of the deviation of both elements in a part of a step, without rounding."""
+    return sagitta_of_part(bounds.first, length) + sagitta_of_part(bounds.second, length)
+
+
+@wp.func
+def _first_contact(
+    kind: int,
+    part: Impact,
+    # points at the start of the part
+    p: wp.vec3d,
+    q: wp.vec3d,
+    r: wp.vec3d,
+    s: wp.vec3d,
+    # points at its end
+    end_p: wp.vec3d,
+    end_q: wp.vec3d,
+    end_r: wp.vec3d,
+    end_s: wp.vec3d,
+    rounding: wp.float64,
+) -> Impact:
+    """Returns the contact of a part with coordinates and normal as of contacts on straight paths."""
+    result = part
+    motion = relative_motion(kind, p, q, r, s, end_p, end_q, end_r, end_s, _ZERO)
+    coordinates, normal = contact_at(motion, part.toi)
+    result.coordinates = coordinates
+    # where paths graze, velocities do not tell the side, but all until the part began is free
+    weights = contact_weights(kind, coordinates)
+    between = weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s
+    result.normal = wp.where(wp.dot(normal, between) < -rounding, -normal, normal)
+    return result
+
+
+@wp.func
+def impact_on_arcs(
+    kind: int,
+    v: wp.vec4i,
+    # points at the start
+    a0: Any,
+    b0: Any,
+    c0: Any,
+    d0: Any,
+    # points at the end
+    a1: Any,
+    b1: Any,
+    c1: Any,
+    d1: Any,
+    arcs: Arcs,
+    min_distance: wp.float64,
+) -> Impact:
+    """Returns the first contact of a pair on its arcs; FREE is certain, and HIT within the tolerance of the arcs.
+
+    Args:
+        kind: VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX, with points as of :func:`.ccd.impact_at_distance`.
+        v: The vertices of the pair.
+        a0: Points at the start, vec3 or vec3d, and so on.
+        b0: See ``a0``.
+        c0: See ``a0``.
+        d0: See ``a0``.
+        a1: Points at the end of the step.
+        b1: See ``a1``.
+        c1: See ``a1``.
+        d1: See ``a1``.
+        arcs: The arcs.
+        min_distance: Distance that the pair keeps, 0 if it must only not touch.
+    """
+    result = Impact()
+    result.status = UNSURE
+    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+        return result
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    p, q, r, s = doubles(a0, b0, c0, d0)
+    a, b, c, d = doubles(a0, b0, c0, d0)
+    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    bounds = _bounds_of_pair(kind, v, a, b, c, d, to_a, to_b, to_c, to_d, arcs)
+    start = wp.float64(0.0)
+    length = wp.float64(1.0)
+    searching = bool(True)
+    parts = int(0)
+    while searching:
+        end = start + length
+        end_p = on_arc_of(arcs, v[0], a, to_a, end)
+        end_q = on_arc_of(arcs, v[1], b, to_b, end)
+        end_r = on_arc_of(arcs, v[2], c, to_c, end)
+        end_s = on_arc_of(arcs, v[3], d, to_d, end)
+        deviation = _sagittas(bounds, length) + bounds.rounding
+        within = _UP * (min_distance + deviation)
+        part = impact_at_distance(kind, p, q, r, s, end_p, end_q, end_r, end_s, within, ROUNDOFF, True, _TIME_TOLERANCE)
+        parts += 1
+        if part.status == FREE:
+            start = end
+            p = end_p
+            q = end_q
+            r = end_r
+            s = end_s
+            length = wp.min(_TWO * length, _ONE - start)
+            if start >= _ONE:
+                result.status = FREE
+                result.toi = _TWO
+                searching = False
+        else:
+            advance = _SHORTEST * wp.floor(part.toi * length / _SHORTEST)
+            found = _ZERO
+            if advance == _ZERO:
+                found, _error = distance_at(points, p, q, r, s)
+            is_within = advance == _ZERO and found <= min_distance + _HALF * bounds.tolerance
+            is_within = is_within or _TWO * deviation <= bounds.tolerance
+            if is_within or parts == MAX_PARTS or length <= _SHORTEST:
+                result = part
+                if min_distance == _ZERO and kind <= EDGE_EDGE:
+                    result = _first_contact(kind, part, p, q, r, s, end_p, end_q, end_r, end_s, bounds.rounding)
+                result.status = wp.where(is_within, HIT, UNSURE)
+                result.within_tolerance = wp.where(is_within, 1, 0)
+                result.toi = start + advance
+                searching = False
+            else:
+                length = _HALF * length
+                if advance > _ZERO:
+                    start += advance
+                    length = wp.min(length, _ONE - start)
+                    p = on_arc_of(arcs, v[0], a, to_a, start)
+                    q = on_arc_of(arcs, v[1], b, to_b, start)
+                    r = on_arc_of(arcs, v[2], c, to_c, start)
+                    s = on_arc_of(arcs, v[3], d, to_d, start)
+                else:
+                    # the first part that may be free at all
+                    needed = _HALF * (found - min_distance) - bounds.rounding
+                    while length > _SHORTEST and needed < _sagittas(bounds, length):
+                        length = _HALF * length
+    return result

@@ -5,10 +5,12 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import trimesh
+import warp as wp
 from arc_truth import path, sampled_distances, speed_bounds
 from sheets import crumpled
 
 import warp_bsc as bsc
+from warp_bsc.detection import arc_pipeline
 
 KINDS = ("vertex_face", "edge_edge")
 X, Y, Z = np.eye(3)
@@ -358,3 +360,74 @@ def test_what_does_not_fit_is_an_error(device):
             detector.detect(x0, end, arcs=arcs)
     with pytest.raises(ValueError, match=r"x1\[4\] has a coordinate that is not finite"):
         detector.detect(x0, np.where(np.arange(6)[:, None] == 4, np.nan, x1), arcs=bsc.RigidMotion(body, [X], [Z]))
+
+
+def blade_and_post():
+    """A blade that turns by 80 degrees about z, and a post on the arc of its tip: mesh, both ends and motion."""
+    x0 = np.array([[0.5, 0, 0], [2, 0, 0], [2, 0, 0.2], [1.6, 1.1, -1], [1.7, 1.1, -1], [1.6, 1.1, 1]], float)
+    turn = np.radians(80.0) * Z
+    x1 = x0.copy()
+    x1[:3] = moved(x0[:3], 0.0, turn)
+    return (
+        bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6),
+        x0,
+        x1,
+        bsc.RigidMotion([0, 0, 0, -1, -1, -1], [[0.0] * 3], [turn]),
+    )
+
+
+def test_one_pass_finds_what_parts_of_the_step_do(device, monkeypatch):
+    """In random scenes with turns of at most a quarter, the same pairs up to the tolerance, at times that agree."""
+    pairs = 0
+    for seed in range(6):
+        mesh, x0, _x1, motion, number = random_scene(seed)
+        turn = 0.49 * np.pi * motion.turn / np.linalg.norm(motion.turn, axis=1, keepdims=True)
+        x1 = x0.copy()
+        for i in range(3):
+            x1[number == i] = moved(x0[number == i], motion.centre[i], turn[i])
+        motion = bsc.RigidMotion(motion.body, motion.centre, turn, tolerance=1e-7)
+        found = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=motion)
+        with monkeypatch.context() as patch:
+            patch.setattr(arc_pipeline.ArcPipeline, "is_for", staticmethod(lambda bounds: False))
+            expected = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=motion)
+        for kind in KINDS:
+            assert getattr(found, kind).tolist() == getattr(expected, kind).tolist()
+            np.testing.assert_allclose(getattr(found, f"{kind}_toi"), getattr(expected, f"{kind}_toi"), atol=1e-3)
+            pairs += len(getattr(found, kind))
+    assert pairs > 50
+
+
+def test_a_graph_detects_on_arcs(device):
+    mesh, x0, x1, arcs = blade_and_post()
+    mesh = bsc.CollisionMesh(mesh.faces, 6, device=device)
+    detector = bsc.CollisionDetector(mesh)
+    expected = detector.detect(x0, x1, arcs=arcs)
+    assert len(expected.vertex_face) + len(expected.edge_edge) > 0 == len(detector.detect(x0, x1).edge_edge)
+    start, end = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
+    with wp.ScopedCapture(device) as capture:
+        captured = detector.capture(start, end, arcs=arcs)
+    for offset in (3.0, 0.0):
+        start.assign(np.where(np.arange(6)[:, None] < 3, x0, x0 + offset * Z))
+        end.assign(np.where(np.arange(6)[:, None] < 3, x1, x1 + offset * Z))
+        wp.capture_launch(capture.graph)
+        found = captured.read()
+        assert found.certified
+        for kind in KINDS:
+            rows = [] if offset else getattr(expected, kind).tolist()
+            assert getattr(found, kind).tolist() == rows
+
+
+@pytest.mark.gpu
+def test_what_a_graph_of_a_gpu_cannot_hold_is_an_error(device):
+    mesh, x0, x1, arcs = blade_and_post()
+    mesh = bsc.CollisionMesh(mesh.faces, 6, device=device)
+    x0, x1 = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
+    wide = bsc.RigidMotion(arcs.body, arcs.centre, 2.0 * arcs.turn)
+    for error, message, given, options in (
+        (RuntimeError, "detect with these arcs once before", arcs, {}),
+        (NotImplementedError, "at most a quarter of a turn", wide, {}),
+        (NotImplementedError, "none with min_distance", arcs, {"min_distance": 0.01}),
+    ):
+        detector = bsc.CollisionDetector(mesh, **options)
+        with pytest.raises(error, match=message), wp.ScopedCapture(device):
+            detector.capture(x0, x1, arcs=given)

@@ -23,6 +23,7 @@ BULLET = FOLDER / "example_cloth_bullet.py"
 THROW = FOLDER / "example_diffsim_throw.py"
 GRIPPER = FOLDER / "example_gripper.py"
 PUSH = FOLDER / "example_diffsim_push.py"
+PROPELLER = FOLDER / "example_propeller.py"
 BEHIND_VBD = {
     "identify": ({"STEPS": 12, "NOISE": 0.0}, ["--triangles", "18", "--starts", "1"], 0.6),
     "towel": ({"STEPS": 10, "LAST": 2, "START": wp.vec3(-0.1, 0.0, 0.07), "STARTS": [(0.5, 0.3, -0.5)]}, [], 0.8),
@@ -43,7 +44,7 @@ PRINTED = re.findall(
 PRINTED.append("paper/example_twisting")
 FIGURES = sorted((FOLDER / "figures").glob("*.py"))
 FRAMES = 2
-RUN_LONGER = ["example_diffsim_push", "example_diffsim_throw", "example_gripper"]
+RUN_LONGER = ["example_diffsim_push", "example_diffsim_throw", "example_gripper", "example_propeller"]
 RUN_LONGER += [f"example_diffsim_{name}" for name in BEHIND_VBD]
 """Examples that other tests run with the same options, and for more frames."""
 COMPARED = ["particle_q", "particle_qd", "particle_mass", "tri_indices", "tri_materials"]
@@ -243,6 +244,15 @@ def test_gradients_behind_vbd_lead_to_the_target(name, monkeypatch):
     assert second < share * first
     assert example.adjoint.report.failed_solves == 0
     assert len(example.solver.report.intersections) == 0
+
+
+def test_a_propeller_throws_a_cloth_that_passes_it_without_stage(capsys):
+    example = run(PROPELLER, 8)
+    example.test_final()
+    example.print_report()
+    assert "turned by 30 degrees a step" in capsys.readouterr().out
+    with pytest.raises(AssertionError, match=r"at most 0\.00 m/s"):
+        run(PROPELLER, 8, "--no-ccd").test_final()
 
 
 @pytest.mark.parametrize("robot", ["featherstone", "mujoco"])

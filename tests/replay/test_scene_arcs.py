@@ -47,6 +47,26 @@ def test_a_blade_that_spins_between_two_samples_strikes_a_pin(stage, angles, tim
     assert min(times) == pytest.approx(time, abs=1e-4)  # there is nothing left for it to find
 
 
+@pytest.mark.parametrize("baked", [False, True])
+def test_a_propeller_goes_through_a_cloth_between_two_samples(stage, baked):
+    """Points at the samples alone, as of a baked cache, pass on their chords, inside of the cloth."""
+    across = np.linspace(-0.1, 0.1, 3)
+    points = [(1.3 + x, 1.3 + x, z) for x in across for z in across]
+    counts, corners = [4] * 4, [i + k for i in (0, 1, 3, 4) for k in (0, 3, 4, 1)]
+    cloth = add_mesh(stage, "/World/Cloth", points, counts, corners)
+    ends = [[(float(x + shift), float(y), float(z)) for x, y, z in points] for shift in (0.0, 0.01)]
+    for time, x in enumerate(ends):
+        cloth.GetPointsAttr().Set(x, time)
+    if baked:
+        propeller = add_mesh(stage, "/World/Blade", BLADE)
+        for time, x in enumerate((BLADE, [(-y, x, z) for x, y, z in BLADE])):
+            propeller.GetPointsAttr().Set(x, time)
+    else:
+        spinning(stage, 0, 90)
+    found = find(stage)
+    assert found["certified"] and (found["hits"] > 0) == (not baked)
+
+
 def test_places_are_on_the_arcs(stage):
     """A spike whose tip passes through the blade, and one that the edge of the blade meets."""
     add_mesh(stage, "/World/Spike", [(0.0, 1.0, 0.0), (-0.01, 1.2, -1.0), (0.01, 1.2, -1.0)])

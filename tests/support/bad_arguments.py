@@ -262,13 +262,16 @@ def calls() -> dict[str, Call]:
         {"x0": COORDINATES, "x1": COORDINATES, "time": NUMBERS | {"early": -0.1, "late": 1.1}},
     )
 
-    def capture(x0, x1):
+    def capture(x0, x1, arcs=None):
         with wp.ScopedCapture("cpu"):
-            detector.capture(x0, x1)
+            detector.capture(x0, x1, arcs=arcs)
 
     on_device = wp.array(X, dtype=wp.vec3d, device="cpu")
     found["CollisionDetector.capture"] = Call(
-        capture, {"x0": on_device, "x1": on_device}, {"x0": COORDINATES, "x1": COORDINATES}, raises=detector.capture
+        capture,
+        {"x0": on_device, "x1": on_device},
+        {"x0": COORDINATES, "x1": COORDINATES, "arcs": without(OBJECTS, "None")},
+        raises=detector.capture,
     )
     found["CollisionDetector.find_intersections"] = Call(detector.find_intersections, {"x": X}, {"x": COORDINATES})
     of_tets = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, tets=tets, device="cpu"))

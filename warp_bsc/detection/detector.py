@@ -6,6 +6,7 @@ import warp as wp
 from .._arguments import as_numpy, check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
+from .arc_pipeline import LARGEST_TURN, ArcPipeline
 from .arc_search import ArcSearch, join_contacts, straight_mesh
 from .collisions import CapturedCollisions, Collisions
 from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
@@ -95,6 +96,7 @@ class CollisionDetector:
         self._has_run = False
         self._rings = rings
         self._arcs: tuple[ArcSearch, CollisionDetector | None] | None = None
+        self._arc_pipeline: ArcPipeline | None = None
 
     @one_at_a_time
     def detect(
@@ -136,24 +138,28 @@ class CollisionDetector:
         changed = None if only is None else self._checked_vertices(only)
         if arcs is not None:
             return self._detect_arcs(x0, x1, only, changed, self._checked_arcs(arcs, x0, x1))
+        self._has_run = True
+        return self._run(self._pipeline, x0, x1, changed)
+
+    def _run(self, pipeline: DetectionPipeline, x0: wp.array, x1: wp.array, changed: wp.array | None) -> Collisions:
+        """Returns the collisions that a pipeline finds."""
 
         def launch() -> StageTimer:
             timer = StageTimer(self.mesh.device)
-            self._pipeline.find_contacts(x0, x1, changed=changed, sort=True, timer=timer)
+            pipeline.find_contacts(x0, x1, changed=changed, sort=True, timer=timer)
             return timer
 
-        timer = retry_until_fits(launch, self._pipeline, self.mesh.device)
-        self._has_run = True
-        counts = self._pipeline.counts
+        timer = retry_until_fits(launch, pipeline, self.mesh.device)
+        counts = pipeline.counts
         if counts.not_finite:
             for name, x in (("x0", x0), ("x1", x1)):
                 check_finite(x.numpy(), name, self.mesh.vertices)
         differentiable = x0.requires_grad or x1.requires_grad
         with timer.stage("sort"):
-            contacts = self._ordered_contacts(counts, recycle=not differentiable)
+            contacts = self._ordered_contacts(pipeline, counts, recycle=not differentiable)
         if self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values()):
             with timer.stage("exact"):  # now, while the arrays hold these positions
-                for narrow_phase in self._pipeline.narrow_phases:
+                for narrow_phase in pipeline.narrow_phases:
                     kind = DistanceKind(narrow_phase.kind)
                     contacts[kind] = self._decide_on_host(kind, contacts[kind], x0, x1)
         arrays = None
@@ -162,7 +168,7 @@ class CollisionDetector:
         return Collisions(self.method != "float", (), arrays, self.method, counts, contacts, timer)
 
     @one_at_a_time
-    def capture(self, x0: wp.array, x1: wp.array) -> CapturedCollisions:
+    def capture(self, x0: wp.array, x1: wp.array, *, arcs: RigidMotion | None = None) -> CapturedCollisions:
         """Adds a detection to the graph that the device captures, and returns its results, to be read after a replay.
 
         Each replay detects the collisions of the positions that the arrays then hold::
@@ -177,18 +183,37 @@ class CollisionDetector:
             x0: Positions at the start, as of :meth:`detect`, Warp array of vec3 or vec3d on the mesh's device. On the
                 CPU it must not require gradients.
             x1: Positions at the end, of the same type.
+            arcs: The bodies that turn and how, as of :meth:`detect`, in each replay alike. On a GPU, detect with them
+                once before; ``x1`` then is not checked to be where they take the bodies, and arcs end there.
 
         Raises:
-            TypeError: If the positions are no arrays of numbers.
+            TypeError: If the positions are no arrays of numbers, or ``arcs`` is no :class:`.RigidMotion`.
             ValueError: If they have another shape or type, differ in type, are elsewhere, or require gradients on the
-                CPU.
-            RuntimeError: If the device captures no graph, or if a GPU captures one before the first :meth:`detect`.
+                CPU or with ``arcs``.
+            NotImplementedError: If a GPU is to capture ``arcs`` of more than a quarter of a turn, or with a minimum
+                distance or radii.
+            RuntimeError: If the device captures no graph, or if a GPU captures one before the first :meth:`detect`, or
+                before that with ``arcs``.
         """
         device = self.mesh.device
         if not device.is_capturing:
             raise RuntimeError(f"{device} captures no graph: call capture(x0, x1) within wp.ScopedCapture, or detect")
         x0, x1 = self._checked_positions(x0, x1)
-        return self._capture_on_cpu(x0, x1) if device.is_cpu else self._capture_on_cuda(x0, x1)
+        if arcs is not None:
+            check_instance(arcs, "arcs", RigidMotion, "a RigidMotion")
+        if device.is_cpu:
+            return self._capture_on_cpu(x0, x1, arcs)
+        if arcs is None:
+            if not self._has_run:
+                raise RuntimeError(
+                    "detect once before capturing, so that kernels are loaded and buffers are large enough"
+                )
+            return self._capture_on_cuda(self._pipeline, x0, x1)
+        at_once = self._arcs_to_capture(arcs)
+        if x0.requires_grad or x1.requires_grad:
+            raise ValueError("arcs: x0 and x1 must not require gradients")
+        at_once.bound(x0, x1)
+        return self._capture_on_cuda(at_once.pipeline, x0, x1, at_once)
 
     def find_intersections(self, x: np.ndarray | wp.array) -> np.ndarray:
         """Returns the edges that meet faces in one configuration, exactly.
@@ -285,6 +310,15 @@ class CollisionDetector:
     ) -> Collisions:
         """Returns the collisions of a motion in which bodies turn."""
         body, options = bounds.motion.body, {"method": self.method, "tolerance": self.tolerance}
+        if self._pipeline.radius is None and ArcPipeline.is_for(bounds):
+            at_once = self._arc_pipeline
+            if at_once is None or not np.array_equal(at_once.body, body):
+                at_once = self._arc_pipeline = ArcPipeline(self.mesh, bounds, **options)
+            at_once.set_motion(bounds)
+            at_once.bound(x0, x1)
+            found = self._run(at_once.pipeline, x0, x1, changed)
+            if not at_once.has_unsure_pairs(found._rows):
+                return found
         options |= {"min_distance": self.min_distance, "rings": self._rings}
         if self._arcs is None or not np.array_equal(self._arcs[0].body, body):
             straight = None
@@ -319,16 +353,19 @@ class CollisionDetector:
             raise ValueError(f"x1 must have the type of x0, {x0.dtype.__name__}, not {x1.dtype.__name__}")
         return x0, x1
 
-    def _ordered_contacts(self, counts: Counts, *, recycle: bool) -> dict[DistanceKind, ContactRows]:
+    def _ordered_contacts(
+        self, pipeline: DetectionPipeline, counts: Counts, *, recycle: bool
+    ) -> dict[DistanceKind, ContactRows]:
         """Returns the sorted contacts of each kind of pair, without those that overflowed.
 
         Args:
+            pipeline: The pipeline that found them.
             counts: The counts of the detection.
             recycle: Whether to use buffers of earlier results that are garbage, and to let later results use these;
                 not where others refer to the arrays. Otherwise the buffers are new, without spare rows.
         """
         contacts = {}
-        for narrow_phase in self._pipeline.narrow_phases:
+        for narrow_phase in pipeline.narrow_phases:
             kind = DistanceKind(narrow_phase.kind)
             count = min(counts.pairs[kind].collisions, len(narrow_phase.contacts.pairs))
             if recycle:
@@ -351,14 +388,27 @@ class CollisionDetector:
         buffer = contacts_from_host(contacts.rows(contacts.hit), self.mesh.device)
         return ContactRows(buffer, len(buffer.pairs))
 
-    def _capture_on_cpu(self, x0: wp.array, x1: wp.array) -> CapturedCollisions:
+    def _arcs_to_capture(self, arcs: RigidMotion) -> ArcPipeline:
+        """Returns the pipeline that has detected with these arcs last; raises errors as of :meth:`capture`."""
+        if self._pipeline.radius is not None:
+            raise NotImplementedError("arcs: a graph holds none with min_distance or radius; detect outside the graph")
+        at_once = self._arc_pipeline
+        if at_once is None or at_once.bounds.motion is not arcs:
+            if (np.linalg.norm(arcs.turn, axis=1) > LARGEST_TURN).any():
+                raise NotImplementedError(
+                    "arcs: a graph holds turns of at most a quarter of a turn; detect outside the graph"
+                )
+            raise RuntimeError("detect with these arcs once before capturing, which copies them to the device")
+        return at_once
+
+    def _capture_on_cpu(self, x0: wp.array, x1: wp.array, arcs: RigidMotion | None) -> CapturedCollisions:
         """Adds a detection to the graph that the CPU captures."""
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("x0 and x1 must not require gradients in a graph on the CPU: detect outside the graph")
         replayed: list[Collisions] = []
 
         def detect() -> None:
-            replayed[:] = [self.detect(x0, x1)]
+            replayed[:] = [self.detect(x0, x1, arcs=arcs)]
 
         def read() -> Collisions:
             if not replayed:
@@ -368,11 +418,10 @@ class CollisionDetector:
         run_on_host(detect, self.mesh.device)
         return CapturedCollisions(None, read)
 
-    def _capture_on_cuda(self, x0: wp.array, x1: wp.array) -> CapturedCollisions:
-        """Adds a detection to the graph that a GPU captures, both kinds of pair side by side."""
-        if not self._has_run:
-            raise RuntimeError("detect once before capturing, so that kernels are loaded and buffers are large enough")
-        pipeline = self._pipeline
+    def _capture_on_cuda(
+        self, pipeline: DetectionPipeline, x0: wp.array, x1: wp.array, at_once: ArcPipeline | None = None
+    ) -> CapturedCollisions:
+        """Adds a detection by a pipeline to the graph that a GPU captures, both kinds of pair side by side."""
         pipeline.find_contacts(x0, x1, sort=True, side_stream=self._side_stream)
         generation = pipeline.generation
 
@@ -383,7 +432,10 @@ class CollisionDetector:
             overflows = tuple(pipeline.overflows(counts))
             left_to_host = self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values())
             certified = self.method != "float" and not (overflows or counts.not_finite or left_to_host)
-            contacts = self._ordered_contacts(counts, recycle=True)
+            contacts = self._ordered_contacts(pipeline, counts, recycle=True)
+            if at_once is not None and self.method == "exact":
+                pipeline.counts = counts
+                certified = certified and not at_once.has_unsure_pairs(contacts)
             return Collisions(certified, overflows, arrays, self.method, counts, contacts, StageTimer(None))
 
         def read_alone() -> Collisions:

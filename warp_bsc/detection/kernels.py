@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import warp as wp
 
+from ..kernels.arcs import Arcs, any_turns, turns
 from ..kernels.classification import classify
 from ..kernels.closest import contact_at
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
@@ -142,6 +143,7 @@ def pair_kernels(dtype: type) -> PairKernels:
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         roundoff: wp.float64,
+        arcs: Arcs,
         # in and out
         vertex_face: PairStages,
         edge_edge: PairStages,
@@ -159,6 +161,8 @@ def pair_kernels(dtype: type) -> PairKernels:
             v = vertices_of_pair(VERTEX_FACE, vertex_face.elements, pair)
         else:
             v = vertices_of_pair(EDGE_EDGE, edge_edge.elements, pair)
+        if turns(arcs, v):
+            return
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -257,6 +261,7 @@ def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         roundoff: wp.float64,
+        arcs: Arcs,
         # in and out
         stages: PairStages,
     ):
@@ -264,6 +269,8 @@ def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
         if pair[0] < 0:
             return
         v = vertices_of_pair(kind_number, stages.elements, pair)
+        if turns(arcs, v):
+            return
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -284,6 +291,7 @@ def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
 def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
     """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position."""
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+    kind_number = int(kind)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull_batches(
@@ -292,15 +300,18 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kerne
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         roundoff: wp.float64,
+        arcs: Arcs,
         # in and out
         stages: PairStages,
     ):
         i = BATCH * (first + wp.tid())
+        any_turn = any_turns(arcs)
         filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
         left = cull_batch(x0, x1, stages.elements, stages.queue, i, wp.min(BATCH, filled - i), roundoff)
         while left != wp.uint64(0):
-            lane = lowest_bit(left)
-            append(stages.queue[i + lane], stages.survivors, stages.counts, _SURVIVORS)
+            pair = stages.queue[i + lowest_bit(left)]
+            if not (any_turn and turns(arcs, vertices_of_pair(kind_number, stages.elements, pair))):
+                append(pair, stages.survivors, stages.counts, _SURVIVORS)
             left = left & (left - wp.uint64(1))
 
     return cull_batches

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from .. import checker
+from ..kernels.arcs import Arcs
 from ..kernels.pipeline.batch_culling import BATCH
 from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
@@ -190,6 +191,7 @@ def run_narrow_phases(
     method: Method,
     timed: bool = True,
     tolerance: float = TOLERANCE,
+    arcs: "Arcs | None" = None,
     timer: StageTimer,
 ) -> None:
     """Launches all stages but the sorting over the queued pairs of both kinds, or of one.
@@ -203,8 +205,10 @@ def run_narrow_phases(
         method: As of :meth:`NarrowPhase.run`.
         timed: As of :meth:`NarrowPhase.run`.
         tolerance: As of :meth:`NarrowPhase.run`.
+        arcs: Pairs with a turning vertex are left out, for :mod:`.arc_phase`; None if nothing turns.
         timer: Measures the stages.
     """
+    arcs = Arcs() if arcs is None else arcs
     device = x0.device
     motion = [x0, x1, 0.0 if method == "float" else ROUNDOFF]
     kernels = pair_kernels(x0.dtype)
@@ -230,12 +234,12 @@ def run_narrow_phases(
             if device.is_cpu:
                 batches = -(-min(len(s.queue), int(s.counts.numpy()[Count.QUEUED])) // BATCH)
                 kernel = batch_culling_kernel(kind, x0.dtype)
-                launch_over(kernel, batches, inputs=motion, outputs=[s], device=device, chunk=16)
+                launch_over(kernel, batches, inputs=[*motion, arcs], outputs=[s], device=device, chunk=16)
             else:
                 kernel = culling_kernel(kind, x0.dtype)
-                launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=motion, outputs=[s])
+                launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=[*motion, arcs], outputs=[s])
     with timer.stage("classify"):
-        launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64)
+        launch(kernels.classify_survivors, [arcs], "survivors", Count.SURVIVORS, 64)
     with timer.stage("time of impact"):
         launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32)
     if method == "exact":

@@ -4,7 +4,9 @@ import numpy as np
 import warp as wp
 
 from .._arguments import checked_choice, checked_distance, checked_integer
+from ..kernels.arcs import Arcs
 from .approach_phase import MinDistances, run_approach_phases
+from .arc_phase import run_arc_phases
 from .broad_phase import BroadPhase, make_broad_phase
 from .distance_phase import run_distance_phases
 from .launch import launch, made_once
@@ -35,7 +37,25 @@ _LARGEST_RADIUS = 2.0**1000
 _ABOVE_SUM = 1.0 + 2.0**-50
 """Raises a radius so that the rounded sum of two is at least the sum of what they were raised from."""
 
+_RAISED = wp.constant(wp.float64(_ABOVE_SUM))
+_ZERO = wp.constant(wp.float64(0.0))
+
 _UNTIMED = StageTimer(None)
+
+
+@wp.kernel(**NO_GRADIENTS)
+def _add_deviations(
+    # in
+    padding: wp.array[wp.float64],
+    deviation: wp.array[wp.float64],
+    # out
+    padding_on_arcs: wp.array[wp.float64],
+):
+    """Writes paddings of boxes that arcs do not leave either; those of vertices that move straight stay the same."""
+    vertex = wp.tid()
+    added = deviation[vertex]
+    pad = padding[vertex]
+    padding_on_arcs[vertex] = wp.where(added > _ZERO, _RAISED * (pad + added), pad)
 
 
 @made_once
@@ -116,6 +136,7 @@ class DetectionPipeline:
         rings: int = 1,
         min_distances: "MinDistances | None" = None,
         body: np.ndarray | None = None,
+        arcs: "Arcs | None" = None,
         only_used_vertices: bool = False,
         pairs_per_face: int | None = None,
     ):
@@ -131,6 +152,8 @@ class DetectionPipeline:
                 ``min_distance``; None for these.
             body: Body of each vertex, int, shape [vertex_count]: pairs whose vertices are all of one body are excluded,
                 and :meth:`add_to_radius` must be called before each run. None for none.
+            arcs: The arcs of bodies that turn, which the caller writes before each run; with them, pairs keep the
+                distances of ``min_distances`` or none. None if nothing turns.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
             pairs_per_face: Capacity of each queue at first, for each face, at least :data:`MIN_CAPACITY` together;
@@ -169,6 +192,12 @@ class DetectionPipeline:
             self.device_radius = wp.empty(vertices, dtype=wp.float64, device=mesh.device)
             self._padding = wp.empty_like(self.device_radius)
             self._set_radius(self.radius)
+        self._arcs = arcs
+        padding = self._padding
+        if arcs is not None:
+            assert self.radius is None or min_distances is not None
+            padding = arcs.deviation if self._padding is None else wp.empty_like(self._padding)
+        self._padding_on_arcs = padding
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs_per_face is not None:
@@ -180,7 +209,7 @@ class DetectionPipeline:
             capacity=face_pairs,
             not_finite=self.counters.not_finite,
             checked_vertices=mesh.vertices if only_used_vertices else None,
-            padding=self._padding,
+            padding=padding,
         )
         self.vertex_face = NarrowPhase(
             PairKind.VERTEX_FACE, self.counters.vertex_face, vertex_face, elements=(vertices, faces)
@@ -250,6 +279,7 @@ class DetectionPipeline:
             side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
         """
         self._captured |= bool(self.mesh.device.is_capturing)
+        self._pad_arcs()
         self.counters.array.zero_()
         if self._filtered_of_worlds is not None:
             self._filtered_of_worlds.zero_()
@@ -262,10 +292,12 @@ class DetectionPipeline:
         narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
         if self._min_distances is not None:
-            options = {"tolerance": self.tolerance, "timer": timer}
+            options = {"tolerance": self.tolerance, "arcs": self._arcs, "timer": timer}
             run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=proximities, **options)
         elif self.device_radius is None:
-            run_narrow_phases(narrow_phases, x0, x1, **options)
+            run_narrow_phases(narrow_phases, x0, x1, arcs=self._arcs, **options)
+            if self._arcs is not None:
+                run_arc_phases(narrow_phases, x0, x1, self._arcs, timer=timer)
         else:
             options["body"] = self._body
             run_distance_phases(narrow_phases, x0, x1, self.device_radius, self._rings, **options)
@@ -277,6 +309,14 @@ class DetectionPipeline:
                 narrow_phase.sort()
         if side_stream is not None:
             wp.wait_stream(side_stream)
+
+    def _pad_arcs(self) -> None:
+        """Makes boxes reach as far beyond elements as their arcs do, and as their minimum distances."""
+        if self._arcs is None or self._padding is None:
+            return
+        inputs, outputs = [self._padding, self._arcs.deviation], [self._padding_on_arcs]
+        device = self.mesh.device
+        launch(_add_deviations, len(self._padding), inputs=inputs, outputs=outputs, device=device, record_tape=False)
 
     @property
     def broad_phase(self) -> BroadPhase:
@@ -290,6 +330,7 @@ class DetectionPipeline:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
         """
+        self._pad_arcs()
         self.counters.array.zero_()
         queues = _queues(self.vertex_face, self.edge_edge)
         self._broad_phase.pair_elements(x0, x1, *queues, keep_separated=True)

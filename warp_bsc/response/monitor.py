@@ -67,7 +67,7 @@ class CollisionMonitor(CollisionStage):
             mesh.distances = mesh.min_distances(distances, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
-        motion = ModelMotion(mesh, friction)
+        motion = ModelMotion(mesh, friction, watches_turns=True)
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
         if report_worlds:
             self._count_worlds(responds=False)

@@ -15,6 +15,7 @@ from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, w
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
+from .contacts.arc_check import check_arcs
 from .forces.contact_forces import ContactForces
 from .integration.vbd_speed_limit import has_self_contact, has_speed_limit, without_speed_limit
 from .integration.wrapped_solver import innermost
@@ -56,11 +57,12 @@ class SolverCCD(CollisionStage):
     :meth:`reset`, and with ``requires_grad``. A body that ``joint_q`` of the model puts elsewhere than ``body_q``
     starts the first step where the state has it.
 
-    The certificate covers straight motion, from the stored state at the start to the stored state at the end; vertices
-    of shapes move straight between the poses of their bodies. On a body that turns, vertices go in arcs. The stage adds
-    the distance of an arc from its chord (the sagitta) to the separation of contacts with that body, up to 4 times the
-    separation, but does not certify the arc. A body whose predicted pose or velocity is not finite is left to the inner
-    solver, and the step is not certified.
+    The certificate covers the motion from the stored state at the start to the stored state at the end: particles move
+    straight, and bodies turn evenly, the shorter way, so that their vertices move on arcs, see :mod:`.state.turns`. A
+    body that the response can move turns about its centre of mass, others about the axis of their screw. With
+    ``requires_grad`` the response resolves contacts of straight paths, and a step in which only an arc collides is not
+    certified. A body whose predicted pose or velocity is not finite is left to the inner solver, and the step is not
+    certified.
 
     With ``min_distance`` or ``particle_radius`` the certificate is of distances: a pair that started farther apart
     stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-30 of that distance
@@ -222,7 +224,8 @@ class SolverCCD(CollisionStage):
         integrator = innermost(solver)
         moves = options.moves_bodies(mesh, integrator)
         coefficients = friction_of(mesh, self.friction, table=friction_table)
-        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=separates)
+        moving = {"moves_bodies": moves, "responds_to_bodies": separates, "watches_turns": True}
+        motion = ModelMotion(mesh, coefficients, **moving)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         self._work.watch_inversions(options.inversions)
         if options.contact_layer and self.model.requires_grad and inner is solver:
@@ -425,6 +428,7 @@ class SolverCCD(CollisionStage):
                     measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
                     wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
                 resolve_inversions(self._work, dt)
+                check_arcs(self._work)
                 self._write_end(end)
 
     def _write_end(self, end):

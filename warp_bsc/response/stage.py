@@ -49,7 +49,8 @@ class CollisionStage(CouplingHooks):
     ):
         """Allocates the workspace of steps, and makes the report."""
         self.mesh, self._motion, model = motion.mesh, motion, self.model
-        self._work = Workspace(motion, separation=separation, restitution=restitution, max_iterations=max_iterations)
+        options = {"max_iterations": max_iterations, "responds": responds}
+        self._work = Workspace(motion, separation=separation, restitution=restitution, **options)
         motion.set_start(arrays_of(model))
         motion.set_end(arrays_of(model), 1.0)
         prepare(self._work)

@@ -25,6 +25,8 @@ SMALL_DISTANCE = wp.constant(wp.float64(0.1))
 nearly 0 is closed again by the rounding of positions."""
 MAX_SAGITTA = wp.constant(wp.float64(4.0))
 """Most that the turn of a body adds to the separation of a contact, in separations."""
+EARLIEST = wp.constant(wp.float64(2.0**-6))
+"""Time, as a share of the step, from which a contact on an arc adds what the arc is ahead of its chord in full."""
 
 # proximities and occluded edges
 REACH = wp.constant(wp.float64(1.5))

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ...detection.settings import Count
+from ...kernels.arcs import Arcs
 from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import filled_entries, has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
@@ -192,7 +193,9 @@ def mark_changed(vertices: Vertices, corners: wp.vec4i):
 
 
 @wp.func
-def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: DividingPlanes, status: SolveStatus):
+def _collect_contact(
+    step: Step, contacts: PairQueue, i: int, arcs: Arcs, dividing: DividingPlanes, status: SolveStatus
+):
     """Counts a contact, and adds a constraint for it; after the last projection, dividing planes."""
     if not has_pair(contacts, i):
         return
@@ -262,7 +265,8 @@ def _collect_contact(step: Step, contacts: PairQueue, i: int, dividing: Dividing
     if added.pace == Pace.SLOW:
         before = wp.dot(added.normal, relative(added.weights, corners, motion.x0)) - added.min_distance
         target = constraints.feasible(step, corners, target, before)
-    target += constraints.sagitta(step, corners)
+    ahead = constraints.ahead_of_chords(step, arcs, corners, added.weights, added.normal, toi)
+    target += wp.max(constraints.sagitta(step, corners), ahead)
     target += added.min_distance
     if near and wp.dot(added.normal, relative(added.weights, corners, vertices.x1)) < target:
         status.detection[Detection.TOO_NEAR] = 1
@@ -283,6 +287,7 @@ def collect_contacts(
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
     can_search: bool,
+    arcs: Arcs,
     # in and out
     step: Step,
     dividing: DividingPlanes,
@@ -297,8 +302,8 @@ def collect_contacts(
     if can_search and has_overflowed(counts, capacities):
         return
     for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
-        _collect_contact(step, first, i, dividing, status)
-        _collect_contact(step, second, i, dividing, status)
+        _collect_contact(step, first, i, arcs, dividing, status)
+        _collect_contact(step, second, i, arcs, dividing, status)
 
 
 @wp.kernel

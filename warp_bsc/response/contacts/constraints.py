@@ -3,13 +3,14 @@
 import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
+from ...kernels.arcs import Arcs, on_arc_of, turns
 from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE, VERTEX_VERTEX
 from ..state.planes import MovingPlanes
 from ..state.poses import turn_between
 from ..state.structs import ContactKind, Materials, Motion, Pace, Step, body_of, can_move
 from ..state.vectors import ONE, ZERO, corners_of, relative, to_double
-from ..tuning import MAX_SAGITTA, RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
+from ..tuning import EARLIEST, MAX_SAGITTA, RECOVERY, REST, ROUNDING, SLOW_PATH, SMALL_DISTANCE
 from .rules import are_on_body, inverse_mass_of
 
 TOUCH = wp.constant(wp.float64(1e-100))
@@ -260,3 +261,24 @@ def sagitta(step: Step, corners: wp.vec4i) -> wp.float64:
             arm = to_double(step.motion.x1[corners[j]]) - step.vertices.bodies.centre[body]
             off = wp.max(off, wp.float64(2.0) * half * half * wp.length(arm))
     return wp.min(off, MAX_SAGITTA * step.separation)
+
+
+@wp.func
+def ahead_of_chords(
+    step: Step, arcs: Arcs, corners: wp.vec4i, weights: wp.vec4d, normal: wp.vec3d, time: wp.float64
+) -> wp.float64:
+    """Returns how much farther apart than by their chords two elements must end so that arcs meet at no time [m].
+
+    At the time of their contact, arcs are ahead of the chords by some distance along the normal. On the straight way to
+    the ends, a share of the distance there, by the time, is to make up for it.
+    """
+    ahead = ZERO
+    if turns(arcs, corners) and time <= ONE:
+        for j in range(4):
+            vertex = corners[j]
+            x0 = to_double(step.motion.x0[vertex])
+            x1 = to_double(step.vertices.x1[vertex])
+            off = on_arc_of(arcs, vertex, x0, x1, time) - ((ONE - time) * x0 + time * x1)
+            ahead -= weights[j] * wp.dot(normal, off)
+        ahead /= wp.max(time, EARLIEST)
+    return wp.max(ahead, ZERO)

@@ -41,6 +41,8 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     """
     detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else work.active
+    if work.on_arcs:
+        work.write_arcs()
 
     def find():
         ends = work.step.motion.x0, vertices.x1
@@ -56,7 +58,7 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
-        work.launch_over_entries(collect_contacts, [*pair, *overflow, work.step, work.dividing, work.status])
+        work.launch_over_entries(collect_contacts, [*pair, *overflow, work.arcs, work.step, work.dividing, work.status])
     if work.recorder is not None:
         work.launch_over_entries(count_grazing, [work.step, *queues[:2], work.record])
     _decide(work, overflow)
@@ -68,7 +70,7 @@ def _search(work, overflow):
     """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
     broad_phase = work.detector.broad_phase
     broad_phase.fit(work.step.motion.x0, work.vertices.x1)
-    find_contacts_without_queues(broad_phase, work.step, work.dividing, work.status)
+    find_contacts_without_queues(broad_phase, work.step, work.arcs, work.dividing, work.status)
     _decide(work, overflow)
 
 

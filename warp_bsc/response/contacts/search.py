@@ -4,10 +4,12 @@ import functools
 
 import warp as wp
 
+from ...detection.approach_phase import impact_on_arcs_at_distance
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.element_pairs import filtered_pairs, pair_functions
 from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...detection.settings import TOLERANCE
+from ...kernels.arcs import Arcs, are_of_one_group, impact_on_arcs, turns
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
@@ -16,7 +18,7 @@ from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.pipeline.pairs import distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
-from ...kernels.time_of_impact import impact
+from ...kernels.time_of_impact import Impact, impact
 from ..schedule import Detection, SolveStatus, count_contact, count_filtered
 from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
@@ -27,6 +29,7 @@ from .face_pairs import pair_of_bit
 from .first_contact import update_first_contact
 from .rules import ContactClass, classify_contact, owner_of
 
+_ABOVE_SUM = wp.constant(wp.float64(1.0 + 2.0**-50))
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
 """The pair of a point and another cell, behind those of the elements of two faces."""
@@ -38,6 +41,7 @@ class _Arguments:
 
     faces: FaceHierarchy
     step: Step
+    arcs: Arcs
     dividing: DividingPlanes
     status: SolveStatus
 
@@ -111,6 +115,31 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
 
 
 @wp.func
+def _decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
+    """Resolves a pair with a turning vertex if it is in contact on its arcs, or comes nearer there than it may."""
+    motion, arcs = arguments.step.motion, arguments.arcs
+    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.step.vertices.x1, corners)
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    most = distance_of_corners(kind, corners, arcs.deviation)
+    if motion.distances.radius:
+        most = _ABOVE_SUM * (most + distance_of_corners(kind, corners, motion.distances.radius))
+    relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
+    if clears_at_once(relative, scaled):
+        return
+    start = ZERO
+    kept = ZERO
+    result = Impact()
+    if motion.distances.radius:
+        start, kept = distances_at_start(motion, corners, kind)
+        result = impact_on_arcs_at_distance(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
+    else:
+        result = impact_on_arcs(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, ZERO)
+        start = result.toi
+    if result.status != FREE:
+        _resolve(arguments, kind, pair, corners, owner, start, result.toi, kept)
+
+
+@wp.func
 def _point_pair(mesh: FaceHierarchy, point: int, other: int):
     """Returns kind, elements and vertices of a pair of a point and another cell, at two places; kind -1 if none."""
     p = mesh.faces[point, 0]
@@ -123,7 +152,7 @@ def _point_pair(mesh: FaceHierarchy, point: int, other: int):
 
 
 @functools.cache
-def _kernel(keep_distances: bool, padded: bool) -> wp.Kernel:
+def _kernel(keep_distances: bool, padded: bool, on_arcs: bool) -> wp.Kernel:
     """The kernel, made where it is first needed, as it takes long to compile."""
     decide = _decide_distance if keep_distances else _decide_pair
     element_pairs = pair_functions(padded, False).element_pairs
@@ -154,14 +183,21 @@ def _kernel(keep_distances: bool, padded: bool) -> wp.Kernel:
                 owner = int(ContactClass.NONE)
                 if kind >= 0:
                     owner = owner_of(arguments.step.motion, corners)
-                if owner != ContactClass.NONE:
+                straight = bool(True)
+                if wp.static(on_arcs):
+                    if owner != ContactClass.NONE:
+                        if turns(arguments.arcs, corners):
+                            straight = False
+                            if not are_of_one_group(arguments.arcs, corners):
+                                _decide_on_arcs(arguments, kind, pair, corners, owner)
+                if owner != ContactClass.NONE and straight:
                     decide(arguments, kind, pair, corners, owner)
 
     return traversal_kernel(visit, _Arguments)
 
 
 def find_contacts_without_queues(
-    broad_phase: BroadPhaseHierarchy, step: Step, dividing: DividingPlanes, status: SolveStatus
+    broad_phase: BroadPhaseHierarchy, step: Step, arcs: Arcs, dividing: DividingPlanes, status: SolveStatus
 ) -> None:
     """Finds all contacts of the motion that a broad phase has fitted last, as a whole, however many there are.
 
@@ -169,7 +205,7 @@ def find_contacts_without_queues(
     and does not synchronize. Slower than the detector, as neighbouring threads decide pairs of different difficulty.
     """
     arguments = _Arguments()
-    arguments.faces, arguments.step = broad_phase.hierarchy, step
+    arguments.faces, arguments.step, arguments.arcs = broad_phase.hierarchy, step, arcs
     arguments.dividing, arguments.status = dividing, status
-    kernel = _kernel(bool(step.motion.distances.radius), broad_phase.is_padded)
+    kernel = _kernel(bool(step.motion.distances.radius), broad_phase.is_padded, bool(arcs.turning))
     broad_phase.traverse(kernel, arguments)

@@ -10,6 +10,7 @@ from .mesh import ModelMesh, Placement, members_of_worlds, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
 from .structs import Bodies, Motion, add_zeros, body_of, can_move
+from .turns import BodyTurns
 from .vectors import to_double
 
 _SAME_POSE = 1e-5
@@ -191,14 +192,29 @@ class ModelMotion:
         mesh: The mesh.
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.
+        turns: How bodies turn, None if nothing asks for it or no body has a shape.
         keeps_poses: Whether ``vertices.bodies`` has the poses of bodies at the start and end: if the response can move
             bodies, or if the model requires gradients.
     """
 
     def __init__(
-        self, mesh: ModelMesh, friction: Friction, *, moves_bodies: bool = False, responds_to_bodies: bool = False
+        self,
+        mesh: ModelMesh,
+        friction: Friction,
+        *,
+        moves_bodies: bool = False,
+        responds_to_bodies: bool = False,
+        watches_turns: bool = False,
     ):
-        """Allocates buffers; ``responds_to_bodies`` keeps bodies apart from each other and from static shapes."""
+        """Allocates buffers.
+
+        Args:
+            mesh: The mesh.
+            friction: The coefficients of its vertices and planes.
+            moves_bodies: Whether the response can move bodies.
+            responds_to_bodies: Whether it keeps bodies apart from each other and from static shapes.
+            watches_turns: Whether the arcs of bodies that turn are to be known.
+        """
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()
@@ -222,6 +238,7 @@ class ModelMotion:
         if moves_bodies:
             vertices.bodies = self._allocate_bodies()
             vertices.bodies.responds = int(responds_to_bodies)
+        self.turns = BodyTurns(mesh) if watches_turns and (mesh.shape_vertices.body >= 0).any() else None
         self.keeps_poses = moves_bodies or bool(model.requires_grad and model.body_count)
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
             add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
@@ -261,6 +278,8 @@ class ModelMotion:
         first = self.mesh.model.particle_count
         positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
         planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan
+        if self.turns is not None:
+            self.turns.remember(misplaced)
         last.assign(positions)
         self.planes.end.assign(planes)
 
@@ -285,6 +304,8 @@ class ModelMotion:
     def starts(self) -> list[wp.array]:
         """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""
         arrays: list[wp.array] = [self.vertices.interrupted]
+        if self.turns is not None:
+            arrays.append(self.turns.turns.end)
         return arrays if self._last is None else [*arrays, self._last, self.planes.end]
 
     def set_start(self, start: StateArrays) -> None:
@@ -293,6 +314,8 @@ class ModelMotion:
         wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
         if self.keeps_poses:
             wp.copy(self.vertices.bodies.start, start.body_q)
+        if self.turns is not None:
+            self.turns.set_start(start.body_q)
 
     def set_end(self, end: StateArrays, dt: float) -> None:
         """Copies the predicted positions and velocities at the end of a step of length ``dt`` [s], after its start.
@@ -304,6 +327,8 @@ class ModelMotion:
             self.set_body_ends(end)
         elif self.keeps_poses:
             wp.copy(self.vertices.bodies.end, end.body_q)
+        if self.turns is not None:
+            self.turns.set_end(self.vertices, end.body_q)
         inputs = [place, end.particle_qd, dt, self._last, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 

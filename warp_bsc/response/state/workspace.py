@@ -10,6 +10,7 @@ import warp as wp
 from ...detection.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.settings import capacity_for
+from ...kernels.arcs import Arcs
 from ..schedule import (
     MAX_ITERATIONS,
     SWEEPS_PER_BATCH,
@@ -101,6 +102,10 @@ class Workspace:
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
         active: 1 of each vertex that takes part in the step, None if all do.
+        turns: How bodies turn, None if no body has a shape.
+        arcs: The arcs of vertices; without arrays if no body has a shape.
+        on_arcs: Whether contacts are those on arcs. Steps that may be recorded are resolved by chords, and checked by
+            :mod:`.contacts.arc_check`.
         tetrahedra: The tetrahedra whose inversions are looked for, None if nobody asks.
         ends: Where particles ended before inversions were prevented; None if they are not.
         unmasked: Inverse masses of vertices and bodies while those that take no part have none.
@@ -115,8 +120,17 @@ class Workspace:
         separation: float,
         restitution: wp.array[float],
         max_iterations: int = MAX_ITERATIONS,
+        responds: bool = True,
     ):
-        """Allocates buffers for steps of a motion; separation [m] and restitution are those of :class:`.Step`."""
+        """Allocates buffers.
+
+        Args:
+            motion: The motion of steps.
+            separation: As of :class:`.Step` [m].
+            restitution: As of :class:`.Step`.
+            max_iterations: Iterations of detect and project, see :mod:`.schedule`.
+            responds: Whether contacts are resolved, and not only counted.
+        """
         self.mesh = mesh = motion.mesh
         self.device, vertices = mesh.device, mesh.vertex_count
         self.differentiable = differentiable = mesh.model.requires_grad
@@ -125,7 +139,11 @@ class Workspace:
         self.particle_count, device = mesh.model.particle_count, mesh.device
         self.body_count = mesh.model.body_count if motion.moves_bodies else 0
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances)
+        self.turns = motion.turns
+        self.arcs = Arcs() if self.turns is None else self.turns.turns.arcs
+        self.on_arcs = self.turns is not None and not (differentiable and responds)
+        arcs = None if self.turns is None else self.arcs
+        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances, arcs=arcs)
         self.crossing_candidates = CrossingCandidates(mesh)
         self.step = step = Step()
         step.mesh = mesh.connectivity
@@ -165,6 +183,11 @@ class Workspace:
         at_once = not self.body_count and not differentiable
         self.sweeping_threads = threads_of_cluster(device, self.particle_count) if at_once else 0
         self._threads = 1 if device.is_cpu else THREADS * device.sm_count
+
+    def write_arcs(self) -> None:
+        """Writes the arcs of the motion as it is now, if a body has a shape."""
+        if self.turns is not None:
+            self.turns.write_arcs(self.step.motion, self.vertices)
 
     def count_worlds(self) -> WorldCounts:
         """Counts contacts and filtered pairs of each world from now on, and returns the counts."""

@@ -2,13 +2,14 @@
 
 import warp as wp
 
+from ...kernels.arcs import Arcs, is_on_arc, on_arc_of
 from ..contacts.constraints import NEVER_SWEPT, NEVER_VIOLATED, approach_of
 from ..schedule import Loop, Result, SolveStatus
 from ..solve.sweeps import add_delta, count_active
 from ..state.motion import StateArrays, moves_with_body, predicted_position, predicted_velocity
 from ..state.planes import MovingPlanes
 from ..state.structs import ContactKind, Motion, Step, can_move, constraint_count
-from ..state.vectors import ZERO
+from ..state.vectors import ZERO, to_single
 from ..tuning import CALM_STEPS
 
 wp.set_module_options({"enable_backward": False})
@@ -232,6 +233,7 @@ def start_substep(
     remaining: wp.array[int],
     detected: wp.array[int],
     end: StateArrays,
+    arcs: Arcs,
     # in and out
     step: Step,
     status: SolveStatus,
@@ -241,7 +243,7 @@ def start_substep(
     """Writes the motion of a substep to that of ``step``, given the motion of the whole step.
 
     Particles, and bodies that the response can move, end where the inner solver predicts them; shapes go a share of
-    their path in the whole step.
+    their path in the whole step, on arcs if they turn.
     """
     i = wp.tid()
     done = substeps - remaining[0]
@@ -269,6 +271,12 @@ def start_substep(
     elif moves_with_body(substep, i):
         x1 = predicted_position(substep, i)
         velocity = predicted_velocity(substep, i, x1)
+    elif is_on_arc(arcs, i):
+        start_of_arc = on_arc_of(arcs, i, motion.x0[i], motion.x1[i], wp.float64(before))
+        end_of_arc = on_arc_of(arcs, i, motion.x0[i], motion.x1[i], wp.float64(after))
+        x1 = to_single(end_of_arc)
+        velocity = float(substeps) / dt * to_single(end_of_arc - start_of_arc)
+        substep.x0[i] = to_single(start_of_arc)
     else:
         way = motion.x1[i] - motion.x0[i]
         x1 = motion.x0[i] + after * way

@@ -332,7 +332,16 @@ class Substeps:
         if self._moves_bodies:
             substep.set_body_ends(arrays_of(end))
             work.launch_over_bodies(begin_bodies)
-        inputs = [motion.vertices, motion.planes, substeps, step.dt, self._remaining, self._detected, arrays_of(end)]
+        inputs = [
+            motion.vertices,
+            motion.planes,
+            substeps,
+            step.dt,
+            self._remaining,
+            self._detected,
+            arrays_of(end),
+            work.arcs,
+        ]
         size = max(mesh.vertex_count, len(motion.planes.start))
         work.launch(kernels.start_substep, size, [*inputs, work.step, work.status, substep.planes])
         if work.max_penetrations:

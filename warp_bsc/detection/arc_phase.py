@@ -1,0 +1,168 @@
+"""The narrow phase of pairs with a turning body: whether they collide on their arcs, each decided by one thread.
+
+All other pairs are those of the other phases, which leave these out. Nothing here depends on the host, so that a CUDA
+graph may contain it; :mod:`.arc_search` decides the same pairs from the host, for bodies that make many turns.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from ..kernels.arcs import Arcs, any_turns, arc_bounds, are_of_one_group, impact_on_arcs, sagitta_of_part, turns
+from ..kernels.min_distance import clears_at_once
+from ..kernels.motion import motion_and_distance
+from ..kernels.pipeline.pairs import distance_of_corners, vertices_of_pair
+from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.signs import FREE, ROUNDOFF, UNSURE
+from .kernels import PairStages
+from .launch import launch_over_queue, made_once
+from .narrow_phase import NarrowPhase
+from .settings import NO_FUSED_OPERATIONS, Count
+from .stage_timer import StageTimer
+
+__all__ = ["allocate_arcs", "bound_arc", "run_arc_phases"]
+
+_QUEUED = wp.constant(int(Count.QUEUED))
+_SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
+_UNSURE = wp.constant(int(Count.UNSURE))
+_ONE = wp.constant(wp.float64(1.0))
+_ZERO = wp.constant(wp.float64(0.0))
+
+
+def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance: float = 0.0) -> Arcs:
+    """Returns the arcs of a mesh in which nothing turns yet; pairs within a body are excluded.
+
+    Args:
+        body: Body of each vertex, -1 for those that move straight, int, shape [vertex_count].
+        bodies: Number of bodies.
+        device: The device.
+        tolerance: As of :class:`warp_bsc.kernels.arcs.Arcs`.
+    """
+    arcs = Arcs()
+    arcs.turning = wp.zeros(1, dtype=int, device=device)
+    arcs.body = wp.array(body, dtype=int, device=device)
+    arcs.group = wp.array(body, dtype=int, device=device)
+    arcs.centre = wp.zeros(bodies, dtype=wp.vec3d, device=device)
+    arcs.turn = wp.zeros(bodies, dtype=wp.vec3d, device=device)
+    arcs.deviation = wp.zeros(len(body), dtype=wp.float64, device=device)
+    arcs.tolerance = tolerance
+    return arcs
+
+
+@wp.func
+def bound_arc(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
+    """Writes how far a vertex is from its chord, and whether it turns, from its positions at both ends of the step."""
+    deviation = _ZERO
+    body = arcs.body[vertex]
+    if body >= 0 and wp.isfinite(x0) and wp.isfinite(x1):
+        turn = arcs.turn[body]
+        if wp.length_sq(turn) > _ZERO:
+            bounds = arc_bounds(x0, x1, arcs.centre[body], turn)
+            deviation = sagitta_of_part(bounds, _ONE) + bounds[2]
+            arcs.turning[0] = 1
+    arcs.deviation[vertex] = deviation
+
+
+@made_once
+def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that cull and decide, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def cull_arcs(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        arcs: Arcs,
+        kind: int,
+        # in and out
+        stages: PairStages,
+    ):
+        if not any_turns(arcs):
+            return
+        i = first + wp.tid()
+        if not is_filled(i, stages.queue, stages.counts, _QUEUED):
+            return
+        pair = stages.queue[i]
+        v = vertices_of_pair(kind, stages.elements, pair)
+        if not turns(arcs, v) or are_of_one_group(arcs, v):
+            return
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        distance = distance_of_corners(kind, v, arcs.deviation)
+        motion, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
+        if not clears_at_once(motion, scaled):
+            append(pair, stages.survivors, stages.counts, _SURVIVORS)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_arcs(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        arcs: Arcs,
+        kind: int,
+        # in and out
+        stages: PairStages,
+    ):
+        if not any_turns(arcs):
+            return
+        i = first + wp.tid()
+        if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
+            return
+        pair = stages.survivors[i]
+        v = vertices_of_pair(kind, stages.elements, pair)
+        if not turns(arcs, v):
+            return
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        result = impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, _ZERO)
+        if result.status == FREE:
+            return
+        slot = take_slot(stages.counts, _CONTACTS)
+        take_slot(stages.counts, _FOUND)
+        if result.status == UNSURE:
+            take_slot(stages.counts, _UNSURE)
+        contacts = stages.contacts
+        if slot < wp.int64(contacts.pairs.shape[0]):
+            k = wp.int32(slot)
+            contacts.pairs[k] = pair
+            contacts.status[k] = wp.int8(result.status)
+            contacts.decided[k] = wp.int8(result.status)
+            contacts.within_tolerance[k] = result.within_tolerance == 1
+            contacts.toi[k] = result.toi
+            contacts.coordinates[k] = result.coordinates
+            contacts.normal[k] = result.normal
+            stages.order[k] = k
+            stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+
+    return cull_arcs, decide_arcs
+
+
+def run_arc_phases(
+    phases: Sequence[tuple[NarrowPhase, wp.array]], x0: wp.array, x1: wp.array, arcs: Arcs, *, timer: StageTimer
+) -> None:
+    """Adds the contacts of queued pairs with a turning body, after the other phases, without synchronizing with a GPU.
+
+    Args:
+        phases: The buffers of vertex-face and edge-edge pairs, with the vertex indices of their second elements.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        arcs: The arcs.
+        timer: Measures the stage.
+    """
+    if x0.device.is_cpu and not arcs.turning.numpy()[0]:
+        return
+    kernels = _kernels(x0.dtype)
+    with timer.stage("classify"):
+        for phase, elements in phases:
+            stages = phase.stages(elements)
+            inputs = [x0, x1, arcs, int(phase.kind)]
+            for kernel, queue, count in (
+                (kernels[0], stages.queue, Count.QUEUED),
+                (kernels[1], stages.survivors, Count.SURVIVORS),
+            ):
+                launch_over_queue(kernel, queue, phase.counts, count, inputs=inputs, outputs=[stages], block_dim=64)
