@@ -60,7 +60,8 @@ html_css_files = ["site.css"]
 html_baseurl = f"https://warp-bsc.github.io/warp-bsc/{VERSION}/"
 html_show_sourcelink = False
 html_copy_source = False
-_WITHOUT_SUBPAGES = ["index", "install", "detector", "kernels", "measurements", "gallery", "changelog", "contributing"]
+_WITHOUT_SUBPAGES = ["index", "install", "detector", "kernels", "measurements", "notebooks", "gallery"]
+_WITHOUT_SUBPAGES += ["changelog", "contributing"]
 html_sidebars = {name: [] for name in _WITHOUT_SUBPAGES}
 html_theme_options = {
     "logo": {"text": "warp-bsc"},
