@@ -8,10 +8,12 @@ from ..kernels.classification import classify
 from ..kernels.closest import contact_at
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
+from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
+from ..kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
-from ..kernels.pipeline.bits import lowest_bit
+from ..kernels.pipeline.bits import count_bits, lowest_bit
 from ..kernels.pipeline.pairs import vertices_of_pair
-from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.pipeline.queues import append, filled_entries, is_filled, take_slot, take_slots
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import Impact, impact
@@ -22,6 +24,7 @@ from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, DistanceKind, Pa
 __all__ = [
     "PairKernels",
     "PairStages",
+    "batch_classification_kernel",
     "batch_culling_kernel",
     "culling_kernel",
     "gather_contacts",
@@ -36,6 +39,8 @@ _FOUND = wp.constant(int(Count.FOUND))
 _UNSURE = wp.constant(int(Count.UNSURE))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _REFUTED = wp.constant(int(Count.REFUTED))
+_LOWER_BITS = wp.constant(wp.uint64(0x5555555555555555))
+"""The lower of the two bits of each status of a batch."""
 
 
 @wp.struct
@@ -303,6 +308,48 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kerne
             left = left & (left - wp.uint64(1))
 
     return cull_batches
+
+
+@made_once
+def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that classifies survivors on the CPU, in batches, for one kind and one type of position."""
+    kind_number = int(kind)
+    classify_batch = classify_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def classify_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        i = CLASSIFIED * (first + wp.tid())
+        number = wp.min(CLASSIFIED, filled_entries(stages.survivors, stages.counts, _SURVIVORS) - i)
+        statuses = classify_batch(x0, x1, stages.elements, stages.survivors, i, number, roundoff)
+        left = statuses & (statuses >> wp.uint64(1)) & _LOWER_BITS
+        while left != wp.uint64(0):
+            bit = lowest_bit(left)
+            v = vertices_of_pair(kind_number, stages.elements, stages.survivors[i + bit // 2])
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            status = classify(motion, coplanarity(motion))
+            statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
+            left = left & (left - wp.uint64(1))
+        contacts = (statuses | (statuses >> wp.uint64(1))) & _LOWER_BITS
+        slot = take_slots(stages.counts, _CONTACTS, count_bits(contacts))
+        while contacts != wp.uint64(0):
+            bit = lowest_bit(contacts)
+            if slot < wp.int64(stages.contacts.pairs.shape[0]):
+                stages.contacts.pairs[wp.int32(slot)] = stages.survivors[i + bit // 2]
+                stages.contacts.status[wp.int32(slot)] = wp.int8((statuses >> wp.uint64(bit)) & wp.uint64(3))
+            slot += wp.int64(1)
+            contacts = contacts & (contacts - wp.uint64(1))
+
+    return classify_batches
 
 
 @wp.kernel(**NO_GRADIENTS)

@@ -5,17 +5,26 @@ the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipel
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
 
 from .. import checker
-from ..kernels.pipeline.batch_culling import BATCH
+from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
+from ..kernels.pipeline.batch_culling import BATCH as CULLED
 from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
-from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
+from .kernels import (
+    PairStages,
+    batch_classification_kernel,
+    batch_culling_kernel,
+    culling_kernel,
+    gather_contacts,
+    pad_keys,
+    pair_kernels,
+)
 from .launch import launch, launch_over, launch_over_queue, max_blocks
 from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, Method, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
@@ -225,17 +234,25 @@ def run_narrow_phases(
             inputs = [*motion, *arguments]
             launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
 
-    with timer.stage("cull"):
+    def launch_batches(kernel_of: Callable, buffer: str, count: Count, batch: int) -> None:
+        """Launches the kernel of each kind over the filled entries of a buffer on the CPU, many at a time."""
         for kind, s in stages.items():
-            if device.is_cpu:
-                batches = -(-min(len(s.queue), int(s.counts.numpy()[Count.QUEUED])) // BATCH)
-                kernel = batch_culling_kernel(kind, x0.dtype)
-                launch_over(kernel, batches, inputs=motion, outputs=[s], device=device, chunk=16)
-            else:
+            filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
+            kernel = kernel_of(kind, x0.dtype)
+            launch_over(kernel, -(-filled // batch), inputs=motion, outputs=[s], device=device, chunk=16)
+
+    with timer.stage("cull"):
+        if device.is_cpu:
+            launch_batches(batch_culling_kernel, "queue", Count.QUEUED, int(CULLED))
+        else:
+            for kind, s in stages.items():
                 kernel = culling_kernel(kind, x0.dtype)
                 launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=motion, outputs=[s])
     with timer.stage("classify"):
-        launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64)
+        if device.is_cpu:
+            launch_batches(batch_classification_kernel, "survivors", Count.SURVIVORS, int(CLASSIFIED))
+        else:
+            launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64)
     with timer.stage("time of impact"):
         launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32)
     if method == "exact":
