@@ -12,7 +12,7 @@ import warp as wp
 from ..classification import SPLIT_ERROR, TINY
 from ..roots import ROOT_CONSTANTS
 from .simd import native_for_pairs
-from .simd_query import QUERY_CONSTANTS, QUERY
+from .simd_query import QUERY, QUERY_CONSTANTS
 
 BATCH = wp.constant(32)
 """Pairs that one call classifies."""

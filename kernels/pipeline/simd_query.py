@@ -2,8 +2,8 @@
 
 Operations and their order are those of the functions for one query, which have the same names, in
 :mod:`warp_bsc.kernels.motion`, :mod:`~warp_bsc.kernels.polynomials`, :mod:`~warp_bsc.kernels.closest` and
-:mod:`~warp_bsc.kernels.culling`: both compute the same bits. Signs are sets of lanes, the bits of a number: those with a
-positive and those with a negative value.
+:mod:`~warp_bsc.kernels.culling`: both compute the same bits. Signs are sets of lanes, the bits of a number: those with
+a positive and those with a negative value.
 
 Lanes whose motion is out of range, or that have subnormal numbers in single precision, which a processor may flush to
 zero, are not usable: they are left to the functions for one query.
@@ -61,7 +61,8 @@ QUERY = """
     auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
         Relative r = relative(points);
         Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
-        const Doubles size = most(most(most(u.x, v.x), w.x), most(most(most(u.y, v.y), w.y), most(most(u.z, v.z), w.z)));
+        auto largest = [=](Vectors a) { return most(a.x, most(a.y, a.z)); };
+        const Doubles size = most(largest(u), most(largest(v), largest(w)));
         usable &= bits((size >= 0x1p-480) & (size < 0x1p1023));
         if constexpr (sizeof(Scalar) == 4) {
             typedef float Floats __attribute__((ext_vector_type(8)));

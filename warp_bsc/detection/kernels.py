@@ -11,12 +11,14 @@ from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_moti
 from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
 from ..kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
+from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
+from ..kernels.pipeline.batch_impacts import impact_batch_of
 from ..kernels.pipeline.bits import count_bits, lowest_bit
 from ..kernels.pipeline.pairs import vertices_of_pair
 from ..kernels.pipeline.queues import append, filled_entries, is_filled, take_slot, take_slots
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
-from ..kernels.time_of_impact import Impact, impact
+from ..kernels.time_of_impact import Impact, clamped_tolerance, impact, power_of_two
 from .contact_buffer import ContactBuffer
 from .launch import made_once
 from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, DistanceKind, PairKind
@@ -26,6 +28,7 @@ __all__ = [
     "PairStages",
     "batch_classification_kernel",
     "batch_culling_kernel",
+    "batch_impact_kernel",
     "culling_kernel",
     "gather_contacts",
     "pad_keys",
@@ -350,6 +353,89 @@ def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> w
             contacts = contacts & (contacts - wp.uint64(1))
 
     return classify_batches
+
+
+@wp.func
+def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
+    """Decides contacts as :func:`_decide` does, with one atomic operation for each count."""
+    contacts = stages.contacts
+    found = int(0)
+    unsure = int(0)
+    for_exact = int(0)
+    for i in range(first, first + count):
+        status = contacts.status[i]
+        contacts.decided[i] = status
+        stages.order[i] = i
+        key = stages.last_key
+        if status != wp.int8(FREE):
+            pair = contacts.pairs[i]
+            key = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+            found += 1
+            if status == wp.int8(UNSURE):
+                unsure += 1
+            if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
+                for_exact += 1
+        stages.keys[i] = key
+    wp.atomic_add(stages.counts, _FOUND, wp.int64(found))
+    if unsure > 0:
+        wp.atomic_add(stages.counts, _UNSURE, wp.int64(unsure))
+    if for_exact > 0:
+        slot = int(wp.atomic_add(stages.counts, _FOR_EXACT, wp.int64(for_exact)))
+        for i in range(first, first + count):
+            status = contacts.status[i]
+            if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
+                stages.for_exact[slot] = i
+                slot += 1
+
+
+@made_once
+def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that finds times of impact on the CPU, in batches, for one kind and one type of position."""
+    kind_number = int(kind)
+    impact_batch = impact_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_impact_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        contacts = stages.contacts
+        i = DECIDED * (first + wp.tid())
+        number = wp.min(DECIDED, filled_entries(contacts.pairs, stages.counts, _CONTACTS) - i)
+        left = impact_batch(
+            x0,
+            x1,
+            stages.elements,
+            contacts.pairs,
+            i,
+            number,
+            roundoff,
+            timed,
+            power_of_two(clamped_tolerance(tolerance)),
+            contacts.status,
+            contacts.within_tolerance,
+            contacts.toi,
+            contacts.coordinates,
+            contacts.normal,
+        )
+        while left != wp.uint64(0):
+            row = i + lowest_bit(left)
+            v = vertices_of_pair(kind_number, stages.elements, contacts.pairs[row])
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            _write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), stages)
+            left = left & (left - wp.uint64(1))
+        _decide_batch(i, number, timed, stages)
+
+    return find_impact_batches
 
 
 @wp.kernel(**NO_GRADIENTS)

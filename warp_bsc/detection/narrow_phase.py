@@ -13,6 +13,7 @@ import warp as wp
 from .. import checker
 from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
 from ..kernels.pipeline.batch_culling import BATCH as CULLED
+from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
@@ -20,6 +21,7 @@ from .kernels import (
     PairStages,
     batch_classification_kernel,
     batch_culling_kernel,
+    batch_impact_kernel,
     culling_kernel,
     gather_contacts,
     pad_keys,
@@ -219,42 +221,42 @@ def run_narrow_phases(
     kernels = pair_kernels(x0.dtype)
     stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
 
-    def launch(kernel: wp.Kernel, arguments: list, buffer: str, count: Count, block_dim: int) -> None:
-        """Launches a kernel over a buffer of both kinds, one after the other on the CPU and if they are too long."""
+    def launch_on_gpu(kernel: wp.Kernel, arguments: list, buffer: str, block_dim: int) -> None:
+        """Launches a kernel over a buffer of both kinds, one after the other if they are too long."""
         entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
-        together = [list(stages)]
-        if device.is_cpu or sum(entries.values()) >= 2**31:
-            together = [[kind] for kind in stages]
+        together = [list(stages)] if sum(entries.values()) < 2**31 else [[kind] for kind in stages]
         for kinds in together:
             both = [stages[kind] if kind in kinds else PairStages() for kind in PairKind]
             dim = sum(entries[kind] for kind in kinds)
-            if device.is_cpu:
-                dim = min(dim, int(stages[kinds[0]].counts.numpy()[count]))
             blocks = max_blocks(device, block_dim)
             inputs = [*motion, *arguments]
             launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
 
-    def launch_batches(kernel_of: Callable, buffer: str, count: Count, batch: int) -> None:
-        """Launches the kernel of each kind over the filled entries of a buffer on the CPU, many at a time."""
+    def launch_on_cpu(kernel_of: Callable, arguments: list, buffer: str, count: Count, batch: int) -> None:
+        """Launches the kernel of each kind over the filled entries of a buffer, many at a time."""
         for kind, s in stages.items():
             filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
-            kernel = kernel_of(kind, x0.dtype)
-            launch_over(kernel, -(-filled // batch), inputs=motion, outputs=[s], device=device, chunk=16)
+            kernel, inputs = kernel_of(kind, x0.dtype), [*motion, *arguments]
+            launch_over(kernel, -(-filled // batch), inputs=inputs, outputs=[s], device=device, chunk=16)
 
     with timer.stage("cull"):
         if device.is_cpu:
-            launch_batches(batch_culling_kernel, "queue", Count.QUEUED, int(CULLED))
+            launch_on_cpu(batch_culling_kernel, [], "queue", Count.QUEUED, CULLED)
         else:
             for kind, s in stages.items():
                 kernel = culling_kernel(kind, x0.dtype)
                 launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=motion, outputs=[s])
     with timer.stage("classify"):
         if device.is_cpu:
-            launch_batches(batch_classification_kernel, "survivors", Count.SURVIVORS, int(CLASSIFIED))
+            launch_on_cpu(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
         else:
-            launch(kernels.classify_survivors, [], "survivors", Count.SURVIVORS, 64)
+            launch_on_gpu(kernels.classify_survivors, [], "survivors", 64)
     with timer.stage("time of impact"):
-        launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32)
+        arguments = [timed, tolerance]
+        if device.is_cpu:
+            launch_on_cpu(batch_impact_kernel, arguments, "for_exact", Count.CONTACTS, DECIDED)
+        else:
+            launch_on_gpu(kernels.find_impacts, arguments, "for_exact", 32)
     if method == "exact":
         with timer.stage("exact"):
             for narrow_phase, elements in narrow_phases:
