@@ -76,7 +76,7 @@ def take_slot_int(count: wp.array[int]) -> int:
 """
 )
 def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
-    """Raises the count of a queue by an amount below 64, and returns its old value: the index of the first entry."""
+    """Raises the count of a queue by an amount, below 64 on a GPU, and returns its old value: the index of the first entry."""
     ...
 
 
@@ -97,7 +97,7 @@ def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
 """
 )
 def raise_count(counts: wp.array[wp.int64], queue: int, amount: int):
-    """Raises the count of a queue by an amount below 64."""
+    """Raises the count of a queue by an amount, below 64 on a GPU."""
     ...
 
 

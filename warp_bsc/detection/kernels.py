@@ -15,7 +15,7 @@ from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ..kernels.pipeline.batch_impacts import impact_batch_of
 from ..kernels.pipeline.bits import count_bits, lowest_bit
 from ..kernels.pipeline.pairs import vertices_of_pair
-from ..kernels.pipeline.queues import append, filled_entries, is_filled, take_slot, take_slots
+from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import Impact, clamped_tolerance, impact, power_of_two
@@ -376,11 +376,10 @@ def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
             if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
                 for_exact += 1
         stages.keys[i] = key
-    wp.atomic_add(stages.counts, _FOUND, wp.int64(found))
-    if unsure > 0:
-        wp.atomic_add(stages.counts, _UNSURE, wp.int64(unsure))
+    raise_count(stages.counts, _FOUND, found)
+    raise_count(stages.counts, _UNSURE, unsure)
     if for_exact > 0:
-        slot = int(wp.atomic_add(stages.counts, _FOR_EXACT, wp.int64(for_exact)))
+        slot = wp.int32(take_slots(stages.counts, _FOR_EXACT, for_exact))
         for i in range(first, first + count):
             status = contacts.status[i]
             if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
