@@ -33,22 +33,16 @@ BATCH = wp.constant(64)
 _LARGEST = 1.0e70
 
 _SNIPPET = """
-    // box test, pair by pair: x y z of both ends in one vector; a fourth number is read with them where there is one
-    auto load = [&](const auto& x, int corner) -> Four {
-        const Scalar* from = position(x, corner);
-        if (corner + 1 < x.shape[0] && x.strides[0] >= 3 * (int)sizeof(Scalar))
-            return *(const Loaded*)from;
-        return Four{from[0], from[1], from[2], 0};
-    };
-    auto both = [&](int corner) -> Scalars {
-        return __builtin_shufflevector(load(x0, corner), load(x1, corner), 0, 1, 2, 3, 4, 5, 6, 7);
-    };
+    // box test, pair by pair: x y z of both ends in one vector
     int near[batch];
     int near_count = 0;
     for (int i = 0; i < count; ++i) {
         int corner[4];
         corners_of(first + i, corner);
-        const Scalars a = both(corner[0]), b = both(corner[1]), c = both(corner[2]), d = both(corner[3]);
+        auto later = [](int a, int b) { return a > b ? a : b; };
+        const bool has_fourth = later(later(corner[0], corner[1]), later(corner[2], corner[3])) < last;
+        auto ends = [&](int i) { return both(position(x0, corner[i]), position(x1, corner[i]), has_fourth); };
+        const Scalars a = ends(0), b = ends(1), c = ends(2), d = ends(3);
         Scalars low = a, high = a;
         Scalars other_low = __builtin_elementwise_min(c, d), other_high = __builtin_elementwise_max(c, d);
         if (vertex_face) {

@@ -8,9 +8,7 @@ import warp as wp
 
 _TYPES = """
     typedef Scalar Scalars __attribute__((ext_vector_type(8)));
-    typedef Scalar Four __attribute__((ext_vector_type(4)));
     typedef Scalar Loaded __attribute__((ext_vector_type(4), aligned(sizeof(Scalar))));
-    typedef Scalar Two __attribute__((ext_vector_type(2), aligned(sizeof(Scalar))));
     typedef double Doubles __attribute__((ext_vector_type(8)));
     typedef decltype(Doubles() < Doubles()) Longs;
     typedef bool Bools __attribute__((ext_vector_type(8)));
@@ -46,39 +44,40 @@ _POINTS = """
         }
     };
 
-    // positions may be a view, with any stride
+    // positions may be a view, with any stride; x y z are read with a fourth number where there is one
     auto position = [](const auto& x, int corner) {
         return (const Scalar*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
     };
+    const bool forward = x0.strides[0] >= 3 * (int)sizeof(Scalar) && x1.strides[0] >= 3 * (int)sizeof(Scalar);
+    const int last = forward ? (x0.shape[0] < x1.shape[0] ? x0.shape[0] : x1.shape[0]) - 1 : -1;
+    auto both = [](const Scalar* a, const Scalar* b, bool has_fourth) -> Scalars {
+        if (has_fourth)
+            return __builtin_shufflevector(*(const Loaded*)a, *(const Loaded*)b, 0, 1, 2, 3, 4, 5, 6, 7);
+        return Scalars{a[0], a[1], a[2], 0, b[0], b[1], b[2], 0};
+    };
 
-    // reads the points of the pairs in eight slots: x y y z of each point, transposed to the coordinates of all eight
+    // reads the points of the pairs in eight slots, transposed to the coordinates of all eight
     auto read_points = [&](const int* slots, Scalars* points) {
-        int corners[4][8];
+        int corners[4][8], largest = 0;
         for (int lane = 0; lane < 8; ++lane) {
             int corner[4];
             corners_of(slots[lane], corner);
-            for (int i = 0; i < 4; ++i)
+            for (int i = 0; i < 4; ++i) {
                 corners[i][lane] = corner[i];
-        }
-        auto read = [&](const auto& x, const int* corner, Scalars* to) {
-            Four at[8], low[3], high[3];
-            for (int lane = 0; lane < 8; ++lane) {
-                const Scalar* from = position(x, corner[lane]);
-                at[lane] = __builtin_shufflevector(*(const Two*)from, *(const Two*)(from + 1), 0, 1, 2, 3);
+                largest = corner[i] > largest ? corner[i] : largest;
             }
-            auto transpose = [](const Four* at, Four* to) {
-                const Four xy = __builtin_shufflevector(at[0], at[1], 0, 4, 1, 5);
-                const Four yz = __builtin_shufflevector(at[0], at[1], 2, 6, 3, 7);
-                const Four more_xy = __builtin_shufflevector(at[2], at[3], 0, 4, 1, 5);
-                const Four more_yz = __builtin_shufflevector(at[2], at[3], 2, 6, 3, 7);
-                to[0] = __builtin_shufflevector(xy, more_xy, 0, 1, 4, 5);
-                to[1] = __builtin_shufflevector(xy, more_xy, 2, 3, 6, 7);
-                to[2] = __builtin_shufflevector(yz, more_yz, 2, 3, 6, 7);
-            };
-            transpose(at, low);
-            transpose(at + 4, high);
-            for (int axis = 0; axis < 3; ++axis)
-                to[axis] = __builtin_shufflevector(low[axis], high[axis], 0, 1, 2, 3, 4, 5, 6, 7);
+        }
+        const bool has_fourth = largest < last;
+        auto read = [&](const auto& x, const int* corner, Scalars* to) {
+            auto row = [&](int lane) { return both(position(x, corner[lane]), position(x, corner[lane + 4]), has_fourth); };
+            const Scalars a = row(0), b = row(1), c = row(2), d = row(3);
+            const Scalars xz = __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14);
+            const Scalars more_xz = __builtin_shufflevector(c, d, 0, 8, 2, 10, 4, 12, 6, 14);
+            const Scalars y = __builtin_shufflevector(a, b, 1, 9, 3, 11, 5, 13, 7, 15);
+            const Scalars more_y = __builtin_shufflevector(c, d, 1, 9, 3, 11, 5, 13, 7, 15);
+            to[0] = __builtin_shufflevector(xz, more_xz, 0, 1, 8, 9, 4, 5, 12, 13);
+            to[1] = __builtin_shufflevector(y, more_y, 0, 1, 8, 9, 4, 5, 12, 13);
+            to[2] = __builtin_shufflevector(xz, more_xz, 2, 3, 10, 11, 6, 7, 14, 15);
         };
         for (int i = 0; i < 4; ++i) {
             read(x0, corners[i], points + 3 * i);

@@ -15,7 +15,7 @@ from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ..kernels.pipeline.batch_impacts import impact_batch_of
 from ..kernels.pipeline.bits import count_bits, lowest_bit
 from ..kernels.pipeline.pairs import vertices_of_pair
-from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots
+from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots, write
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
 from ..kernels.time_of_impact import Impact, clamped_tolerance, impact, power_of_two
@@ -305,9 +305,10 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kerne
         i = BATCH * (first + wp.tid())
         filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
         left = cull_batch(x0, x1, stages.elements, stages.queue, i, wp.min(BATCH, filled - i), roundoff)
+        slot = take_slots(stages.counts, _SURVIVORS, count_bits(left))
         while left != wp.uint64(0):
-            lane = lowest_bit(left)
-            append(stages.queue[i + lane], stages.survivors, stages.counts, _SURVIVORS)
+            write(stages.queue[i + lowest_bit(left)], stages.survivors, slot)
+            slot += wp.int64(1)
             left = left & (left - wp.uint64(1))
 
     return cull_batches
