@@ -18,7 +18,7 @@ four, below 2^(2B+2). The outer coefficients of V are determinants, below 3 sqrt
 and one bit for the sign. With coordinates of L limbs, V and C_e of 2 L, g and K of 4 L and signs of numbers of
 8 L limbs, everything fits for
 
-    B <= min((512 L - 18) / 14, (256 L - 11) / 7):  35 bits in one limb, 71 in two, 291 in eight.
+    B <= min((512 L - 18) / 14, (256 L - 11) / 7):  35 bits in one limb, 71 in two, 144 in four, 291 in eight.
 
 Single precision takes at most 278, its whole range.
 """
@@ -30,7 +30,7 @@ import warp as wp
 from ..polynomials import VERTEX_FACE
 from .wide_integers import LIMBS, SCALED, add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
 
-BITS = {1: 35, 2: 71, 8: 291}
+BITS = {1: 35, 2: 71, 4: 144, 8: 291}
 """Largest B for each number of limbs of a coordinate."""
 
 _FROM_POINTS = f"""{SCALED}

@@ -75,24 +75,24 @@ _SNIPPET = """
         const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
         const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
         const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
-        // with a roundoff of zero all bounds are zero
-        Vectors size = {0.0, 0.0, 0.0};
-        Doubles bound = 0.0;
-        double flushed = 0.0;
-        int trusted = 255;
-        if (roundoff > 0.0) {
-            const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
-            const Vectors uv = {u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x};
-            size = plus(plus(u, v), w);
-            flushed = flushed_size;
-            const Doubles extent = most(most(size.x, size.y), size.z);
-            bound = roundoff * (coplanarity_error * dot(w, uv) + underflow) + flushed * extent * extent;
-            trusted = bits(extent < largest_size);
+        // bounds take longer than signs: only where some lane has one sign; with a roundoff of zero they are zero
+        int unsure = (1 << filled) - 1;
+        const Doubles lowest_k = least(least(k0, k1), least(k2, k3)), highest_k = most(most(k0, k1), most(k2, k3));
+        if (bits((lowest_k > 0.0) | (highest_k < 0.0)) & unsure) {
+            Doubles bound = 0.0;
+            int trusted = 255;
+            if (roundoff > 0.0) {
+                const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
+                const Vectors uv = {u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x};
+                const Vectors size = plus(plus(u, v), w);
+                const Doubles extent = most(most(size.x, size.y), size.z);
+                bound = roundoff * (coplanarity_error * dot(w, uv) + underflow) + flushed * extent * extent;
+                trusted = bits(extent < largest_size);
+            }
+            unsure &= ~(bits((lowest_k > bound) | (highest_k < -bound)) & trusted);
+            if (!unsure)
+                continue;
         }
-        auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
-        int unsure = ((1 << filled) - 1) & ~(bits(culled) & trusted);
-        if (!unsure)
-            continue;
 
         // separating direction
         const Vectors us = plus(u0, u1), vs = plus(v0, v1), ws = plus(w0, w1);
@@ -109,11 +109,18 @@ _SNIPPET = """
             lowest = least(dw0 - most(du0, zero) + least(dv0, zero), dw1 - most(du1, zero) + least(dv1, zero));
             highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
         }
-        const Vectors along = sizes(direction, direction);
-        const Doubles slack
-            = roundoff * (direction_error * dot(along, size) + underflow) + flushed * (along.x + along.y + along.z);
-        culled = (lowest > slack) | (highest < -slack);
-        unsure &= ~(bits(culled) & trusted);
+        if (bits((lowest > 0.0) | (highest < 0.0)) & unsure) {
+            Doubles slack = 0.0;
+            int trusted = 255;
+            if (roundoff > 0.0) {
+                const Vectors along = sizes(direction, direction);
+                const Vectors size = plus(plus(sizes(u0, u1), sizes(v0, v1)), sizes(w0, w1));
+                slack = roundoff * (direction_error * dot(along, size) + underflow)
+                    + flushed * (along.x + along.y + along.z);
+                trusted = bits(most(most(size.x, size.y), size.z) < largest_size);
+            }
+            unsure &= ~(bits((lowest > slack) | (highest < -slack)) & trusted);
+        }
         for (int lane = 0; lane < filled; ++lane)
             left |= (unsigned long long)((unsure >> lane) & 1) << near[group + lane];
     }
@@ -143,7 +150,7 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         direction_error=float(DIRECTION_ERROR),
         underflow=float(UNDERFLOW),
         largest_size=_LARGEST,
-        flushed_size=40.0 * 2.0 ** (-126 if dtype is wp.vec3 else -1022),
+        flushed=40.0 * 2.0 ** (-126 if dtype is wp.vec3 else -1022),
     )
 
     @wp.func_native(snippet)

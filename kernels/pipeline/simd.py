@@ -69,7 +69,9 @@ _POINTS = """
         }
         const bool has_fourth = largest < last;
         auto read = [&](const auto& x, const int* corner, Scalars* to) {
-            auto row = [&](int lane) { return both(position(x, corner[lane]), position(x, corner[lane + 4]), has_fourth); };
+            auto row = [&](int lane) {
+                return both(position(x, corner[lane]), position(x, corner[lane + 4]), has_fourth);
+            };
             const Scalars a = row(0), b = row(1), c = row(2), d = row(3);
             const Scalars xz = __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14);
             const Scalars more_xz = __builtin_shufflevector(c, d, 0, 8, 2, 10, 4, 12, 6, 14);

@@ -160,7 +160,7 @@ class NarrowPhase:
             queues=self._for_exact,
             counts=self.counts,
             filled=Count.FOR_EXACT,
-            too_wide=[Count.TOO_WIDE_1, Count.TOO_WIDE_2, Count.TOO_WIDE_8],
+            too_wide={1: Count.TOO_WIDE_1, 2: Count.TOO_WIDE_2, 4: Count.TOO_WIDE_4, 8: Count.TOO_WIDE_8},
             refuted=Count.REFUTED,
             contacts=self.contacts,
             keys=self._keys,
