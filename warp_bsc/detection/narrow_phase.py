@@ -73,6 +73,11 @@ class NarrowPhase:
         self._order = wp.empty(2 * capacity, dtype=int, device=device)
         self._for_exact = [wp.empty(capacity, dtype=int, device=device) for _ in range(2)]
 
+    def fit_all(self) -> None:
+        """Enlarges the buffers so that no run overflows them: all queued pairs may survive and be contacts."""
+        self._allocate_survivors(len(self.queue))
+        self._allocate_contacts(len(self.queue))
+
     @property
     def buffers(self) -> list:
         """All buffers that a run writes to and that may be replaced."""
