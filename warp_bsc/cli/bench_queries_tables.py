@@ -66,6 +66,7 @@ def print_query_benchmarks(
     say(console, "impact: finds the time of impact, coordinates and normal as well.")
     say(console, "queued: finds the status by two kernels: culls, and a decision of the survivors.")
     say(console, "exact: finds the status in integers, where floating point cannot certify it.")
+    say(console, "function: query_vertex_face or query_edge_edge with out=, exact, with times.")
     say(console, f"A copy on this device reads and writes {copy_rate / 1e9:,.1f} GB/s.")
 
 
