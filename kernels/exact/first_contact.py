@@ -41,7 +41,7 @@ import warp as wp
 
 from ..polynomials import EDGE_EDGE, VERTEX_FACE
 from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
-from .polygon import BITS, coordinate, cross_component, make_polygon, sign_at_end, spread, volume
+from .polygon import BITS, coordinate, cross_component, make_narrow_polygon, make_polygon, sign_at_end, spread, volume
 from .wide_integers import add, integer, product, sign, subtract, widen
 
 NONE = wp.constant(wp.float64(2.0))
@@ -349,11 +349,17 @@ def decide_in(limbs: int) -> wp.Function:
             timed: Whether the time is needed, see :func:`first_contact_exactly`.
             digits: Binary digits of the time, at most 38.
         """
-        exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
-        if bits > largest:
-            return TOO_WIDE
         polygon = wp.zeros(shape=(24,), dtype=number)
-        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        fits = int(-1)
+        if wp.static(limbs == 1):
+            fits = make_narrow_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, polygon)
+        if fits < 0:
+            exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+            if bits > largest:
+                return TOO_WIDE
+            make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        elif fits == 0:
+            return TOO_WIDE
         return _decide(kind, polygon, timed, digits)
 
     return decide
