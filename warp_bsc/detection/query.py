@@ -237,7 +237,8 @@ def _query_into(
 ) -> QueryArrays:
     """Decides queries whose results stay on the device."""
     check_instance(out, "out", QueryArrays, "a QueryArrays")
-    check_instance(points, "points", wp.array, "a Warp array if there is out")
+    if not isinstance(points, wp.array):
+        raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
     checked_choice(method, "method", METHODS)
     if checked_flag(timed, "toi") != (out.toi is not None):
         raise ValueError(f"toi must be {out.toi is not None}, as out was made with")

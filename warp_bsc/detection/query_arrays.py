@@ -248,7 +248,8 @@ def query_into(out: QueryArrays, kind: PairKind, points: wp.array, method: Metho
         RuntimeError: If a GPU captures a graph before the first such call with these results.
     """
     x = _vectors_of(points, out)
-    device, key = out.device, (kind, x.dtype, method)
+    device = out.device
+    key: tuple[PairKind, type, Method] = (kind, x.dtype, method)
     if device.is_cuda and device.is_capturing and key not in out._loaded:
         raise RuntimeError(
             "query once with this out, method and type of points before capturing, so that kernels are loaded and "
