@@ -10,6 +10,7 @@ import warp as wp
 from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
 from ..bench.query_files import benchmark_given_queries
 from ..bench.timing import count_threads, limited_threads
+from ..detection.launch import cores
 from ..detection.settings import PairKind
 from .bench_queries_tables import (
     given_queries_to_dict,
@@ -100,7 +101,7 @@ def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> int:
             queries = read_query_file(file)
             points.setdefault((path, queries.kind), []).append(queries.points)
     options = {"device": device, "repeat": arguments.repeat}
-    with limited_threads(arguments.threads):
+    with limited_threads(arguments.threads), cores(count_threads()):
         with loading_kernels(device):
             for kind in {kind for _, kind in points}:
                 benchmark_given_queries("", _KINDS[kind], np.zeros((1, 8, 3)), device=device, repeat=1)

@@ -119,7 +119,8 @@ def print_given_queries(
         repeat: Number of turns.
     """
     cores = count(threads, "core") if device.is_cpu else device.name
-    say(console, f"Nanoseconds a query on {device}, {cores}; the fastest of {count(repeat, 'turn')}")
+    kind_of_time = "Nanoseconds of processor time" if device.is_cpu else "Nanoseconds"
+    say(console, f"{kind_of_time} a query on {device}, {cores}; the fastest of {count(repeat, 'turn')}")
     caption = "cubic: a floating-point cubic solver, see warp-bsc bench. Times of impact are not sought."
     names = [method.replace("conservative", "conser-\nvative") for method in METHODS]
     table = make_table("Queries", "Number", "Collide", *names, "float /\ncubic", "exact /\ncubic", caption=caption)
