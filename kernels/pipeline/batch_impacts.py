@@ -144,7 +144,7 @@ _SNIPPET = """
 
     // the search of each lane for its first contact, see first_contact
     const double shortest = finest * length;
-    Query query;
+    Query query = {};
     double time_found[batch], time_of_contact[batch];
     signed char outcome[batch];
     Doubles start = 0.0, end = 1.0, root = 0.0;
