@@ -34,7 +34,13 @@ from typing import Any
 
 import warp as wp
 
-from .filters import UNKNOWN, near_cubic_discriminant, near_quadratic_discriminant, near_signs_at_roots
+from .filters import (
+    UNKNOWN,
+    near_cubic_discriminant,
+    near_quadratic_discriminant,
+    near_sign_at_time,
+    near_signs_at_roots,
+)
 from .wide_integers import add, minor, product, shift, sign, subtract, times, widen
 
 _2 = wp.constant(wp.uint64(2))
@@ -206,6 +212,9 @@ def signs_at_cubic_roots(
 @wp.func(inline=False)
 def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: int) -> int:
     """Returns the sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""
+    near = near_sign_at_time(p0, p1, p2, p3, time, digits)
+    if near != 0:
+        return near
     m1 = subtract(p1, times(p0, _3))
     m2 = add(subtract(p2, times(p1, _2)), times(p0, _3))
     m3 = subtract(add(p3, p1), add(p2, p0))

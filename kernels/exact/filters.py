@@ -119,6 +119,20 @@ _CUBIC_DISCRIMINANT = f"""
 #endif
 """
 
+_SIGN_AT_TIME = f"""
+#if defined(__CUDA_ARCH__)
+    return 0;
+#else
+{_NUMBERS}
+    const Integer* of_p[4] = {{&p0, &p1, &p2, &p3}};
+    Number p[4];
+    scale(of_p, 4, p);
+    const double whole = (double)(1ull << digits), t = (double)time / whole, s = 1.0 - t;  // all exact
+    const Number ends = plus(by(s * s * s, p[0]), by(t * t * t, p[3]));
+    return sign(plus(ends, plus(by(s * s * t, p[1]), by(s * t * t, p[2]))));
+#endif
+"""
+
 for _limbs in LIMBS[1:]:
     _Integer = integer(_limbs)
     _define = f"    typedef wp::vec_t<{_limbs}, wp::uint64> Integer;"
@@ -145,4 +159,9 @@ for _limbs in LIMBS[1:]:
     @wp.func_native(snippet=_define + _CUBIC_DISCRIMINANT)
     def near_cubic_discriminant(c0: _Integer, c1: _Integer, c2: _Integer, c3: _Integer) -> int:
         """Returns the sign of the discriminant of a cubic, or 0 if it is not certain."""
+        ...
+
+    @wp.func_native(snippet=_define + _SIGN_AT_TIME)
+    def near_sign_at_time(p0: _Integer, p1: _Integer, p2: _Integer, p3: _Integer, time: wp.uint64, digits: int) -> int:
+        """Returns the sign of a cubic in z at t = time / 2^digits, of at most 38 digits, or 0 if it is not certain."""
         ...

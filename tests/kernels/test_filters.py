@@ -7,6 +7,7 @@ from warp_bsc.kernels.exact import filters
 from warp_bsc.kernels.exact.wide_integers import integer
 
 LIMBS = 8
+DIGITS = 12
 number = integer(LIMBS)
 
 
@@ -18,8 +19,10 @@ def find_signs(
     at_roots: wp.array[int],
     quadratic: wp.array[int],
     cubic: wp.array[int],
+    at_time: wp.array[int],
 ):
     i = wp.tid()
+    at_time[i] = filters.near_sign_at_time(p[i, 0], p[i, 1], p[i, 2], p[i, 3], wp.uint64(i), wp.static(DIGITS))
     at_roots[i] = filters.near_signs_at_roots(p[i, 0], p[i, 1], p[i, 2], p[i, 3], q[i, 0], q[i, 1], q[i, 2], roots[i])
     quadratic[i] = filters.near_quadratic_discriminant(q[i, 0], q[i, 1], q[i, 2])
     cubic[i] = filters.near_cubic_discriminant(p[i, 0], p[i, 1], p[i, 2], p[i, 3])
@@ -86,15 +89,18 @@ def test_signs_are_right_where_they_are_certain():
     n = len(rows)
     roots = np.resize([1, 2], n).astype(np.int32)
     p, q = (wp.array(to_limbs([row[part] for row in rows]), dtype=number, device="cpu") for part in (0, 1))
-    outputs = [wp.zeros(n, dtype=int, device="cpu") for _ in range(3)]
+    outputs = [wp.zeros(n, dtype=int, device="cpu") for _ in range(4)]
     inputs = [p, q, wp.array(roots, dtype=int, device="cpu")]
     wp.launch(find_signs, n, inputs=inputs, outputs=outputs, device="cpu")
-    at_roots, quadratic, cubic = (array.numpy() for array in outputs)
+    at_roots, quadratic, cubic, at_time = (array.numpy() for array in outputs)
     for i, row in enumerate(rows):
         if at_roots[i] != filters.UNKNOWN:
             first, second = signs_at_roots(*row, roots[i])
             assert at_roots[i] == 3 * first + second, row
         expected = discriminants(*row)
+        s = 2**DIGITS - i
+        value = sum(c * s ** (3 - j) * i**j for j, c in enumerate(row[0]))
+        assert at_time[i] in (0, sign(value)), row
         assert quadratic[i] in (0, expected[0]) and cubic[i] in (0, expected[1]), row
-    for certain in (at_roots != filters.UNKNOWN, quadratic != 0, cubic != 0):
+    for certain in (at_roots != filters.UNKNOWN, quadratic != 0, cubic != 0, at_time != 0):
         assert 0.4 < certain.mean() < 0.999
