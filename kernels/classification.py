@@ -10,8 +10,8 @@ from .roots import TWO_EXTREMA, UNKNOWN, count_roots, curve_class, largest, quad
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic, certified_sign_quadratic
 
 _ZERO = wp.constant(wp.float64(0.0))
-_TINY = wp.constant(wp.float64(2.0**-80))
-_SPLIT = wp.constant(wp.float64(2.5))
+TINY = wp.constant(wp.float64(2.0**-80))
+SPLIT_ERROR = wp.constant(wp.float64(2.5))
 
 
 @wp.func
@@ -95,14 +95,14 @@ def classify_with(k: wp.vec4d, bound: wp.float64, tests: InsideTests) -> int:
     e1 = (k[3] - k[2]) - (k[2] - k[1])
     a, b = scaled_weights(wp.abs(e0), wp.abs(e1))
     square = (a + b) * (a + b)
-    part_bound = _SPLIT * square * (a + b) * bound
+    part_bound = SPLIT_ERROR * square * (a + b) * bound
     k_first, k_second = split_cubic(k, a, b)
     status = FREE
     for piece in range(2):
         first = piece == 0
         part_k = wp.where(first, k_first, k_second)
         part = InsideTests()
-        part.bounds = _SPLIT * square * tests.bounds
+        part.bounds = SPLIT_ERROR * square * tests.bounds
         part.q0 = _half(tests.q0, a, b, first)
         part.q1 = _half(tests.q1, a, b, first)
         part.q2 = _half(tests.q2, a, b, first)
@@ -143,7 +143,7 @@ def _touches(k: wp.vec4d, tests: InsideTests) -> bool:
 @wp.func
 def _without_zeros(k: wp.vec4d) -> wp.vec4d:
     """Returns the cubic with zeros at its ends moved, far less than a rounding, to the sign of the next coefficient."""
-    tiny = _TINY * largest(k)
+    tiny = TINY * largest(k)
     start = wp.where(k[1] != _ZERO, k[1], wp.where(k[2] != _ZERO, k[2], k[3]))
     end = wp.where(k[2] != _ZERO, k[2], wp.where(k[1] != _ZERO, k[1], k[0]))
     return wp.vec4d(

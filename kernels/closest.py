@@ -10,7 +10,7 @@ from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Mot
 
 _ZERO = wp.constant(wp.float64(0.0))
 _ONE = wp.constant(wp.float64(1.0))
-_FLAT = wp.constant(wp.float64(1.0e-24))
+FLAT = wp.constant(wp.float64(1.0e-24))
 _PARALLEL = wp.constant(wp.float64(1.0e-12))
 """Squared sine up to which edges, or two sides of a face, count as parallel."""
 
@@ -102,7 +102,7 @@ def contact_at(motion: Motion, time: wp.float64):
     unit_u = unit_scale(u)
     unit_v = unit_scale(v)
     normal = wp.cross(unit_u, unit_v)
-    if wp.length_sq(normal) <= _FLAT * wp.length_sq(unit_u) * wp.length_sq(unit_v):
+    if wp.length_sq(normal) <= FLAT * wp.length_sq(unit_u) * wp.length_sq(unit_v):
         normal = velocity
     if wp.length_sq(normal) == _ZERO:
         normal = wp.vec3d(_ZERO, _ZERO, _ONE)

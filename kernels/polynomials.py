@@ -38,9 +38,9 @@ VERTEX_VERTEX = wp.constant(3)
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _HALF = wp.constant(wp.float64(0.5))
 COPLANARITY_ERROR = wp.constant(wp.float64(14.0))
-_PRODUCT_ERROR = wp.constant(wp.float64(6.0))
-_DIFFERENCE_ERROR = wp.constant(wp.float64(7.0))
-_REMAINDER_ERROR = wp.constant(wp.float64(8.0))
+PRODUCT_ERROR = wp.constant(wp.float64(6.0))
+DIFFERENCE_ERROR = wp.constant(wp.float64(7.0))
+REMAINDER_ERROR = wp.constant(wp.float64(8.0))
 
 
 @wp.struct
@@ -178,10 +178,10 @@ def inside_tests(motion: Motion, y: Coplanarity, axis: int) -> InsideTests:
         tests.q2 = n - w_v - u_w
         tests.q3 = n
         tests.bounds = motion.roundoff * wp.vec4d(
-            _PRODUCT_ERROR * wv + UNDERFLOW,
-            _PRODUCT_ERROR * wu + UNDERFLOW,
-            _REMAINDER_ERROR * (uv + wv + wu) + UNDERFLOW,
-            _PRODUCT_ERROR * uv + UNDERFLOW,
+            PRODUCT_ERROR * wv + UNDERFLOW,
+            PRODUCT_ERROR * wu + UNDERFLOW,
+            REMAINDER_ERROR * (uv + wv + wu) + UNDERFLOW,
+            PRODUCT_ERROR * uv + UNDERFLOW,
         )
     else:
         w_u = _cross_component(motion.w0, motion.w1, motion.u0, motion.u1, axis)
@@ -189,9 +189,9 @@ def inside_tests(motion: Motion, y: Coplanarity, axis: int) -> InsideTests:
         tests.q2 = w_u
         tests.q3 = n - w_u
         tests.bounds = motion.roundoff * wp.vec4d(
-            _PRODUCT_ERROR * wv + UNDERFLOW,
-            _DIFFERENCE_ERROR * (uv + wv) + UNDERFLOW,
-            _PRODUCT_ERROR * wu + UNDERFLOW,
-            _DIFFERENCE_ERROR * (uv + wu) + UNDERFLOW,
+            PRODUCT_ERROR * wv + UNDERFLOW,
+            DIFFERENCE_ERROR * (uv + wv) + UNDERFLOW,
+            PRODUCT_ERROR * wu + UNDERFLOW,
+            DIFFERENCE_ERROR * (uv + wu) + UNDERFLOW,
         )
     return tests

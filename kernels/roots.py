@@ -35,6 +35,17 @@ _SLOPE_CROSSING = wp.constant(wp.float64(16.0))
 _DIVISION_L = wp.constant(wp.float64(288.0))
 _DIVISION_K = wp.constant(wp.float64(896.0))
 
+ROOT_CONSTANTS = {
+    "difference_of_cubic": float(_DIFFERENCE),
+    "discriminant_error": float(_DISCRIMINANT),
+    "turning_error": float(_TURNING),
+    "crossing_error": float(_CROSSING),
+    "slope_crossing_error": float(_SLOPE_CROSSING),
+    "factor_error": float(_DIVISION_L),
+    "division_error": float(_DIVISION_K),
+}
+"""The factors of bounds in this module, by name."""
+
 
 @wp.func
 def largest(k: wp.vec4d) -> wp.float64:

@@ -35,6 +35,17 @@ _SMALLEST_TOLERANCE = wp.constant(wp.float64(2.0**-38))
 _LARGEST_TOLERANCE = wp.constant(wp.float64(2.0**-MIN_DIGITS))
 _QUADRATIC_ERROR = wp.constant(wp.float64(2.5))
 
+SEARCH_CONSTANTS = {
+    "max_visits": int(MAX_VISITS),
+    "finest": float(FINEST),
+    "planar": float(_PLANAR),
+    "newton_steps": int(_NEWTON_STEPS),
+    "newton_end": float(_NEWTON_END),
+    "cubic_error": float(_CUBIC_ERROR),
+    "quadratic_error": float(_QUADRATIC_ERROR),
+}
+"""The constants of the search for the first contact, by name."""
+
 
 @wp.struct
 class Impact:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
         query_vertex_face,
         query_vertex_vertex,
     )
+    from .detection.query_arrays import QueryArrays
     from .detection.query_points import query_points
     from .detection.rigid_motion import RigidMotion
     from .implicit.solver import SolverImplicitAdjoint
@@ -75,6 +76,7 @@ _MODULES = {
     "FrictionTable": "response.state.friction_table",
     "IntervalResult": "replay.results",
     "IntervalSummary": "replay.results",
+    "QueryArrays": "detection.query_arrays",
     "QueryResult": "detection.query",
     "RepairResult": "repair.results",
     "RigidMotion": "detection.rigid_motion",
@@ -113,6 +115,7 @@ __all__ = [
     "FrictionTable",
     "IntervalResult",
     "IntervalSummary",
+    "QueryArrays",
     "QueryResult",
     "RepairResult",
     "RigidMotion",

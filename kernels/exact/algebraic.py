@@ -34,6 +34,13 @@ from typing import Any
 
 import warp as wp
 
+from .filters import (
+    UNKNOWN,
+    near_cubic_discriminant,
+    near_quadratic_discriminant,
+    near_sign_at_time,
+    near_signs_at_roots,
+)
 from .wide_integers import add, minor, product, shift, sign, subtract, times, widen
 
 _2 = wp.constant(wp.uint64(2))
@@ -64,7 +71,10 @@ def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
     """Returns the number of positive roots of a quadratic, with multiplicity: 0, 1 or 2; 0 for the zero polynomial."""
     changes = sign_changes(sign(c0), sign(c1), sign(c2), 0)
     if changes == 2:
-        return wp.where(sign(minor(c1, c1, times(c0, _4), c2)) >= 0, 2, 0)
+        discriminant = near_quadratic_discriminant(c0, c1, c2)
+        if discriminant == 0:
+            discriminant = sign(minor(c1, c1, times(c0, _4), c2))
+        return wp.where(discriminant >= 0, 2, 0)
     return changes
 
 
@@ -79,10 +89,13 @@ def count_cubic_roots(c0: Any, c1: Any, c2: Any, c3: Any) -> int:
     changes = sign_changes(sign(c0), sign(c1), sign(c2), sign(c3))
     if changes < 2:
         return changes
-    h0 = minor(c1, c1, times(c0, _3), c2)
-    h1 = minor(c1, c2, times(c0, _9), c3)
-    h2 = minor(c2, c2, times(c1, _3), c3)
-    return wp.where(sign(minor(times(h0, _4), h2, h1, h1)) >= 0, changes, changes - 2)
+    discriminant = near_cubic_discriminant(c0, c1, c2, c3)
+    if discriminant == 0:
+        h0 = minor(c1, c1, times(c0, _3), c2)
+        h1 = minor(c1, c2, times(c0, _9), c3)
+        h2 = minor(c2, c2, times(c1, _3), c3)
+        discriminant = sign(minor(times(h0, _4), h2, h1, h1))
+    return wp.where(discriminant >= 0, changes, changes - 2)
 
 
 @wp.func
@@ -97,6 +110,9 @@ def remainder(p0: Any, p1: Any, p2: Any, p3: Any, q0: Any, q1: Any, q2: Any):
 @wp.func(inline=False)
 def _signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, a: Any, roots: int) -> wp.vec2i:
     """Returns :func:`signs_at_roots` of a quadratic whose leading coefficient a is not zero."""
+    near = near_signs_at_roots(p0, p1, p2, p3, c0, c1, a, roots)
+    if near != UNKNOWN:
+        return wp.vec2i((near + 4) // 3 - 1, (near + 4) % 3 - 1)
     k0, k1, j = remainder(p0, p1, p2, p3, c0, c1, a)
     s0 = sign(k0)
     s1 = sign(k1)
@@ -196,6 +212,9 @@ def signs_at_cubic_roots(
 @wp.func(inline=False)
 def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: int) -> int:
     """Returns the sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""
+    near = near_sign_at_time(p0, p1, p2, p3, time, digits)
+    if near != 0:
+        return near
     m1 = subtract(p1, times(p0, _3))
     m2 = add(subtract(p2, times(p1, _2)), times(p0, _3))
     m3 = subtract(add(p3, p1), add(p2, p0))

@@ -41,7 +41,7 @@ import warp as wp
 
 from ..polynomials import EDGE_EDGE, VERTEX_FACE
 from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
-from .polygon import BITS, coordinate, cross_component, make_polygon, sign_at_end, spread, volume
+from .polygon import BITS, coordinate, cross_component, make_narrow_polygon, make_polygon, sign_at_end, spread, volume
 from .wide_integers import add, integer, product, sign, subtract, widen
 
 NONE = wp.constant(wp.float64(2.0))
@@ -202,7 +202,7 @@ def _component_signs(
     v3: Any,
     roots: int,
     constant: bool,
-) -> wp.vec3i:
+):
     """Returns the signs of a component of the cross product of an edge's corners at the roots of V.
 
     Args:
@@ -215,16 +215,17 @@ def _component_signs(
         v2: Coefficient of z^2 in V.
         v3: Coefficient of z^3 in V.
         roots: Number of positive roots of V, with multiplicity.
-        constant: True to return signs only of a component that has no positive root, False only of one that has.
+        constant: Whether to return signs only of a component that has no positive root.
 
     Returns:
-        Signs at the roots a1 <= a2 <= a3 of V, whose positive ones are the last; zeros for other components.
+        Signs at the roots a1 <= a2 <= a3 of V, whose positive ones are the last, or zeros; and whether the component
+        has positive roots.
     """
     c0, c1, c2 = cross_component(polygon, first, second, axis)
     turns = count_quadratic_roots(c0, c1, c2)
-    if (turns == 0) != constant:
-        return wp.vec3i(0, 0, 0)
-    return signs_at_cubic_roots(c0, c1, c2, turns, v0, v1, v2, v3, roots)
+    if turns > 0 and constant:
+        return wp.vec3i(0, 0, 0), True
+    return signs_at_cubic_roots(c0, c1, c2, turns, v0, v1, v2, v3, roots), turns > 0
 
 
 @wp.func
@@ -264,13 +265,17 @@ def first_contact_exactly(kind: int, polygon: wp.array[Any], timed: bool, digits
         low = wp.vec3i(0, 0, 0)
         high = wp.vec3i(0, 0, 0)
         # components without roots first: they take little time, and opposite signs decide the query
+        later = int(0)  # the others, as bits
         step = int(0)
         while step < 2 * corners:
-            if wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
-                corner = wp.where(step < corners, step, step - corners)
-                signs = _component_signs(
+            corner = wp.where(step < corners, step, step - corners)
+            is_next = step < corners or ((later >> corner) & 1) == 1
+            if is_next and wp.max(wp.cw_mul(is_open, wp.vec3i(1, 1, 1) + wp.cw_mul(low, high))) > 0:
+                signs, turns = _component_signs(
                     polygon, corner, _next(corner, corners), axis, v0, v1, v2, v3, roots, step < corners
                 )
+                if turns and step < corners:
+                    later = later | (1 << corner)
                 low = wp.min(low, signs)
                 high = wp.max(high, signs)
             step += 1
@@ -344,11 +349,17 @@ def decide_in(limbs: int) -> wp.Function:
             timed: Whether the time is needed, see :func:`first_contact_exactly`.
             digits: Binary digits of the time, at most 38.
         """
-        exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
-        if bits > largest:
-            return TOO_WIDE
         polygon = wp.zeros(shape=(24,), dtype=number)
-        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        fits = int(-1)
+        if wp.static(limbs == 1):
+            fits = make_narrow_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, polygon)
+        if fits < 0:
+            exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+            if bits > largest:
+                return TOO_WIDE
+            make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        elif fits == 0:
+            return TOO_WIDE
         return _decide(kind, polygon, timed, digits)
 
     return decide

@@ -25,6 +25,49 @@ _MULTIPLY = """
         constexpr int A = sizeof(x) / 8, B = sizeof(y) / 8, R = sizeof(ret_type) / 8;
         for (int i = 0; i < R; ++i)
             p[i] = 0;
+#if !defined(__CUDA_ARCH__)
+        if constexpr (A * B >= 64) {
+            // only the limbs that are not zero, of absolute values: most numbers are much narrower than their type
+            struct Limbs { wp::uint64 of[A > B ? A : B]; int low, high; };
+            const auto magnitude = [](const auto& a, Limbs& to) -> wp::uint64 {
+                constexpr int N = sizeof(a) / 8;
+                const wp::uint64 mask = 0 - (a[N - 1] >> 63);
+                wp::uint64 carry = mask & 1;
+                to.low = N, to.high = 0;
+                for (int i = 0; i < N; ++i) {
+                    to.of[i] = (a[i] ^ mask) + carry;
+                    carry &= to.of[i] == 0;
+                    if (to.of[i] != 0) {
+                        to.low = to.low < i ? to.low : i;
+                        to.high = i + 1;
+                    }
+                }
+                return mask;
+            };
+            Limbs a, b;
+            const wp::uint64 negative = magnitude(x, a) ^ magnitude(y, b);
+            if (a.high == 0 || b.high == 0)
+                return;
+            for (int i = a.low; i < a.high; ++i) {
+                unsigned __int128 sum = 0;
+                int j = b.low;
+                for (; j < b.high && i + j < R; ++j) {
+                    sum = (unsigned __int128)a.of[i] * b.of[j] + p[i + j] + (wp::uint64)(sum >> 64);
+                    p[i + j] = (wp::uint64)sum;
+                }
+                if (i + j < R)
+                    p[i + j] = (wp::uint64)(sum >> 64);
+            }
+            if (negative) {
+                wp::uint64 carry = 1;
+                for (int i = 0; i < R; ++i) {
+                    p[i] = ~p[i] + carry;
+                    carry &= p[i] == 0;
+                }
+            }
+            return;
+        }
+#endif
         // small ones without loops: an index that varies would put them into local memory on a GPU
         constexpr bool small = A * B <= 64;
 #pragma unroll(small ? A : 1)
@@ -170,6 +213,15 @@ SCALED = """
         wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
         if (field > 0)
             mantissa |= 1ull << 52;
+#if !defined(__CUDA_ARCH__)
+        if constexpr (L == 1) {
+            if (field > 0 && exponent > -1023 && exponent < 1023 && field - 1023 - exponent < 62) {
+                word.bits = (wp::uint64)(1023 - exponent) << 52;
+                x[0] = (wp::uint64)(long long)(value * word.value);
+                return;
+            }
+        }
+#endif
         int shift = (field > 0 ? field : 1) - 1075 - exponent;
         if (shift < 0) {
             mantissa = shift > -64 ? mantissa >> -shift : 0;

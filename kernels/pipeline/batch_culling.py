@@ -25,6 +25,7 @@ import warp as wp
 from ..culling import DIRECTION_ERROR
 from ..polynomials import COPLANARITY_ERROR
 from ..signs import UNDERFLOW
+from .simd import native_for_pairs
 
 BATCH = wp.constant(64)
 """Pairs that one call culls."""
@@ -32,156 +33,66 @@ BATCH = wp.constant(64)
 _LARGEST = 1.0e70
 
 _SNIPPET = """
-    typedef {scalar} Scalars __attribute__((ext_vector_type(8)));
-    typedef {scalar} Four __attribute__((ext_vector_type(4)));
-    typedef {scalar} Loaded __attribute__((ext_vector_type(4), aligned(sizeof({scalar}))));
-    typedef {scalar} Two __attribute__((ext_vector_type(2), aligned(sizeof({scalar}))));
-    typedef double Doubles __attribute__((ext_vector_type(8)));
-    typedef bool Bools __attribute__((ext_vector_type(8)));
-    struct Vectors {{ Doubles x, y, z; }};
-
-    auto bits = [](auto mask) -> int {{
-        return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
-    }};
-    auto least = [](Doubles a, Doubles b) {{ return __builtin_elementwise_min(a, b); }};
-    auto most = [](Doubles a, Doubles b) {{ return __builtin_elementwise_max(a, b); }};
-    auto larger = [](Doubles a, Doubles b) {{
-        return __builtin_elementwise_max(__builtin_elementwise_abs(a), __builtin_elementwise_abs(b));
-    }};
-    auto sizes = [larger](Vectors a, Vectors b) {{
-        return Vectors{{larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)}};
-    }};
-    auto plus = [](Vectors a, Vectors b) {{ return Vectors{{a.x + b.x, a.y + b.y, a.z + b.z}}; }};
-    auto minus = [](Vectors a, Vectors b) {{ return Vectors{{a.x - b.x, a.y - b.y, a.z - b.z}}; }};
-    auto times = [](double a, Vectors b) {{ return Vectors{{a * b.x, a * b.y, a * b.z}}; }};
-    auto dot = [](Vectors a, Vectors b) {{ return a.x * b.x + a.y * b.y + a.z * b.z; }};
-    auto cross = [](Vectors a, Vectors b) {{
-        return Vectors{{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}};
-    }};
-
-    auto corners_of = [&](int slot, int* corner) {{
-        const int* pair = (const int*)pairs.data + 2 * (size_t)slot;
-        if (vertex_face) {{
-            const int* face = elements.data + 3 * (size_t)pair[1];
-            corner[0] = pair[0], corner[1] = face[0], corner[2] = face[1], corner[3] = face[2];
-        }} else {{
-            const int* edge = elements.data + 2 * (size_t)pair[0];
-            const int* other = elements.data + 2 * (size_t)pair[1];
-            corner[0] = edge[0], corner[1] = edge[1], corner[2] = other[0], corner[3] = other[1];
-        }}
-    }};
-
-    // positions may be a view, with any stride
-    auto position = [](const auto& x, int corner) {{
-        return (const {scalar}*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
-    }};
-
-    // box test, pair by pair: x y z of both ends in one vector; a fourth number is read with them where there is one
-    auto load = [&](const auto& x, int corner) -> Four {{
-        const {scalar}* from = position(x, corner);
-        if (corner + 1 < x.shape[0] && x.strides[0] >= 3 * (int)sizeof({scalar}))
-            return *(const Loaded*)from;
-        return Four{{from[0], from[1], from[2], 0}};
-    }};
-    auto both = [&](int corner) -> Scalars {{
-        return __builtin_shufflevector(load(x0, corner), load(x1, corner), 0, 1, 2, 3, 4, 5, 6, 7);
-    }};
-    int near[{batch} + 8];
+    // box test, pair by pair: x y z of both ends in one vector
+    int near[batch];
     int near_count = 0;
-    for (int i = 0; i < count; ++i) {{
+    for (int i = 0; i < count; ++i) {
         int corner[4];
         corners_of(first + i, corner);
-        const Scalars a = both(corner[0]), b = both(corner[1]), c = both(corner[2]), d = both(corner[3]);
+        auto later = [](int a, int b) { return a > b ? a : b; };
+        const bool has_fourth = later(later(corner[0], corner[1]), later(corner[2], corner[3])) < last;
+        auto ends = [&](int i) { return both(position(x0, corner[i]), position(x1, corner[i]), has_fourth); };
+        const Scalars a = ends(0), b = ends(1), c = ends(2), d = ends(3);
         Scalars low = a, high = a;
         Scalars other_low = __builtin_elementwise_min(c, d), other_high = __builtin_elementwise_max(c, d);
-        if (vertex_face) {{
+        if (vertex_face) {
             other_low = __builtin_elementwise_min(other_low, b);
             other_high = __builtin_elementwise_max(other_high, b);
-        }} else {{
+        } else {
             low = __builtin_elementwise_min(a, b);
             high = __builtin_elementwise_max(a, b);
-        }}
+        }
         const int above = bits(other_low > high), below = bits(low > other_high);
         const int apart = ((above & (above >> 4)) | (below & (below >> 4))) & 7;
         near[near_count] = i;
         near_count += apart == 0;
-    }}
+    }
 
     unsigned long long left = 0;
-    for (int group = 0; group < near_count; group += 8) {{
+    for (int group = 0; group < near_count; group += 8) {
         const int filled = near_count - group < 8 ? near_count - group : 8;
-        // loads x y y z of each point, and transposes to the coordinates of all eight pairs
-        int corners[4][8];
-        for (int lane = 0; lane < 8; ++lane) {{
-            int corner[4];
-            corners_of(first + near[group + (lane < filled ? lane : 0)], corner);
-            for (int i = 0; i < 4; ++i)
-                corners[i][lane] = corner[i];
-        }}
+        int slots[8];
+        for (int lane = 0; lane < 8; ++lane)
+            slots[lane] = first + near[group + (lane < filled ? lane : 0)];
         Scalars points[24];
-        auto read = [&](const auto& x, const int* corner, Scalars* to) {{
-            Four at[8], low[3], high[3];
-            for (int lane = 0; lane < 8; ++lane) {{
-                const {scalar}* from = position(x, corner[lane]);
-                at[lane] = __builtin_shufflevector(*(const Two*)from, *(const Two*)(from + 1), 0, 1, 2, 3);
-            }}
-            auto transpose = [](const Four* at, Four* to) {{
-                const Four xy = __builtin_shufflevector(at[0], at[1], 0, 4, 1, 5);
-                const Four yz = __builtin_shufflevector(at[0], at[1], 2, 6, 3, 7);
-                const Four more_xy = __builtin_shufflevector(at[2], at[3], 0, 4, 1, 5);
-                const Four more_yz = __builtin_shufflevector(at[2], at[3], 2, 6, 3, 7);
-                to[0] = __builtin_shufflevector(xy, more_xy, 0, 1, 4, 5);
-                to[1] = __builtin_shufflevector(xy, more_xy, 2, 3, 6, 7);
-                to[2] = __builtin_shufflevector(yz, more_yz, 2, 3, 6, 7);
-            }};
-            transpose(at, low);
-            transpose(at + 4, high);
-            for (int axis = 0; axis < 3; ++axis)
-                to[axis] = __builtin_shufflevector(low[axis], high[axis], 0, 1, 2, 3, 4, 5, 6, 7);
-        }};
-        for (int i = 0; i < 4; ++i) {{
-            read(x0, corners[i], points + 3 * i);
-            read(x1, corners[i], points + 12 + 3 * i);
-        }}
+        read_points(slots, points);
 
         // Bernstein signs
-        auto point = [&](int i) {{
-            return Vectors{{
-                __builtin_convertvector(points[3 * i], Doubles),
-                __builtin_convertvector(points[3 * i + 1], Doubles),
-                __builtin_convertvector(points[3 * i + 2], Doubles)}};
-        }};
-        Vectors u0, v0, w0, u1, v1, w1;
-        if (vertex_face) {{
-            u0 = minus(point(2), point(1)), v0 = minus(point(3), point(1)), w0 = minus(point(0), point(1));
-            u1 = minus(point(6), point(5)), v1 = minus(point(7), point(5)), w1 = minus(point(4), point(5));
-        }} else {{
-            u0 = minus(point(1), point(0)), v0 = minus(point(3), point(2)), w0 = minus(point(2), point(0));
-            u1 = minus(point(5), point(4)), v1 = minus(point(7), point(6)), w1 = minus(point(6), point(4));
-        }}
+        const Relative r = relative(points);
+        const Vectors u0 = r.u0, v0 = r.v0, w0 = r.w0, u1 = r.u1, v1 = r.v1, w1 = r.w1;
         const Vectors n0 = cross(u0, v0), n1 = cross(u1, v1);
         const Vectors twice_nh = plus(cross(u0, v1), cross(u1, v0));
         const Doubles k0 = dot(w0, n0), k3 = dot(w1, n1);
         const Doubles k1 = (dot(w0, twice_nh) + dot(w1, n0)) * (1.0 / 3.0);
         const Doubles k2 = (dot(w1, twice_nh) + dot(w0, n1)) * (1.0 / 3.0);
-        // with a roundoff of zero all bounds are zero
-        Vectors size = {{0.0, 0.0, 0.0}};
-        Doubles bound = 0.0;
-        double flushed = 0.0;
-        int trusted = 255;
-        if (roundoff > 0.0) {{
-            const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
-            const Vectors uv = {{u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x}};
-            size = plus(plus(u, v), w);
-            flushed = {flushed};
-            const Doubles extent = most(most(size.x, size.y), size.z);
-            bound = roundoff * ({coplanarity_error} * dot(w, uv) + {underflow}) + flushed * extent * extent;
-            trusted = bits(extent < {largest});
-        }}
-        auto culled = (least(least(k0, k1), least(k2, k3)) > bound) | (most(most(k0, k1), most(k2, k3)) < -bound);
-        int unsure = ((1 << filled) - 1) & ~(bits(culled) & trusted);
-        if (!unsure)
-            continue;
+        // bounds take longer than signs: only where some lane has one sign; with a roundoff of zero they are zero
+        int unsure = (1 << filled) - 1;
+        const Doubles lowest_k = least(least(k0, k1), least(k2, k3)), highest_k = most(most(k0, k1), most(k2, k3));
+        if (bits((lowest_k > 0.0) | (highest_k < 0.0)) & unsure) {
+            Doubles bound = 0.0;
+            int trusted = 255;
+            if (roundoff > 0.0) {
+                const Vectors u = sizes(u0, u1), v = sizes(v0, v1), w = sizes(w0, w1);
+                const Vectors uv = {u.y * v.z + u.z * v.y, u.z * v.x + u.x * v.z, u.x * v.y + u.y * v.x};
+                const Vectors size = plus(plus(u, v), w);
+                const Doubles extent = most(most(size.x, size.y), size.z);
+                bound = roundoff * (coplanarity_error * dot(w, uv) + underflow) + flushed * extent * extent;
+                trusted = bits(extent < largest_size);
+            }
+            unsure &= ~(bits((lowest_k > bound) | (highest_k < -bound)) & trusted);
+            if (!unsure)
+                continue;
+        }
 
         // separating direction
         const Vectors us = plus(u0, u1), vs = plus(v0, v1), ws = plus(w0, w1);
@@ -191,21 +102,28 @@ _SNIPPET = """
         const Doubles dv0 = dot(direction, v0), dv1 = dot(direction, v1);
         const Doubles dw0 = dot(direction, w0), dw1 = dot(direction, w1);
         Doubles lowest, highest;
-        if (vertex_face) {{
+        if (vertex_face) {
             lowest = least(dw0 - most(most(du0, dv0), zero), dw1 - most(most(du1, dv1), zero));
             highest = most(dw0 - least(least(du0, dv0), zero), dw1 - least(least(du1, dv1), zero));
-        }} else {{
+        } else {
             lowest = least(dw0 - most(du0, zero) + least(dv0, zero), dw1 - most(du1, zero) + least(dv1, zero));
             highest = most(dw0 - least(du0, zero) + most(dv0, zero), dw1 - least(du1, zero) + most(dv1, zero));
-        }}
-        const Vectors along = sizes(direction, direction);
-        const Doubles slack
-            = roundoff * ({direction_error} * dot(along, size) + {underflow}) + flushed * (along.x + along.y + along.z);
-        culled = (lowest > slack) | (highest < -slack);
-        unsure &= ~(bits(culled) & trusted);
+        }
+        if (bits((lowest > 0.0) | (highest < 0.0)) & unsure) {
+            Doubles slack = 0.0;
+            int trusted = 255;
+            if (roundoff > 0.0) {
+                const Vectors along = sizes(direction, direction);
+                const Vectors size = plus(plus(sizes(u0, u1), sizes(v0, v1)), sizes(w0, w1));
+                slack = roundoff * (direction_error * dot(along, size) + underflow)
+                    + flushed * (along.x + along.y + along.z);
+                trusted = bits(most(most(size.x, size.y), size.z) < largest_size);
+            }
+            unsure &= ~(bits((lowest > slack) | (highest < -slack)) & trusted);
+        }
         for (int lane = 0; lane < filled; ++lane)
             left |= (unsigned long long)((unsure >> lane) & 1) << near[group + lane];
-    }}
+    }
     return left;
 """
 
@@ -223,18 +141,19 @@ def cull_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         of pairs, the first pair of the batch, the number of pairs in it, at most :data:`BATCH`, and the roundoff. It
         returns a bit for each pair, set where no cull decides the pair. Indices are not checked.
     """
-    single = dtype is wp.vec3
-    snippet = _SNIPPET.format(
-        scalar="float" if single else "double",
+    snippet = native_for_pairs(
+        dtype,
+        vertex_face,
+        _SNIPPET,
+        batch=int(BATCH),
         coplanarity_error=float(COPLANARITY_ERROR),
         direction_error=float(DIRECTION_ERROR),
-        underflow=repr(float(UNDERFLOW)),
-        largest=repr(_LARGEST),
-        flushed=repr(40.0 * 2.0 ** (-126 if single else -1022)),
-        batch=int(BATCH),
+        underflow=float(UNDERFLOW),
+        largest_size=_LARGEST,
+        flushed=40.0 * 2.0 ** (-126 if dtype is wp.vec3 else -1022),
     )
 
-    @wp.func_native(f"    constexpr bool vertex_face = {'true' if vertex_face else 'false'};\n{snippet}")
+    @wp.func_native(snippet)
     def cull_batch(
         # mesh
         x0: wp.array[dtype],

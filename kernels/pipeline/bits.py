@@ -15,3 +15,17 @@ import warp as wp
 def lowest_bit(bits: wp.uint64) -> int:
     """Returns the number of the lowest bit that is set; 64 if there is none."""
     ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    return __popcll(bits);
+#else
+    return __builtin_popcountll(bits);
+#endif
+"""
+)
+def count_bits(bits: wp.uint64) -> int:
+    """Returns how many bits are set."""
+    ...

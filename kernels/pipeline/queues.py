@@ -76,7 +76,10 @@ def take_slot_int(count: wp.array[int]) -> int:
 """
 )
 def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
-    """Raises the count of a queue by an amount below 64, and returns its old value: the index of the first entry."""
+    """Raises the count of a queue by an amount, and returns its old value: the index of the first entry.
+
+    On a GPU the amount must be below 64.
+    """
     ...
 
 
@@ -97,7 +100,7 @@ def take_slots(counts: wp.array[wp.int64], queue: int, amount: int) -> wp.int64:
 """
 )
 def raise_count(counts: wp.array[wp.int64], queue: int, amount: int):
-    """Raises the count of a queue by an amount below 64."""
+    """Raises the count of a queue by an amount, below 64 on a GPU."""
     ...
 
 

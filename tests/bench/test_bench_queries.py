@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from generators import GENERATORS
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -106,6 +107,8 @@ def test_tables_fit_a_terminal(capsys, monkeypatch, device):
         (["--repeat", "0"], "--repeat: must be an integer of at least 1"),
         (["--threads", "100000"], "threads must be in [1, "),
         (["--device", "cuda:99"], "--device cuda:99"),
+        (["no-such-file.csv"], "no-such-file.csv: no such file"),
+        (["no-such-file.csv", "--count", "10"], "--count is for random queries"),
     ],
 )
 def test_wrong_use(capsys, arguments, part):
@@ -115,3 +118,31 @@ def test_wrong_use(capsys, arguments, part):
     (line,) = output.err.splitlines()
     assert line.startswith("warp-bsc: error: ")
     assert part in line
+
+
+def write_queries(folder, kind, points):
+    """Writes a file of queries with integer coordinates."""
+    folder = folder / kind
+    folder.mkdir(parents=True)
+    rows = [",".join(f"{int(x)},1" for x in row) for row in points.reshape(-1, 3)]
+    (folder / "data.csv").write_text("\n".join(rows) + "\n")
+
+
+def test_methods_are_measured_on_files(capsys, monkeypatch, tmp_path, device):
+    rng = np.random.default_rng(1)
+    points = {kind: GENERATORS["integer_lattice"](rng, 50, kind.label, np.float64) for kind in PairKind}
+    for kind in PairKind:
+        write_queries(tmp_path / "lattice", kind.display_name, points[kind])
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = measure(capsys, device, str(tmp_path / "lattice")).splitlines()
+    assert max(map(len, lines)) <= 80
+    for kind in PairKind:
+        assert sum(f"lattice, {kind.display_name} " in line for line in lines) == 1
+    measured = json.loads(measure(capsys, device, str(tmp_path / "lattice"), "--json"))["queries"]
+    by_kind = {row["kind"]: row for row in measured}
+    for kind in PairKind:
+        row = by_kind[kind.display_name]
+        truth = getattr(checker, kind.label)(points[kind])
+        assert (row["name"], row["queries"], row["hits"]) == ("lattice", 50, truth.sum())
+        assert set(row["nanoseconds"]) == {"float", "conservative", "exact", "cubic"}
+        assert all(took > 0.0 for took in row["nanoseconds"].values())

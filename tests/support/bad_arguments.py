@@ -299,6 +299,11 @@ def calls() -> dict[str, Call]:
         {"mesh": OBJECTS, "distance": POSITIVE, "rings": NOT_COUNT},
         raises=ProximityFinder.__init__,
     )
+    found["QueryArrays"] = Call(
+        bsc.QueryArrays,
+        {"count": 1, "device": "cpu"},
+        {"count": NOT_COUNT | {"huge": 2**28}, "toi": FLAGS, "device": without(DEVICES)},
+    )
     for kind, good in POINTS.items():
         bad = {**bad_arrays(good), **not_finite(good)}
         found[f"query_{kind}"] = Call(
@@ -312,7 +317,8 @@ def calls() -> dict[str, Call]:
                 "toi": FLAGS,
                 "tolerance": TOLERANCES,
                 "device": without(DEVICES),
-            },
+            }
+            | ({"out": without(OBJECTS, "None")} if kind in ("vertex_face", "edge_edge") else {}),
         )
         for name in (kind, f"{kind}_toi"):
             function = getattr(bsc.checker, name)

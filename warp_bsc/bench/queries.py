@@ -8,6 +8,8 @@ import warp as wp
 
 from .._arguments import checked_integer
 from ..detection.launch import launch_over, launch_over_queue
+from ..detection.query import query_edge_edge, query_vertex_face
+from ..detection.query_arrays import QueryArrays
 from ..detection.settings import TOLERANCE, PairKind
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from ..kernels.classification import classify
@@ -31,7 +33,7 @@ __all__ = [
     "generate_touching_queries",
 ]
 
-MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
+MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1, "function": 96 + 58}
 """The modes that are measured, with the bytes of a query and its result.
 
 - ``status``: finds the status, one thread a query.
@@ -39,6 +41,8 @@ MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1}
 - ``queued``: finds the status by two kernels: one culls, the other decides the survivors.
 - ``exact``: finds the status by exact integers of one limb a coordinate, for as many queries that floating point cannot
   certify.
+- ``function``: what a program calls: :func:`warp_bsc.query_vertex_face` or :func:`warp_bsc.query_edge_edge` with
+  ``out=``, method "exact": hit, status, time of impact, coordinates and normal.
 """
 
 SEED = 0
@@ -344,9 +348,11 @@ def benchmark_queries(
     check_query_count(count)
     find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
     points = generate_queries(kind, count, device=device)
+    query = query_vertex_face if kind == PairKind.VERTEX_FACE else query_edge_edge
+    out = QueryArrays(count, device=device)
     touching = generate_touching_queries(kind, count, device=device)
     # no status is -1
-    status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES}
+    status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES} | {"function": out.status}
     toi = wp.empty(count, dtype=wp.float64, device=device)
     coordinates, normal = (wp.empty(count, dtype=wp.vec3d, device=device) for _ in range(2))
     survivors = wp.empty(count, dtype=int, device=device)
@@ -370,7 +376,11 @@ def benchmark_queries(
         outputs = [status["exact"]]
         launch_over(find_exact_status, count, inputs=[touching], outputs=outputs, device=device, block_dim=64)
 
+    def run_function():
+        query(points, out=out)
+
     runs = {"status": run_status, "impact": run_impact, "queued": run_queued, "exact": run_exact}
+    runs["function"] = run_function
     milliseconds = {mode: median_milliseconds(runs[mode], device, repeat) for mode in MODES}
     results = {mode: array.numpy() for mode, array in status.items()}
     missed = int((results["exact"] != HIT).sum())

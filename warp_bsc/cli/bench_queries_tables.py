@@ -6,9 +6,10 @@ import warp as wp
 from rich.console import Console
 
 from ..bench.queries import MODES, SEED, QueryBenchmark
+from ..bench.query_files import METHODS, GivenQueries
 from .tables import count, make_table, say
 
-__all__ = ["print_query_benchmarks", "query_benchmarks_to_dict"]
+__all__ = ["given_queries_to_dict", "print_given_queries", "print_query_benchmarks", "query_benchmarks_to_dict"]
 
 
 def print_query_benchmarks(
@@ -66,6 +67,7 @@ def print_query_benchmarks(
     say(console, "impact: finds the time of impact, coordinates and normal as well.")
     say(console, "queued: finds the status by two kernels: culls, and a decision of the survivors.")
     say(console, "exact: finds the status in integers, where floating point cannot certify it.")
+    say(console, "function: query_vertex_face or query_edge_edge with out=, exact, with times.")
     say(console, f"A copy on this device reads and writes {copy_rate / 1e9:,.1f} GB/s.")
 
 
@@ -100,5 +102,58 @@ def query_benchmarks_to_dict(
                 },
             }
             for found in benchmarks
+        ],
+    }
+
+
+def print_given_queries(
+    console: Console, measured: list[GivenQueries], *, device: wp.Device, threads: int, repeat: int
+) -> None:
+    """Prints the times of the methods on given queries.
+
+    Args:
+        console: The terminal or file to print to.
+        measured: The measurements.
+        device: The Warp device.
+        threads: Number of CPU cores.
+        repeat: Number of turns.
+    """
+    cores = count(threads, "core") if device.is_cpu else device.name
+    kind_of_time = "Nanoseconds of processor time" if device.is_cpu else "Nanoseconds"
+    say(console, f"{kind_of_time} a query on {device}, {cores}; the fastest of {count(repeat, 'turn')}")
+    caption = "cubic: a floating-point cubic solver, see warp-bsc bench. Times of impact are not sought."
+    names = [method.replace("conservative", "conser-\nvative") for method in METHODS]
+    table = make_table("Queries", "Number", "Collide", *names, "float /\ncubic", "exact /\ncubic", caption=caption)
+    for found in measured:
+        ns = found.nanoseconds
+        table.add_row(
+            f"{found.name}, {found.kind.display_name}",
+            f"{found.queries:,}",
+            f"{found.hits / found.queries:.0%}",
+            *(f"{ns[method]:,.1f}" for method in METHODS),
+            *(f"{ns[method] / ns['cubic']:.2f}" for method in ("float", "exact")),
+        )
+    console.print(table)
+
+
+def given_queries_to_dict(
+    measured: list[GivenQueries], *, device: wp.Device, threads: int, repeat: int
+) -> dict[str, Any]:
+    """Returns the measurements as plain data for JSON. Arguments: as of :func:`print_given_queries`."""
+    return {
+        "benchmark": "given queries",
+        "device": str(device),
+        "device_name": device.name,
+        "threads": threads,
+        "repeat": repeat,
+        "queries": [
+            {
+                "name": found.name,
+                "kind": found.kind.display_name,
+                "queries": found.queries,
+                "hits": found.hits,
+                "nanoseconds": found.nanoseconds,
+            }
+            for found in measured
         ],
     }

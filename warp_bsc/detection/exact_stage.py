@@ -2,9 +2,9 @@
 
 Contacts that the previous stage has enqueued are decided in integers of one limb a coordinate, see
 :mod:`warp_bsc.kernels.exact.first_contact`. Those whose exponents are too far apart for that go to the next queue,
-for two limbs, and then to the queue for eight, which suffice for every query in single precision. Contacts that are
-too wide for eight limbs are counted and left to the host. Each width has its own kernel, so that the usual one stays
-small.
+for two limbs, on a CPU then to that for four, and at last to the queue for eight, which suffice for every query in
+single precision. Contacts that are too wide for eight limbs are counted and left to the host. Each width has its own
+kernel, so that the usual one stays small.
 
 Contacts with a minimum distance are decided as far as :mod:`warp_bsc.kernels.exact.distance` can. The host decides the
 others, and those that are too wide.
@@ -32,6 +32,9 @@ from .launch import launch_over_queue, made_once
 from .settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
 
 __all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_stage"]
+
+_WIDTHS_ON_GPU = (1, 2, 8)
+"""Limbs of the integers on a GPU, where a launch over an empty queue takes longer than four limbs would save."""
 
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
@@ -246,7 +249,7 @@ def launch_exact_stage(
     queues: list[wp.array],
     counts: wp.array,
     filled: int,
-    too_wide: list[int],
+    too_wide: dict[int, int],
     refuted: int,
     contacts: ContactBuffer,
     keys: wp.array,
@@ -265,7 +268,7 @@ def launch_exact_stage(
             of int.
         counts: Counts of the narrow phase, array of int64.
         filled: Index of the number of contacts to decide in it.
-        too_wide: Indices of the numbers of those too wide for 1, 2 and 8 limbs.
+        too_wide: Indices of the numbers of those too wide for each number of limbs.
         refuted: Index of the number of those decided to be free.
         contacts: The contacts; without times only ``pairs`` and ``decided`` are used.
         keys: Sorting keys of the contacts, array of int64.
@@ -273,8 +276,8 @@ def launch_exact_stage(
     """
     digits = max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     queue, left = queues
-    for limbs, too_wide_for_it in zip(BITS, too_wide, strict=True):
-        indices = [int(filled), int(too_wide_for_it), int(refuted)]
+    for limbs in BITS if queue.device.is_cpu else _WIDTHS_ON_GPU:
+        indices = [int(filled), int(too_wide[limbs]), int(refuted)]
         launch_over_queue(
             _kernel(x0.dtype, limbs),
             queue,
@@ -284,4 +287,4 @@ def launch_exact_stage(
             outputs=[counts, contacts, keys, left],
             block_dim=64,
         )
-        queue, left, filled = left, queue, too_wide_for_it
+        queue, left, filled = left, queue, too_wide[limbs]

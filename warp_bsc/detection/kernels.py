@@ -9,13 +9,17 @@ from ..kernels.classification import classify
 from ..kernels.closest import contact_at
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
+from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
+from ..kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
-from ..kernels.pipeline.bits import lowest_bit
+from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
+from ..kernels.pipeline.batch_impacts import impact_batch_of
+from ..kernels.pipeline.bits import count_bits, lowest_bit
 from ..kernels.pipeline.pairs import vertices_of_pair
-from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.pipeline.queues import append, filled_entries, is_filled, raise_count, take_slot, take_slots, write
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
 from ..kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
-from ..kernels.time_of_impact import Impact, impact
+from ..kernels.time_of_impact import Impact, clamped_tolerance, impact, power_of_two
 from .contact_buffer import ContactBuffer
 from .launch import made_once
 from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, DistanceKind, PairKind
@@ -23,7 +27,9 @@ from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, DistanceKind, Pa
 __all__ = [
     "PairKernels",
     "PairStages",
+    "batch_classification_kernel",
     "batch_culling_kernel",
+    "batch_impact_kernel",
     "culling_kernel",
     "gather_contacts",
     "pad_keys",
@@ -37,6 +43,8 @@ _FOUND = wp.constant(int(Count.FOUND))
 _UNSURE = wp.constant(int(Count.UNSURE))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _REFUTED = wp.constant(int(Count.REFUTED))
+_LOWER_BITS = wp.constant(wp.uint64(0x5555555555555555))
+"""The lower of the two bits of each status of a batch."""
 
 
 @wp.struct
@@ -143,7 +151,6 @@ def pair_kernels(dtype: type) -> PairKernels:
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         roundoff: wp.float64,
-        arcs: Arcs,
         # in and out
         vertex_face: PairStages,
         edge_edge: PairStages,
@@ -161,8 +168,6 @@ def pair_kernels(dtype: type) -> PairKernels:
             v = vertices_of_pair(VERTEX_FACE, vertex_face.elements, pair)
         else:
             v = vertices_of_pair(EDGE_EDGE, edge_edge.elements, pair)
-        if turns(arcs, v):
-            return
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -305,16 +310,146 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kerne
         stages: PairStages,
     ):
         i = BATCH * (first + wp.tid())
-        any_turn = any_turns(arcs)
         filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
         left = cull_batch(x0, x1, stages.elements, stages.queue, i, wp.min(BATCH, filled - i), roundoff)
+        if any_turns(arcs):
+            straight = left
+            while straight != wp.uint64(0):
+                lane = lowest_bit(straight)
+                straight = straight & (straight - wp.uint64(1))
+                if turns(arcs, vertices_of_pair(kind_number, stages.elements, stages.queue[i + lane])):
+                    left = left ^ (wp.uint64(1) << wp.uint64(lane))
+        slot = take_slots(stages.counts, _SURVIVORS, count_bits(left))
         while left != wp.uint64(0):
-            pair = stages.queue[i + lowest_bit(left)]
-            if not (any_turn and turns(arcs, vertices_of_pair(kind_number, stages.elements, pair))):
-                append(pair, stages.survivors, stages.counts, _SURVIVORS)
+            write(stages.queue[i + lowest_bit(left)], stages.survivors, slot)
+            slot += wp.int64(1)
             left = left & (left - wp.uint64(1))
 
     return cull_batches
+
+
+@made_once
+def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that classifies survivors on the CPU, in batches, for one kind and one type of position."""
+    kind_number = int(kind)
+    classify_batch = classify_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def classify_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        i = CLASSIFIED * (first + wp.tid())
+        number = wp.min(CLASSIFIED, filled_entries(stages.survivors, stages.counts, _SURVIVORS) - i)
+        statuses = classify_batch(x0, x1, stages.elements, stages.survivors, i, number, roundoff)
+        left = statuses & (statuses >> wp.uint64(1)) & _LOWER_BITS
+        while left != wp.uint64(0):
+            bit = lowest_bit(left)
+            v = vertices_of_pair(kind_number, stages.elements, stages.survivors[i + bit // 2])
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            status = classify(motion, coplanarity(motion))
+            statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
+            left = left & (left - wp.uint64(1))
+        contacts = (statuses | (statuses >> wp.uint64(1))) & _LOWER_BITS
+        slot = take_slots(stages.counts, _CONTACTS, count_bits(contacts))
+        while contacts != wp.uint64(0):
+            bit = lowest_bit(contacts)
+            if slot < wp.int64(stages.contacts.pairs.shape[0]):
+                stages.contacts.pairs[wp.int32(slot)] = stages.survivors[i + bit // 2]
+                stages.contacts.status[wp.int32(slot)] = wp.int8((statuses >> wp.uint64(bit)) & wp.uint64(3))
+            slot += wp.int64(1)
+            contacts = contacts & (contacts - wp.uint64(1))
+
+    return classify_batches
+
+
+@wp.func
+def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
+    """Decides contacts as :func:`_decide` does, with one atomic operation for each count."""
+    contacts = stages.contacts
+    found = int(0)
+    unsure = int(0)
+    for_exact = int(0)
+    for i in range(first, first + count):
+        status = contacts.status[i]
+        contacts.decided[i] = status
+        stages.order[i] = i
+        key = stages.last_key
+        if status != wp.int8(FREE):
+            pair = contacts.pairs[i]
+            key = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+            found += 1
+            if status == wp.int8(UNSURE):
+                unsure += 1
+            if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
+                for_exact += 1
+        stages.keys[i] = key
+    raise_count(stages.counts, _FOUND, found)
+    raise_count(stages.counts, _UNSURE, unsure)
+    if for_exact > 0:
+        slot = wp.int32(take_slots(stages.counts, _FOR_EXACT, for_exact))
+        for i in range(first, first + count):
+            status = contacts.status[i]
+            if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
+                stages.for_exact[slot] = i
+                slot += 1
+
+
+@made_once
+def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that finds times of impact on the CPU, in batches, for one kind and one type of position."""
+    kind_number = int(kind)
+    impact_batch = impact_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_impact_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        contacts = stages.contacts
+        i = DECIDED * (first + wp.tid())
+        number = wp.min(DECIDED, filled_entries(contacts.pairs, stages.counts, _CONTACTS) - i)
+        left = impact_batch(
+            x0,
+            x1,
+            stages.elements,
+            contacts.pairs,
+            i,
+            number,
+            roundoff,
+            timed,
+            power_of_two(clamped_tolerance(tolerance)),
+            contacts.status,
+            contacts.within_tolerance,
+            contacts.toi,
+            contacts.coordinates,
+            contacts.normal,
+        )
+        while left != wp.uint64(0):
+            row = i + lowest_bit(left)
+            v = vertices_of_pair(kind_number, stages.elements, contacts.pairs[row])
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            _write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), stages)
+            left = left & (left - wp.uint64(1))
+        _decide_batch(i, number, timed, stages)
+
+    return find_impact_batches
 
 
 @wp.kernel(**NO_GRADIENTS)

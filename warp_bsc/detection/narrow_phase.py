@@ -5,18 +5,29 @@ the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipel
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
 
 from .. import checker
 from ..kernels.arcs import Arcs
-from ..kernels.pipeline.batch_culling import BATCH
+from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
+from ..kernels.pipeline.batch_culling import BATCH as CULLED
+from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ..kernels.signs import FREE, HIT, ROUNDOFF
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
-from .kernels import PairStages, batch_culling_kernel, culling_kernel, gather_contacts, pad_keys, pair_kernels
+from .kernels import (
+    PairStages,
+    batch_classification_kernel,
+    batch_culling_kernel,
+    batch_impact_kernel,
+    culling_kernel,
+    gather_contacts,
+    pad_keys,
+    pair_kernels,
+)
 from .launch import launch, launch_over, launch_over_queue, max_blocks
 from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, Method, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
@@ -62,6 +73,11 @@ class NarrowPhase:
         self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
         self._order = wp.empty(2 * capacity, dtype=int, device=device)
         self._for_exact = [wp.empty(capacity, dtype=int, device=device) for _ in range(2)]
+
+    def fit_all(self) -> None:
+        """Enlarges the buffers so that no run overflows them: all queued pairs may survive and be contacts."""
+        self._allocate_survivors(len(self.queue))
+        self._allocate_contacts(len(self.queue))
 
     @property
     def buffers(self) -> list:
@@ -150,7 +166,7 @@ class NarrowPhase:
             queues=self._for_exact,
             counts=self.counts,
             filled=Count.FOR_EXACT,
-            too_wide=[Count.TOO_WIDE_1, Count.TOO_WIDE_2, Count.TOO_WIDE_8],
+            too_wide={1: Count.TOO_WIDE_1, 2: Count.TOO_WIDE_2, 4: Count.TOO_WIDE_4, 8: Count.TOO_WIDE_8},
             refuted=Count.REFUTED,
             contacts=self.contacts,
             keys=self._keys,
@@ -214,34 +230,42 @@ def run_narrow_phases(
     kernels = pair_kernels(x0.dtype)
     stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
 
-    def launch(kernel: wp.Kernel, arguments: list, buffer: str, count: Count, block_dim: int) -> None:
-        """Launches a kernel over a buffer of both kinds, one after the other on the CPU and if they are too long."""
+    def launch_on_gpu(kernel: wp.Kernel, arguments: list, buffer: str, block_dim: int) -> None:
+        """Launches a kernel over a buffer of both kinds, one after the other if they are too long."""
         entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
-        together = [list(stages)]
-        if device.is_cpu or sum(entries.values()) >= 2**31:
-            together = [[kind] for kind in stages]
+        together = [list(stages)] if sum(entries.values()) < 2**31 else [[kind] for kind in stages]
         for kinds in together:
             both = [stages[kind] if kind in kinds else PairStages() for kind in PairKind]
             dim = sum(entries[kind] for kind in kinds)
-            if device.is_cpu:
-                dim = min(dim, int(stages[kinds[0]].counts.numpy()[count]))
             blocks = max_blocks(device, block_dim)
             inputs = [*motion, *arguments]
             launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
 
-    with timer.stage("cull"):
+    def launch_on_cpu(kernel_of: Callable, arguments: list, buffer: str, count: Count, batch: int) -> None:
+        """Launches the kernel of each kind over the filled entries of a buffer, many at a time."""
         for kind, s in stages.items():
-            if device.is_cpu:
-                batches = -(-min(len(s.queue), int(s.counts.numpy()[Count.QUEUED])) // BATCH)
-                kernel = batch_culling_kernel(kind, x0.dtype)
-                launch_over(kernel, batches, inputs=[*motion, arcs], outputs=[s], device=device, chunk=16)
-            else:
+            filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
+            kernel, inputs = kernel_of(kind, x0.dtype), [*motion, *arguments]
+            launch_over(kernel, -(-filled // batch), inputs=inputs, outputs=[s], device=device, chunk=16)
+
+    with timer.stage("cull"):
+        if device.is_cpu:
+            launch_on_cpu(batch_culling_kernel, [arcs], "queue", Count.QUEUED, CULLED)
+        else:
+            for kind, s in stages.items():
                 kernel = culling_kernel(kind, x0.dtype)
                 launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=[*motion, arcs], outputs=[s])
     with timer.stage("classify"):
-        launch(kernels.classify_survivors, [arcs], "survivors", Count.SURVIVORS, 64)
+        if device.is_cpu:
+            launch_on_cpu(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
+        else:
+            launch_on_gpu(kernels.classify_survivors, [], "survivors", 64)
     with timer.stage("time of impact"):
-        launch(kernels.find_impacts, [timed, tolerance], "for_exact", Count.CONTACTS, 32)
+        arguments = [timed, tolerance]
+        if device.is_cpu:
+            launch_on_cpu(batch_impact_kernel, arguments, "for_exact", Count.CONTACTS, DECIDED)
+        else:
+            launch_on_gpu(kernels.find_impacts, arguments, "for_exact", 32)
     if method == "exact":
         with timer.stage("exact"):
             for narrow_phase, elements in narrow_phases:

@@ -1,16 +1,18 @@
 """Elementary queries: many pairs of vertices, edges and faces at once, each given by its points."""
 
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 import warp as wp
 
-from .._arguments import check_finite, checked_choice, checked_distances, checked_flag, checked_shape
+from .._arguments import check_finite, check_instance, checked_choice, checked_distances, checked_flag, checked_shape
 from ..kernels.signs import FREE, HIT, UNSURE
 from .contact_buffer import HostContacts, read_contacts
 from .distance_phase import decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
+from .query_arrays import QueryArrays, query_into
 from .rings import Rings
 from .settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
 from .stage_timer import StageTimer
@@ -43,6 +45,7 @@ class QueryResult:
     normal: np.ndarray | None
 
 
+@overload
 def query_vertex_face(
     points: np.ndarray | wp.array,
     *,
@@ -51,7 +54,27 @@ def query_vertex_face(
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
-) -> QueryResult:
+    out: None = None,
+) -> QueryResult: ...
+@overload
+def query_vertex_face(
+    points: wp.array,
+    *,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    out: QueryArrays,
+) -> QueryArrays: ...
+def query_vertex_face(
+    points: np.ndarray | wp.array,
+    *,
+    min_distance: float | np.ndarray = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+    out: QueryArrays | None = None,
+) -> QueryResult | QueryArrays:
     """Returns which moving vertices meet their moving triangles.
 
     Args:
@@ -63,18 +86,26 @@ def query_vertex_face(
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+        out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
+            call, see :class:`QueryArrays`. The points must be a contiguous Warp array on the same device, and there
+            must be no minimum distance.
 
     Returns:
-        QueryResult: One row a query.
+        QueryResult: One row a query; or ``out``.
 
     Raises:
         TypeError: If an argument has another type.
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or the method is unknown.
+            tolerance is out of range, or the method is unknown. With ``out``: if the points are not
+            as it has rows, elsewhere or not contiguous, ``toi`` is not as in it, or there is a minimum distance.
+        RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
     """
+    if out is not None:
+        return _query_into(out, PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
     return _query(DistanceKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
 
 
+@overload
 def query_edge_edge(
     points: np.ndarray | wp.array,
     *,
@@ -83,7 +114,27 @@ def query_edge_edge(
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
-) -> QueryResult:
+    out: None = None,
+) -> QueryResult: ...
+@overload
+def query_edge_edge(
+    points: wp.array,
+    *,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    out: QueryArrays,
+) -> QueryArrays: ...
+def query_edge_edge(
+    points: np.ndarray | wp.array,
+    *,
+    min_distance: float | np.ndarray = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+    out: QueryArrays | None = None,
+) -> QueryResult | QueryArrays:
     """Returns which pairs of moving edges meet.
 
     Args:
@@ -95,15 +146,22 @@ def query_edge_edge(
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+        out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
+            call, see :class:`QueryArrays`. The points must be a contiguous Warp array on the same device, and there
+            must be no minimum distance.
 
     Returns:
-        QueryResult: One row a query.
+        QueryResult: One row a query; or ``out``.
 
     Raises:
         TypeError: If an argument has another type.
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or the method is unknown.
+            tolerance is out of range, or the method is unknown. With ``out``: if the points are not
+            as it has rows, elsewhere or not contiguous, ``toi`` is not as in it, or there is a minimum distance.
+        RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
     """
+    if out is not None:
+        return _query_into(out, PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
     return _query(DistanceKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
 
 
@@ -165,6 +223,31 @@ def query_vertex_vertex(
         ValueError: As :func:`query_vertex_face`.
     """
     return _query(DistanceKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
+
+
+def _query_into(
+    out: QueryArrays,
+    kind: PairKind,
+    points: np.ndarray | wp.array,
+    min_distance: float | np.ndarray,
+    method: Method,
+    timed: bool,
+    tolerance: float,
+    device: wp.DeviceLike,
+) -> QueryArrays:
+    """Decides queries whose results stay on the device."""
+    check_instance(out, "out", QueryArrays, "a QueryArrays")
+    if not isinstance(points, wp.array):
+        raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
+    checked_choice(method, "method", METHODS)
+    if checked_flag(timed, "toi") != (out.toi is not None):
+        raise ValueError(f"toi must be {out.toi is not None}, as out was made with")
+    if device is not None and checked_device(device) != out.device:
+        raise ValueError(f"device must be that of out, {out.device}, not {device}")
+    if not isinstance(min_distance, (int, float)) or min_distance != 0.0:
+        raise ValueError("min_distance must be 0 if there is out")
+    query_into(out, kind, points, method, checked_tolerance(tolerance))
+    return out
 
 
 def _query(

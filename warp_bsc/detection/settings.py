@@ -127,6 +127,7 @@ class Count(enum.IntEnum):
         FOR_EXACT: Found pairs that the exact stage decides, or whose times it finds.
         TOO_WIDE_1: Pairs of the exact stage whose exponents are too far apart for one limb.
         TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
+        TOO_WIDE_4: Pairs of the exact stage whose exponents are too far apart for four limbs, on a CPU.
         TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs or, with a minimum
             distance, that it does not decide: left to the host.
         REFUTED: Found pairs that the exact stage decides to be free.
@@ -142,10 +143,11 @@ class Count(enum.IntEnum):
     FOR_EXACT = 5
     TOO_WIDE_1 = 6
     TOO_WIDE_2 = 7
-    TOO_WIDE_8 = 8
-    REFUTED = 9
-    SUBDIVIDED = 10
-    FILTERED = 11
+    TOO_WIDE_4 = 8
+    TOO_WIDE_8 = 9
+    REFUTED = 10
+    SUBDIVIDED = 11
+    FILTERED = 12
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ class PairCounts:
     for_exact: int = 0
     too_wide_1: int = 0
     too_wide_2: int = 0
+    too_wide_4: int = 0
     too_wide_8: int = 0
     refuted: int = 0
     subdivided: int = 0

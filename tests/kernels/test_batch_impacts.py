@@ -1,0 +1,148 @@
+"""Times of impact of eight pairs at once: what they find is what one pair finds, bit by bit."""
+
+import numpy as np
+import pytest
+import warp as wp
+from generators import GENERATORS
+from simd_packets import in_normal_range
+
+from warp_bsc.bench.methods import Queries, QuerySet
+from warp_bsc.detection.settings import NO_FUSED_OPERATIONS, PairKind
+from warp_bsc.kernels.classification import classify
+from warp_bsc.kernels.motion import relative_motion
+from warp_bsc.kernels.pipeline.batch_impacts import BATCH, impact_batch_of
+from warp_bsc.kernels.pipeline.bits import lowest_bit
+from warp_bsc.kernels.polynomials import coplanarity
+from warp_bsc.kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
+from warp_bsc.kernels.time_of_impact import clamped_tolerance, impact, power_of_two
+
+KINDS = ("vertex_face", "edge_edge")
+
+
+def kernels_of(kind, dtype):
+    """Kernels that classify and find the impact of one query a thread, and the impacts of a batch."""
+    number = int(PairKind[kind.upper()])
+    impact_batch = impact_batch_of(dtype, kind == "vertex_face")
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_one(
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        tolerance: wp.float64,
+        classified: wp.array[wp.int8],
+        status: wp.array[wp.int8],
+        within_tolerance: wp.array[wp.bool],
+        toi: wp.array[wp.float64],
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
+    ):
+        i = wp.tid()
+        j = 4 * i
+        a0, b0, c0, d0 = x0[j], x0[j + 1], x0[j + 2], x0[j + 3]
+        a1, b1, c1, d1 = x1[j], x1[j + 1], x1[j + 2], x1[j + 3]
+        motion = relative_motion(number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+        y = coplanarity(motion)
+        found = classify(motion, y)
+        classified[i] = wp.int8(found)
+        if found == FREE:
+            return
+        result = impact(motion, y, found, tolerance)
+        status[i] = wp.int8(result.status)
+        within_tolerance[i] = result.within_tolerance == 1
+        toi[i] = result.toi
+        coordinates[i] = result.coordinates
+        normal[i] = result.normal
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_batches(
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        pairs: wp.array[wp.vec2i],
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        status: wp.array[wp.int8],
+        within_tolerance: wp.array[wp.bool],
+        toi: wp.array[wp.float64],
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
+        left: wp.array[int],
+    ):
+        i = BATCH * wp.tid()
+        length = power_of_two(clamped_tolerance(tolerance))
+        number = wp.min(BATCH, pairs.shape[0] - i)
+        bits = impact_batch(
+            x0,
+            x1,
+            elements,
+            pairs,
+            i,
+            number,
+            roundoff,
+            timed,
+            length,
+            status,
+            within_tolerance,
+            toi,
+            coordinates,
+            normal,
+        )
+        while bits != wp.uint64(0):
+            left[i + lowest_bit(bits)] = 1
+            bits = bits & (bits - wp.uint64(1))
+
+    return find_one, find_batches
+
+
+def outputs_of(n):
+    """Status, whether times are within the tolerance, times, coordinates and normals, without values."""
+    types = (wp.int8, wp.bool, wp.float64, wp.vec3d, wp.vec3d)
+    return [wp.full(n, dtype(0), dtype=dtype, device="cpu") for dtype in types]
+
+
+def find_both_ways(kind, points, roundoff, tolerance):
+    """Returns what one query finds, what batches find, the same without times, and which pairs batches leave open."""
+    one, many = kernels_of(kind, wp.vec3 if points.dtype == np.float32 else wp.vec3d)
+    queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
+    classified, *alone = wp.zeros(len(points), dtype=wp.int8, device="cpu"), *outputs_of(len(points))
+    inputs = [*queries.arrays[:2], roundoff, tolerance]
+    wp.launch(one, len(points), inputs=inputs, outputs=[classified, *alone], device="cpu")
+    contacts = classified.numpy() != FREE
+    alone = [array.numpy()[contacts] for array in alone]
+    n = int(contacts.sum())
+    pairs = wp.array(queries.pairs[contacts], dtype=wp.vec2i, device="cpu")
+    results = []
+    left = wp.zeros(n, dtype=int, device="cpu")
+    for timed in (True, False):
+        status, *others = outputs_of(n)
+        status.assign(classified.numpy()[contacts])
+        inputs = [*queries.arrays[:3], pairs, roundoff, timed, tolerance]
+        wp.launch(many, -(-n // BATCH), inputs=inputs, outputs=[status, *others, left], device="cpu")
+        results.append([array.numpy() for array in (status, *others)])
+    return alone, *results, left.numpy() == 1, contacts
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_impacts_are_those_of_one_query(kind, dtype):
+    rng = np.random.default_rng(9)
+    for roundoff, tolerance in ((float(ROUNDOFF), 2.0**-20), (0.0, 2.0**-20), (float(ROUNDOFF), 2.0**-37)):
+        number = 403 if tolerance > 2.0**-30 else 103
+        seen = dict.fromkeys((int(FREE), int(HIT), int(UNSURE)), 0)
+        for name, generator in GENERATORS.items():
+            points = generator(rng, number, kind, dtype)
+            alone, timed, untimed, left, contacts = find_both_ways(kind, points, roundoff, tolerance)
+            assert not left[in_normal_range(points[contacts])].any(), name
+            reported = ~left & (alone[0] != FREE)
+            for values in (alone, timed):
+                for array in values[3:]:
+                    array[~reported] = 0.0  # those of other rows have no meaning
+            for expected, found in zip(alone, timed, strict=True):
+                assert np.array_equal(expected[~left], found[~left], equal_nan=True), (name, roundoff, tolerance)
+            assert np.array_equal(untimed[0][~left], alone[0][~left])
+            assert not any(array.any() for array in untimed[1:])
+            for status in seen:
+                seen[status] += int((alone[0] == status).sum())
+        assert all(seen[status] > 20 for status in seen if roundoff > 0.0 or status == HIT), seen
