@@ -102,6 +102,30 @@ def test_moved_mesh_with_a_transform(tmp_path):
     assert np.array_equal(points_of(output, 2), old)
 
 
+def test_a_limb_that_turns_is_left_free_on_its_arc(tmp_path):
+    """A cylinder turns by 8 degrees about an axis outside of it, through a curtain that its chord does not reach."""
+    stage = new_stage(tmp_path / "shot.usda")
+    angles = np.arange(24) * np.pi / 12
+    rings = [
+        np.stack([1.5 + 0.5 * np.cos(angles), 0.5 * np.sin(angles), z + 0.0 * angles], axis=1) for z in (-0.7, 0.7)
+    ]
+    points = np.concatenate(rings).tolist()
+    sides = [v for i in range(24) for v in (i, (i + 1) % 24, 24 + (i + 1) % 24, 24 + i)]
+    add_mesh(stage, "/World/Limb", points, [4] * 24, sides)
+    turn = UsdGeom.Xformable(stage.GetPrimAtPath("/World/Limb")).AddRotateZOp()
+    for time, angle in {0: -4, HIT: -4, HIT + 1: 4, FRAMES - 1: 4}.items():
+        turn.Set(angle, time)
+    curtain = {time: (sheet(0.0)[:, [2, 1, 0]] + [1.9975 + 1e-4 * (time % 2), 0, 0]).tolist() for time in range(FRAMES)}
+    add_mesh(stage, "/World/Curtain", curtain, [4] * SIZE**2, quads())
+    assert find(stage)["hits"]
+    output = repaired(stage)
+    assert not find(output)["hits"]
+    moved = [points_of(output, time, "/World/Curtain") for time in (0, HIT, HIT + 1, FRAMES - 1)]
+    assert (moved[1] + moved[2])[:, 0].max() > 2 * 2.0
+    assert np.array_equal(moved[0], np.float32(curtain[0]))
+    assert np.allclose(moved[3], curtain[FRAMES - 1], atol=0.01)
+
+
 def test_last_frame_is_repaired(tmp_path):
     output = repaired(dipping_sheet(tmp_path, last=HIT + 1))
     found = find(output)

@@ -58,7 +58,7 @@ class SolverCCD(CollisionStage):
     starts the first step where the state has it.
 
     The certificate covers the motion from the stored state at the start to the stored state at the end: particles move
-    straight, and bodies turn evenly, the shorter way, so that their vertices move on arcs, see :mod:`.state.turns`. A
+    straight, and bodies turn evenly, the shorter way, so that their vertices move on arcs, see ``state.turns``. A
     body that the response can move turns about its centre of mass, others about the axis of their screw. With
     ``requires_grad`` the response resolves contacts of straight paths, and a step in which only an arc collides is not
     certified. A body whose predicted pose or velocity is not finite is left to the inner solver, and the step is not

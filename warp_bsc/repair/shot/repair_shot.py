@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..._arguments import check_instance, checked_distance, checked_integer, checked_strings
+from ...detection.rigid_motion import RigidMotion
+from ...replay.scene_arcs import arcs_of
 from ...usd.interval import Interval
 from ...usd.points_layer import MovedFrame
 from ...usd.scene import Scene
@@ -218,6 +220,13 @@ class _Shot:
         """Returns positions of the scene in single precision, relative to the origin."""
         return x if self._is_single else (x - self._origin).astype(np.float32)
 
+    def _arcs(self, interval) -> RigidMotion | None:
+        """Returns the turns of the meshes of an interval, relative to the origin."""
+        arcs = arcs_of(interval)
+        if arcs is None or self._is_single:
+            return arcs
+        return RigidMotion(arcs.body, arcs.centre - self._origin, arcs.turn, tolerance=arcs.tolerance)
+
     def _start(self, first, interval, left) -> ShotFrame:
         """Returns the first frame, repaired if it crosses; adds to ``left`` what still does."""
         given = self._single(interval.x0)
@@ -257,7 +266,8 @@ class _Shot:
         for index in range(first, last):
             if index >= stop and not frame.differs:
                 return
-            given = self._single(self._scene.interval(index).x1)
+            interval = self._scene.interval(index)
+            given = self._single(interval.x1)
             if displacements is None:
                 displacement = _FADING * frame.displacement
                 size = np.linalg.norm(displacement, axis=1, keepdims=True)
@@ -280,6 +290,7 @@ class _Shot:
                     tolerance=tolerance,
                     known=known,
                     free_start=frame.given if self._findings[index].is_free and self._is_single else None,
+                    arcs=self._arcs(interval),
                 )
                 if displacements is None:
                     known = contacts[index] = found.contacts
