@@ -17,6 +17,7 @@ __all__ = [
     "default_scenes",
     "generate_cloth",
     "generate_crash",
+    "is_scene_name",
     "load_intervals",
     "load_scene",
     "paper_scenes",
@@ -43,6 +44,11 @@ class BenchmarkScene:
     faces: np.ndarray
     x0: np.ndarray
     x1: np.ndarray
+
+
+def is_scene_name(text: str) -> bool:
+    """Returns whether a text is the name of a scene, as of :func:`load_scene`, not that of another file."""
+    return ":" in text or "," in text or Path(text).suffix.startswith(".usd")
 
 
 def default_scenes() -> list[str]:

@@ -1,19 +1,20 @@
 """The command ``warp-bsc bench queries``: measures how many elementary queries a second are decided."""
 
 import argparse
-import json
 
+from .._atomic_file import STDOUT
+from ..bench.provenance import with_record
 from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
 from ..bench.timing import count_threads, limited_threads
 from ..detection.settings import PairKind
 from .bench_queries_tables import print_query_benchmarks, query_benchmarks_to_dict
+from .bench_runs import add_json_file, open_json
 from .device import find_device, loading_kernels
 from .exit_status import explain_statuses
 from .options import (
     Commands,
     add_command,
     add_device,
-    add_json,
     add_repeat,
     add_threads,
     positive,
@@ -32,7 +33,7 @@ _EPILOG = f"""\
 examples:
   warp-bsc bench queries
   warp-bsc bench queries --device cpu --threads 1 --count 1000000
-  warp-bsc bench queries --json > rates.json
+  warp-bsc bench queries --json rates.json
 
 {explain_statuses()}"""
 
@@ -46,7 +47,7 @@ def add_to(commands: Commands, summary: str) -> None:
     add_repeat(command, default=20)
     add_threads(command)
     add_device(command)
-    add_json(command)
+    add_json_file(command)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -54,14 +55,13 @@ def _run(arguments: argparse.Namespace) -> int:
         check_query_count(arguments.count)
     device = find_device(arguments.device)
     options = {"device": device, "repeat": arguments.repeat}
-    with limited_threads(arguments.threads):
+    with open_json(arguments.json) as write, limited_threads(arguments.threads):
         with loading_kernels(device):
             for kind in PairKind:
                 benchmark_queries(kind, count=1, device=device, repeat=1)
         benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in PairKind]
         settings = {"copy_rate": benchmark_copy(**options), "threads": count_threads(), **options}
-    if arguments.json:
-        print(json.dumps(query_benchmarks_to_dict(benchmarks, **settings)))
-    else:
-        print_query_benchmarks(Console(), benchmarks, **settings)
+        if arguments.json != STDOUT:
+            print_query_benchmarks(Console(), benchmarks, **settings)
+        write(with_record(query_benchmarks_to_dict(benchmarks, **settings), arguments.command_line, [device]))
     return 0

@@ -75,6 +75,7 @@ def run(argv: list[str]) -> int:
     """Runs the command line as :func:`main` does, but raises every error."""
     argv = _with_joined_frames(_with_benchmark(argv))
     arguments = _build_parser(argv).parse_args(argv)
+    arguments.command_line = ["warp-bsc", *argv]
     return arguments.run(arguments)
 
 
