@@ -261,7 +261,7 @@ def main():
         folder.mkdir(exist_ok=True)
         for name in arguments.scenes or SCENES:
             cost = replay(folder, name, ["--workers", arguments.workers])
-            found.append({"scene": name, "size": SCENES[name][1], **cost._asdict()})
+            found.append({"scene": name, "description": SCENES[name][1], **cost._asdict()})
             numbers = (
                 f"{cost.hits:,}",
                 f"{cost.wall:.1f} s",
