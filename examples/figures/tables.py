@@ -1,0 +1,381 @@
+"""Writes the tables of the page of measurements, from the files that the commands of the page wrote.
+
+    python examples/figures/tables.py              # --check: writes nothing, and fails if the page would change
+
+A table of ``warp_bsc/bench/README.md`` stands between ``<!-- table: NAME -->`` and ``<!-- end -->``, with a line below
+it that says where its figures come from. Its files are in ``warp_bsc/bench/measurements``; where one is missing, the
+table stays as it is.
+"""
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from warp_bsc._atomic_file import OutputFile
+from warp_bsc.bench.repair import FILE, KNOWN_MESH
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "warp_bsc" / "bench" / "README.md"
+MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
+_COMPARED = {
+    "detector": {"ipctk": "IPC Toolkit"},
+    "repair": {"ipctk": "IPC Toolkit"},
+}
+"""Libraries that a benchmark compares with, with their titles."""
+_BLOCK = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+Found = dict[str, Any]
+"""A measurement: what a command wrote with --json."""
+Rows = list[tuple[str, ...]]
+"""The rows of a table, the header first."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page.
+
+    Attributes:
+        files: Names of its measurements, without ending.
+        make: Returns its rows, given the measurements in the same order.
+    """
+
+    files: tuple[str, ...]
+    make: Callable[..., Rows]
+
+
+def milliseconds(value: float) -> str:
+    """Returns a time with three digits, in seconds from 0.1 s on."""
+    return f"{value / 1e3:.3g} s" if value >= 100.0 else f"{value:.3g} ms"
+
+
+def _counts(values: Any) -> str:
+    """Returns the smallest and the largest of some numbers."""
+    return f"{min(values):,} to {max(values):,}"
+
+
+# Detection ---------------------------------------------------------------------------------------------------------
+
+
+_MESHES = {"227.ply": "cloth-funnel", "cloth_ball92.ply": "cloth-ball"}
+"""Names of the scenes of two frames by their first file; the ends of paths, as these differ from machine to machine."""
+
+
+def _scene_name(scene: Found) -> str:
+    first = Path(scene["scene"].split(",")[0]).name
+    return f"{_MESHES.get(first, first.partition(':')[0])}, {scene['triangles']:,} triangles"
+
+
+def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
+    """Detections on a GPU and on the CPU, beside the IPC Toolkit."""
+    rows = [("scene", "candidates", "hits", "GPU", "two cores", "one core", "IPC Toolkit, two cores", "one core")]
+    for scenes in zip(gpu["scenes"], two_cores["scenes"], one_core["scenes"], strict=False):
+        first = scenes[0]
+        times = [scene["milliseconds"]["detect"] for scene in scenes]
+        times += [
+            scene["ipc_toolkit"]["build_milliseconds"] + scene["ipc_toolkit"]["step_milliseconds"]
+            for scene in scenes[1:]
+        ]
+        counts = [f"{first[name]:,}" for name in ("candidates", "hits")]
+        rows.append((_scene_name(first), *counts, *map(milliseconds, times)))
+    return rows
+
+
+def detector_stages(gpu: Found) -> Rows:
+    """Where the time of a detection goes on a GPU."""
+    stages = list(gpu["scenes"][0]["milliseconds"]["stages"])
+    rows = [("scene", "whole graph", *stages)]
+    for scene in gpu["scenes"]:
+        took = scene["milliseconds"]
+        numbers = [took["cuda_graph"], *(took["stages"][stage] for stage in stages)]
+        rows.append((f"{_scene_name(scene)}, {scene['hits']:,} hits", *(f"{number:.2f}" for number in numbers)))
+    return rows
+
+
+def queries(gpu: Found, one_core: Found) -> Rows:
+    """Elementary queries a second."""
+    titles = {
+        "status": "one kernel that calls `ccd_edge_edge` or `ccd_vertex_face`",
+        "queued": "a second kernel decides the survivors",
+        "exact": "queries that are UNSURE in floating point, in exact arithmetic",
+    }
+    rows = [("queries", "edge-edge, a second", "vertex-face, a second")]
+    for mode, title in titles.items():
+        for found, place in ((gpu, ""), (one_core, ", on one core of the CPU")):
+            rates = {kind["kind"]: kind["modes"][mode]["queries_per_second"] for kind in found["kinds"]}
+            rows.append((title + place, *(_rate(rates[kind]) for kind in ("edge-edge", "vertex-face"))))
+    return rows
+
+
+def _rate(number: float) -> str:
+    return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
+
+
+def paper(found: Found) -> Rows:
+    """Times of a query on one core in the scenes of the paper."""
+    methods = {"float": "`float`", "conservative": "`conservative`", "exact": "`exact`", "cubic": "cubic solver"}
+    rows = [("scene", *methods.values(), "cubic / `float`", "slowest query, `float` / cubic")]
+    for scene in found["scenes"]:
+        timing = scene["timings"][0]
+        took, worst = timing["nanoseconds"], timing["worst"]
+        slowest = (worst[method]["nanoseconds"][method] for method in ("float", "cubic"))
+        rows.append(
+            (
+                f"{scene['name']}, {scene['triangles']:,} triangles",
+                *(f"{took[method]:.1f}" for method in methods),
+                f"{took['cubic'] / took['float']:.1f}",
+                " / ".join(f"{time:.0f}" for time in slowest),
+            )
+        )
+    return rows
+
+
+def touching(found: Found) -> Rows:
+    """Sheets that touch exactly."""
+    titles = {
+        "intersections": "`find_intersections`",
+        "at a distance, at rest": "`exact` at their minimum distance, at rest",
+        "at a distance, moving": "the same, moving together",
+    }
+    rows = [("flat sheets in the same plane", "pairs", "wrong of those checked", "time")]
+    for row in found["rows"]:
+        title = f"{titles[row['question']]}: {row['sheets']} sheets of {row['faces']:,} faces"
+        rows.append((title, f"{row['pairs']:,}", str(row["wrong"]), f"{row['seconds']:#.2g} s"))
+    return rows
+
+
+# Newton ------------------------------------------------------------------------------------------------------------
+
+
+def newton(*measurements: Found) -> Rows:
+    """Newton's examples, plain and with the stage."""
+    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
+    for found in measurements:
+        modes: dict[str, dict[str, Found]] = {}
+        for run in found["runs"]:
+            modes.setdefault(run["example"], {})[run["mode"]] = run
+        for name, run in modes.items():
+            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
+            frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
+            title = f"`{name}`" + (f", {frames} frames" if frames else "")
+            rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
+    return rows
+
+
+def _newton_cell(run: Found) -> str:
+    took = run["measured"]
+    if took is None:
+        return f"not run: {run['problem']}"
+    times = took["milliseconds"]
+    return f"{times['median']:.1f} ({times['percentile_95']:.1f}); {took['most_crossings']:,}"
+
+
+def _newton_steps(plain: Found | None, stage: Found | None) -> str:
+    """Returns what the stage reports, and how the example's own tests end."""
+    if stage is None or stage["stage"] is None:
+        return ""
+    steps = stage["stage"]
+    words = [f"{steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,} certified"]
+    words.append(f"{steps['truncated_steps'] or 'none'} truncated")
+    if steps["frozen_steps"]:
+        words.append(f"{steps['frozen_steps']} with frozen vertices")
+    tests = [_newton_tests(took) for took in (plain, stage) if took]
+    return f"{', '.join(words)}; tests {' / '.join(dict.fromkeys(tests))}"
+
+
+def _newton_tests(took: Found) -> str:
+    ends = [took["test_post_step"], took["test_final"]]
+    if all(end is None for end in ends):
+        return "none"
+    return "ok" if all(end in (None, "ok") for end in ends) else "fail"
+
+
+def substeps(found: Found) -> Rows:
+    """Steps in substeps: stretch, distance from the reference, stress and time."""
+    columns = list(dict.fromkeys((run["rate"], run["substeps"]) for run in found["runs"]))
+    rows = [("", *(f"1/{rate} s, {_quoted(count)}" for rate, count in columns))]
+    titles = {
+        ("drape", "largest stretch [%]"): ("a cloth drapes over a sphere: stretch", "{:.2g}%"),
+        ("drape", "distance [mm]"): ("distance from the reference", "{:.2g} mm"),
+        ("drape", "time [s]"): ("time", "{:.2g} s"),
+        ("sleeve", "largest stretch [%]"): ("a cylinder moves into a narrower sleeve: stretch", "{:.3g}%"),
+        ("blocks", "stress on the lower plate [Pa]"): ("two plates press two blocks: stress on the lower", "{:.3g} Pa"),
+    }
+    for (scene, quantity), (title, form) in titles.items():
+        measured = {(run["rate"], run["substeps"]): run["measured"] for run in found["runs"] if run["scene"] == scene}
+        rows.append((title, *(form.format(measured[column][quantity]) for column in columns)))
+    return rows
+
+
+def _quoted(count: int | str | None) -> str:
+    return "none" if count is None else f'`"{count}"`' if isinstance(count, str) else str(count)
+
+
+# Repair and replay -------------------------------------------------------------------------------------------------
+
+
+def repair_named(found: Found, *kinds: str) -> Rows:
+    """Repairs of known meshes or files, each with every hint that was tried."""
+    rows = [("`bsc.repair`", "vertices", "crossings", "largest, mean move", "strain", "time")]
+    for run in found["runs"]:
+        if run["kind"] in kinds:
+            for attempt in run["attempts"]:
+                hint = "" if attempt["hint"] == "none" else f", `{attempt['hint']}=`"
+                rows.append((f"{Path(run['name']).stem}{hint}", f"{run['vertices']:,}", *_repair_cells(run, attempt)))
+    return rows
+
+
+def _repair_cells(run: Found, attempt: Found) -> tuple[str, ...]:
+    return (
+        f"{run['crossings']:,} to {attempt['crossings']:,}",
+        f"{attempt['largest_move']:.2g}, {attempt['mean_move']:.2g}",
+        f"{100.0 * attempt['strain']:.2g}%",
+        f"{attempt['seconds']:.2f} s",
+    )
+
+
+def repair_random(found: Found) -> Rows:
+    """Random damage by kind."""
+    costs = "largest move, median and most", "strain, median and most", "more than 10%", "median time"
+    rows = [("kind", "freed", "crossings", *costs)]
+    kinds: dict[str, list[Found]] = {}
+    for run in found["runs"]:
+        if run["kind"] not in (KNOWN_MESH, FILE):
+            kinds.setdefault(run["kind"], []).append(run)
+    for kind, runs in kinds.items():
+        first = [run["attempts"][0] for run in runs]
+        moves, strains = ([attempt[name] for attempt in first] for name in ("largest_move", "strain"))
+        rows.append(
+            (
+                kind,
+                f"{sum(attempt['crossings'] == 0 for attempt in first)} of {len(runs)}",
+                _counts([run["crossings"] for run in runs]),
+                f"{median(moves):.2g}, {max(moves):.2g}",
+                f"{100.0 * median(strains):.2g}, {100.0 * max(strains):.2g}%",
+                str(sum(strain > 0.1 for strain in strains)),
+                f"{median(attempt['seconds'] for attempt in first):.2f} s",
+            )
+        )
+    return rows
+
+
+def replay_sizes(found: Found) -> Rows:
+    """Large, long and crowded scenes."""
+    rows = [("scene", "collisions", "wall", "processor", "memory", "file")]
+    for row in found["rows"]:
+        sizes = f"{row['memory'] / 1e9:.2f} GB", f"{row['size'] / 1e6:.1f} MB"
+        times = f"{row['wall']:.1f} s", f"{row['cpu']:.1f} s"
+        rows.append((f"`{row['scene']}`: {row['description']}", f"{row['hits']:,}", *times, *sizes))
+    return rows
+
+
+# The page ----------------------------------------------------------------------------------------------------------
+
+
+TABLES = {
+    "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
+    "detector_stages": Table(("detector_gpu",), detector_stages),
+    "newton_coupled": Table(("newton_coupled_cpu",), newton),
+    "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
+    "paper": Table(("paper_cpu",), paper),
+    "queries": Table(("queries_gpu", "queries_one_core"), queries),
+    "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
+    "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),
+    "repair_random": Table(("repair_random_cpu",), repair_random),
+    "replay_sizes": Table(("replay_sizes",), replay_sizes),
+    "substeps": Table(("substeps_cpu",), substeps),
+    "touching": Table(("touching",), touching),
+}
+"""The tables of the page by name."""
+
+
+def load(name: str) -> Found | None:
+    """Returns a measurement, None if there is none.
+
+    Raises:
+        ValueError: If it was interrupted, or its record is missing.
+    """
+    path = MEASUREMENTS / f"{name}.json"
+    if not path.exists():
+        return None
+    found = json.loads(path.read_text())
+    if found.get("partial"):
+        raise ValueError(f"{path.name}: the measurement was interrupted")
+    if "record" not in found:
+        raise ValueError(f"{path.name}: has no record of where it comes from")
+    return found
+
+
+def describe(found: Found) -> str:
+    """Returns where a measurement comes from, in a line."""
+    record = found["record"]
+    commit = f"commit {record['commit'][:7]}" if record["commit"] else "not from a checkout"
+    machine = ", ".join(record["gpus"]) or f"{record['cpu']}, {record['cores']} cores"
+    names = {"warp-lang": "Warp", "newton": "Newton"} | _COMPARED.get(found["benchmark"], {})
+    used = ", ".join(f"{title} {record['versions'].get(name, 'none')}" for name, title in names.items())
+    changed = " with changes" if record["changed"] else ""
+    return f"*`{record['command']}`: {record['date'][:10]}, {commit}{changed}, {machine}, {used}*"
+
+
+def make(name: str) -> str | None:
+    """Returns a table with the lines below it, None if a measurement of it is missing.
+
+    Raises:
+        ValueError: If there is no such table, or a measurement cannot be used.
+    """
+    if name not in TABLES:
+        raise ValueError(f"no table is named {name}, only {', '.join(TABLES)}")
+    table = TABLES[name]
+    measurements = [load(file) for file in table.files]
+    if any(found is None for found in measurements):
+        return None
+    head, *rows = table.make(*measurements)
+    lines = [head, ("---",) * len(head), *rows]
+    text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return text + "\n" + "  \n".join(describe(found) for found in measurements if found) + "\n"
+
+
+def update(page: str) -> tuple[str, list[str]]:
+    """Returns a page with its tables made anew, and the names of those that stay as they are."""
+    kept = []
+
+    def replace(block: re.Match) -> str:
+        made = make(block[2])
+        if made is None:
+            kept.append(block[2])
+            return block[0]
+        return f"{block[1]}{made}{block[4]}"
+
+    return _BLOCK.sub(replace, page), kept
+
+
+def main() -> int:
+    """Writes the page, or checks it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if the page would change")
+    arguments = parser.parse_args()
+    before = PAGE.read_text()
+    after, kept = update(before)
+    for name in kept:
+        missing = [file for file in TABLES[name].files if not (MEASUREMENTS / f"{file}.json").exists()]
+        print(f"{name} stays as it is: there is no {', '.join(f'{file}.json' for file in missing)}")
+    if arguments.check:
+        if after != before:
+            print(f"{PAGE.relative_to(ROOT)} is not what its measurements make: run python examples/figures/tables.py")
+        return int(after != before)
+    file = OutputFile(PAGE)
+    try:
+        file.write(after)
+        file.commit()
+    finally:
+        file.discard()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
