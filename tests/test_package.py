@@ -91,6 +91,11 @@ LIBRARIES = {
         "warp_bsc/bench/crossings.py",  # of a model
         "warp_bsc/bench/response_simulation.py",  # steps its solvers
         "warp_bsc/bench/response_scenes.py",  # makes models
+        "warp_bsc/bench/penetration_scenes.py",
+        "warp_bsc/bench/penetration_newton.py",  # steps its solvers
+        "warp_bsc/bench/penetration_mujoco.py",  # reads its models
+        "warp_bsc/bench/penetration_states.py",
+        "warp_bsc/bench/judge.py",
         "torch",  # takes its solvers
         "jax",
     },
@@ -103,6 +108,8 @@ LIBRARIES = {
     "argparse": {"cli"},
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
+    "mujoco": {"bench"},
+    "uipc": {"bench"},
     "trimesh": {"bench", "response", "usd"},
     "warp": {
         "kernels",

@@ -28,6 +28,8 @@ _COMPARED = {
     "repair": {"ipctk": "IPC Toolkit"},
 }
 """Libraries that a benchmark compares with, with their titles."""
+_BUSY = 0.5
+"""Load of a machine before a measurement from which on the line below its table says so."""
 _BLOCK = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
 Found = dict[str, Any]
@@ -52,6 +54,11 @@ class Table:
 def milliseconds(value: float) -> str:
     """Returns a time with three digits, in seconds from 0.1 s on."""
     return f"{value / 1e3:.3g} s" if value >= 100.0 else f"{value:.3g} ms"
+
+
+def digits(value: float) -> str:
+    """Returns a number with two digits, more if it is large."""
+    return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:,.0f}"
 
 
 def _counts(values: Any) -> str:
@@ -145,7 +152,7 @@ def touching(found: Found) -> Rows:
     rows = [("flat sheets in the same plane", "pairs", "wrong of those checked", "time")]
     for row in found["rows"]:
         title = f"{titles[row['question']]}: {row['sheets']} sheets of {row['faces']:,} faces"
-        rows.append((title, f"{row['pairs']:,}", str(row["wrong"]), f"{row['seconds']:#.2g} s"))
+        rows.append((title, f"{row['pairs']:,}", str(row["wrong"]), f"{digits(row['seconds'])} s"))
     return rows
 
 
@@ -200,15 +207,15 @@ def substeps(found: Found) -> Rows:
     columns = list(dict.fromkeys((run["rate"], run["substeps"]) for run in found["runs"]))
     rows = [("", *(f"1/{rate} s, {_quoted(count)}" for rate, count in columns))]
     titles = {
-        ("drape", "largest stretch [%]"): ("a cloth drapes over a sphere: stretch", "{:.2g}%"),
-        ("drape", "distance [mm]"): ("distance from the reference", "{:.2g} mm"),
-        ("drape", "time [s]"): ("time", "{:.2g} s"),
-        ("sleeve", "largest stretch [%]"): ("a cylinder moves into a narrower sleeve: stretch", "{:.3g}%"),
-        ("blocks", "stress on the lower plate [Pa]"): ("two plates press two blocks: stress on the lower", "{:.3g} Pa"),
+        ("drape", "largest stretch [%]"): "a cloth drapes over a sphere: stretch [%]",
+        ("drape", "distance [mm]"): "distance from the reference [mm]",
+        ("drape", "time [s]"): "time [s]",
+        ("sleeve", "largest stretch [%]"): "a cylinder moves into a sleeve a third narrower: stretch [%]",
+        ("blocks", "stress on the lower plate [Pa]"): "two plates press two blocks to half their height: stress [Pa]",
     }
-    for (scene, quantity), (title, form) in titles.items():
+    for (scene, quantity), title in titles.items():
         measured = {(run["rate"], run["substeps"]): run["measured"] for run in found["runs"] if run["scene"] == scene}
-        rows.append((title, *(form.format(measured[column][quantity]) for column in columns)))
+        rows.append((title, *(digits(measured[column][quantity]) for column in columns)))
     return rows
 
 
@@ -233,8 +240,8 @@ def repair_named(found: Found, *kinds: str) -> Rows:
 def _repair_cells(run: Found, attempt: Found) -> tuple[str, ...]:
     return (
         f"{run['crossings']:,} to {attempt['crossings']:,}",
-        f"{attempt['largest_move']:.2g}, {attempt['mean_move']:.2g}",
-        f"{100.0 * attempt['strain']:.2g}%",
+        f"{digits(attempt['largest_move'])}, {digits(attempt['mean_move'])}",
+        f"{digits(100.0 * attempt['strain'])}%",
         f"{attempt['seconds']:.2f} s",
     )
 
@@ -255,8 +262,8 @@ def repair_random(found: Found) -> Rows:
                 kind,
                 f"{sum(attempt['crossings'] == 0 for attempt in first)} of {len(runs)}",
                 _counts([run["crossings"] for run in runs]),
-                f"{median(moves):.2g}, {max(moves):.2g}",
-                f"{100.0 * median(strains):.2g}, {100.0 * max(strains):.2g}%",
+                f"{digits(median(moves))}, {digits(max(moves))}",
+                f"{digits(100.0 * median(strains))}, {digits(100.0 * max(strains))}%",
                 str(sum(strain > 0.1 for strain in strains)),
                 f"{median(attempt['seconds'] for attempt in first):.2f} s",
             )
@@ -316,6 +323,8 @@ def describe(found: Found) -> str:
     record = found["record"]
     commit = f"commit {record['commit'][:7]}" if record["commit"] else "not from a checkout"
     machine = ", ".join(record["gpus"]) or f"{record['cpu']}, {record['cores']} cores"
+    if (record.get("load") or 0.0) >= _BUSY:
+        machine += f" shared with other programs (load {record['load']})"
     names = {"warp-lang": "Warp", "newton": "Newton"} | _COMPARED.get(found["benchmark"], {})
     used = ", ".join(f"{title} {record['versions'].get(name, 'none')}" for name, title in names.items())
     changed = " with changes" if record["changed"] else ""

@@ -34,6 +34,7 @@ def test_machine_date_and_versions():
     assert before <= datetime.datetime.fromisoformat(record["date"]) <= datetime.datetime.now(datetime.UTC)
     assert (record["gpus"], record["cores"]) == (["a GPU"], count_threads())
     assert record["cpu"]
+    assert record["load"] is None or record["load"] >= 0.0
     assert record["python"] == sys.version.split()[0]
     versions = record["versions"]
     assert versions["warp-bsc"] == warp_bsc.__version__

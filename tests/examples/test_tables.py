@@ -57,7 +57,7 @@ def test_each_measurement_can_be_traced(path):
     record = json.loads(text)["record"]
     assert re.fullmatch("[0-9a-f]{40}", record["commit"])
     assert record["changed"] is False
-    assert record.keys() == RECORD.keys() | {"python"}
+    assert record.keys() >= RECORD.keys() | {"python"}
     assert not re.search(r'["\s,](/|~|[A-Z]:\\)\w', text)  # folders of one machine
     assert len(text) < 1_000_000
 
@@ -137,8 +137,10 @@ def test_a_table_has_its_sources_below(tmp_path, monkeypatch):
     source = "*`warp-bsc bench x`: 2026-11-26, commit 0123456, a CPU, 2 cores, Warp 1.2, Newton 3.4*"
     table = f"| a | b |\n| --- | --- |\n| 1 | 2 |\n\n{source}\n"
     assert tables.update(page) == (f"before\n<!-- table: x -->\n{table}<!-- end -->\nafter\n", [])
-    write(benchmark="detector", record=RECORD | {"gpus": ["NVIDIA X"], "changed": True})
+    write(benchmark="detector", record=RECORD | {"gpus": ["NVIDIA X"], "changed": True, "load": 0.4})
     assert "0123456 with changes, NVIDIA X, Warp 1.2, Newton 3.4, IPC Toolkit none*" in tables.update(page)[0]
+    write(record=RECORD | {"load": 2.5})
+    assert "a CPU, 2 cores shared with other programs (load 2.5), Warp" in tables.update(page)[0]
     write(partial=True)
     with pytest.raises(ValueError, match=r"x_gpu\.json: the measurement was interrupted"):
         tables.update(page)

@@ -22,6 +22,8 @@ __all__ = ["LIBRARIES", "describe_run", "shorten_path", "with_record", "write_me
 LIBRARIES = ("warp-lang", "newton", "numpy", "usd-core", "trimesh", "ipctk", "mujoco", "pyuipc")
 """Distributions whose versions are recorded if they are installed."""
 
+_LOAD = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
+"""Processes that were running on average over the minute before this one measures anything."""
 _ROOT = Path(__file__).resolve().parents[2]
 _OUTPUTS = ("--json", "--figure")
 """Options that name output files, which the recorded command omits with their files."""
@@ -37,8 +39,9 @@ def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> d
     Returns:
         ``command``: the command line, without output files; ``commit``: that of the checkout, and ``changed``: whether
         tracked files differ from it, both None where there is no checkout; ``date``: now in UTC; ``cpu`` and ``cores``:
-        the processor, and the number of cores that this process may use; ``gpus``: names of the devices that are GPUs;
-        ``python`` and ``versions``: those of this package and of the installed :data:`LIBRARIES`.
+        the processor, and the number of cores that this process may use; ``load``: how many processes were running in
+        the minute before this one began, None where the system does not say; ``gpus``: names of the devices that are
+        GPUs; ``python`` and ``versions``: those of this package and of the installed :data:`LIBRARIES`.
     """
     commit, changed = _find_commit()
     return {
@@ -48,6 +51,7 @@ def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> d
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "cpu": _name_cpu(),
         "cores": count_threads(),
+        "load": _LOAD,
         "gpus": [device.name for device in devices if device.is_cuda],
         "python": platform.python_version(),
         "versions": {"warp-bsc": __version__} | _find_versions(),
