@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import newton
 import numpy as np
+import warp as wp
 
 from .response_scenes import Motion, Scene, SceneBuilder, build_scene
 
@@ -66,10 +67,11 @@ def _build_drape(builder: SceneBuilder) -> PenetrationScene:
 
 def _build_stack(builder: SceneBuilder) -> PenetrationScene:
     """Five sheets fall on a sphere, on each other and on a floor."""
-    builder.to.add_shape_sphere(body=-1, radius=0.15)
+    # a little above the floor: libuipc refuses scenes in which shapes cross
+    builder.to.add_shape_sphere(body=-1, xform=wp.transform(wp.vec3(0.0, 0.0, 0.16), wp.quat_identity()), radius=0.15)
     builder.add_box((0.0, 0.0, -0.05), (0.6, 0.6, 0.05))
     for sheet in range(5):
-        builder.add_cloth((0.02 * sheet - 0.04, 0.013 * sheet, 0.18 + 0.04 * sheet), (12, 12), 0.05)
+        builder.add_cloth((0.02 * sheet - 0.04, 0.013 * sheet, 0.34 + 0.04 * sheet), (12, 12), 0.05)
     return PenetrationScene(Scene(builder.finish(), 1.0))
 
 
