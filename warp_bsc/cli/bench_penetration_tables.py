@@ -14,13 +14,13 @@ from .tables import count, make_table, say
 __all__ = ["penetration_runs_to_dict", "print_penetration_runs"]
 
 _HEADERS = (
-    "Crossings\nworst",
-    "\nsum",
-    "Met on\nthe way",
-    "Inver-\nted",
-    "Speed\nkept [%]",
-    "Stretch\n[%]",
-    "Step\n[ms]",
+    "Cross-\nings\nworst",
+    "\n\nsum",
+    "Met\non the\nway",
+    "In-\nver-\nted",
+    "Speed\nkept\n[%]",
+    "Stretch\n\n[%]",
+    "Step\n\n[ms]",
 )
 
 
@@ -80,8 +80,8 @@ def penetration_runs_to_dict(runs: Sequence[PenetrationRun], *, device: wp.Devic
 def _print_scene(console: Console, scene: str, runs: Sequence[PenetrationRun]) -> None:
     """Prints the table of one scene, and the lines below it."""
     table = make_table(scene, *_HEADERS)
-    table.columns[0].width = 23
-    for column, width in zip(table.columns[1:], (9, 9, 10, 6, 8, 8, 8), strict=True):
+    table.columns[0].width = 20
+    for column, width in zip(table.columns[1:], (6, 9, 10, 5, 5, 9, 8), strict=True):
         column.width = width
     notes = []
     for run in runs:
