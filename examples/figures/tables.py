@@ -25,6 +25,7 @@ PAGE = ROOT / "warp_bsc" / "bench" / "README.md"
 MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
 _COMPARED = {
     "detector": {"ipctk": "IPC Toolkit"},
+    "penetration": {"mujoco": "MuJoCo", "pyuipc": "libuipc"},
     "repair": {"ipctk": "IPC Toolkit"},
 }
 """Libraries that a benchmark compares with, with their titles."""
@@ -223,6 +224,53 @@ def _quoted(count: int | str | None) -> str:
     return "none" if count is None else f'`"{count}"`' if isinstance(count, str) else str(count)
 
 
+def penetration(found: Found) -> Rows:
+    """Who penetrates, where: crossings in the worst frame and in all, and pairs that meet on the way."""
+    return _by_scene(
+        found,
+        lambda took: f"{max(took['crossings']):,}; {sum(took['crossings']):,}; {took['collisions']:,}",
+    )
+
+
+def penetration_costs(found: Found) -> Rows:
+    """What simulators keep of speed, tetrahedra and lengths, and their time."""
+
+    def cell(took: Found) -> str:
+        kept = "" if took["speed_kept"] is None else f"{digits(100.0 * took['speed_kept'])}% kept, "
+        inverted = f"{max(took['inverted'])} inverted, " if max(took["inverted"]) else ""
+        return f"{kept}{inverted}{digits(took['stretch'])}%, {digits(took['milliseconds']['median'])} ms"
+
+    return _by_scene(found, cell)
+
+
+def penetration_simulators(found: Found) -> Rows:
+    """Settings and claims of simulators, and what they did not run."""
+    rows = [("simulator", "version", "settings", "says of penetration", "not run")]
+    for name, simulator in found["simulators"].items():
+        runs = [run for run in found["runs"] if run["simulator"] == name]
+        versions = {run["measured"]["version"] for run in runs if run["measured"]}
+        missing: dict[str, list[str]] = {}
+        for run in runs:
+            if run["problem"]:
+                missing.setdefault(run["problem"], []).append(run["scene"])
+        scenes = [
+            f"{reason} ({', '.join(names) if len(names) < len(runs) else 'all'})" for reason, names in missing.items()
+        ]
+        claims = simulator["claims"] or "nothing"
+        rows.append((simulator["title"], ", ".join(versions), simulator["settings"], claims, "; ".join(scenes)))
+    return rows
+
+
+def _by_scene(found: Found, cell: Callable[[Found], str]) -> Rows:
+    """Returns a row for each simulator, and a column for each scene."""
+    runs = {(run["scene"], run["simulator"]): run["measured"] for run in found["runs"]}
+    rows = [("simulator", *found["scenes"])]
+    for name, simulator in found["simulators"].items():
+        measured = [runs[scene, name] for scene in found["scenes"]]
+        rows.append((simulator["title"], *("not run" if took is None else cell(took) for took in measured)))
+    return rows
+
+
 # Repair and replay -------------------------------------------------------------------------------------------------
 
 
@@ -290,6 +338,9 @@ TABLES = {
     "newton_coupled": Table(("newton_coupled_cpu",), newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
+    "penetration": Table(("penetration",), penetration),
+    "penetration_costs": Table(("penetration",), penetration_costs),
+    "penetration_simulators": Table(("penetration",), penetration_simulators),
     "queries": Table(("queries_gpu", "queries_one_core"), queries),
     "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
     "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),

@@ -65,15 +65,32 @@ def test_a_corner_that_is_pulled_through_crosses_by_its_edges(device):
 
 
 def test_crossings_with_shapes_count_and_those_of_two_shapes_do_not(device):
-    model = sheets(boxes=(-0.1, -0.11))  # the two cross
+    model = sheets(boxes=(-0.1, -0.11, -0.14))  # the first crosses the second and touches the third
     start = positions(model)
     inside = start.copy()
     inside[[0, 1]] += [0.0, 0.0, -0.09]  # an edge of the border within the first box
     found = Judge(model).judge([start, inside], 1)
-    assert Judge(model).judge([start, start], 1).crossings == (0,)
+    at_rest = Judge(model).judge([start, start], 1)
+    assert at_rest.crossings == at_rest.collisions == (0,)
     assert found.crossings == found.shape_crossings
     assert found.crossings[0] > 0
-    assert found.collisions[0] > 0
+    lower = slice(model.particle_count // 2)
+    start[lower, :2] += [0.013, 0.007]  # no particle above the diagonal of the box
+    through = start.copy()
+    through[lower, 2] -= 0.09
+    (collisions,) = Judge(model).judge([start, through], 1).collisions
+    assert collisions > 9  # each particle meets a face of the box, and edges of the sheet meet its diagonal
+
+
+def test_stretch_is_that_of_edges_that_can_move(device):
+    builder = SceneBuilder("vbd")
+    builder.add_cloth((0.0, 0.0, 0.0), (2, 2), CELL, is_held=True)  # all but the middle, at which each edge has one end
+    model = builder.finish()
+    start = positions(model)
+    pulled = start.copy()
+    pulled[4, 2] += CELL
+    stretch = Judge(model).judge([start, pulled], 1).stretch
+    assert stretch == pytest.approx(100.0 * (np.sqrt(2.0) - 1.0), rel=1e-4)
 
 
 def test_frames_are_ends_of_steps(device):

@@ -91,6 +91,22 @@ def test_a_bullet_passes_a_solver_without_detection_and_not_the_stage(simulator)
         assert found.substepped_steps >= 0
 
 
+@pytest.mark.parametrize("has_stage", [False, True])
+def test_the_stage_replaces_the_contacts_of_newton(monkeypatch, has_stage):
+    made = []
+
+    class Recorder(penetration_newton.Simulation):
+        def __init__(self, *arguments, **options):
+            made.append(options)
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr(penetration_newton, "Simulation", Recorder)
+    measure_penetration("bullet", "ccd-xpbd" if has_stage else "xpbd", frames=1)
+    (options,) = made
+    assert options["has_contacts"] is not has_stage
+    assert options["stage_options"] == ({} if has_stage else None)
+
+
 def test_self_contact_limits_the_speed_of_what_flies_freely():
     """To half the relaxed reach a step, as ``examples/speed_limit.py`` has it; the first of nine steps is faster."""
     found = measure_penetration("bullet", "vbd-self-contact", frames=1).measured
