@@ -1,5 +1,6 @@
 """Says where a measurement comes from: its command, commit, date, machine and versions, and writes it as JSON."""
 
+import contextlib
 import datetime
 import importlib.metadata
 import json
@@ -17,7 +18,10 @@ from .._atomic_file import OutputFile
 from .._version import __version__
 from .timing import count_threads
 
-__all__ = ["LIBRARIES", "describe_run", "shorten_path", "with_record", "write_measurement"]
+__all__ = ["COMMIT", "LIBRARIES", "describe_run", "shorten_path", "with_record", "write_measurement"]
+
+COMMIT = "WARP_BSC_COMMIT"
+"""Environment variable that names the commit of a copy of the project without git, as on another machine."""
 
 LIBRARIES = ("warp-lang", "newton", "numpy", "usd-core", "trimesh", "ipctk", "mujoco", "pyuipc")
 """Distributions whose versions are recorded if they are installed."""
@@ -38,7 +42,8 @@ def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> d
 
     Returns:
         ``command``: the command line, without output files; ``commit``: that of the checkout, and ``changed``: whether
-        tracked files differ from it, both None where there is no checkout; ``date``: now in UTC; ``cpu`` and ``cores``:
+        tracked files differ from it, both None where there is no checkout; in a copy without git, the commit that the
+        environment names by :data:`COMMIT`, and that it is not changed; ``date``: now in UTC; ``cpu`` and ``cores``:
         the processor, and the number of cores that this process may use; ``load``: how many processes were running in
         the minute before this one began, None where the system does not say; ``gpus``: names of the devices that are
         GPUs; ``python`` and ``versions``: those of this package and of the installed :data:`LIBRARIES`.
@@ -113,12 +118,11 @@ def _find_commit() -> tuple[str | None, bool | None]:
         command = ["git", "-C", str(_ROOT), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    try:
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != _ROOT:
-            return None, None  # installed below a checkout of something else
-        return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
-    except (OSError, subprocess.CalledProcessError):
-        return None, None
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        if Path(git("rev-parse", "--show-toplevel")).resolve() == _ROOT:  # not a checkout of something else around it
+            return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
+    named = os.environ.get(COMMIT)
+    return (named, False) if named else (None, None)
 
 
 def _find_versions() -> dict[str, str]:
