@@ -7,14 +7,21 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-_SPEC = importlib.util.spec_from_file_location("tables", ROOT / "examples" / "figures" / "tables.py")
-tables = importlib.util.module_from_spec(_SPEC)
-sys.modules["tables"] = tables  # its dataclass needs it
-_SPEC.loader.exec_module(tables)
 
+
+def load(name):
+    """A program of examples/figures, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / "figures" / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
+    spec.loader.exec_module(module)
+    return module
+
+
+tables = load("tables")
 FILES = sorted(tables.MEASUREMENTS.glob("*.json"))
 RECORD = {
     "command": "warp-bsc bench x",
@@ -121,6 +128,63 @@ def test_examples_of_newton():
         ("`cloth_twist`, 20 frames", "12.3 (20.0); 1,234", "12.3 (20.0); 1,234", steps),
         ("`gone`", "not run: a reason", "not run: a reason", ""),
     ]
+
+
+def penetration_run(scene, simulator, problem=None, **others):
+    took = {
+        "version": "1.2",
+        "crossings": [0, 1234, 6],
+        "collisions": 5,
+        "inverted": [0, 0],
+        "speed_kept": None,
+        "stretch": 3.456,
+        "milliseconds": {"median": 12.3},
+    }
+    measured = None if problem else took | others
+    return {"scene": scene, "simulator": simulator, "problem": problem, "measured": measured}
+
+
+PENETRATION = {
+    "scenes": {"bullet": "a patch flies", "soft": "a block falls"},
+    "simulators": {
+        "a": {"title": "A", "settings": "its own", "claims": None},
+        "b": {"title": "B", "settings": "defaults", "claims": "no penetration"},
+    },
+    "runs": [
+        penetration_run("bullet", "a", speed_kept=0.305),
+        penetration_run("bullet", "b", problem="no GPU"),
+        penetration_run("soft", "a", inverted=[0, 7], crossings=[0, 0, 0], collisions=0),
+        penetration_run("soft", "b", problem="no GPU"),
+    ],
+}
+
+
+def test_penetration():
+    assert tables.penetration(PENETRATION) == [
+        ("simulator", "bullet", "soft"),
+        ("A", "1,234; 1,240; 5", "0; 0; 0"),
+        ("B", "not run", "not run"),
+    ]
+    assert tables.penetration_costs(PENETRATION)[1:] == [
+        ("A", "30% kept, 3.5%, 12 ms", "7 inverted, 3.5%, 12 ms"),
+        ("B", "not run", "not run"),
+    ]
+    assert tables.penetration_simulators(PENETRATION)[1:] == [
+        ("A", "1.2", "its own", "nothing", ""),
+        ("B", "", "defaults", "no penetration", "no GPU (all)"),
+    ]
+
+
+def test_the_picture_of_penetration(tmp_path, monkeypatch):
+    figure = load("penetration")
+    numbers = figure.count(PENETRATION, lambda took: max(took["crossings"]))
+    assert numbers[0].tolist() == [1234.0, 0.0]
+    assert np.isnan(numbers[1]).all()
+    path, picture = tmp_path / "found.json", tmp_path / "found.png"
+    path.write_text(json.dumps(PENETRATION))
+    monkeypatch.setattr(sys, "argv", ["penetration.py", str(path), str(picture)])
+    figure.main()
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_table_has_its_sources_below(tmp_path, monkeypatch):
