@@ -409,7 +409,7 @@ def update(page: str) -> tuple[str, list[str]]:
         if made is None:
             kept.append(block[2])
             return block[0]
-        return f"{block[1]}{made}{block[4]}"
+        return f"{block[1]}\n{made}\n{block[4]}"  # with blank lines, without which some programs see no table
 
     return _BLOCK.sub(replace, page), kept
 

@@ -200,7 +200,7 @@ def test_a_table_has_its_sources_below(tmp_path, monkeypatch):
     write()
     source = "*`warp-bsc bench x`: 2026-11-26, commit 0123456, a CPU, 2 cores, Warp 1.2, Newton 3.4*"
     table = f"| a | b |\n| --- | --- |\n| 1 | 2 |\n\n{source}\n"
-    assert tables.update(page) == (f"before\n<!-- table: x -->\n{table}<!-- end -->\nafter\n", [])
+    assert tables.update(page) == (f"before\n<!-- table: x -->\n\n{table}\n<!-- end -->\nafter\n", [])
     write(benchmark="detector", record=RECORD | {"gpus": ["NVIDIA X"], "changed": True, "load": 0.4})
     assert "0123456 with changes, NVIDIA X, Warp 1.2, Newton 3.4, IPC Toolkit none*" in tables.update(page)[0]
     write(record=RECORD | {"load": 2.5})

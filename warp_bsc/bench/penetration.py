@@ -226,30 +226,13 @@ def measure_penetration(
 def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int, int], None]) -> PenetrationMeasurement:
     """Runs and judges a scene on the current device."""
     from .judge import Judge  # noqa: PLC0415 (imports Newton)
-    from .penetration_libuipc import simulate_libuipc  # noqa: PLC0415 (imports Newton)
-    from .penetration_mujoco import simulate_mujoco  # noqa: PLC0415 (imports Newton)
-    from .penetration_newton import simulate_newton  # noqa: PLC0415 (imports Newton)
     from .penetration_scenes import build_penetration_scene  # noqa: PLC0415 (imports Newton)
 
     simulator = SIMULATORS[name]
     built = build_penetration_scene(scene, simulator.solver or "vbd", simulator.rate)
     model = built.scene.model
     seconds = built.scene.seconds if frames is None else frames / FRAME_RATE
-    if simulator.solver:
-        device = str(model.device)
-        trajectory = simulate_newton(
-            built,
-            simulator.solver,
-            simulator.rate,
-            seconds,
-            progress,
-            has_self_contact=simulator.has_self_contact,
-            has_stage=simulator.has_stage,
-        )
-    elif name == "mujoco-ipc":
-        device, trajectory = "cpu", simulate_mujoco(built, simulator.rate, seconds, progress)
-    else:
-        device, trajectory = "cuda", simulate_libuipc(built, simulator.rate, seconds, progress)
+    device, trajectory = _simulate(built, name, seconds, progress)
     states, timed = trajectory.states, trajectory.milliseconds[WARM_UP:] or trajectory.milliseconds
     judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE)
     return PenetrationMeasurement(
@@ -270,6 +253,24 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
         substepped_steps=trajectory.substepped_steps,
         milliseconds=(float(np.median(timed)), float(np.mean(timed))),
     )
+
+
+def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], None]):
+    """Runs a scene with a simulator, whose library is imported now; returns the device and the trajectory."""
+    simulator = SIMULATORS[name]
+    if simulator.solver:
+        from .penetration_newton import simulate_newton  # noqa: PLC0415
+
+        options = {"has_self_contact": simulator.has_self_contact, "has_stage": simulator.has_stage}
+        device = str(built.scene.model.device)
+        return device, simulate_newton(built, simulator.solver, simulator.rate, seconds, progress, **options)
+    if name == "mujoco-ipc":
+        from .penetration_mujoco import simulate_mujoco  # noqa: PLC0415
+
+        return "cpu", simulate_mujoco(built, simulator.rate, seconds, progress)
+    from .penetration_libuipc import simulate_libuipc  # noqa: PLC0415
+
+    return "cuda", simulate_libuipc(built, simulator.rate, seconds, progress)
 
 
 def _speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
