@@ -335,7 +335,7 @@ def replay_sizes(found: Found) -> Rows:
 TABLES = {
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
     "detector_stages": Table(("detector_gpu",), detector_stages),
-    "newton_coupled": Table(("newton_coupled_cpu",), newton),
+    "newton_coupled": Table(("newton_coupled_gpu",), newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
     "penetration": Table(("penetration",), penetration),
