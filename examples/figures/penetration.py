@@ -3,8 +3,8 @@
     warp-bsc bench penetration --json penetration.json
     python examples/figures/penetration.py penetration.json penetration.png
 
-A cell of the left grid has the crossings of the worst frame, one of the right grid the pairs that meet between states.
-Needs matplotlib (``pip install matplotlib``).
+Several files, each of some scenes, make one picture. A cell of the left grid has the crossings of the worst frame, one
+of the right grid the pairs that meet between states. Needs matplotlib (``pip install matplotlib``).
 """
 
 import argparse
@@ -47,6 +47,16 @@ def draw_grid(axes, numbers, title):
         spine.set_visible(False)
 
 
+def join(measurements):
+    """Returns measurements of different scenes as one."""
+    joined = {"scenes": {}, "simulators": {}, "runs": []}
+    for found in measurements:
+        joined["scenes"] |= found["scenes"]
+        joined["simulators"] |= found["simulators"]
+        joined["runs"] += found["runs"]
+    return joined
+
+
 def draw(found, path):
     """Writes the picture of a measurement to a file."""
     titles = [simulator["title"] for simulator in found["simulators"].values()]
@@ -65,10 +75,10 @@ def draw(found, path):
 def main():
     """Reads the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("measurement", type=Path, help="JSON of warp-bsc bench penetration")
+    parser.add_argument("measurements", nargs="+", type=Path, help="JSON of warp-bsc bench penetration")
     parser.add_argument("picture", help="file to write, .png, .svg or .pdf")
     arguments = parser.parse_args()
-    draw(json.loads(arguments.measurement.read_text()), arguments.picture)
+    draw(join(json.loads(path.read_text()) for path in arguments.measurements), arguments.picture)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,14 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from warp_bsc._atomic_file import OutputFile
+from warp_bsc.bench.penetration import SCENES
 from warp_bsc.bench.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -46,10 +47,12 @@ class Table:
     Attributes:
         files: Names of its measurements, without ending.
         make: Returns its rows, given the measurements in the same order.
+        needs_all: Whether the table needs all of its files, not only one.
     """
 
     files: tuple[str, ...]
     make: Callable[..., Rows]
+    needs_all: bool = True
 
 
 def milliseconds(value: float) -> str:
@@ -224,15 +227,15 @@ def _quoted(count: int | str | None) -> str:
     return "none" if count is None else f'`"{count}"`' if isinstance(count, str) else str(count)
 
 
-def penetration(found: Found) -> Rows:
+def penetration(*measurements: Found) -> Rows:
     """Who penetrates, where: crossings in the worst frame and in all, and pairs that meet on the way."""
     return _by_scene(
-        found,
+        measurements,
         lambda took: f"{max(took['crossings']):,}; {sum(took['crossings']):,}; {took['collisions']:,}",
     )
 
 
-def penetration_costs(found: Found) -> Rows:
+def penetration_costs(*measurements: Found) -> Rows:
     """What simulators keep of speed, tetrahedra and lengths, and their time."""
 
     def cell(took: Found) -> str:
@@ -240,14 +243,14 @@ def penetration_costs(found: Found) -> Rows:
         inverted = f"{max(took['inverted'])} inverted, " if max(took["inverted"]) else ""
         return f"{kept}{inverted}{digits(took['stretch'])}%, {digits(took['milliseconds']['median'])} ms"
 
-    return _by_scene(found, cell)
+    return _by_scene(measurements, cell)
 
 
-def penetration_simulators(found: Found) -> Rows:
+def penetration_simulators(*measurements: Found) -> Rows:
     """Settings and claims of simulators, and what they did not run."""
     rows = [("simulator", "version", "settings", "says of penetration", "not run")]
-    for name, simulator in found["simulators"].items():
-        runs = [run for run in found["runs"] if run["simulator"] == name]
+    for name, simulator in _joined(measurements, "simulators").items():
+        runs = [run for found in measurements for run in found["runs"] if run["simulator"] == name]
         versions = {run["measured"]["version"] for run in runs if run["measured"]}
         missing: dict[str, list[str]] = {}
         for run in runs:
@@ -261,12 +264,18 @@ def penetration_simulators(found: Found) -> Rows:
     return rows
 
 
-def _by_scene(found: Found, cell: Callable[[Found], str]) -> Rows:
+def _joined(measurements: Sequence[Found], key: str) -> Found:
+    """Returns what measurements have at a key, together."""
+    return {name: value for found in measurements for name, value in found[key].items()}
+
+
+def _by_scene(measurements: Sequence[Found], cell: Callable[[Found], str]) -> Rows:
     """Returns a row for each simulator, and a column for each scene."""
-    runs = {(run["scene"], run["simulator"]): run["measured"] for run in found["runs"]}
-    rows = [("simulator", *found["scenes"])]
-    for name, simulator in found["simulators"].items():
-        measured = [runs[scene, name] for scene in found["scenes"]]
+    runs = {(run["scene"], run["simulator"]): run["measured"] for found in measurements for run in found["runs"]}
+    scenes = _joined(measurements, "scenes")
+    rows = [("simulator", *scenes)]
+    for name, simulator in _joined(measurements, "simulators").items():
+        measured = [runs.get((scene, name)) for scene in scenes]
         rows.append((simulator["title"], *("not run" if took is None else cell(took) for took in measured)))
     return rows
 
@@ -332,15 +341,16 @@ def replay_sizes(found: Found) -> Rows:
 # The page ----------------------------------------------------------------------------------------------------------
 
 
+_PENETRATION = tuple(f"penetration_{scene}" for scene in SCENES)
 TABLES = {
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
     "detector_stages": Table(("detector_gpu",), detector_stages),
     "newton_coupled": Table(("newton_coupled_gpu",), newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
-    "penetration": Table(("penetration",), penetration),
-    "penetration_costs": Table(("penetration",), penetration_costs),
-    "penetration_simulators": Table(("penetration",), penetration_simulators),
+    "penetration": Table(_PENETRATION, penetration, needs_all=False),
+    "penetration_costs": Table(_PENETRATION, penetration_costs, needs_all=False),
+    "penetration_simulators": Table(_PENETRATION, penetration_simulators, needs_all=False),
     "queries": Table(("queries_gpu", "queries_one_core"), queries),
     "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
     "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),
@@ -391,13 +401,14 @@ def make(name: str) -> str | None:
     if name not in TABLES:
         raise ValueError(f"no table is named {name}, only {', '.join(TABLES)}")
     table = TABLES[name]
-    measurements = [load(file) for file in table.files]
-    if any(found is None for found in measurements):
+    loaded = [load(file) for file in table.files]
+    measurements = [found for found in loaded if found is not None]
+    if len(measurements) < (len(loaded) if table.needs_all else 1):
         return None
     head, *rows = table.make(*measurements)
     lines = [head, ("---",) * len(head), *rows]
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
-    return text + "\n" + "  \n".join(describe(found) for found in measurements if found) + "\n"
+    return text + "\n" + "  \n".join(dict.fromkeys(map(describe, measurements))) + "\n"
 
 
 def update(page: str) -> tuple[str, list[str]]:

@@ -1,6 +1,7 @@
 """Judges what a simulator made of a scene, by exact detection: crossings, collisions between states, inversions."""
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import newton
@@ -64,12 +65,15 @@ class Judge:
         moves = moves[edges].any(axis=1)
         self._edges, self._lengths = edges[moves], lengths[moves]
 
-    def judge(self, states: list[np.ndarray], steps_per_frame: int) -> Judgement:
+    def judge(
+        self, states: list[np.ndarray], steps_per_frame: int, progress: Callable[[int], None] = lambda done: None
+    ) -> Judgement:
         """Returns what detection finds in a trajectory.
 
         Args:
             states: Positions of the particles at the start and after each step [m], each of shape [particle_count, 3].
             steps_per_frame: Steps of a frame; the last frame may have fewer.
+            progress: Called with the number of steps that are judged.
 
         Raises:
             ValueError: If positions are not finite or have another shape.
@@ -78,10 +82,14 @@ class Judge:
         ends = [*range(steps_per_frame, len(states) - 1, steps_per_frame), len(states) - 1]
         crossings = [self._count_crossings(positions[end]) for end in ends]
         inverted = [len(self._detector.find_inversions(positions[end])) for end in ends] if len(self._mesh.tets) else []
+        collisions = []
+        for step, pair in enumerate(itertools.pairwise(positions)):
+            collisions.append(self._count_collisions(*pair))
+            progress(step + 1)
         return Judgement(
             crossings=tuple(every for every, _ in crossings),
             shape_crossings=tuple(with_shapes for _, with_shapes in crossings),
-            collisions=tuple(self._count_collisions(*pair) for pair in itertools.pairwise(positions)),
+            collisions=tuple(collisions),
             inverted=tuple(inverted) or (0,) * len(ends),
             stretch=100.0 * max(largest_stretch(states[end], self._edges, self._lengths) for end in ends),
         )

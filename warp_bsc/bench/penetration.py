@@ -80,12 +80,6 @@ def _with_stage(inner: Simulator) -> Simulator:
 _VBD = _of_newton("vbd", "VBD", 600, "10 iterations, 10 steps a frame: Newton's softbody_hanging")
 _XPBD = _of_newton("xpbd", "XPBD", 600, "10 iterations, 10 steps a frame: Newton's cloth_hanging --solver xpbd")
 _STYLE3D = _of_newton("style3d", "Style3D", 600, "4 iterations, 10 steps a frame: Newton's cloth_style3d")
-_SEMI_IMPLICIT = _of_newton(
-    "semi-implicit",
-    "SemiImplicit",
-    3840,
-    "64 steps a frame; Newton's cloth_hanging --solver semi_implicit has 32, with which the lighter cloth here bursts",
-)
 
 SIMULATORS = {
     "vbd": _VBD,
@@ -98,11 +92,15 @@ SIMULATORS = {
     ),
     "style3d": _STYLE3D,
     "xpbd": _XPBD,
-    "semi-implicit": _SEMI_IMPLICIT,
+    "semi-implicit": _of_newton(
+        "semi-implicit",
+        "SemiImplicit",
+        3840,
+        "64 steps a frame; Newton's cloth_hanging --solver semi_implicit has 32, with which light cloth bursts",
+    ),
     "ccd-vbd": _with_stage(_VBD),
     "ccd-style3d": _with_stage(_STYLE3D),
     "ccd-xpbd": _with_stage(_XPBD),
-    "ccd-semi-implicit": _with_stage(_SEMI_IMPLICIT),
     "mujoco-ipc": Simulator(
         "MuJoCo, ipc",
         "mujoco",
@@ -195,7 +193,7 @@ def measure_penetration(
         simulator: A key of :data:`SIMULATORS`.
         device: The Warp device of Newton's solvers and of detection; default: the current one.
         frames: Number of frames; default: that of the scene. Newton's solvers take at least four steps.
-        progress: Called with the number of steps done and the number of all.
+        progress: Called with how much is done and how much there is to do, in steps: each is taken, then judged.
 
     Returns:
         The measurement, or the reason why there is none: the simulator is not installed or cannot run the scene, or
@@ -232,16 +230,17 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
     built = build_penetration_scene(scene, simulator.solver or "vbd", simulator.rate)
     model = built.scene.model
     seconds = built.scene.seconds if frames is None else frames / FRAME_RATE
-    device, trajectory = _simulate(built, name, seconds, progress)
+    device, trajectory = _simulate(built, name, seconds, lambda done, steps: progress(done, 2 * steps))
     states, timed = trajectory.states, trajectory.milliseconds[WARM_UP:] or trajectory.milliseconds
-    judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE)
+    steps = len(states) - 1
+    judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE, lambda done: progress(steps + done, 2 * steps))
     return PenetrationMeasurement(
         device=device,
         version=importlib.metadata.version(simulator.package),
         particles=model.particle_count,
         triangles=model.tri_count,
         frames=len(judgement.crossings),
-        steps=len(states) - 1,
+        steps=steps,
         crossings=judgement.crossings,
         shape_crossings=judgement.shape_crossings,
         collisions=sum(judgement.collisions),

@@ -7,9 +7,10 @@ import newton
 import numpy as np
 
 from ..response.state.mesh import host_array
+from ..response.substeps.strain import edges_at_rest
 from .penetration_scenes import PenetrationScene
 from .penetration_states import Trajectory
-from .response_simulation import NotFinite, Simulation
+from .response_simulation import NotFinite, Simulation, largest_stretch
 
 __all__ = ["simulate_newton"]
 
@@ -19,27 +20,33 @@ _STYLE3D_ITERATIONS = 4
 """In Newton's example cloth_style3d."""
 _PAIRS = {"particle_vertex_contact_buffer_size": 64, "particle_edge_contact_buffer_size": 128}
 """VBD's buffers in Newton's example cloth_twist; pairs that do not fit are dropped."""
-_FARTHEST = 100.0
-"""Distance from the origin [m] from which on a scene, which is within a metre, has burst."""
+_BURST = 10.0
+"""Elongation of an edge, as a share of its length at rest, from which on a scene has burst, and is not judged."""
 
 
 class _States:
     """Keeps the positions of each state, in place of :class:`.response_simulation.Samples`."""
 
-    def __init__(self):
+    def __init__(self, model: newton.Model):
         self.positions: list[np.ndarray] = []
+        self._edges, self._lengths, _ = edges_at_rest(model)
 
     def add(self, state: newton.State) -> bool:
         """Keeps a state; returns whether its positions are finite.
 
         Raises:
-            NotFinite: If they are finite, and so far away that the scene has burst.
+            NotFinite: If they are finite, and the scene has burst.
         """
-        self.positions.append(host_array(state.particle_q).copy())
-        farthest = np.abs(self.positions[-1]).max()
-        if _FARTHEST < farthest < np.inf:
-            raise NotFinite(f"it bursts: particles are {farthest:.0f} m away after step {len(self.positions) - 1}")
-        return bool(np.isfinite(farthest))
+        x = host_array(state.particle_q).copy()
+        self.positions.append(x)
+        if not np.isfinite(x).all():
+            return False
+        stretch = largest_stretch(x, self._edges, self._lengths)
+        if stretch > _BURST:
+            raise NotFinite(
+                f"it bursts: after step {len(self.positions) - 1} an edge is {1.0 + stretch:.0f} times as long"
+            )
+        return True
 
 
 def simulate_newton(
@@ -67,7 +74,7 @@ def simulate_newton(
     Raises:
         NotFinite: If positions are not finite, or the scene bursts.
     """
-    states = _States()
+    states = _States(built.scene.model)
     simulation = Simulation(
         built.scene,
         solver,

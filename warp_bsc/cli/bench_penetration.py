@@ -92,10 +92,9 @@ def _measure(arguments: argparse.Namespace, device: wp.Device) -> Generator[Pene
             title = f"{scene}, {SIMULATORS[simulator].title}"
             progress.show(done, f"{title}: starts")
 
-            def show(step: int, steps: int, title: str = title, done: int = done) -> None:
+            def show(part: int, parts: int, title: str = title, done: int = done) -> None:
                 INTERRUPTS.check()
-                # what is left is to judge the states, which takes about as long again
-                progress.show(done + 0.5 * step / steps, f"{title}: step {step:,} of {steps:,}")
+                progress.show(done + part / parts, f"{title}: {part / parts:.0%}")
 
             with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
                 run = measure_penetration(scene, simulator, device=device, frames=arguments.frames, progress=show)
