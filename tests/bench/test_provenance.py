@@ -60,6 +60,13 @@ def test_commit_of_the_checkout_and_whether_it_is_changed(tmp_path, monkeypatch)
     git(root, "commit", "-m", "first")
     head = git(root, "rev-parse", "HEAD")
     (root / "untracked").write_text("")
+    result = root / "warp_bsc" / "bench" / "measurements" / "a.json"
+    result.parent.mkdir(parents=True)
+    result.write_text("1")
+    git(root, "add", "warp_bsc")
+    git(root, "commit", "-m", "second")
+    head = git(root, "rev-parse", "HEAD")
+    result.write_text("2")  # a result is no change of what is measured
     assert commit() == (head, False)
     (root / "a.py").write_text("2")
     monkeypatch.setenv(provenance.COMMIT, "0123")  # git knows better

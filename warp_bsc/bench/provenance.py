@@ -29,6 +29,8 @@ LIBRARIES = ("warp-lang", "newton", "numpy", "usd-core", "trimesh", "ipctk", "mu
 _LOAD = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
 """Processes that were running on average over the minute before this one measures anything."""
 _ROOT = Path(__file__).resolve().parents[2]
+_NO_CAUSE = ":!warp_bsc/bench/measurements"
+"""Files whose change is no change of what is measured: results, which one measurement after another replaces."""
 _OUTPUTS = ("--json", "--figure")
 """Options that name output files, which the recorded command omits with their files."""
 
@@ -120,7 +122,9 @@ def _find_commit() -> tuple[str | None, bool | None]:
 
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
         if Path(git("rev-parse", "--show-toplevel")).resolve() == _ROOT:  # not a checkout of something else around it
-            return git("rev-parse", "HEAD"), bool(git("status", "--porcelain", "--untracked-files=no"))
+            return git("rev-parse", "HEAD"), bool(
+                git("status", "--porcelain", "--untracked-files=no", "--", ".", _NO_CAUSE)
+            )
     named = os.environ.get(COMMIT)
     return (named, False) if named else (None, None)
 
