@@ -18,7 +18,7 @@ from statistics import median
 from typing import Any
 
 from warp_bsc._atomic_file import OutputFile
-from warp_bsc.bench.penetration import SCENES
+from warp_bsc.bench.penetration import SCENES, SIMULATORS
 from warp_bsc.bench.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -255,11 +255,11 @@ def penetration_simulators(*measurements: Found) -> Rows:
         missing: dict[str, list[str]] = {}
         for run in runs:
             if run["problem"]:
-                missing.setdefault(run["problem"], []).append(run["scene"])
+                missing.setdefault(run["problem"].partition(": ")[0], []).append(run["scene"])
         scenes = [
             f"{reason} ({', '.join(names) if len(names) < len(runs) else 'all'})" for reason, names in missing.items()
         ]
-        claims = simulator["claims"] or "nothing"
+        claims = SIMULATORS[name].claims or "nothing"  # not measured
         rows.append((simulator["title"], ", ".join(versions), simulator["settings"], claims, "; ".join(scenes)))
     return rows
 

@@ -152,7 +152,8 @@ def simulate_libuipc(
         try:
             engine = uipc.Engine("cuda", folder)
         except Exception as error:
-            raise NotInstalled(f"libuipc needs a GPU with CUDA: {error}") from error
+            reason = str(error).rpartition("] ")[2]  # without the place in its sources
+            raise NotInstalled(f"libuipc needs a GPU with CUDA: {reason}") from error
         world, scene = uipc.World(engine), LibuipcScene(built, rate)
         world.init(scene.scene)
         if not world.is_valid():
