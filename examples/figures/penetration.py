@@ -63,8 +63,8 @@ def draw(found, path):
     scenes = list(found["scenes"])
     size = 3.2 + 1.8 * len(scenes), 1.2 + 0.36 * len(titles)
     figure, (left, right) = plt.subplots(1, 2, figsize=size, layout="constrained", sharey=True)
-    draw_grid(left, count(found, lambda took: max(took["crossings"])), "edges through faces, worst frame")
-    draw_grid(right, count(found, lambda took: took["collisions"]), "pairs that meet between states, all steps")
+    draw_grid(left, count(found, lambda took: max(took["crossings"])), "edges in faces, worst frame")
+    draw_grid(right, count(found, lambda took: took["collisions"]), "pairs that meet between states")
     left.set_yticks(range(len(titles)), titles)
     for axes in (left, right):
         axes.set_xticks(range(len(scenes)), scenes)
