@@ -48,11 +48,13 @@ class Table:
         files: Names of its measurements, without ending.
         make: Returns its rows, given the measurements in the same order.
         needs_all: Whether the table needs all of its files, not only one.
+        has_sources: Whether the line below it says where its figures come from; else that of a later table does.
     """
 
     files: tuple[str, ...]
     make: Callable[..., Rows]
     needs_all: bool = True
+    has_sources: bool = True
 
 
 def milliseconds(value: float) -> str:
@@ -348,8 +350,8 @@ TABLES = {
     "newton_coupled": Table(("newton_coupled_gpu",), newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
-    "penetration": Table(_PENETRATION, penetration, needs_all=False),
-    "penetration_costs": Table(_PENETRATION, penetration_costs, needs_all=False),
+    "penetration": Table(_PENETRATION, penetration, needs_all=False, has_sources=False),
+    "penetration_costs": Table(_PENETRATION, penetration_costs, needs_all=False, has_sources=False),
     "penetration_simulators": Table(_PENETRATION, penetration_simulators, needs_all=False),
     "queries": Table(("queries_gpu", "queries_one_core"), queries),
     "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
@@ -408,6 +410,8 @@ def make(name: str) -> str | None:
     head, *rows = table.make(*measurements)
     lines = [head, ("---",) * len(head), *rows]
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    if not table.has_sources:
+        return text
     return text + "\n" + "  \n".join(dict.fromkeys(map(describe, measurements))) + "\n"
 
 

@@ -1,6 +1,7 @@
 """The tables of the page of measurements: they are what the program makes of the files beside the page."""
 
 import copy
+import dataclasses
 import importlib.util
 import json
 import re
@@ -205,6 +206,8 @@ def test_a_table_has_its_sources_below(tmp_path, monkeypatch):
     assert "0123456 with changes, NVIDIA X, Warp 1.2, Newton 3.4, IPC Toolkit none*" in tables.update(page)[0]
     write(record=RECORD | {"load": 2.5})
     assert "a CPU, 2 cores shared with other programs (load 2.5), Warp" in tables.update(page)[0]
+    monkeypatch.setitem(tables.TABLES, "x", dataclasses.replace(tables.TABLES["x"], has_sources=False))
+    assert source not in tables.update(page)[0] and "| 1 | 2 |" in tables.update(page)[0]
     write(partial=True)
     with pytest.raises(ValueError, match=r"x_gpu\.json: the measurement was interrupted"):
         tables.update(page)
