@@ -11,6 +11,7 @@ chooses. Distances are root mean squares.
 """
 
 import argparse
+import sys
 import time
 
 import newton
@@ -20,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
+from warp_bsc.bench.provenance import write_measurement
 
 REFERENCE = 1.0 / 1920.0
 """Length of the reference's step [s]."""
@@ -245,7 +247,9 @@ def main():
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES), help="scenes (default: all)")
     parser.add_argument("--substeps", type=int, default=4, help="substeps at 1/240 s; four times as many at 1/60 s")
     parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
     options = parser.parse_args()
+    found = []
     wp.config.log_level = wp.LOG_WARNING
     with wp.ScopedDevice(options.device or wp.get_preferred_device()):
         for name in options.scenes:
@@ -260,11 +264,17 @@ def main():
                 run = Run(scene, dt, substeps).simulate()
                 reference = run.positions() if reference is None else reference
                 distance = 1e3 * np.sqrt(((run.positions() - reference) ** 2).sum(axis=1).mean())
-                values = [f"{value:.3g}" for value in (*scene.measure(run), np.mean(run.substeps), distance)]
-                report = run.solver.report
-                values += [str(report.totals.uncertified_steps), f"{run.seconds:.1f}"]
-                table.add_row(f"1/{1.0 / dt:.0f}", str(substeps or "-"), *values)
+                measured = [float(value) for value in (*scene.measure(run), np.mean(run.substeps), distance)]
+                uncertified = run.solver.report.totals.uncertified_steps
+                rate, values = round(1.0 / dt), [f"{value:.3g}" for value in measured]
+                table.add_row(f"1/{rate}", str(substeps or "-"), *values, str(uncertified), f"{run.seconds:.1f}")
+                names = (*scene.measures, *columns)
+                row = dict(zip(names, (*measured, uncertified, run.seconds), strict=True))
+                found.append({"scene": name, "rate": rate, "substeps": substeps, "measured": row})
             Console().print(table)
+    if options.json:
+        device = wp.get_device(options.device or wp.get_preferred_device())
+        write_measurement(options.json, {"benchmark": "substeps", "runs": found}, sys.argv, [device])
 
 
 if __name__ == "__main__":

@@ -51,7 +51,18 @@ PACKAGES = {
     "repair": {"detection", "response", "kernels", "usd", "replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread", "_sorted_keys"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},
-    "bench": {"detection", "kernels", "usd", "checker", "response", "repair", "_arguments", "_private_names"},
+    "bench": {
+        "detection",
+        "kernels",
+        "usd",
+        "checker",
+        "response",
+        "repair",
+        "_arguments",
+        "_atomic_file",
+        "_private_names",
+        "_version",
+    },
     "cli": {"replay", "repair", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
     "__main__": {"cli"},
     "__init__": {
@@ -80,6 +91,11 @@ LIBRARIES = {
         "warp_bsc/bench/crossings.py",  # of a model
         "warp_bsc/bench/response_simulation.py",  # steps its solvers
         "warp_bsc/bench/response_scenes.py",  # makes models
+        "warp_bsc/bench/penetration_scenes.py",
+        "warp_bsc/bench/penetration_newton.py",  # steps its solvers
+        "warp_bsc/bench/penetration_mujoco.py",  # reads its models
+        "warp_bsc/bench/penetration_states.py",
+        "warp_bsc/bench/judge.py",
         "torch",  # takes its solvers
         "jax",
     },
@@ -92,6 +108,8 @@ LIBRARIES = {
     "argparse": {"cli"},
     "matplotlib": {"bench"},
     "ipctk": {"bench"},
+    "mujoco": {"bench"},
+    "uipc": {"bench"},
     "trimesh": {"bench", "response", "usd"},
     "warp": {
         "kernels",

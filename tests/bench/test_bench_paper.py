@@ -50,6 +50,7 @@ def fail(capsys, *arguments):
 def test_json_has_everything(capsys):
     found = json.loads(bench(capsys, "cloth:1000", "--json"))
     assert (found["benchmark"], found["quick"], found["methods"]) == ("paper", True, list(METHODS))
+    assert found["record"]["command"].startswith("warp-bsc bench")
     (scene,) = found["scenes"]
     assert (scene["name"], scene["triangles"], scene["precision"]) == ("cloth:1000", 1000, 32)
     step = load_scene("cloth:1000")

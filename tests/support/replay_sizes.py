@@ -17,10 +17,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import warp as wp
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+from warp_bsc.bench.provenance import write_measurement
 
 SAMPLING_SECONDS = 0.05
 
@@ -244,6 +247,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(SCENES)}; default: all")
     parser.add_argument("--folder", type=Path, help="keeps scenes and results there")
+    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
     parser.add_argument("--workers", default="1", help="processes that check intervals (default: 1)")
     arguments = parser.parse_args()
     if unknown := set(arguments.scenes) - SCENES.keys():
@@ -251,11 +255,13 @@ def main():
     table = Table(box=box.SIMPLE_HEAD)
     for title in ("scene", "", "hits", "wall", "processor", "memory", "file"):
         table.add_column(title, justify="left" if title in ("scene", "") else "right", no_wrap=True)
+    found = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.folder or Path(temporary)
         folder.mkdir(exist_ok=True)
         for name in arguments.scenes or SCENES:
             cost = replay(folder, name, ["--workers", arguments.workers])
+            found.append({"scene": name, "description": SCENES[name][1], **cost._asdict()})
             numbers = (
                 f"{cost.hits:,}",
                 f"{cost.wall:.1f} s",
@@ -265,6 +271,9 @@ def main():
             )
             table.add_row(name, SCENES[name][1], *numbers)
     Console(width=None if sys.stdout.isatty() else 120).print(table)
+    if arguments.json:
+        result = {"benchmark": "replay_sizes", "workers": arguments.workers, "rows": found}
+        write_measurement(arguments.json, result, sys.argv, [wp.get_device("cpu")])
 
 
 if __name__ == "__main__":

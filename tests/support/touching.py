@@ -18,6 +18,7 @@ from sheets import grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.bench.provenance import write_measurement
 from warp_bsc.bench.timing import limited_threads
 from warp_bsc.detection.launch import cores
 
@@ -74,19 +75,22 @@ def main():
     """Measures, and judges."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--judged", type=int, default=500, help="pairs of each scene to hold against the checker")
+    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     rng = np.random.default_rng(0)
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
     for column in ("Question", "Sheets", "Faces of each", "Pairs", "Seconds", "Pairs a second", "Wrong"):
         table.add_column(column, justify="left" if column == "Question" else "right", no_wrap=True)
-    failures = 0
+    failures, results = 0, []
 
     def add(question, count, faces, pairs, seconds, wrong):
         nonlocal failures
         failures += wrong
         cells = f"{count}", f"{faces // count:,}", f"{pairs:,}", f"{seconds:.2f}", f"{pairs / seconds:,.0f}", f"{wrong}"
         table.add_row(question, *cells)
+        results.append({"question": question, "sheets": count, "faces": faces // count, "pairs": pairs})
+        results[-1] |= {"seconds": seconds, "wrong": int(wrong)}
 
     with limited_threads(1), cores(1):
         for count, columns, rows in ((2, 32, 32), (2, 42, 42), (8, 32, 16)):
@@ -105,6 +109,9 @@ def main():
             wrong = judge_distances(rng, mesh, x0, x1, collisions, arguments.judged)
             add(question, 2, len(faces), pairs, seconds, wrong)
     Console(width=120).print(table)
+    if arguments.json:
+        found = {"benchmark": "touching", "judged": arguments.judged, "rows": results}
+        write_measurement(arguments.json, found, sys.argv, [wp.get_device("cpu")])
     return 1 if failures else 0
 
 

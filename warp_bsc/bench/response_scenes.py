@@ -11,13 +11,13 @@ import newton
 import numpy as np
 import warp as wp
 
-__all__ = ["SCENES", "Motion", "NotRunnable", "Scene", "build_scene"]
+__all__ = ["SCENES", "Motion", "NotRunnable", "Scene", "SceneBuilder", "build_scene"]
 
 _FRICTION = 0.5
 _IDENTITY = wp.quat_identity()
 _EXPLICIT_CONTACT = 1e2, 0.1, 0.5
 """Stiffness [N/m], damping and friction [N s/m] of Newton's contacts in an explicit solver."""
-_XPBD_STIFFNESS = 0.1 * 60.0**2  # N/m of a spring for each kilogram of a particle
+_XPBD_STIFFNESS = 0.1  # N/m of a spring for each kilogram of a particle, times the steps a second squared
 
 
 class NotRunnable(Exception):
@@ -62,16 +62,17 @@ class Scene:
     strands: bool = False
 
 
-class _Builder:
+class SceneBuilder:
     """Adds the parts of a scene to a builder of Newton, with materials for one solver.
 
     Attributes:
         solver: Name of the solver.
+        rate: Steps a second.
         to: The builder.
     """
 
-    def __init__(self, solver: str):
-        self.solver, self.to = solver, newton.ModelBuilder()
+    def __init__(self, solver: str, rate: int = 60):
+        self.solver, self.rate, self.to = solver, rate, newton.ModelBuilder()
         shape = self.to.default_shape_cfg
         shape.mu = _FRICTION
         if solver == "semi-implicit":  # explicit: its step takes no stiffer contacts, nor more damping
@@ -198,7 +199,7 @@ class _Builder:
     def _membrane(self, stiffness: float, mass: float) -> dict[str, Any]:
         """Returns the material of cloth as arguments of Newton; XPBD has springs instead of triangles."""
         if self.solver == "xpbd":  # stiffer springs than this, by the mass of a particle, burst in XPBD itself
-            spring = min(stiffness, _XPBD_STIFFNESS * mass)
+            spring = min(stiffness, _XPBD_STIFFNESS * self.rate**2 * mass)
             return {"edge_ke": 0.0, "edge_kd": 0.0, "add_springs": True, "spring_ke": spring, "spring_kd": 0.0}
         return {"tri_ke": stiffness, "tri_ka": stiffness, "tri_kd": 1e-3, "edge_ke": 1e-3, "edge_kd": 1e-4}
 
@@ -231,21 +232,21 @@ def _revolve(profile: np.ndarray, around: int) -> tuple[np.ndarray, np.ndarray]:
     return points, faces.reshape(-1, 3)
 
 
-def _build_sphere(builder: _Builder) -> Scene:
+def _build_sphere(builder: SceneBuilder) -> Scene:
     """A cloth drapes over a fixed sphere."""
     builder.to.add_shape_sphere(body=-1, radius=0.2)
     builder.add_cloth((0.0, 0.0, 0.23), (16, 16), 0.05)
     return Scene(builder.finish(), 2.5)
 
 
-def _build_box_edge(builder: _Builder) -> Scene:
+def _build_box_edge(builder: SceneBuilder) -> Scene:
     """A cloth falls across the edge of a fixed box, and hangs from it by friction."""
     builder.add_box((-0.25, 0.0, -0.15), (0.25, 0.3, 0.15))
     builder.add_cloth((-0.06, 0.0, 0.03), (16, 12), 0.035)
     return Scene(builder.finish(), 2.0)
 
 
-def _build_tube_cone(builder: _Builder) -> Scene:
+def _build_tube_cone(builder: SceneBuilder) -> Scene:
     """An elastic tube is pulled over a fixed cone by its flared mouth, which is wider than the cone."""
     upside_down = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), np.pi)
     place = wp.transform(wp.vec3(0.0, 0.0, 0.1), upside_down)
@@ -266,7 +267,7 @@ def _build_tube_cone(builder: _Builder) -> Scene:
     return Scene(builder.finish(), 2.4, motion=motion)
 
 
-def _build_fold(builder: _Builder) -> Scene:
+def _build_fold(builder: SceneBuilder) -> Scene:
     """A hinged plate under half of a cloth on a table turns by 150 degrees, folds the cloth, and turns back."""
     hinge, half = 0.01, (0.1, 0.15, 0.004)
 
@@ -281,7 +282,7 @@ def _build_fold(builder: _Builder) -> Scene:
     return Scene(builder.finish(), 2.8, motion=Motion(poses))
 
 
-def _build_soft_bowl(builder: _Builder) -> Scene:
+def _build_soft_bowl(builder: SceneBuilder) -> Scene:
     """A soft block falls into a bowl."""
     inner, outer = (
         np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -305,7 +306,7 @@ def _build_soft_bowl(builder: _Builder) -> Scene:
     return Scene(builder.finish(), 2.0)
 
 
-def _build_pile(builder: _Builder) -> Scene:
+def _build_pile(builder: SceneBuilder) -> Scene:
     """Five soft cubes fall on each other, in a box without a lid."""
     builder.add_walled_floor(0.16, 0.5)
     places = (-0.06, 0.0, 0.01), (0.06, 0.005, 0.02), (0.01, 0.0, 0.14), (-0.01, 0.03, 0.26), (0.02, -0.02, 0.38)
@@ -314,7 +315,7 @@ def _build_pile(builder: _Builder) -> Scene:
     return Scene(builder.finish(), 2.5)
 
 
-def _build_press(builder: _Builder, *, height: float = 0.6, walls: bool = False) -> Scene:
+def _build_press(builder: SceneBuilder, *, height: float = 0.6, walls: bool = False) -> Scene:
     """A plate presses a soft block on a table to a share of its height, between walls or with room at its sides."""
     side, gap, half = 0.2, 0.002, 0.01
     width = 0.5 * side + (gap if walls else 0.1)
@@ -333,12 +334,12 @@ def _build_press(builder: _Builder, *, height: float = 0.6, walls: bool = False)
     return Scene(builder.finish(), 2.0, motion=Motion(poses))
 
 
-def _build_press_tight(builder: _Builder) -> Scene:
+def _build_press_tight(builder: SceneBuilder) -> Scene:
     """A plate presses a soft block in a box to 0.75 of its height, without room at its sides."""
     return _build_press(builder, height=0.75, walls=True)
 
 
-def _build_ropes(builder: _Builder) -> Scene:
+def _build_ropes(builder: SceneBuilder) -> Scene:
     """Six ropes of springs fall across a cloth that is held at its border."""
     builder.add_cloth((0.0, 0.0, 0.0), (12, 12), 0.04, radius=0.004, is_held=True)
     rng = np.random.default_rng(1)
@@ -355,14 +356,14 @@ def _build_ropes(builder: _Builder) -> Scene:
 _BALL_RADIUS, _BALL_MASS, _BALL_SPEED, _BALL_HEIGHT = 0.02, 0.034, 40.0, 0.3
 
 
-def _add_net(builder: _Builder):
+def _add_net(builder: SceneBuilder):
     """Adds the cloth that the balls meet."""
     if builder.solver == "semi-implicit":
         raise NotRunnable("the cloth is too stiff for the steps of an explicit solver")
     builder.add_cloth((0.0, 0.0, 0.0), (12, 12), 0.05, mass=1e-3, stiffness=4e3, is_held=True)
 
 
-def _build_ball(builder: _Builder) -> Scene:
+def _build_ball(builder: SceneBuilder) -> Scene:
     """A program moves a ball at 40 m/s into a cloth that is held at its border, and stops it 8 cm below."""
 
     def poses(t: float) -> np.ndarray:
@@ -374,7 +375,7 @@ def _build_ball(builder: _Builder) -> Scene:
     return Scene(builder.finish(), 1.5, rate=120, motion=Motion(poses))
 
 
-def _build_ball_two_way(builder: _Builder) -> Scene:
+def _build_ball_two_way(builder: SceneBuilder) -> Scene:
     """A ball of 34 g flies at 40 m/s into a cloth that is held at its border, which throws it back."""
     if builder.solver == "style3d":
         raise NotRunnable("Style3D moves no rigid bodies")
@@ -395,17 +396,17 @@ def _build_ball_two_way(builder: _Builder) -> Scene:
     return Scene(model, 1.5, rate=120)
 
 
-def _build_worlds(builder: _Builder) -> Scene:
+def _build_worlds(builder: SceneBuilder) -> Scene:
     """Eight worlds, in each of which a cloth drapes over a sphere from another height; two are reset on the way."""
     for number in range(8):
-        world = _Builder(builder.solver)
+        world = SceneBuilder(builder.solver)
         world.to.add_shape_sphere(body=-1, radius=0.1)
         world.add_cloth((0.0, 0.0, 0.12 + 0.03 * number), (8, 8), 0.04)
         builder.to.add_world(world.to, xform=wp.transform(wp.vec3(number, 0.0, 0.0), _IDENTITY))
     return Scene(builder.finish(), 2.0, resets={0.8: (2, 5)})
 
 
-SCENES: dict[str, Callable[[_Builder], Scene]] = {
+SCENES: dict[str, Callable[[SceneBuilder], Scene]] = {
     "sphere": _build_sphere,
     "box_edge": _build_box_edge,
     "tube_cone": _build_tube_cone,
@@ -422,14 +423,15 @@ SCENES: dict[str, Callable[[_Builder], Scene]] = {
 """Functions that build the scenes, by name, in the order of :data:`.response.SCENES`."""
 
 
-def build_scene(name: str, solver: str) -> Scene:
+def build_scene(name: str, solver: str, rate: int = 60) -> Scene:
     """Builds a scene for a solver on Warp's current device.
 
     Args:
         name: A key of :data:`SCENES`.
         solver: One of :data:`.response.SOLVERS`.
+        rate: Steps a second for which the springs of XPBD are made.
 
     Raises:
         NotRunnable: If the solver cannot run the scene; the message says why.
     """
-    return SCENES[name](_Builder(solver))
+    return SCENES[name](SceneBuilder(solver, rate))

@@ -138,6 +138,8 @@ class Simulation:
         has_contacts: bool = False,
         stage_options: dict[str, Any] | None = None,
         offset: float = 0.0,
+        inner: Any = None,
+        samples: Any = None,
     ):
         """Makes the solver and the states.
 
@@ -149,6 +151,9 @@ class Simulation:
             has_contacts: Whether the solver gets Newton's contacts.
             stage_options: Arguments of the stage, beside those that the scene needs; None for no stage.
             offset: How far all particles are moved along x [m].
+            inner: The solver that is stepped, behind the stage if there is one; default: that of the bench of contact.
+            samples: What the states are given to, with a method ``add`` as that of :class:`Samples`; default:
+                :class:`Samples`.
         """
         model = scene.model
         self._scene, self._model, self._rate, self._offset = scene, model, rate, offset
@@ -157,7 +162,7 @@ class Simulation:
             moved = host_array(model.particle_q).astype(np.float64)
             moved[:, 0] += offset
             model.particle_q.assign(moved.astype(np.float32))
-        inner = _make_solver(scene, solver, has_self_contact=has_self_contact)
+        inner = inner or _make_solver(scene, solver, has_self_contact=has_self_contact)
         if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
             inner.collision = None  # its own contacts, which need those of Newton
         self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
@@ -169,7 +174,7 @@ class Simulation:
         self._poses_in_both = solver != "vbd"
         self._ends = [(model.state(), wp.zeros(1, dtype=int)) for _ in self._states]  # copies of both ends of a pair
         self._graph: wp.Graph | None = None
-        self.samples, self.milliseconds, self.substeps = Samples(model), [], []
+        self.samples, self.milliseconds, self.substeps = samples or Samples(model), [], []
 
     def run(self, seconds: float, progress: Callable[[int, int], None]) -> int:
         """Takes all steps, at least four and an even number, and returns how many.

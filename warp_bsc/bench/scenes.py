@@ -17,6 +17,7 @@ __all__ = [
     "default_scenes",
     "generate_cloth",
     "generate_crash",
+    "is_scene_name",
     "load_intervals",
     "load_scene",
     "paper_scenes",
@@ -65,6 +66,11 @@ class BenchmarkScene:
             x1=np.tile(self.x1, (count, 1)),
             world=np.repeat(np.arange(count, dtype=np.int32), vertices),
         )
+
+
+def is_scene_name(text: str) -> bool:
+    """Returns whether a text is the name of a scene, as of :func:`load_scene`, not that of another file."""
+    return ":" in text or "," in text or Path(text).suffix.startswith(".usd")
 
 
 def default_scenes() -> list[str]:

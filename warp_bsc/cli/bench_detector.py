@@ -2,21 +2,22 @@
 
 import argparse
 import importlib.util
-import json
 
 from rich.progress import track
 
+from .._atomic_file import STDOUT
 from ..bench.detector import benchmark_detector
-from ..bench.scenes import default_scenes, load_scene
+from ..bench.provenance import with_record
+from ..bench.scenes import default_scenes, is_scene_name, load_scene
 from ..bench.timing import count_threads, limited_threads
 from .bench_detector_tables import detector_benchmarks_to_dict, print_detector_benchmarks
+from .bench_runs import add_json_file, open_json
 from .device import find_device, load_detector, loading_kernels
 from .exit_status import explain_statuses
 from .options import (
     Commands,
     add_command,
     add_detection_options,
-    add_json,
     add_repeat,
     add_threads,
     natural,
@@ -40,7 +41,7 @@ examples:
   warp-bsc bench detector first.ply,second.ply crash:1100000 --device cuda:0
   warp-bsc bench detector cloth:50000 --device cpu --threads 1 --compare
   warp-bsc bench detector cloth:1000 --worlds 1024 --device cuda:0
-  warp-bsc bench detector --json > times.json
+  warp-bsc bench detector --json times.json
 
 {explain_statuses()}"""
 
@@ -67,12 +68,14 @@ def add_to(commands: Commands, summary: str) -> None:
         help="measure the IPC Toolkit's candidates and collision-free step size as well, on the CPU; needs ipctk",
     )
     add_detection_options(command, method="conservative")
-    add_json(command)
+    add_json_file(command)
 
 
 def _run(arguments: argparse.Namespace) -> int:
     if arguments.compare and arguments.worlds > 1:
         raise ValueError("--compare and --worlds exclude each other: the IPC Toolkit has no worlds")
+    if arguments.json and is_scene_name(arguments.json):
+        raise ValueError(f"--json {arguments.json}: this is a scene; name scenes before the options")
     if arguments.compare and importlib.util.find_spec("ipctk") is None:
         raise ValueError("--compare needs the IPC Toolkit: pip install 'warp-bsc[bench]'")
     scenes = [load_scene(name, interval=arguments.interval) for name in arguments.scenes or default_scenes()]
@@ -80,7 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
     device = find_device(arguments.device)
     progress = Console(stderr=True)
     options = {"method": arguments.method, "device": device, "repeat": arguments.repeat}
-    with limited_threads(arguments.threads):
+    with open_json(arguments.json) as write, limited_threads(arguments.threads):
         with loading_kernels(device):
             for dtype in {scene.x0.dtype for scene in scenes}:
                 load_detector(arguments.method, dtype, device)
@@ -91,8 +94,7 @@ def _run(arguments: argparse.Namespace) -> int:
             )
         ]
         settings = {**options, "threads": count_threads()}
-    if arguments.json:
-        print(json.dumps(detector_benchmarks_to_dict(benchmarks, **settings)))
-    else:
-        print_detector_benchmarks(Console(), benchmarks, **settings)
+        if arguments.json != STDOUT:
+            print_detector_benchmarks(Console(), benchmarks, **settings)
+        write(with_record(detector_benchmarks_to_dict(benchmarks, **settings), arguments.command_line, [device]))
     return 0

@@ -8,6 +8,7 @@ import warp as wp
 from rich.console import Console
 
 from ..bench.detector import DetectorBenchmark
+from ..bench.provenance import shorten_path
 from .tables import count, make_table, say
 
 __all__ = ["detector_benchmarks_to_dict", "print_detector_benchmarks"]
@@ -120,7 +121,7 @@ def detector_benchmarks_to_dict(
         "repeat": repeat,
         "scenes": [
             {
-                "scene": found.scene.name,
+                "scene": shorten_path(found.scene.name),
                 "precision": found.precision,
                 "triangles": len(found.scene.faces),
                 "vertices": len(found.scene.x0),

@@ -100,6 +100,7 @@ def _run(arguments: argparse.Namespace) -> int:
         to_dict=example_runs_to_dict,
         show=print_example_runs,
         json_path=arguments.json,
+        command=arguments.command_line,
         device=device,
     )
     return 0

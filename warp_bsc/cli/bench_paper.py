@@ -12,7 +12,8 @@ from .._atomic_file import STDOUT, OutputFile
 from ..bench import ipc_toolkit
 from ..bench.figure import draw_paper_benchmarks
 from ..bench.paper import Effort, Place, SceneBenchmark, benchmark_scene, find_adversarial_worst, find_places
-from ..bench.scenes import PAPER_SCENES, BenchmarkScene, load_intervals, paper_scenes
+from ..bench.provenance import with_record
+from ..bench.scenes import PAPER_SCENES, BenchmarkScene, is_scene_name, load_intervals, paper_scenes
 from ..bench.timing import limited_threads
 from .bench_paper_tables import paper_benchmarks_to_dict, print_paper_benchmarks
 from .device import find_device
@@ -82,6 +83,7 @@ def _run(arguments: argparse.Namespace) -> int:
             benchmarks = _measure(scenes, places, effort)
             adversarial = find_adversarial_worst(places, effort)
         found = paper_benchmarks_to_dict(benchmarks, adversarial, quick=arguments.quick)
+        found = with_record(found, arguments.command_line, devices)
         if arguments.json != STDOUT:
             print_paper_benchmarks(Console(), benchmarks, adversarial)
         else:
@@ -104,7 +106,7 @@ def _check(arguments: argparse.Namespace) -> None:
             raise ValueError(f"--figure {arguments.figure}: its name must end in one of {', '.join(_FIGURES)}")
         if importlib.util.find_spec("matplotlib") is None:
             raise ValueError("--figure needs matplotlib: pip install 'warp-bsc[bench]'")
-    if arguments.json and (":" in arguments.json or Path(arguments.json).suffix.startswith(".usd")):
+    if arguments.json and is_scene_name(arguments.json):
         raise ValueError(f"--json {arguments.json}: this is a scene; name scenes before the options")
 
 

@@ -9,6 +9,7 @@ from rich.console import Console
 from ..bench import ipc_toolkit
 from ..bench.methods import METHODS, STAGES
 from ..bench.paper import Place, SceneBenchmark, Timing
+from ..bench.provenance import shorten_path
 from ..bench.worst_case import WorstQuery
 from .tables import count, make_table, say
 
@@ -204,7 +205,7 @@ def paper_benchmarks_to_dict(
 
 def _scene_to_dict(found: SceneBenchmark) -> dict[str, Any]:
     return {
-        "scene": found.name,
+        "scene": shorten_path(found.name),
         "name": _short(found.name),
         "triangles": found.triangles,
         "precision": found.precision,

@@ -1,12 +1,13 @@
 """The command ``warp-bsc bench queries``: measures how many elementary queries a second are decided."""
 
 import argparse
-import json
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 
+from .._atomic_file import STDOUT
+from ..bench.provenance import with_record
 from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
 from ..bench.query_files import benchmark_given_queries
 from ..bench.timing import count_threads, limited_threads
@@ -18,13 +19,13 @@ from .bench_queries_tables import (
     print_query_benchmarks,
     query_benchmarks_to_dict,
 )
+from .bench_runs import add_json_file, open_json
 from .device import find_device, loading_kernels
 from .exit_status import explain_statuses
 from .options import (
     Commands,
     add_command,
     add_device,
-    add_json,
     add_repeat,
     add_threads,
     positive,
@@ -48,7 +49,7 @@ examples:
   warp-bsc bench queries
   warp-bsc bench queries --device cpu --threads 1 --count 1000000
   warp-bsc bench queries unit-tests 227vf.csv --device cpu --threads 1
-  warp-bsc bench queries --json > rates.json
+  warp-bsc bench queries --json rates.json
 
 {explain_statuses()}"""
 
@@ -68,7 +69,7 @@ def add_to(commands: Commands, summary: str) -> None:
     add_repeat(command, default=20)
     add_threads(command)
     add_device(command)
-    add_json(command)
+    add_json_file(command)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -80,16 +81,15 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.paths:
         return _measure_files(arguments, device)
     options = {"device": device, "repeat": arguments.repeat}
-    with limited_threads(arguments.threads):
+    with open_json(arguments.json) as write, limited_threads(arguments.threads):
         with loading_kernels(device):
             for kind in PairKind:
                 benchmark_queries(kind, count=1, device=device, repeat=1)
         benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in PairKind]
         settings = {"copy_rate": benchmark_copy(**options), "threads": count_threads(), **options}
-    if arguments.json:
-        print(json.dumps(query_benchmarks_to_dict(benchmarks, **settings)))
-    else:
-        print_query_benchmarks(Console(), benchmarks, **settings)
+        if arguments.json != STDOUT:
+            print_query_benchmarks(Console(), benchmarks, **settings)
+        write(with_record(query_benchmarks_to_dict(benchmarks, **settings), arguments.command_line, [device]))
     return 0
 
 
@@ -101,7 +101,7 @@ def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> int:
             queries = read_query_file(file)
             points.setdefault((path, queries.kind), []).append(queries.points)
     options = {"device": device, "repeat": arguments.repeat}
-    with limited_threads(arguments.threads), cores(count_threads()):
+    with open_json(arguments.json) as write, limited_threads(arguments.threads), cores(count_threads()):
         with loading_kernels(device):
             for kind in {kind for _, kind in points}:
                 benchmark_given_queries("", _KINDS[kind], np.zeros((1, 8, 3)), device=device, repeat=1)
@@ -110,8 +110,7 @@ def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> int:
             for (path, kind), parts in points.items()
         ]
         settings = {"threads": count_threads(), **options}
-    if arguments.json:
-        print(json.dumps(given_queries_to_dict(measured, **settings)))
-    else:
-        print_given_queries(Console(), measured, **settings)
+        if arguments.json != STDOUT:
+            print_given_queries(Console(), measured, **settings)
+        write(with_record(given_queries_to_dict(measured, **settings), arguments.command_line, [device]))
     return 0

@@ -98,6 +98,7 @@ def _run(arguments: argparse.Namespace) -> int:
         to_dict=repair_runs_to_dict,
         show=print_repair_runs,
         json_path=arguments.json,
+        command=arguments.command_line,
         device=device,
     )
     return 0

@@ -154,6 +154,7 @@ def _run(arguments: argparse.Namespace) -> int:
         to_dict=response_runs_to_dict,
         show=print_response_runs,
         json_path=arguments.json,
+        command=arguments.command_line,
         device=device,
     )
     return 0

@@ -1,19 +1,20 @@
-"""What benchmarks of many runs share: --json FILE, results that an interrupt keeps, and the progress of the runs."""
+"""What benchmarks share: --json FILE, results that an interrupt keeps, and the progress of runs."""
 
 import argparse
 import contextlib
 import json
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, TypeVar
 
 import warp as wp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from .._atomic_file import STDOUT, OutputFile
+from ..bench.provenance import with_record
 from .interrupts import INTERRUPTS
 from .tables import Console, say
 
-__all__ = ["RunsProgress", "add_json_file", "report_runs"]
+__all__ = ["RunsProgress", "add_json_file", "open_json", "report_runs"]
 
 _Run = TypeVar("_Run")
 
@@ -29,12 +30,43 @@ def add_json_file(command: argparse.ArgumentParser) -> None:
     )
 
 
+@contextlib.contextmanager
+def open_json(path: str | None) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """Opens the file of --json, so that a path that cannot be written fails before anything is measured.
+
+    Args:
+        path: The value of --json.
+
+    Yields:
+        A function that writes a measurement, given as plain data: to the file, to standard output, or nowhere.
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    file = OutputFile(path) if path not in (None, STDOUT) else None
+
+    def write(found: dict[str, Any]) -> None:
+        text = json.dumps(found)
+        if path == STDOUT:
+            print(text)
+        if file:
+            file.write(text)
+            file.commit()
+
+    try:
+        yield write
+    finally:
+        if file:
+            file.discard()
+
+
 def report_runs(
     measured: Generator[_Run, None, None],
     *,
     to_dict: Callable[..., dict[str, Any]],
     show: Callable[..., None],
     json_path: str | None,
+    command: Sequence[str],
     device: wp.Device,
 ) -> None:
     """Measures all runs, prints them, and writes those that were complete if an interrupt ends it.
@@ -44,14 +76,14 @@ def report_runs(
         to_dict: Returns runs as plain data, given a list of them, the device, and whether some are missing (partial).
         show: Prints runs to a console, given the console and the same.
         json_path: The value of --json.
+        command: The program and its arguments, for the record of the measurement.
         device: The Warp device.
 
     Raises:
         OSError: If the file cannot be written.
         KeyboardInterrupt: If an interrupt ended the measurement, after its results are written.
     """
-    file = OutputFile(json_path) if json_path not in (None, STDOUT) else None
-    try:
+    with open_json(json_path) as write:
         runs: list[_Run] = []
         interrupt = None
         try:
@@ -62,19 +94,11 @@ def report_runs(
             interrupt = signal
         with INTERRUPTS.held():
             settings = {"device": device, "partial": interrupt is not None}
-            found = to_dict(runs, **settings)
-            if json_path == STDOUT:
-                print(json.dumps(found))
-            else:
+            if json_path != STDOUT:
                 show(Console(), runs, **settings)
-            if file:
-                file.write(json.dumps(found))
-                file.commit()
+            write(with_record(to_dict(runs, **settings), command, [device]))
         if interrupt:
             raise interrupt
-    finally:
-        if file:
-            file.discard()
 
 
 class RunsProgress:

@@ -35,6 +35,7 @@ examples:
   warp-bsc bench newton
   warp-bsc bench response
   warp-bsc bench repair
+  warp-bsc bench penetration
   warp-bsc bench detector --help
 
 {explain_statuses()}"""
@@ -51,6 +52,7 @@ _BENCHMARKS = {
     "newton": "measure Newton's own examples",
     "response": "measure stretch, rest, energy and time of contact",
     "repair": "measure what repair frees, and how",
+    "penetration": "judge simulators by exact detection: who penetrates, where",
 }
 """The commands and the benchmarks. Each is a module of this package, imported when it is named: some take seconds."""
 
@@ -75,6 +77,7 @@ def run(argv: list[str]) -> int:
     """Runs the command line as :func:`main` does, but raises every error."""
     argv = _with_joined_frames(_with_benchmark(argv))
     arguments = _build_parser(argv).parse_args(argv)
+    arguments.command_line = ["warp-bsc", *argv]
     return arguments.run(arguments)
 
 

@@ -1,0 +1,523 @@
+"""Writes the tables of measurements in the pages, from the files that the commands of the page of measurements wrote.
+
+    python examples/figures/tables.py              # --check: writes nothing, and fails if the page would change
+
+A table of ``docs/measurements.md``, ``docs/index.md`` or ``README.md`` stands between ``<!-- table: NAME -->`` and
+``<!-- end -->``, on the page of measurements with a line below it that says where its figures come from. Its files are
+in ``warp_bsc/bench/measurements``; where one is missing, the table stays as it is.
+"""
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from warp_bsc._atomic_file import OutputFile
+from warp_bsc.bench.penetration import SCENES, SIMULATORS
+from warp_bsc.bench.repair import FILE, KNOWN_MESH
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "docs" / "measurements.md", ROOT / "docs" / "index.md", ROOT / "README.md"]
+MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
+_COMPARED = {
+    "detector": {"ipctk": "IPC Toolkit"},
+    "penetration": {"mujoco": "MuJoCo", "pyuipc": "libuipc"},
+    "repair": {"ipctk": "IPC Toolkit"},
+}
+"""Libraries that a benchmark compares with, with their titles."""
+_BUSY = 0.5
+"""Load of a machine before a measurement from which on the line below its table says so."""
+_BLOCK = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+
+Found = dict[str, Any]
+"""A measurement: what a command wrote with --json."""
+Rows = list[tuple[str, ...]]
+"""The rows of a table, the header first."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page.
+
+    Attributes:
+        files: Names of its measurements, without ending.
+        make: Returns its rows, given the measurements in the same order.
+        needs_all: Whether the table needs all of its files, not only one.
+        has_sources: Whether the line below it says where its figures come from; else that of a later table does.
+    """
+
+    files: tuple[str, ...]
+    make: Callable[..., Rows]
+    needs_all: bool = True
+    has_sources: bool = True
+
+
+def milliseconds(value: float) -> str:
+    """Returns a time with three digits, in seconds from 0.1 s on."""
+    return f"{value / 1e3:.3g} s" if value >= 100.0 else f"{value:.3g} ms"
+
+
+def digits(value: float) -> str:
+    """Returns a number with two digits, more if it is large."""
+    return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:,.0f}"
+
+
+def _counts(values: Any) -> str:
+    """Returns the smallest and the largest of some numbers."""
+    return f"{min(values):,} to {max(values):,}"
+
+
+# Detection ---------------------------------------------------------------------------------------------------------
+
+
+_MESHES = {"227.ply": "cloth-funnel", "cloth_ball92.ply": "cloth-ball"}
+"""Names of the scenes of two frames by their first file; the ends of paths, as these differ from machine to machine."""
+
+
+def _scene_name(scene: Found) -> str:
+    first = Path(scene["scene"].split(",")[0]).name
+    return f"{_MESHES.get(first, first.partition(':')[0])}, {scene['triangles']:,} triangles"
+
+
+def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
+    """Detections on a GPU and on the CPU, beside the IPC Toolkit."""
+    rows = [("scene", "candidates", "hits", "GPU", "two cores", "one core", "IPC Toolkit, two cores", "one core")]
+    for scenes in zip(gpu["scenes"], two_cores["scenes"], one_core["scenes"], strict=False):
+        first = scenes[0]
+        times = [scene["milliseconds"]["detect"] for scene in scenes]
+        times += [
+            scene["ipc_toolkit"]["build_milliseconds"] + scene["ipc_toolkit"]["step_milliseconds"]
+            for scene in scenes[1:]
+        ]
+        counts = [f"{first[name]:,}" for name in ("candidates", "hits")]
+        rows.append((_scene_name(first), *counts, *map(milliseconds, times)))
+    return rows
+
+
+def detector_stages(gpu: Found) -> Rows:
+    """Where the time of a detection goes on a GPU."""
+    stages = list(gpu["scenes"][0]["milliseconds"]["stages"])
+    rows = [("scene", "whole graph", *stages)]
+    for scene in gpu["scenes"]:
+        took = scene["milliseconds"]
+        numbers = [took["cuda_graph"], *(took["stages"][stage] for stage in stages)]
+        rows.append((f"{_scene_name(scene)}, {scene['hits']:,} hits", *(f"{number:.2f}" for number in numbers)))
+    return rows
+
+
+def queries(gpu: Found, one_core: Found) -> Rows:
+    """Elementary queries a second."""
+    titles = {
+        "status": "one kernel that calls `ccd_edge_edge` or `ccd_vertex_face`",
+        "queued": "a second kernel decides the survivors",
+        "exact": "queries that are UNSURE in floating point, in exact arithmetic",
+    }
+    rows = [("queries", "edge-edge, a second", "vertex-face, a second")]
+    for mode, title in titles.items():
+        for found, place in ((gpu, ""), (one_core, ", on one core of the CPU")):
+            rates = {kind["kind"]: kind["modes"][mode]["queries_per_second"] for kind in found["kinds"]}
+            rows.append((title + place, *(_rate(rates[kind]) for kind in ("edge-edge", "vertex-face"))))
+    return rows
+
+
+def _rate(number: float) -> str:
+    return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
+
+
+def given_queries(found: Found) -> Rows:
+    """Times of a query of public files by method, on one core."""
+    methods = ("float", "conservative", "exact")
+    rows = [
+        ("queries", "collide", *(f"`{name}`" for name in methods), "cubic solver", "`float` / cubic", "`exact` / cubic")
+    ]
+    titles = {"queries": "hand-made", "cloth-funnel": "simulated (cloth-funnel)"}
+    for row in found["queries"]:
+        took = row["nanoseconds"]
+        rows.append(
+            (
+                f"{titles.get(row['name'], row['name'])}, {row['queries']:,} {row['kind']}",
+                f"{100.0 * row['hits'] / row['queries']:.0f}%",
+                *(digits(took[name]) for name in (*methods, "cubic")),
+                *(digits(took[name] / took["cubic"]) for name in ("float", "exact")),
+            )
+        )
+    return rows
+
+
+def paper(found: Found) -> Rows:
+    """Times of a query on one core in the scenes of the paper."""
+    methods = {"float": "`float`", "conservative": "`conservative`", "exact": "`exact`", "cubic": "cubic solver"}
+    rows = [("scene", *methods.values(), "cubic / `float`", "slowest query, `float` / cubic")]
+    for scene in found["scenes"]:
+        timing = scene["timings"][0]
+        took, worst = timing["nanoseconds"], timing["worst"]
+        slowest = (worst[method]["nanoseconds"][method] for method in ("float", "cubic"))
+        rows.append(
+            (
+                f"{scene['name']}, {scene['triangles']:,} triangles",
+                *(f"{took[method]:.1f}" for method in methods),
+                f"{took['cubic'] / took['float']:.1f}",
+                " / ".join(f"{time:.0f}" for time in slowest),
+            )
+        )
+    return rows
+
+
+def touching(found: Found) -> Rows:
+    """Sheets that touch exactly."""
+    titles = {
+        "intersections": "`find_intersections`",
+        "at a distance, at rest": "`exact` at their minimum distance, at rest",
+        "at a distance, moving": "the same, moving together",
+    }
+    rows = [("flat sheets in the same plane", "pairs", "wrong of those checked", "time")]
+    for row in found["rows"]:
+        title = f"{titles[row['question']]}: {row['sheets']} sheets of {row['faces']:,} faces"
+        rows.append((title, f"{row['pairs']:,}", str(row["wrong"]), f"{digits(row['seconds'])} s"))
+    return rows
+
+
+# Newton ------------------------------------------------------------------------------------------------------------
+
+
+def newton(*measurements: Found) -> Rows:
+    """Newton's examples, plain and with the stage."""
+    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
+    for found in measurements:
+        modes: dict[str, dict[str, Found]] = {}
+        for run in found["runs"]:
+            modes.setdefault(run["example"], {})[run["mode"]] = run
+        for name, run in modes.items():
+            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
+            frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
+            title = f"`{name}`" + (f", {frames} frames" if frames else "")
+            rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
+    return rows
+
+
+def _newton_cell(run: Found) -> str:
+    took = run["measured"]
+    if took is None:
+        return f"not run: {run['problem']}"
+    times = took["milliseconds"]
+    return f"{times['median']:.1f} ({times['percentile_95']:.1f}); {took['most_crossings']:,}"
+
+
+def _newton_steps(plain: Found | None, stage: Found | None) -> str:
+    """Returns what the stage reports, and how the example's own tests end."""
+    if stage is None or stage["stage"] is None:
+        return ""
+    steps = stage["stage"]
+    words = [f"{steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,} certified"]
+    words.append(f"{steps['truncated_steps'] or 'none'} truncated")
+    if steps["frozen_steps"]:
+        words.append(f"{steps['frozen_steps']} with frozen vertices")
+    tests = [_newton_tests(took) for took in (plain, stage) if took]
+    return f"{', '.join(words)}; tests {' / '.join(dict.fromkeys(tests))}"
+
+
+def _newton_tests(took: Found) -> str:
+    ends = [took["test_post_step"], took["test_final"]]
+    if all(end is None for end in ends):
+        return "none"
+    return "ok" if all(end in (None, "ok") for end in ends) else "fail"
+
+
+def substeps(found: Found) -> Rows:
+    """Steps in substeps: stretch, distance from the reference, stress and time."""
+    columns = list(dict.fromkeys((run["rate"], run["substeps"]) for run in found["runs"]))
+    rows = [("", *(f"1/{rate} s, {_quoted(count)}" for rate, count in columns))]
+    titles = {
+        ("drape", "largest stretch [%]"): "a cloth drapes over a sphere: stretch [%]",
+        ("drape", "distance [mm]"): "distance from the reference [mm]",
+        ("drape", "time [s]"): "time [s]",
+        ("sleeve", "largest stretch [%]"): "a cylinder moves into a sleeve a third narrower: stretch [%]",
+        ("blocks", "stress on the lower plate [Pa]"): "two plates press two blocks to half their height: stress [Pa]",
+    }
+    for (scene, quantity), title in titles.items():
+        measured = {(run["rate"], run["substeps"]): run["measured"] for run in found["runs"] if run["scene"] == scene}
+        rows.append((title, *(digits(measured[column][quantity]) for column in columns)))
+    return rows
+
+
+def _quoted(count: int | str | None) -> str:
+    return "none" if count is None else f'`"{count}"`' if isinstance(count, str) else str(count)
+
+
+def penetration(*measurements: Found) -> Rows:
+    """Who penetrates, where: crossings in the worst frame and in all, and pairs that meet on the way."""
+    return _by_scene(
+        measurements,
+        lambda took: f"{max(took['crossings']):,}; {sum(took['crossings']):,}; {took['collisions']:,}",
+    )
+
+
+def penetration_costs(*measurements: Found) -> Rows:
+    """What simulators keep of speed, tetrahedra and lengths, and their time."""
+
+    def cell(took: Found) -> str:
+        kept = "" if took["speed_kept"] is None else f"{digits(100.0 * took['speed_kept'])}% kept, "
+        inverted = f"{max(took['inverted'])} inverted, " if max(took["inverted"]) else ""
+        return f"{kept}{inverted}{digits(took['stretch'])}%, {digits(took['milliseconds']['median'])} ms"
+
+    return _by_scene(measurements, cell)
+
+
+def penetration_simulators(*measurements: Found) -> Rows:
+    """Settings and claims of simulators, and what they did not run."""
+    rows = [("simulator", "version", "settings", "says of penetration", "not run")]
+    for name, simulator in _joined(measurements, "simulators").items():
+        runs = [run for found in measurements for run in found["runs"] if run["simulator"] == name]
+        versions = {run["measured"]["version"] for run in runs if run["measured"]}
+        missing: dict[str, list[str]] = {}
+        for run in runs:
+            if run["problem"]:
+                missing.setdefault(run["problem"].partition(": ")[0], []).append(run["scene"])
+        scenes = [
+            f"{reason} ({', '.join(names) if len(names) < len(runs) else 'all'})" for reason, names in missing.items()
+        ]
+        claims = SIMULATORS[name].claims or "nothing"  # not measured
+        rows.append((simulator["title"], ", ".join(versions), simulator["settings"], claims, "; ".join(scenes)))
+    return rows
+
+
+def _joined(measurements: Sequence[Found], key: str) -> Found:
+    """Returns what measurements have at a key, together."""
+    return {name: value for found in measurements for name, value in found[key].items()}
+
+
+def _by_scene(measurements: Sequence[Found], cell: Callable[[Found], str]) -> Rows:
+    """Returns a row for each simulator, and a column for each scene."""
+    runs = {(run["scene"], run["simulator"]): run["measured"] for found in measurements for run in found["runs"]}
+    scenes = _joined(measurements, "scenes")
+    rows = [("simulator", *scenes)]
+    for name, simulator in _joined(measurements, "simulators").items():
+        measured = [runs.get((scene, name)) for scene in scenes]
+        rows.append((simulator["title"], *("not run" if took is None else cell(took) for took in measured)))
+    return rows
+
+
+# Repair and replay -------------------------------------------------------------------------------------------------
+
+
+def repair_named(found: Found, *kinds: str) -> Rows:
+    """Repairs of known meshes or files, each with every hint that was tried."""
+    rows = [("`bsc.repair`", "vertices", "crossings", "largest, mean move", "strain", "time")]
+    for run in found["runs"]:
+        if run["kind"] in kinds:
+            for attempt in run["attempts"]:
+                hint = "" if attempt["hint"] == "none" else f", `{attempt['hint']}=`"
+                rows.append((f"{Path(run['name']).stem}{hint}", f"{run['vertices']:,}", *_repair_cells(run, attempt)))
+    return rows
+
+
+def _repair_cells(run: Found, attempt: Found) -> tuple[str, ...]:
+    return (
+        f"{run['crossings']:,} to {attempt['crossings']:,}",
+        f"{digits(attempt['largest_move'])}, {digits(attempt['mean_move'])}",
+        f"{digits(100.0 * attempt['strain'])}%",
+        f"{attempt['seconds']:.2f} s",
+    )
+
+
+def repair_random(found: Found) -> Rows:
+    """Random damage by kind."""
+    costs = "largest move, median and most", "strain, median and most", "more than 10%", "median time"
+    rows = [("kind", "freed", "crossings", *costs)]
+    kinds: dict[str, list[Found]] = {}
+    for run in found["runs"]:
+        if run["kind"] not in (KNOWN_MESH, FILE):
+            kinds.setdefault(run["kind"], []).append(run)
+    for kind, runs in kinds.items():
+        first = [run["attempts"][0] for run in runs]
+        moves, strains = ([attempt[name] for attempt in first] for name in ("largest_move", "strain"))
+        rows.append(
+            (
+                kind,
+                f"{sum(attempt['crossings'] == 0 for attempt in first)} of {len(runs)}",
+                _counts([run["crossings"] for run in runs]),
+                f"{digits(median(moves))}, {digits(max(moves))}",
+                f"{digits(100.0 * median(strains))}, {digits(100.0 * max(strains))}%",
+                str(sum(strain > 0.1 for strain in strains)),
+                f"{median(attempt['seconds'] for attempt in first):.2f} s",
+            )
+        )
+    return rows
+
+
+def replay_sizes(found: Found) -> Rows:
+    """Large, long and crowded scenes."""
+    rows = [("scene", "collisions", "wall", "processor", "memory", "file")]
+    for row in found["rows"]:
+        sizes = f"{row['memory'] / 1e9:.2f} GB", f"{row['size'] / 1e6:.1f} MB"
+        times = f"{row['wall']:.1f} s", f"{row['cpu']:.1f} s"
+        rows.append((f"`{row['scene']}`: {row['description']}", f"{row['hits']:,}", *times, *sizes))
+    return rows
+
+
+# The page ----------------------------------------------------------------------------------------------------------
+
+
+_PENETRATION = tuple(f"penetration_{scene}" for scene in SCENES)
+
+
+def front(gpu: Found, two_cores: Found, bullet: Found, drape: Found) -> Rows:
+    """What the front page shows."""
+    balls = {}
+    for name, found in (("gpu", gpu), ("cpu", two_cores)):
+        balls[name] = next(scene for scene in found["scenes"] if _scene_name(scene).startswith("cloth-ball"))
+    ball, peer = balls["cpu"], balls["cpu"]["ipc_toolkit"]
+    took = balls["gpu"]["milliseconds"]["cuda_graph"]
+    size = (
+        f"{ball['triangles']:,} triangles, {ball['candidates'] / 1e6:.1f} million candidates, {ball['hits']:,} contacts"
+    )
+    rows = [
+        ("measured", ""),
+        (
+            f"{size}: all, with time and normal",
+            f"{took:.1f} ms on an {gpu['record']['gpus'][0].removeprefix('NVIDIA ')}",
+        ),
+        (
+            "the same on two cores",
+            f"{milliseconds(ball['milliseconds']['detect'])} (IPC Toolkit, the earliest time alone: "
+            f"{milliseconds(peer['build_milliseconds'] + peer['step_milliseconds'])})",
+        ),
+    ]
+    names = {"vbd": "VBD", "vbd-self-contact": "with its self-contact", "ccd-vbd": "with `SolverCCD`"}
+    for found, title, what in (
+        (bullet, "a patch of cloth is shot at a sheet: pairs that pass through", "collisions"),
+        (drape, "a cloth drapes over a ball: edges through faces, worst frame", "crossings"),
+    ):
+        runs = {run["simulator"]: run["measured"][what] for run in found["runs"] if run["measured"]}
+        counts = {name: value if isinstance(value, int) else max(value) for name, value in runs.items()}
+        rows.append((title, ", ".join(f"{names[name]} {counts[name]:,}" for name in names)))
+    return rows
+
+
+TABLES = {
+    "front": Table(
+        ("detector_gpu", "detector_two_cores", "penetration_bullet", "penetration_drape"), front, has_sources=False
+    ),
+    "given_queries": Table(("given_queries_one_core",), given_queries),
+    "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
+    "detector_stages": Table(("detector_gpu",), detector_stages),
+    "newton_coupled": Table(("newton_coupled_gpu",), newton),
+    "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
+    "paper": Table(("paper_cpu",), paper),
+    "penetration": Table(_PENETRATION, penetration, needs_all=False, has_sources=False),
+    "penetration_costs": Table(_PENETRATION, penetration_costs, needs_all=False, has_sources=False),
+    "penetration_simulators": Table(_PENETRATION, penetration_simulators, needs_all=False),
+    "queries": Table(("queries_gpu", "queries_one_core"), queries),
+    "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
+    "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),
+    "repair_random": Table(("repair_random_cpu",), repair_random),
+    "replay_sizes": Table(("replay_sizes",), replay_sizes),
+    "substeps": Table(("substeps_cpu",), substeps),
+    "touching": Table(("touching",), touching),
+}
+"""The tables of the page by name."""
+
+
+def load(name: str) -> Found | None:
+    """Returns a measurement, None if there is none.
+
+    Raises:
+        ValueError: If it was interrupted, or its record is missing.
+    """
+    path = MEASUREMENTS / f"{name}.json"
+    if not path.exists():
+        return None
+    found = json.loads(path.read_text())
+    if found.get("partial"):
+        raise ValueError(f"{path.name}: the measurement was interrupted")
+    if "record" not in found:
+        raise ValueError(f"{path.name}: has no record of where it comes from")
+    return found
+
+
+def describe(found: Found) -> str:
+    """Returns where a measurement comes from, in a line."""
+    record = found["record"]
+    commit = f"commit {record['commit'][:7]}" if record["commit"] else "not from a checkout"
+    machine = ", ".join(record["gpus"]) or f"{record['cpu']}, {record['cores']} cores"
+    if (record.get("load") or 0.0) >= _BUSY:
+        machine += f" shared with other programs (load {record['load']})"
+    names = {"warp-lang": "Warp", "newton": "Newton"} | _COMPARED.get(found["benchmark"], {})
+    used = ", ".join(f"{title} {record['versions'].get(name, 'none')}" for name, title in names.items())
+    changed = " with changes" if record["changed"] else ""
+    return f"*`{record['command']}`: {record['date'][:10]}, {commit}{changed}, {machine}, {used}*"
+
+
+def make(name: str) -> str | None:
+    """Returns a table with the lines below it, None if a measurement of it is missing.
+
+    Raises:
+        ValueError: If there is no such table, or a measurement cannot be used.
+    """
+    if name not in TABLES:
+        raise ValueError(f"no table is named {name}, only {', '.join(TABLES)}")
+    table = TABLES[name]
+    loaded = [load(file) for file in table.files]
+    measurements = [found for found in loaded if found is not None]
+    if len(measurements) < (len(loaded) if table.needs_all else 1):
+        return None
+    head, *rows = table.make(*measurements)
+    lines = [head, ("---",) * len(head), *rows]
+    text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    if not table.has_sources:
+        return text
+    return text + "\n" + "  \n".join(dict.fromkeys(map(describe, measurements))) + "\n"
+
+
+def update(page: str) -> tuple[str, list[str]]:
+    """Returns a page with its tables made anew, and the names of those that stay as they are."""
+    kept = []
+
+    def replace(block: re.Match) -> str:
+        made = make(block[2])
+        if made is None:
+            kept.append(block[2])
+            return block[0]
+        return f"{block[1]}\n{made}\n{block[4]}"  # with blank lines, without which some programs see no table
+
+    return _BLOCK.sub(replace, page), kept
+
+
+def main() -> int:
+    """Writes the pages, or checks them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a page would change")
+    arguments = parser.parse_args()
+    differ = False
+    for page in PAGES:
+        before = page.read_text()
+        after, kept = update(before)
+        for name in kept:
+            missing = [file for file in TABLES[name].files if not (MEASUREMENTS / f"{file}.json").exists()]
+            print(f"{name} stays as it is: there is no {', '.join(f'{file}.json' for file in missing)}")
+        if after == before:
+            continue
+        differ = True
+        if arguments.check:
+            print(f"{page.relative_to(ROOT)} is not what its measurements make: run python examples/figures/tables.py")
+        else:
+            _write(page, after)
+    return int(arguments.check and differ)
+
+
+def _write(page: Path, text: str) -> None:
+    file = OutputFile(page)
+    try:
+        file.write(text)
+        file.commit()
+    finally:
+        file.discard()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

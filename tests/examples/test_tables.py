@@ -1,0 +1,237 @@
+"""The tables of the page of measurements: they are what the program makes of the files beside the page."""
+
+import copy
+import dataclasses
+import importlib.util
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def load(name):
+    """A program of examples/figures, as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / "figures" / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # its dataclasses look for it there
+    spec.loader.exec_module(module)
+    return module
+
+
+tables = load("tables")
+FILES = sorted(tables.MEASUREMENTS.glob("*.json"))
+RECORD = {
+    "command": "warp-bsc bench x",
+    "commit": "0123456789" * 4,
+    "changed": False,
+    "date": "2026-11-26T05:00:00+00:00",
+    "cpu": "a CPU",
+    "cores": 2,
+    "gpus": [],
+    "versions": {"warp-lang": "1.2", "newton": "3.4"},
+}
+
+
+def measured(name):
+    return json.loads((tables.MEASUREMENTS / f"{name}.json").read_text())
+
+
+@pytest.mark.parametrize("path", tables.PAGES, ids=lambda path: path.name)
+def test_the_page_is_what_its_measurements_make(path):
+    page = path.read_text()
+    made, kept = tables.update(page)
+    assert made == page, "run python examples/figures/tables.py"
+    missing = {file for name in kept for file in tables.TABLES[name].files} - {path.stem for path in FILES}
+    assert all(file.endswith("_gpu") for file in missing), missing  # what has a CPU alone can be measured by anybody
+
+
+def test_each_table_stands_on_the_page_once():
+    pages = [path.read_text() for path in tables.PAGES]
+    marked = [re.findall(r"<!-- table: (\S+) -->", page) for page in pages]
+    assert sorted([*marked[0], "front"]) == sorted(tables.TABLES) and marked[1:] == [["front"]] * 2
+    assert [page.count("<!-- end -->") for page in pages] == [len(names) for names in marked]
+
+
+def test_each_measurement_belongs_to_a_table():
+    used = {file for table in tables.TABLES.values() for file in table.files}
+    assert {path.stem for path in FILES} <= used
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_each_measurement_can_be_traced(path):
+    text = path.read_text()
+    record = json.loads(text)["record"]
+    assert re.fullmatch("[0-9a-f]{40}", record["commit"])
+    assert record["changed"] is False
+    assert record.keys() >= RECORD.keys() | {"python"}
+    assert not re.search(r'["\s,](/|~|[A-Z]:\\)\w', text)  # folders of one machine
+    assert len(text) < 1_000_000
+
+
+def with_gpu(found):
+    """A measurement as if it were of a GPU."""
+    found = copy.deepcopy(found)
+    found["record"]["gpus"] = ["NVIDIA X"]
+    for scene in found["scenes"]:
+        scene["milliseconds"]["cuda_graph"] = 1.234
+    return found
+
+
+def test_detections():
+    two, one = measured("detector_two_cores"), measured("detector_one_core")
+    head, *rows = tables.detector(with_gpu(two), two, one)
+    assert [row[0].split(",")[0] for row in rows] == ["cloth-funnel", "cloth-ball"]
+    assert [row[2] for row in rows] == ["134", "113,854"]
+    assert all(len(row) == len(head) for row in rows)
+    times = two["scenes"][1]["ipc_toolkit"]
+    total = times["build_milliseconds"] + times["step_milliseconds"]
+    assert rows[1][6] == tables.milliseconds(total) == f"{total / 1e3:.3g} s"
+    head, *rows = tables.detector_stages(with_gpu(two))
+    assert head[:3] == ("scene", "whole graph", "broad phase")
+    assert rows[0][1] == "1.23"
+
+
+def test_queries():
+    found = measured("queries_one_core")
+    faster = copy.deepcopy(found)
+    for kind in faster["kinds"]:
+        kind["modes"]["queued"]["queries_per_second"] = 7.71e9
+    _, *rows = tables.queries(faster, found)
+    assert rows[2][1:] == ("7.7 billion", "7.7 billion")
+    assert rows[3][0].endswith("on one core of the CPU")
+    rate = {kind["kind"]: kind["modes"]["queued"]["queries_per_second"] for kind in found["kinds"]}["edge-edge"]
+    assert rows[3][1] == f"{rate / 1e6:.3g} million"
+
+
+def example(mode, **others):
+    took = {
+        "frames": 20,
+        "milliseconds": {"median": 12.34, "percentile_95": 20.0},
+        "most_crossings": 1234,
+        "test_post_step": None,
+        "test_final": "ok",
+        "stage": None,
+    }
+    if mode == "stage":
+        took["stage"] = {"steps": 200, "uncertified_steps": 3, "truncated_steps": 0, "frozen_steps": 1}
+    return {"example": "cloth_twist", "mode": mode, "problem": None, "measured": took | others}
+
+
+def test_examples_of_newton():
+    stage = example("stage", test_final="no")
+    gone = {"example": "gone", "problem": "a reason", "measured": None}
+    lost = [gone | {"mode": mode} for mode in ("plain", "stage")]
+    _, *rows = tables.newton({"runs": [example("plain"), stage]}, {"runs": lost})
+    steps = "197 of 200 certified, none truncated, 1 with frozen vertices; tests ok / fail"
+    assert rows == [
+        ("`cloth_twist`, 20 frames", "12.3 (20.0); 1,234", "12.3 (20.0); 1,234", steps),
+        ("`gone`", "not run: a reason", "not run: a reason", ""),
+    ]
+
+
+def penetration_run(scene, simulator, problem=None, **others):
+    took = {
+        "version": "1.2",
+        "crossings": [0, 1234, 6],
+        "collisions": 5,
+        "inverted": [0, 0],
+        "speed_kept": None,
+        "stretch": 3.456,
+        "milliseconds": {"median": 12.3},
+    }
+    measured = None if problem else took | others
+    return {"scene": scene, "simulator": simulator, "problem": problem, "measured": measured}
+
+
+PENETRATION = {
+    "scenes": {"bullet": "a patch flies", "soft": "a block falls"},
+    "simulators": {
+        "vbd": {"title": "A", "settings": "its own"},
+        "libuipc": {"title": "B", "settings": "defaults"},
+    },
+    "runs": [
+        penetration_run("bullet", "vbd", speed_kept=0.305),
+        penetration_run("bullet", "libuipc", problem="no GPU: why"),
+        penetration_run("soft", "vbd", inverted=[0, 7], crossings=[0, 0, 0], collisions=0),
+        penetration_run("soft", "libuipc", problem="no GPU: why"),
+    ],
+}
+
+
+def test_penetration():
+    assert tables.penetration(PENETRATION) == [
+        ("simulator", "bullet", "soft"),
+        ("A", "1,234; 1,240; 5", "0; 0; 0"),
+        ("B", "not run", "not run"),
+    ]
+    assert tables.penetration_costs(PENETRATION)[1:] == [
+        ("A", "30% kept, 3.5%, 12 ms", "7 inverted, 3.5%, 12 ms"),
+        ("B", "not run", "not run"),
+    ]
+    assert tables.penetration_simulators(PENETRATION)[1:] == [
+        ("A", "1.2", "its own", "nothing", ""),
+        ("B", "", "defaults", tables.SIMULATORS["libuipc"].claims, "no GPU (all)"),
+    ]
+
+
+def test_the_picture_of_penetration(tmp_path, monkeypatch):
+    figure = load("penetration")
+    numbers = figure.count(PENETRATION, lambda took: max(took["crossings"]))
+    assert numbers[0].tolist() == [1234.0, 0.0]
+    assert np.isnan(numbers[1]).all()
+    path, picture = tmp_path / "found.json", tmp_path / "found.png"
+    path.write_text(json.dumps(PENETRATION))
+    monkeypatch.setattr(sys, "argv", ["penetration.py", str(path), str(picture)])
+    figure.main()
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_table_has_its_sources_below(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "MEASUREMENTS", tmp_path)
+    monkeypatch.setitem(tables.TABLES, "x", tables.Table(("x_gpu",), lambda found: [("a", "b"), ("1", found["b"])]))
+    page = "before\n<!-- table: x -->\nold\n<!-- end -->\nafter\n"
+    assert tables.update(page) == (page, ["x"])
+    path = tmp_path / "x_gpu.json"
+
+    def write(**others):
+        path.write_text(json.dumps({"benchmark": "x", "b": "2", "record": RECORD} | others))
+
+    write()
+    source = "*`warp-bsc bench x`: 2026-11-26, commit 0123456, a CPU, 2 cores, Warp 1.2, Newton 3.4*"
+    table = f"| a | b |\n| --- | --- |\n| 1 | 2 |\n\n{source}\n"
+    assert tables.update(page) == (f"before\n<!-- table: x -->\n\n{table}\n<!-- end -->\nafter\n", [])
+    write(benchmark="detector", record=RECORD | {"gpus": ["NVIDIA X"], "changed": True, "load": 0.4})
+    assert "0123456 with changes, NVIDIA X, Warp 1.2, Newton 3.4, IPC Toolkit none*" in tables.update(page)[0]
+    write(record=RECORD | {"load": 2.5})
+    assert "a CPU, 2 cores shared with other programs (load 2.5), Warp" in tables.update(page)[0]
+    monkeypatch.setitem(tables.TABLES, "x", dataclasses.replace(tables.TABLES["x"], has_sources=False))
+    assert source not in tables.update(page)[0] and "| 1 | 2 |" in tables.update(page)[0]
+    write(partial=True)
+    with pytest.raises(ValueError, match=r"x_gpu\.json: the measurement was interrupted"):
+        tables.update(page)
+    path.write_text('{"benchmark": "x"}')
+    with pytest.raises(ValueError, match=r"x_gpu\.json: has no record"):
+        tables.update(page)
+    with pytest.raises(ValueError, match="no table is named y, only detector"):
+        tables.update(page.replace("x", "y"))
+
+
+def test_the_program_checks_and_writes(tmp_path, monkeypatch, capsys):
+    page = tmp_path / "README.md"
+    page.write_text(tables.PAGES[0].read_text().replace("| 59,912 |", "| 59,913 |"))
+    for name, value in {"PAGES": [page], "ROOT": tmp_path}.items():
+        monkeypatch.setattr(tables, name, value)
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--check"])
+    edited = page.read_text()
+    assert tables.main() == 1
+    assert "README.md is not what its measurements make" in capsys.readouterr().out
+    assert page.read_text() == edited
+    monkeypatch.setattr(sys, "argv", ["tables.py"])
+    assert tables.main() == 0
+    assert "| 59,912 |" in page.read_text()
+    monkeypatch.setattr(sys, "argv", ["tables.py", "--check"])
+    assert tables.main() == 0
