@@ -1,17 +1,21 @@
 """What the programs of films share: a studio that Blender renders on the CPU, text on pictures, and files that move.
 
-Needs Blender as a Python module (``pip install bpy``, Python 3.11), and Pillow, which comes with matplotlib. A program
-imports without them.
+Needs Blender as a Python module (``pip install bpy``, Python 3.11), only to render, and Pillow, which comes with
+matplotlib.
 """
 
 import argparse
 import io
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 from rich.progress import track
+
+from warp_bsc._atomic_file import OutputFile
 
 BLUE, ORANGE, RED, GREY = "#5b8fc7", "#e8842a", "#d4101c", "#b9b4ae"
 """Colors of cloths, of what crosses, and of rigid bodies; blue and orange differ to all kinds of sight."""
@@ -28,13 +32,15 @@ class Film(NamedTuple):
         frames: Number of frames.
         draw: Returns the picture of a frame, given its number.
         duration: Time that a frame is shown [ms].
-        pause: Time that the last frame is shown before the film begins again [ms].
+        pause: Time that the last frame of each part is shown [ms].
+        part: Number of frames of a part; by default the film is one part.
     """
 
     frames: int
     draw: Callable
     duration: int
     pause: int = 800
+    part: int | None = None
 
 
 def main(description, make, **inputs):
@@ -56,20 +62,29 @@ def main(description, make, **inputs):
         parser.error(f"picture: {path} is not .webp or .png")
     if arguments.frames and path.suffix != ".png":
         parser.error("--frames chooses the frames of a .png")
-    film = make(*[getattr(arguments, name) for name in inputs])
-    chosen = range(film.frames)
-    if path.suffix == ".png":
-        chosen = arguments.frames or np.linspace(0, film.frames - 1, 5).round().astype(int).tolist()
-    if not all(0 <= frame < film.frames for frame in chosen):
-        parser.error(f"--frames: the film has frames 0 to {film.frames - 1}")
-    pictures = [film.draw(frame) for frame in track(chosen, "Rendering")]
-    path.write_bytes(_strip(pictures) if path.suffix == ".png" else _animation(pictures, film))
+    try:
+        file = OutputFile(path)
+    except OSError as error:
+        parser.error(f"picture: {error}")
+    try:
+        film = make(*[getattr(arguments, name) for name in inputs])
+        chosen = range(film.frames)
+        if path.suffix == ".png":
+            chosen = arguments.frames or np.linspace(0, film.frames - 1, 5).round().astype(int).tolist()
+        if not all(0 <= frame < film.frames for frame in chosen):
+            parser.error(f"--frames: the film has frames 0 to {film.frames - 1}")
+        pictures = [film.draw(frame) for frame in track(chosen, "Rendering")]
+        file.write(_strip(pictures) if path.suffix == ".png" else _animation(pictures, film))
+        file.commit()
+    finally:
+        file.discard()
 
 
 def _animation(pictures, film):
     """Returns an animated WebP of pictures that goes on for ever, as bytes."""
     buffer = io.BytesIO()
-    durations = [film.duration] * (len(pictures) - 1) + [film.pause]
+    part = film.part or film.frames
+    durations = [film.duration if (i + 1) % part else film.pause for i in range(film.frames)]
     options = {"save_all": True, "append_images": pictures[1:], "duration": durations, "loop": 0}
     pictures[0].save(buffer, "WEBP", quality=82, method=4, **options)
     return buffer.getvalue()
@@ -77,17 +92,15 @@ def _animation(pictures, film):
 
 def _strip(pictures):
     """Returns a PNG of pictures below each other, or beside each other if they are higher than wide, as bytes."""
-    import PIL.Image  # noqa: PLC0415
-
     width, height = pictures[0].size
     across = height > width
     step = (width, 0) if across else (0, height)
     size = (width * len(pictures), height) if across else (width, height * len(pictures))
-    strip = PIL.Image.new("RGB", size)
+    strip = Image.new("RGB", size)
     for i, picture in enumerate(pictures):
         strip.paste(picture, (i * step[0], i * step[1]))
     buffer = io.BytesIO()
-    strip.quantize(256).save(buffer, "PNG", optimize=True)
+    strip.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 
@@ -100,8 +113,6 @@ def beside(pictures, titles, note="", band=0):
         note: Words in the corner at the right and the bottom.
         band: Height of a band above the pictures for the titles, which otherwise stand in the pictures [pixels].
     """
-    from PIL import Image, ImageDraw, ImageFont  # noqa: PLC0415
-
     gap = 4
     width, height = pictures[0].size
     whole = Image.new("RGB", (len(pictures) * (width + gap) - gap, height + band), "white")
@@ -125,8 +136,6 @@ def dots(picture, pixels, color, radius):
         color: Color of the dots.
         radius: Radius of the dots [pixels].
     """
-    from PIL import Image, ImageDraw  # noqa: PLC0415
-
     finer = 4
     mask = Image.new("L", [finer * side for side in picture.size])
     draw = ImageDraw.Draw(mask)
@@ -196,11 +205,11 @@ class Studio:
 
     def _place(self, name, data, position, target):
         """Adds something that looks at a target, and returns it."""
-        thing = self._bpy.data.objects.new(name, data)
-        self._scene.collection.objects.link(thing)
-        thing.location = position
-        thing.rotation_euler = self._vector(target - position).to_track_quat("-Z", "Y").to_euler()
-        return thing
+        placed = self._bpy.data.objects.new(name, data)
+        self._scene.collection.objects.link(placed)
+        placed.location = position
+        placed.rotation_euler = self._vector(target - position).to_track_quat("-Z", "Y").to_euler()
+        return placed
 
     def _add_sky(self):
         """Adds a sky that lights evenly."""
@@ -218,14 +227,13 @@ class Studio:
         ground.is_shadow_catcher = True
         self.move(ground, middle + np.array([[-w, -w, 0.0], [w, -w, 0.0], [w, w, 0.0], [-w, w, 0.0]]))
 
-    def add(self, name, faces, colors, roughness=0.75, sheen=0.25, smooth=True):
+    def add(self, name, faces, colors, sheen=0.25, smooth=True):
         """Adds a mesh, which :meth:`move` must place, and returns it.
 
         Args:
             name: Name of the mesh.
             faces: Vertex indices, shape [n, corners of a face].
             colors: A color "#rrggbb", or one of each face in linear light, shape [n, 3].
-            roughness: 0 for a mirror, 1 for chalk.
             sheen: Share of light that fibres scatter at grazing angles.
             smooth: Whether normals are interpolated.
         """
@@ -233,40 +241,30 @@ class Studio:
         mesh = bpy.data.meshes.new(name)
         mesh.from_pydata(np.zeros((faces.max() + 1, 3)).tolist(), [], faces.tolist())
         mesh.polygons.foreach_set("use_smooth", np.full(len(faces), smooth))
-        mesh.attributes.new("tint", "FLOAT_COLOR", "FACE")
+        rgba = np.ones((len(faces), 4), dtype=np.float32)
+        rgba[:, :3] = linear(colors) if isinstance(colors, str) else colors
+        mesh.attributes.new("tint", "FLOAT_COLOR", "FACE").data.foreach_set("color", rgba.ravel())
         material = bpy.data.materials.new(name)
         material.use_nodes = True
         nodes = material.node_tree.nodes
         surface = nodes["Principled BSDF"]
-        surface.inputs["Roughness"].default_value = roughness
+        surface.inputs["Roughness"].default_value = 0.75
         surface.inputs["Sheen Weight"].default_value = sheen
         attribute = nodes.new("ShaderNodeAttribute")
         attribute.attribute_name = "tint"
         material.node_tree.links.new(attribute.outputs["Color"], surface.inputs["Base Color"])
         mesh.materials.append(material)
-        thing = bpy.data.objects.new(name, mesh)
-        self._scene.collection.objects.link(thing)
-        self.paint(thing, linear(colors) if isinstance(colors, str) else colors)
-        return thing
+        placed = bpy.data.objects.new(name, mesh)
+        self._scene.collection.objects.link(placed)
+        return placed
 
-    def paint(self, thing, colors):
-        """Sets the color of a mesh, or of each of its faces, in linear light, shape [3] or [n, 3]."""
-        rgba = np.ones((len(thing.data.polygons), 4), dtype=np.float32)
-        rgba[:, :3] = colors
-        thing.data.attributes["tint"].data.foreach_set("color", rgba.ravel())
-        thing.data.update()
-
-    def move(self, thing, positions):
-        """Sets the positions of the vertices of a mesh [m], shape [n, 3]."""
-        thing.data.vertices.foreach_set("co", np.asarray(positions, dtype=np.float32).ravel())
-        thing.data.update()
+    def move(self, mesh, positions):
+        """Sets the positions of the vertices of a mesh that :meth:`add` returned [m], shape [n, 3]."""
+        mesh.data.vertices.foreach_set("co", np.asarray(positions, dtype=np.float32).ravel())
+        mesh.data.update()
 
     def shoot(self):
         """Returns a picture, as an image of Pillow."""
-        import tempfile  # noqa: PLC0415
-
-        from PIL import Image  # noqa: PLC0415
-
         with tempfile.TemporaryDirectory() as folder:
             self._scene.render.filepath = str(Path(folder) / "frame.png")
             self._bpy.ops.render.render(write_still=True)

@@ -11,6 +11,8 @@ from pathlib import Path
 import newton.viewer
 import numpy as np
 
+import warp_bsc as bsc
+
 sys.path += [str(Path(__file__).parents[1]), str(Path(__file__).parent)]  # for the example and the studio
 import film
 from example_cloth_bullet import PATCH_CELLS, SHEET_CELLS, Example
@@ -94,14 +96,24 @@ def make():
     bars, bar_faces = frame_bars()
     studio.move(studio.add("frame", bar_faces, "#4a4f57", sheen=0.0, smooth=False), bars)
 
+    mesh = bsc.CollisionMesh(faces, len(runs[0][1][0]), device="cpu")
+    detector = bsc.CollisionDetector(mesh)
+
+    def shoot(x):
+        """Returns the picture of positions, with red dots where edges cross faces."""
+        studio.move(sheet, x[:count])
+        studio.move(patch, x[count:])
+        picture = studio.shoot()
+        crossing = mesh.edges[detector.find_intersections(x)[:, 0]]
+        film.dots(picture, studio.pixels(x[crossing].mean(axis=1)), film.RED, 3.0)
+        return picture
+
     def draw(frame):
         step, part = divmod(frame, _BETWEEN)
-        pictures = []
-        for _, states in runs:
-            x = states[step] + part / _BETWEEN * (states[min(step + 1, _STEPS)] - states[step])
-            studio.move(sheet, x[:count])
-            studio.move(patch, x[count:])
-            pictures.append(studio.shoot())
+        without, behind = (x[step] + part / _BETWEEN * (x[min(step + 1, _STEPS)] - x[step]) for _, x in runs)
+        pictures = [shoot(without)]
+        # the same until the patch meets the sheet
+        pictures.append(pictures[0].copy() if np.array_equal(without, behind) else shoot(behind))
         milliseconds = 1e3 * frame / _BETWEEN * example.sim_dt
         return film.beside(pictures, ("VBD", "VBD + SolverCCD"), f"{milliseconds:.0f} ms")
 
