@@ -17,7 +17,7 @@ sys.path += [str(Path(__file__).parents[1]), str(Path(__file__).parent)]  # for 
 import film
 from example_diffsim_throw import MARK, STARTS, Example
 
-_SIZE = 640, 480
+_SIZE = 640, 440
 _ITERATIONS = 1, 5, 12, 40  # which are shown
 _EVERY = 10  # steps from one frame to the next
 _COLORS = film.BLUE, film.ORANGE, "#3a9a5b"
@@ -38,7 +38,7 @@ def record():
 def make():
     """Returns the film."""
     faces, count, shown = record()
-    studio = film.Studio(_SIZE, (-0.9, -4.2, 1.5), (-0.12, 0.0, 0.13), lens=66.0, light=(-0.5, -0.6, 0.9))
+    studio = film.Studio(_SIZE, (-0.9, -4.2, 1.5), (-0.12, 0.0, 0.2), lens=62.0, light=(-0.5, -0.6, 0.9))
     sheet = studio.add("sheet", faces[(faces >= count).all(axis=1)] - count, "#8a97a6", smooth=False)
     studio.move(sheet, shown[0, 0, 0, count:])
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.035)
@@ -54,7 +54,7 @@ def make():
         picture = studio.shoot()
         for world, color in enumerate(_COLORS):
             film.dots(picture, studio.pixels(paths[iteration, : moment + 1, world]), color, 2.5)
-        return film.beside([picture], [f"iteration {_ITERATIONS[iteration]}"])
+        return film.beside([picture], [f"iteration {_ITERATIONS[iteration]}"], band=52)
 
     return film.Film(len(_ITERATIONS) * frames, draw, duration=55, part=frames)
 
