@@ -86,7 +86,7 @@ def _animation(pictures, film):
     part = film.part or film.frames
     durations = [film.duration if (i + 1) % part else film.pause for i in range(film.frames)]
     options = {"save_all": True, "append_images": pictures[1:], "duration": durations, "loop": 0}
-    pictures[0].save(buffer, "WEBP", quality=82, method=4, **options)
+    pictures[0].save(buffer, "WEBP", quality=90, method=4, **options)
     return buffer.getvalue()
 
 
