@@ -42,7 +42,7 @@ PRINTED = re.findall(
     r"^python examples/(example_\w+)\.py", (FOLDER.parent / "docs" / "newton.md").read_text(), re.MULTILINE
 )
 PRINTED.append("paper/example_twisting")
-FIGURES = sorted((FOLDER / "figures").glob("*.py"))
+FIGURES = sorted(set((FOLDER / "figures").glob("*.py")) - {FOLDER / "figures" / "film.py"})
 FRAMES = 2
 RUN_LONGER = ["example_diffsim_push", "example_diffsim_throw", "example_gripper", "example_propeller"]
 RUN_LONGER += [f"example_diffsim_{name}" for name in BEHIND_VBD]
