@@ -30,7 +30,7 @@ _COMPARED = {
     "repair": {"ipctk": "IPC Toolkit"},
 }
 """Libraries that a benchmark compares with, with their titles."""
-_BUSY = 0.5
+_BUSY = 2.0
 """Load of a machine before a measurement from which on the line below its table says so."""
 _BLOCK = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
@@ -80,8 +80,10 @@ _MESHES = {"227.ply": "cloth-funnel", "cloth_ball92.ply": "cloth-ball"}
 
 
 def _scene_name(scene: Found) -> str:
-    first = Path(scene["scene"].split(",")[0]).name
-    return f"{_MESHES.get(first, first.partition(':')[0])}, {scene['triangles']:,} triangles"
+    name, _, worlds = scene["scene"].partition(" in ")
+    first = Path(name.split(",")[0]).name
+    title = _MESHES.get(first, first.partition(":")[0]) + (f" in {worlds}" if worlds else "")
+    return f"{title}, {scene['triangles']:,} triangles"
 
 
 def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
@@ -99,11 +101,11 @@ def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
     return rows
 
 
-def detector_stages(gpu: Found) -> Rows:
+def detector_stages(gpu: Found, worlds: Found) -> Rows:
     """Where the time of a detection goes on a GPU."""
-    stages = list(gpu["scenes"][0]["milliseconds"]["stages"])
+    stages = [stage for stage in gpu["scenes"][0]["milliseconds"]["stages"] if stage not in ("sort", "exact")]
     rows = [("scene", "whole graph", *stages)]
-    for scene in gpu["scenes"]:
+    for scene in (*gpu["scenes"], *worlds["scenes"]):
         took = scene["milliseconds"]
         numbers = [took["cuda_graph"], *(took["stages"][stage] for stage in stages)]
         rows.append((f"{_scene_name(scene)}, {scene['hits']:,} hits", *(f"{number:.2f}" for number in numbers)))
@@ -405,7 +407,7 @@ TABLES = {
     ),
     "given_queries": Table(("given_queries_one_core",), given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
-    "detector_stages": Table(("detector_gpu",), detector_stages),
+    "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), detector_stages),
     "newton_coupled": Table(("newton_coupled_gpu",), newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),

@@ -28,7 +28,11 @@ function onView() {
   const parts = new URLSearchParams(addressOf(state.interval, state.prims).slice(1));
   if (viewer?.cameraPath()) parts.set("camera", viewer.cameraPath());
   addMeshStates(parts);
-  history.replaceState(null, "", `#${parts}`);
+  try {
+    history.replaceState(null, "", `#${parts}`);
+  } catch {
+    // a page that stands in another one, as in a notebook, may have no address
+  }
 }
 
 function readAddress() {

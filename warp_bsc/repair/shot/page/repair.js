@@ -95,7 +95,11 @@ function makeViewer(markTime) {
     if (index < 0 || index >= frames.length || index === state.index) return;
     state.index = index;
     const chosen = frames[index];
-    history.replaceState(null, "", `#frame=${index}`);
+    try {
+      history.replaceState(null, "", `#frame=${index}`);
+    } catch {
+      // a page that stands in another one, as in a notebook, may have no address
+    }
     byId("viewer-heading").textContent = `Time ${short(chosen.time)}${chosen.before ? ", just before" : ""}`;
     byId("viewer-title").textContent = `${plural(chosen.moved, "point")} moved, at most by ${edges(chosen.move)}`;
     byId("frame").value = index;
