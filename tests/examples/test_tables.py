@@ -90,9 +90,24 @@ def test_detections():
     times = two["scenes"][1]["ipc_toolkit"]
     total = times["build_milliseconds"] + times["step_milliseconds"]
     assert rows[1][6] == tables.milliseconds(total) == f"{total / 1e3:.3g} s"
-    head, *rows = tables.detector_stages(with_gpu(two))
+    worlds = copy.deepcopy(with_gpu(two))
+    worlds["scenes"][:] = [worlds["scenes"][0] | {"scene": "cloth:1000 in 1,024 worlds"}]
+    head, *rows = tables.detector_stages(with_gpu(two), worlds)
     assert head[:3] == ("scene", "whole graph", "broad phase")
-    assert rows[0][1] == "1.23"
+    assert rows[0][1] == "1.23" and rows[2][0].startswith("cloth in 1,024 worlds, ")
+
+
+def test_the_front_page():
+    two = measured("detector_two_cores")
+    gpu = with_gpu(two)
+    gpu["record"] = gpu["record"] | {"gpus": ["NVIDIA H200"]}
+    bullet, drape = measured("penetration_bullet"), measured("penetration_drape")
+    _, *rows = tables.front(gpu, two, bullet, drape)
+    assert rows[0] == (rows[0][0], "1.2 ms on an H200") and "113,854 contacts" in rows[0][0]
+    assert "IPC Toolkit" in rows[1][1]
+    for row, found, what in ((rows[2], bullet, "collisions"), (rows[3], drape, "crossings")):
+        counts = {run["simulator"]: run["measured"][what] for run in found["runs"] if run["measured"]}
+        assert row[1].startswith(f"VBD {np.max(counts['vbd']):,}, ") and row[1].endswith("`SolverCCD` 0")
 
 
 def test_queries():
@@ -216,7 +231,7 @@ def test_a_table_has_its_sources_below(tmp_path, monkeypatch):
     path.write_text('{"benchmark": "x"}')
     with pytest.raises(ValueError, match=r"x_gpu\.json: has no record"):
         tables.update(page)
-    with pytest.raises(ValueError, match="no table is named y, only detector"):
+    with pytest.raises(ValueError, match="no table is named y, only front"):
         tables.update(page.replace("x", "y"))
 
 
