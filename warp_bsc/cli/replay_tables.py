@@ -216,10 +216,8 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     other = "its" if first == second else f"{second},"
     say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
     worst = summary.worst[0]
-    say(
-        console,
-        f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} {'pair' if worst.hits == 1 else 'pairs'}.",
-    )
+    pairs = "pair" if worst.hits == 1 else "pairs"
+    say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} {pairs}.")
 
 
 def _print_intersections(console: Console, summary: Summary) -> None:
