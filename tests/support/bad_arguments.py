@@ -730,6 +730,8 @@ VALUES: dict[str, list[str]] = {
     "--validate": [*NUMERIC, "ALL"],
     "--workers": [*NUMERIC, "head:8786", "tcp://", "://head:8786"],
     "--modes": ["", "x", "plain,x"],
+    "--scene": ["", "x", "bullet,x"],
+    "--simulator": ["", "x", "vbd,x"],
     "--kinds": ["", "x", "bodies,x"],
     "--configurations": ["", "x", "plain,x"],
     "--seconds": ["", "x", "nan", "inf", "-1", "0", "1e400", "True"],
