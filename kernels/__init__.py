@@ -1,12 +1,13 @@
 """Device functions for continuous collision detection, to call from any Warp kernel.
 
 ``ccd_vertex_face`` and ``ccd_edge_edge`` return FREE, HIT or UNSURE; ``impact_vertex_face`` and ``impact_edge_edge``
-return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``. With a last
-argument, a minimum distance in double precision, ``ccd_vertex_face``, ``ccd_edge_edge``, ``ccd_vertex_edge`` and
-``ccd_vertex_vertex`` return whether the features come within that distance, without gradients.
-``inversion_tetrahedron`` returns whether and when a moving tetrahedron inverts. FREE and HIT are certain with any
-options of the calling module, ``fast_math`` among them, and on processors that flush subnormal numbers to zero, as long
-as these round to nearest. Each of the other modules holds one part of the method.
+return the first contact as well, and have gradients. They take eight points, ``vec3`` or ``vec3d``, and the latter two
+a tolerance of the time, a ``float64``. With a last argument, a minimum distance in double precision,
+``ccd_vertex_face``, ``ccd_edge_edge``, ``ccd_vertex_edge`` and ``ccd_vertex_vertex`` return whether the features come
+within that distance, without gradients. ``inversion_tetrahedron`` returns whether and when a moving tetrahedron
+inverts. FREE and HIT are certain with any options of the calling module, ``fast_math`` among them, and on processors
+that flush subnormal numbers to zero, as long as these round to nearest. Each of the other modules holds one part of the
+method.
 
 References:
     Min Tang, Ruofeng Tong, Zhendong Wang, and Dinesh Manocha. "Fast and Exact Continuous Collision Detection with
