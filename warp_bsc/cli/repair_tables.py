@@ -51,6 +51,7 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
 
 def _print_stretches(console: Console, run: RepairRun) -> None:
     """Prints a table of the stretches."""
+    lengths = sorted({f"{stretch.edge_length:.3g}" for stretch in run.stretches})
     table = make_table(
         "time",
         "frames",
@@ -59,8 +60,9 @@ def _print_stretches(console: Console, run: RepairRun) -> None:
         "mean",
         "edges",
         "acceleration",
-        caption="Points: the most of a frame. Moves and the added acceleration a frame in median edge lengths, in "
-        "parentheses that of the scene; edges: the shortest and the longest against the scene at the same time.",
+        caption="Points: the most of a frame. Moves and the added acceleration a frame in median edge lengths "
+        f"({' or '.join(lengths)} in the scene's unit, as of --max-move), in parentheses that of the scene; edges: the shortest and "
+        "the longest against the scene at the same time.",
     )
     for stretch, frames in zip(run.stretches[:LONGEST], run.frames, strict=False):
         unit = stretch.edge_length
