@@ -26,6 +26,7 @@ inner = newton.solvers.SolverVBD(builder.finalize())
 """
 BEFORE = {
     "newton/contacts.md": CLOTH,
+    "newton/reports.md": CLOTH,
     "usd/replay.md": "import json\nimport numpy as np\n",
     "usd/programs.md": f"import warp_bsc as bsc\nfrom pxr import Usd\nstage = Usd.Stage.Open({str(SCENE)!r})\n",
 }
@@ -70,7 +71,7 @@ def test_newton(tmp_path, capsys):
     names, output = run("newton.md", tmp_path, capsys)
     report = names["solver"].report
     assert (report.totals.steps, report.totals.uncertified_steps) == (10, 0) and report.totals.truncated_steps == 0
-    assert output.strip() == "10 0"
+    assert re.fullmatch(r"10 0\n\d+ \d+\n", output) and names["plain"].report.totals.steps == 1
 
 
 def test_contacts(tmp_path, capsys):
@@ -78,6 +79,11 @@ def test_contacts(tmp_path, capsys):
     state, end = names["inner"].model.state(), names["inner"].model.state()
     names["solver"].step(state, end, None, None, 0.01)
     assert names["solver"].report.certified
+
+
+def test_reports(tmp_path, capsys):
+    names, output = run("newton/reports.md", tmp_path, capsys)
+    assert names["force"].shape == (3,) and "shape" in output
 
 
 def test_gradients(tmp_path, capsys):

@@ -284,4 +284,4 @@ def test_crossings_at_the_start_are_counted_from_the_first_step(make, device):
         assert (report.crossings, report.totals.steps) == (expected, steps)
         assert (report.hits, report.excluded) == (0, 0)  # nothing moves
         assert report.certified and len(report.uncertified_vertices) == 0
-    assert f"0 not certified, {expected} crossings at the start" in str(report)
+    assert f"0 not certified, {expected} crossings at the start of the step" in str(report)
