@@ -61,8 +61,8 @@ def _print_stretches(console: Console, run: RepairRun) -> None:
         "edges",
         "acceleration",
         caption="Points: the most of a frame. Moves and the added acceleration a frame in median edge lengths "
-        f"({' or '.join(lengths)} in the scene's unit, as of --max-move), in parentheses that of the scene; edges: the shortest and "
-        "the longest against the scene at the same time.",
+        f"({' or '.join(lengths)} in the scene's unit, as of --max-move), in parentheses that of the scene; edges: the "
+        "shortest and the longest against the scene at the same time.",
     )
     for stretch, frames in zip(run.stretches[:LONGEST], run.frames, strict=False):
         unit = stretch.edge_length

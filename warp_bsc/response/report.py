@@ -360,7 +360,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         if totals.inverting_steps:
             line += f", {totals.inverting_steps} that inverted tetrahedra"
         if self.crossings:
-            line += f", {self.crossings} crossings at the start of the step (warp_bsc.repair_state removes them from a start)"
+            line += f", {self.crossings} crossings at the start of the step"
+            line += " (warp_bsc.repair_state removes those of a first step)"
         if totals.remaining or totals.excluded:
             line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
         if self.filtered:
