@@ -37,9 +37,8 @@ _SMALLEST = 1e-4
 """Displacement, as a share of that length, that is none: a contact does not reach all of a mesh."""
 _LARGEST_STEP = 1.0
 """Largest displacement of a vertex that is spread, as a share of that length."""
-_EARLIEST = 0.1, 0.3
-"""Times of a contact on an arc, as shares of the step, from which an earlier one is resolved as one at this time: the
-second where the first finds no motion that is free."""
+_EARLIEST = 0.06
+"""Time of a contact on an arc, as a share of the step: an earlier one is resolved as one at this time."""
 _TIMES = 9
 """Times from a contact on an arc on at which it is looked how far the elements would pass through each other."""
 
@@ -52,7 +51,8 @@ class FollowedFrame:
         x: Positions, float32, shape [vertex_count, 3].
         displacement: The displacements that were added to the given positions before the last contacts were moved
             apart, float64, shape [vertex_count, 3].
-        certified: Whether the straight motion to these positions is free of collisions, and keeps the distance.
+        certified: Whether the motion to these positions, straight or on arcs, is free of collisions, and keeps the
+            distance.
         contacts: The contacts that are kept apart there.
     """
 
@@ -144,21 +144,8 @@ class Follower:
                 vertices that move otherwise are looked at; None if it is not known.
             arcs: The obstacles that turn on their way and how; None if all move straight.
         """
-        inputs = start, given, displacement, tolerance * self.length, known, free_start, arcs
-        for earliest in _EARLIEST[: 1 if arcs is None else None]:
-            frame, is_free = self._search(*inputs, earliest)
-            if is_free:
-                return frame
-        x, certified = self._playback.step(start, frame.x)
-        if certified and arcs is not None:  # the stage knows the chords alone
-            _, touched = self._contacts(start, x, self._is_movable, arcs)
-            certified = not touched.any()
-        return replace(frame, x=x, certified=certified)
-
-    def _search(
-        self, start, given, displacement, tolerance, known, free_start, arcs, earliest
-    ) -> tuple[FollowedFrame, bool]:
-        """Returns positions that a straight motion reaches, and whether it is free; arguments as of :meth:`follow`."""
+        tolerance *= self.length
+        device_start = self._mesh.device_positions(start, "start")
         best: tuple[float, FollowedFrame] | None = None
         sweeps = list(_SWEEPS)
         target = _displaced(given, displacement)
@@ -167,7 +154,9 @@ class Follower:
             changed = (start != free_start).any(axis=1) | (x.astype(np.float32) != given).any(axis=1)
         for number in range(_DETECTIONS):
             x = x.astype(np.float32)
-            contacts, touched = self._contacts(start, x, changed, arcs, earliest)
+            contacts, touched = self._contacts(device_start, x, changed, arcs)
+            if arcs is not None:
+                contacts = _on_arcs(contacts, arcs, start, x)
             is_free = not touched.any()
             unspread = float(np.linalg.norm(x.astype(np.float64) - target, axis=1).max(initial=0.0))
             if is_free:
@@ -193,8 +182,12 @@ class Follower:
                     x = self._moved_apart(target, known)
             changed = touched | (x.astype(np.float32) != last).any(axis=1)
         if best is not None:
-            return best[1], True
-        return FollowedFrame(x.astype(np.float32), displacement, False, known), False
+            return best[1]
+        x, certified = self._playback.step(start, x.astype(np.float32))
+        if certified and arcs is not None:  # the stage knows the chords alone
+            _, touched = self._contacts(device_start, x, self._is_movable, arcs)
+            certified = not touched.any()
+        return FollowedFrame(x, displacement, certified, known)
 
     def near(self, contacts: Contacts, x: np.ndarray) -> Contacts:
         """Returns the contacts of which the elements are still near each other at positions, with directions there.
@@ -218,22 +211,25 @@ class Follower:
             return target
         return projected(~self._is_movable, target.astype(np.float64), known, _PROJECTIONS, device=self._device)
 
-    def _contacts(self, start, target, changed, arcs, earliest=_EARLIEST[0]) -> tuple[Contacts, np.ndarray]:
+    def _contacts(self, start: wp.array, target, changed, arcs) -> tuple[Contacts, np.ndarray]:
         """Returns the contacts of a motion that can be moved apart, and which vertices collide or come too near.
 
         Pairs that start too near are left to the stage, which lets them come no nearer. Those of which no vertex is
         movable do not count, nor do those of which none is changed.
         """
-        x0, x1 = (self._mesh.device_positions(x, name) for x, name in ((start, "start"), (target, "target")))
+        end = self._mesh.device_positions(target, "target")
         found, touched = [], np.zeros(len(target), dtype=bool)
         for detector, gap in self._gaps.items():
-            contacts = as_contacts(detector.mesh, detector.detect(x0, x1, only=changed, arcs=arcs), gap)
+            contacts = as_contacts(detector.mesh, detector.detect(start, end, only=changed, arcs=arcs), gap)
             contacts = contacts.rows(np.asarray(self._is_movable[contacts.vertices].any(axis=1)))
             touched[contacts.vertices] = True
             found.append(contacts.rows(contacts.toi > 0.0) if detector.min_distance else contacts)
         contacts = Contacts.joined(found)
-        straight = self._directed(contacts, x0, x1)
-        return straight if arcs is None else _on_arcs(contacts, straight, arcs, start, target, earliest), touched
+        if arcs is None:
+            return self._directed(contacts, start, end), touched
+        turning = _turns(contacts, arcs)
+        straight = self._directed(contacts.rows(~turning), start, end)
+        return Contacts.joined([straight, contacts.rows(turning)]), touched
 
     def _directed(self, contacts: Contacts, x0: wp.array, x1: wp.array) -> Contacts:
         """Returns contacts of a motion with the closest points, and the directions between them, a moment before.
@@ -282,33 +278,31 @@ class Follower:
         return np.where(np.linalg.norm(spread, axis=1, keepdims=True) < _SMALLEST * self.length, 0.0, spread)
 
 
-def _on_arcs(
-    contacts: Contacts, straight: Contacts, arcs: RigidMotion, x0: np.ndarray, x1: np.ndarray, earliest: float
-) -> Contacts:
-    """Returns contacts with those of turning vertices as they are on the arcs, and the others as they are on chords.
+def _turns(contacts: Contacts, arcs: RigidMotion) -> np.ndarray:
+    """Returns which contacts have a vertex that turns, bool, shape [n]."""
+    return np.any(arcs.body[contacts.vertices] >= 0, axis=1)
+
+
+def _on_arcs(contacts: Contacts, arcs: RigidMotion, x0: np.ndarray, x1: np.ndarray) -> Contacts:
+    """Returns contacts of a motion with the distances that those with a turning vertex are to have at its end.
 
     At the time of a contact on an arc the chords may be apart. Where the elements are nearest on the rest of the way,
     along the normal, the movable side is to be farther: as it moves straight, it ends farther by that over the time.
     """
-    turning: np.ndarray = np.any(arcs.body[contacts.vertices] >= 0, axis=1)
+    turning = _turns(contacts, arcs)
     rows = contacts.rows(turning)
 
     def distances(time: np.ndarray) -> np.ndarray:
         at = points_on_arcs(arcs, x0, x1, rows.vertices, time[:, None])
         return np.einsum("ik,ikj,ij->i", rows.weights, at, rows.normals)
 
-    needed = rows.gap / np.maximum(rows.toi, earliest)
+    needed = rows.gap / np.maximum(rows.toi, _EARLIEST)
     for share in np.linspace(0.0, 1.0, _TIMES):
         time = rows.toi + share * (1.0 - rows.toi)
-        needed = np.maximum(needed, (rows.gap - distances(time)) / np.maximum(time, earliest))
-    gap = straight.gap.copy()
+        needed = np.maximum(needed, (rows.gap - distances(time)) / np.maximum(time, _EARLIEST))
+    gap = contacts.gap.copy()
     gap[turning] = np.maximum(rows.gap, distances(np.ones(len(rows.toi))) + needed)
-    return replace(
-        straight,
-        weights=np.where(turning[:, None], contacts.weights, straight.weights),
-        normals=np.where(turning[:, None], contacts.normals, straight.normals),
-        gap=gap,
-    )
+    return replace(contacts, gap=gap)
 
 
 def _displaced(given, displacement) -> np.ndarray:
