@@ -52,23 +52,14 @@ def is_filtered(pair_filter: PairFilter, element: wp.vec3i, other: wp.vec3i) -> 
 
 
 @wp.func
-def owns_vertex(owned: int, corner: int) -> bool:
-    """Returns whether a face is the representative of the vertex at a corner."""
-    return (owned >> corner) & 1 == 1
-
-
-@wp.func
 def finite_elements(owned: int, a: bool, b: bool, c: bool) -> int:
-    """Returns what a face represents without the elements that have a corner that is not finite."""
+    """Returns what a face represents without the elements that have a corner that is not finite.
+
+    Bits 0 to 2 of ``owned`` are the vertices at the corners, bits 3 to 5 the edges from a corner to the next.
+    """
     finite = wp.where(a, 1, 0) | wp.where(b, 2, 0) | wp.where(c, 4, 0)
     next = (finite >> 1) | ((finite & 1) << 2)
     return owned & (finite | ((finite & next) << 3))
-
-
-@wp.func
-def owns_edge(owned: int, side: int) -> bool:
-    """Returns whether a face is the representative of the edge from corner ``side`` to the next."""
-    return (owned >> (3 + side)) & 1 == 1
 
 
 @wp.func

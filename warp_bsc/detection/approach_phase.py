@@ -31,6 +31,7 @@ from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count
 from .stage_timer import StageTimer
 
 __all__ = [
+    "ABOVE_SUM",
     "MinDistances",
     "distances_of_pair",
     "impact_on_arcs_at_distance",
@@ -46,7 +47,8 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 """Share of its distance at the start that a pair must keep: the search certifies it for a pair at rest."""
 SHARE_ON_ARCS = wp.constant(wp.float64(1.0 - 2.0**-6))
 """Share of its minimum distance that a pair keeps on arcs, between the start and the end of the step."""
-_ABOVE_SUM = wp.constant(wp.float64(1.0 + 2.0**-50))
+ABOVE_SUM = wp.constant(wp.float64(1.0 + 2.0**-50))
+"""Raises a distance so that a rounded sum is at least the exact one."""
 _ZERO = wp.constant(wp.float64(0.0))
 _TWO = wp.constant(wp.float64(2.0))
 
@@ -175,8 +177,8 @@ def _kernels(dtype: type, on_arcs: bool) -> tuple[wp.Kernel, wp.Kernel]:
                 if are_of_one_group(arcs, v):
                     return
                 deviation = distance_of_corners(kind, v, arcs.deviation)
-                distance = _ABOVE_SUM * (distance + deviation)
-                reach = _ABOVE_SUM * (reach + deviation)
+                distance = ABOVE_SUM * (distance + deviation)
+                reach = ABOVE_SUM * (reach + deviation)
         motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
         if clears_at_once(motion, scaled):
             return

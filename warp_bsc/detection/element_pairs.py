@@ -71,9 +71,13 @@ def _count_filtered(mesh: FaceHierarchy, place: int, count: int):
 
 
 @wp.func
-def _common_corners(a: wp.vec4i, b: wp.vec4i, i: int) -> int:
-    """Returns which corners of a face b are the vertex at corner i of another, from their labels, as bits."""
-    return wp.where(b[0] == a[i], 1, 0) | wp.where(b[1] == a[i], 2, 0) | wp.where(b[2] == a[i], 4, 0)
+def _corners_with(vertices: wp.vec3i, vertex: int) -> int:
+    """Returns which corners of a cell are a vertex, as bits."""
+    return (
+        wp.where(vertices[0] == vertex, 1, 0)
+        | wp.where(vertices[1] == vertex, 2, 0)
+        | wp.where(vertices[2] == vertex, 4, 0)
+    )
 
 
 @wp.func
@@ -128,140 +132,109 @@ class PairFunctions(NamedTuple):
 @made_once
 def pair_functions(padded: bool, swept: bool) -> PairFunctions:
     """Returns the functions for boxes with a padding or without, over the time of the motion or at both ends."""
-    corners_type = PaddedCorners if padded else Corners
-    if padded:
 
-        @wp.func
-        def label_at(mesh: FaceHierarchy, place: int) -> wp.vec4i:
-            return read_padded_label(mesh.padded_corners, place)
+    @wp.struct
+    class Cell:
+        """What a thread reads of the cell at a place."""
 
-        @wp.func
-        def corners_at(mesh: FaceHierarchy, place: int) -> PaddedCorners:
-            return read_padded_corners(mesh.padded_corners, place)
-
-        @wp.func
-        def paddings_at(mesh: FaceHierarchy, place: int) -> wp.vec3d:
-            return paddings_of(mesh.padded_corners, place)
-    else:
-
-        @wp.func
-        def label_at(mesh: FaceHierarchy, place: int) -> wp.vec4i:
-            return read_label(mesh.corners, place)
-
-        @wp.func
-        def corners_at(mesh: FaceHierarchy, place: int) -> Corners:
-            return read_corners(mesh.corners, place)
-
-        @wp.func
-        def paddings_at(mesh: FaceHierarchy, place: int) -> wp.vec3d:
-            return wp.vec3d()
+        vertices: wp.vec3i
+        elements: int  # what it represents, as bits, see :mod:`warp_bsc.kernels.pipeline.corners`
+        corners: PaddedCorners if padded else Corners
+        paddings: wp.vec3d
 
     @wp.func
-    def unseparated_corners(corners: corners_type, paddings: wp.vec3d, box: BoxRows, sought: int) -> int:
-        """Returns which of some corners no axis separates from a box."""
+    def cell_at(mesh: FaceHierarchy, place: int) -> Cell:
+        cell = Cell()
+        label = wp.vec4i()
+        if wp.static(padded):
+            label = read_padded_label(mesh.padded_corners, place)
+            cell.corners = read_padded_corners(mesh.padded_corners, place)
+            cell.paddings = paddings_of(mesh.padded_corners, place)
+        else:
+            label = read_label(mesh.corners, place)
+            cell.corners = read_corners(mesh.corners, place)
+        cell.vertices = wp.vec3i(label[0], label[1], label[2])
+        cell.elements = label[3]
+        return cell
+
+    @wp.func
+    def common_corners(a: Cell, b: Cell) -> int:
+        """Returns which corners of a cell are vertices of another, as bits."""
+        common = int(0)
+        for i in range(3):
+            if _corners_with(b.vertices, a.vertices[i]) != 0:
+                common = common | (1 << i)
+        return common
+
+    @wp.func
+    def corners_near(a: Cell, box: BoxRows) -> int:
+        """Returns which corners no axis separates from a box, as bits."""
         found = int(0)
         for i in range(3):
-            if not are_apart(vertex_box(corners, paddings, i, wp.static(swept)), box):
+            if not are_apart(vertex_box(a.corners, a.paddings, i, wp.static(swept)), box):
                 found = found | (1 << i)
-        return found & sought
-
-    @wp.func
-    def unseparated_sides(corners: corners_type, paddings: wp.vec3d, box: BoxRows, sought: int) -> int:
-        """Returns which of some sides no axis separates from a box."""
-        found = int(0)
-        for i in range(3):
-            if not are_apart(edge_box(corners, paddings, i, (i + 1) % 3, wp.static(swept)), box):
-                found = found | (1 << i)
-        return found & sought
-
-    @wp.func
-    def of_corners(
-        a: wp.vec4i,
-        b: wp.vec4i,
-        corners: corners_type,
-        paddings: wp.vec3d,
-        other_corners: corners_type,
-        other_paddings: wp.vec3d,
-    ) -> int:
-        """Returns the corners of a face a with the face b, from labels and positions."""
-        sought = a[3] & 7
-        for i in range(3):
-            if _common_corners(a, b, i) != 0:
-                sought = sought & ~(1 << i)
-        if sought == 0 or b[3] & IS_FACE == 0:
-            return 0
-        return unseparated_corners(corners, paddings, face_box(other_corners, other_paddings, wp.static(swept)), sought)
-
-    @wp.func
-    def vertex_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
-        a = label_at(mesh, place)
-        b = label_at(mesh, other)
-        p = corners_at(mesh, place)
-        q = corners_at(mesh, other)
-        p_pad = paddings_at(mesh, place)
-        q_pad = paddings_at(mesh, other)
-        found = of_corners(a, b, p, p_pad, q, q_pad)
-        return found | (of_corners(b, a, q, q_pad, p, p_pad) << 3)
-
-    @wp.func
-    def element_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
-        a = label_at(mesh, place)
-        b = label_at(mesh, other)
-        p = corners_at(mesh, place)
-        q = corners_at(mesh, other)
-        p_pad = paddings_at(mesh, place)
-        q_pad = paddings_at(mesh, other)
-        found = of_corners(a, b, p, p_pad, q, q_pad)
-        found = found | (of_corners(b, a, q, q_pad, p, p_pad) << 3)
-        sides = (a[3] >> 3) & 7
-        other_sides = (b[3] >> 3) & 7
-        for i in range(3):
-            common = _common_corners(a, b, i) | _common_corners(a, b, (i + 1) % 3)
-            sought = other_sides & ~_sides_at(common)
-            if (sides >> i) & 1 == 1 and sought != 0:
-                box = edge_box(p, p_pad, i, (i + 1) % 3, wp.static(swept))
-                found = found | (unseparated_sides(q, q_pad, box, sought) << (6 + 3 * i))
         return found
 
     @wp.func
-    def of_sides(
-        a: wp.vec4i,
-        b: wp.vec4i,
-        corners: corners_type,
-        paddings: wp.vec3d,
-        other_corners: corners_type,
-        other_paddings: wp.vec3d,
-    ) -> int:
-        """Returns the sides of a face a with the face b, from labels and positions."""
-        common = int(0)
+    def sides_near(a: Cell, box: BoxRows) -> int:
+        """Returns which sides no axis separates from a box, as bits."""
+        found = int(0)
         for i in range(3):
-            if _common_corners(a, b, i) != 0:
-                common = common | (1 << i)
-        sought = (a[3] >> 3) & 7 & ~_sides_at(common)
-        if sought == 0 or b[3] & IS_FACE == 0:
+            if not are_apart(edge_box(a.corners, a.paddings, i, (i + 1) % 3, wp.static(swept)), box):
+                found = found | (1 << i)
+        return found
+
+    @wp.func
+    def corners_with_face(a: Cell, b: Cell) -> int:
+        """Returns the corners of a cell with the face b."""
+        sought = a.elements & 7 & ~common_corners(a, b)
+        if sought == 0 or b.elements & IS_FACE == 0:
             return 0
-        return unseparated_sides(corners, paddings, face_box(other_corners, other_paddings, wp.static(swept)), sought)
+        return sought & corners_near(a, face_box(b.corners, b.paddings, wp.static(swept)))
+
+    @wp.func
+    def sides_with_face(a: Cell, b: Cell) -> int:
+        """Returns the sides of a cell with the face b."""
+        sought = (a.elements >> 3) & 7 & ~_sides_at(common_corners(a, b))
+        if sought == 0 or b.elements & IS_FACE == 0:
+            return 0
+        return sought & sides_near(a, face_box(b.corners, b.paddings, wp.static(swept)))
+
+    @wp.func
+    def vertex_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+        a = cell_at(mesh, place)
+        b = cell_at(mesh, other)
+        return corners_with_face(a, b) | (corners_with_face(b, a) << 3)
 
     @wp.func
     def edge_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
-        a = label_at(mesh, place)
-        b = label_at(mesh, other)
-        p = corners_at(mesh, place)
-        q = corners_at(mesh, other)
-        p_pad = paddings_at(mesh, place)
-        q_pad = paddings_at(mesh, other)
-        found = of_sides(a, b, p, p_pad, q, q_pad)
-        return found | (of_sides(b, a, q, q_pad, p, p_pad) << 3)
+        a = cell_at(mesh, place)
+        b = cell_at(mesh, other)
+        return sides_with_face(a, b) | (sides_with_face(b, a) << 3)
+
+    @wp.func
+    def element_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
+        a = cell_at(mesh, place)
+        b = cell_at(mesh, other)
+        found = corners_with_face(a, b) | (corners_with_face(b, a) << 3)
+        for i in range(3):
+            common = _corners_with(b.vertices, a.vertices[i]) | _corners_with(b.vertices, a.vertices[(i + 1) % 3])
+            sought = (b.elements >> 3) & 7 & ~_sides_at(common)
+            if (a.elements >> (3 + i)) & 1 == 1 and sought != 0:
+                box = edge_box(a.corners, a.paddings, i, (i + 1) % 3, wp.static(swept))
+                found = found | ((sought & sides_near(b, box)) << (6 + 3 * i))
+        return found
 
     @wp.func
     def point_pair(mesh: FaceHierarchy, place: int, other: int) -> int:
-        is_point = mesh.order[other] >= mesh.point_start
-        needed = wp.where(is_point, 1, 8)
-        if label_at(mesh, place)[3] & 1 == 0 or label_at(mesh, other)[3] & needed == 0:
+        a = cell_at(mesh, place)
+        b = cell_at(mesh, other)
+        needed = wp.where(mesh.order[other] >= mesh.point_start, 1, 8)
+        if a.elements & 1 == 0 or b.elements & needed == 0:
             return 0
-        box = vertex_box(corners_at(mesh, place), paddings_at(mesh, place), 0, wp.static(swept))
+        box = vertex_box(a.corners, a.paddings, 0, wp.static(swept))
         # the ends of a point are one vertex
-        other_box = edge_box(corners_at(mesh, other), paddings_at(mesh, other), 0, 1, wp.static(swept))
+        other_box = edge_box(b.corners, b.paddings, 0, 1, wp.static(swept))
         return wp.where(are_apart(box, other_box), 0, 1)
 
     return PairFunctions(vertex_face_pairs, element_pairs, edge_face_pairs, point_pair)

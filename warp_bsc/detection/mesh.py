@@ -150,7 +150,6 @@ class CollisionMesh:
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
-        self.device_points = wp.array(self.points, dtype=int, device=self.device)
         self.radius = None
         if radius is not None:
             self.radius = self._checked_radius(radius)

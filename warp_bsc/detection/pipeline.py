@@ -5,7 +5,7 @@ import warp as wp
 
 from .._arguments import checked_choice, checked_distance, checked_integer
 from ..kernels.arcs import Arcs
-from .approach_phase import MinDistances, run_approach_phases
+from .approach_phase import ABOVE_SUM, MinDistances, run_approach_phases
 from .arc_phase import run_arc_phases
 from .broad_phase import BroadPhase, make_broad_phase
 from .distance_phase import run_distance_phases
@@ -34,10 +34,6 @@ MIN_CAPACITY = 4096
 _LARGEST_RADIUS = 2.0**1000
 """The sum of two is finite."""
 
-_ABOVE_SUM = 1.0 + 2.0**-50
-"""Raises a radius so that the rounded sum of two is at least the sum of what they were raised from."""
-
-_RAISED = wp.constant(wp.float64(_ABOVE_SUM))
 _ZERO = wp.constant(wp.float64(0.0))
 
 _UNTIMED = StageTimer(None)
@@ -55,7 +51,7 @@ def _add_deviations(
     vertex = wp.tid()
     added = deviation[vertex]
     pad = padding[vertex]
-    padding_on_arcs[vertex] = wp.where(added > _ZERO, _RAISED * (pad + added), pad)
+    padding_on_arcs[vertex] = wp.where(added > _ZERO, ABOVE_SUM * (pad + added), pad)
 
 
 @made_once
@@ -241,7 +237,7 @@ class DetectionPipeline:
             deviation: What is added to the radius of each vertex, float64, shape [vertex_count].
         """
         assert self.radius is not None
-        self._set_radius(_ABOVE_SUM * (self.radius + deviation))
+        self._set_radius(float(ABOVE_SUM) * (self.radius + deviation))
 
     def _set_radius(self, radius: np.ndarray) -> None:
         assert self.device_radius is not None and self._padding is not None

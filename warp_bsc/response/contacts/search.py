@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from ...detection.approach_phase import impact_on_arcs_at_distance
+from ...detection.approach_phase import ABOVE_SUM, impact_on_arcs_at_distance
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.element_pairs import filtered_pairs, pair_functions
 from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
@@ -29,7 +29,6 @@ from .face_pairs import pair_of_bit
 from .first_contact import update_first_contact
 from .rules import ContactClass, classify_contact, owner_of
 
-_ABOVE_SUM = wp.constant(wp.float64(1.0 + 2.0**-50))
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
 _POINT_BIT, _POINTS = wp.constant(15), wp.constant(1 << 15)
 """The pair of a point and another cell, behind those of the elements of two faces."""
@@ -122,7 +121,7 @@ def _decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: w
     points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     most = distance_of_corners(kind, corners, arcs.deviation)
     if motion.distances.radius:
-        most = _ABOVE_SUM * (most + distance_of_corners(kind, corners, motion.distances.radius))
+        most = ABOVE_SUM * (most + distance_of_corners(kind, corners, motion.distances.radius))
     relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
     if clears_at_once(relative, scaled):
         return
