@@ -41,7 +41,7 @@ from .ccd import impact_at_distance
 from .closest import contact_at, contact_weights
 from .distance import closest_points
 from .motion import all_finite, double, doubles, relative_motion
-from .pipeline.pairs import firsts_of
+from .pipeline.pairs import distance_of_corners, firsts_of
 from .polynomials import EDGE_EDGE, VERTEX_FACE
 from .signs import FREE, HIT, ROUNDOFF, UNSURE
 from .time_of_impact import Impact
@@ -329,18 +329,25 @@ def impact_on_arcs(
     p, q, r, s = doubles(a0, b0, c0, d0)
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    bounds = _bounds_of_pair(kind, v, a, b, c, d, to_a, to_b, to_c, to_d, arcs)
+    bounds = _PairBounds()
     start = wp.float64(0.0)
     length = wp.float64(1.0)
     searching = bool(True)
     parts = int(0)
     while searching:
         end = start + length
-        end_p = on_arc_of(arcs, v[0], a, to_a, end)
-        end_q = on_arc_of(arcs, v[1], b, to_b, end)
-        end_r = on_arc_of(arcs, v[2], c, to_c, end)
-        end_s = on_arc_of(arcs, v[3], d, to_d, end)
-        deviation = _sagittas(bounds, length) + bounds.rounding
+        end_p = to_a
+        end_q = to_b
+        end_r = to_c
+        end_s = to_d
+        if end < _ONE:
+            end_p = on_arc_of(arcs, v[0], a, to_a, end)
+            end_q = on_arc_of(arcs, v[1], b, to_b, end)
+            end_r = on_arc_of(arcs, v[2], c, to_c, end)
+            end_s = on_arc_of(arcs, v[3], d, to_d, end)
+        deviation = distance_of_corners(kind, v, arcs.deviation)
+        if length < _ONE:
+            deviation = _sagittas(bounds, length) + bounds.rounding
         within = _UP * (min_distance + deviation)
         part = impact_at_distance(kind, p, q, r, s, end_p, end_q, end_r, end_s, within, ROUNDOFF, True, _TIME_TOLERANCE)
         parts += 1
@@ -356,6 +363,8 @@ def impact_on_arcs(
                 result.toi = _TWO
                 searching = False
         else:
+            if parts == 1:  # most pairs need no more than the first part
+                bounds = _bounds_of_pair(kind, v, a, b, c, d, to_a, to_b, to_c, to_d, arcs)
             advance = _SHORTEST * wp.floor(part.toi * length / _SHORTEST)
             found = _ZERO
             if advance == _ZERO:

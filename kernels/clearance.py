@@ -40,10 +40,10 @@ _TWO = wp.constant(wp.float64(2.0))
 _FOUR = wp.constant(wp.float64(4.0))
 _THIRD = wp.constant(wp.float64(1.0 / 3.0))
 _SIXTH = wp.constant(wp.float64(1.0 / 6.0))
-_INFLATED = wp.constant(wp.float64(1.0 + 2.0**-48))
+INFLATED = wp.constant(wp.float64(1.0 + 2.0**-48))
 POINT_ERROR = wp.constant(wp.float64(12.0))
-_NORMAL_ERROR = wp.constant(wp.float64(16.0))
-_PLANE_ERROR = wp.constant(wp.float64(2.0))
+NORMAL_ERROR = wp.constant(wp.float64(16.0))
+PLANE_ERROR = wp.constant(wp.float64(2.0))
 _CROSS_ERROR = wp.constant(wp.float64(20.0))
 _SIDE_ERROR = wp.constant(wp.float64(8.0))
 _DOT_ERROR = wp.constant(wp.float64(20.0))
@@ -53,7 +53,7 @@ _QUARTIC_ERROR = wp.constant(wp.float64(40.0))
 @wp.func
 def norm_bound(x: wp.vec3d) -> wp.float64:
     """Returns an upper bound of the norm of a vector, apart from the underflow of squares."""
-    return wp.sqrt(wp.dot(x, x)) * _INFLATED
+    return wp.sqrt(wp.dot(x, x)) * INFLATED
 
 
 @wp.func
@@ -78,16 +78,14 @@ def plane_clears(part: Motion, distance: wp.float64) -> bool:
     than twice its own. A component of n has 4 + 4 roundings of u and v, 1 of the product and 1 or 2 of the sum.
     """
     y = coplanarity(part)
-    error = (
-        _NORMAL_ERROR * part.roundoff * sum_of_size(cross_size(part.u_size, part.v_size)) + part.roundoff * UNDERFLOW
-    )
+    error = NORMAL_ERROR * part.roundoff * sum_of_size(cross_size(part.u_size, part.v_size)) + part.roundoff * UNDERFLOW
     start = norm_bound(y.n0) + error
     middle = norm_bound(y.nh) + error
     end = norm_bound(y.n1) + error
-    needed = (distance * _INFLATED) * wp.vec4d(
+    needed = (distance * INFLATED) * wp.vec4d(
         start, (start + _TWO * middle) * _THIRD, (_TWO * middle + end) * _THIRD, end
     )
-    bound = _PLANE_ERROR * y.bound
+    bound = PLANE_ERROR * y.bound
     above = y.k - needed
     below = -y.k - needed
     return (
@@ -132,7 +130,7 @@ def _side_clears(
     error = _SIDE_ERROR * part.roundoff * sum_of_size(e_size) + slack
     start = norm_bound(e0) + error
     end = norm_bound(e1) + error
-    needed = distance * norm_bound(direction) * _INFLATED
+    needed = distance * norm_bound(direction) * INFLATED
     if not (
         wp.dot(direction, c0) - bound > needed * start
         and wp.dot(direction, ch) - bound > needed * (_HALF * (start + end))

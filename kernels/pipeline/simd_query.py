@@ -57,7 +57,7 @@ QUERY = """
         return __builtin_bit_cast(Doubles, (2046 - exponent) << 52);
     };
 
-    struct Motion { Vectors u0, v0, w0, u1, v1, w1, u_size, v_size, w_size; };
+    struct Motion { Vectors u0, v0, w0, u1, v1, w1, u_size, v_size, w_size; Doubles scale; };
     auto scaled_motion = [&](const Scalars* points, int& usable) -> Motion {
         Relative r = relative(points);
         Vectors u = sizes(r.u0, r.u1), v = sizes(r.v0, r.v1), w = sizes(r.w0, r.w1);
@@ -77,7 +77,7 @@ QUERY = """
         const Doubles scale = inverse_power_of_two(size);
         return {times(scale, r.u0), times(scale, r.v0), times(scale, r.w0),
                 times(scale, r.u1), times(scale, r.v1), times(scale, r.w1),
-                times(scale, u), times(scale, v), times(scale, w)};
+                times(scale, u), times(scale, v), times(scale, w), scale};
     };
 
     auto cross_size = [](Vectors a, Vectors b) {
@@ -203,8 +203,9 @@ QUERY = """
         return minus(minus(times(c.first, u), times(c.second, v)), w);
     };
 
-    // the lanes in which a direction certainly separates the features at both ends, on the same side
-    auto direction_separates = [=](const Motion& m, Vectors direction) -> int {
+    // by how much a direction separates the features at both ends, on either side
+    struct Gaps { Doubles low, high, bound; };
+    auto gaps_along = [=](const Motion& m, Vectors direction) -> Gaps {
         const Doubles u0 = dot(direction, m.u0), v0 = dot(direction, m.v0), w0 = dot(direction, m.w0);
         const Doubles u1 = dot(direction, m.u1), v1 = dot(direction, m.v1), w1 = dot(direction, m.w1), zero = 0.0;
         Doubles low, high;
@@ -216,8 +217,12 @@ QUERY = """
             high = most(w0 - least(u0, zero) + most(v0, zero), w1 - least(u1, zero) + most(v1, zero));
         }
         const Doubles size = dot(sizes(direction, direction), plus(plus(m.u_size, m.v_size), m.w_size));
-        const Doubles bound = roundoff * (direction_error * size + underflow);
-        return bits((low > bound) | (high < -bound));
+        return {low, high, roundoff * (direction_error * size + underflow)};
+    };
+    // the lanes in which a direction certainly separates the features at both ends, on the same side
+    auto direction_separates = [=](const Motion& m, Vectors direction) -> int {
+        const Gaps gaps = gaps_along(m, direction);
+        return bits((gaps.low > gaps.bound) | (gaps.high < -gaps.bound));
     };
 """
 """For the snippet of a native function with an argument ``roundoff``, see :func:`.simd.native_for_pairs`."""

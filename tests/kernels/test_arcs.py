@@ -17,7 +17,7 @@ def bounds_of(x0, x1, centre, turn, device):
     """The bounds of one body with one vertex a row, each with a centre and a turn of its own; any end is taken."""
     motion = bsc.RigidMotion(np.arange(len(x0)), centre, turn)
     ends = [wp.array(x, dtype=wp.vec3 if x.dtype == np.float32 else wp.vec3d, device=device) for x in (x0, x1)]
-    return ArcBounds(motion, np.arange(len(x0)), *ends)
+    return ArcBounds(motion, wp.array(np.arange(len(x0)), dtype=int, device=device), *ends)
 
 
 def error_of(computed, exact):

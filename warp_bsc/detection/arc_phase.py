@@ -5,6 +5,7 @@ graph may contain it; :mod:`.arc_search` decides the same pairs from the host, f
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,11 +13,12 @@ import warp as wp
 from ..kernels.arcs import Arcs, any_turns, arc_bounds, are_of_one_group, impact_on_arcs, sagitta_of_part, turns
 from ..kernels.min_distance import clears_at_once
 from ..kernels.motion import motion_and_distance
+from ..kernels.pipeline.batch_culling import BATCH
 from ..kernels.pipeline.pairs import distance_of_corners, vertices_of_pair
-from ..kernels.pipeline.queues import append, is_filled, take_slot
+from ..kernels.pipeline.queues import append, is_filled, take_slot, take_slots
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE
 from .kernels import PairStages
-from .launch import launch_over_queue, made_once
+from .launch import launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase
 from .settings import NO_FUSED_OPERATIONS, Count
 from .stage_timer import StageTimer
@@ -66,9 +68,72 @@ def bound_arc(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
     arcs.deviation[vertex] = deviation
 
 
+@wp.func
+def _decide(
+    pair: wp.vec2i,
+    # mesh
+    x0: wp.array[Any],
+    x1: wp.array[Any],
+    arcs: Arcs,
+    kind: int,
+    # in and out
+    stages: PairStages,
+):
+    """Adds a pair with a turning vertex to the contacts if it collides on its arcs, with its place in their order."""
+    v = vertices_of_pair(kind, stages.elements, pair)
+    a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+    a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+    result = impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, _ZERO)
+    if result.status == FREE:
+        return
+    slot = take_slot(stages.counts, _CONTACTS)
+    take_slot(stages.counts, _FOUND)
+    if result.status == UNSURE:
+        take_slot(stages.counts, _UNSURE)
+    contacts = stages.contacts
+    if slot < wp.int64(contacts.pairs.shape[0]):
+        k = wp.int32(slot)
+        contacts.pairs[k] = pair
+        contacts.status[k] = wp.int8(result.status)
+        contacts.decided[k] = wp.int8(result.status)
+        contacts.within_tolerance[k] = result.within_tolerance == 1
+        contacts.toi[k] = result.toi
+        contacts.coordinates[k] = result.coordinates
+        contacts.normal[k] = result.normal
+        stages.order[k] = k
+        stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+
+
+@made_once
+def _batch_kernel(dtype: type) -> wp.Kernel:
+    """Returns the kernel that decides what the culls of a CPU left of each batch, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_arc_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        arcs: Arcs,
+        kind: int,
+        # in and out
+        stages: PairStages,
+    ):
+        i = BATCH * (first + wp.tid())
+        filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
+        end = wp.min(i + BATCH, filled)
+        begin = i
+        while i < end and stages.queue[i][0] >= 0:
+            _decide(stages.queue[i], x0, x1, arcs, kind, stages)
+            i += 1
+        take_slots(stages.counts, _SURVIVORS, i - begin)
+
+    return decide_arc_batches
+
+
 @made_once
 def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels that cull and decide, for one type of position."""
+    """Returns the kernels that cull and decide on a GPU, for one type of position."""
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull_arcs(
@@ -114,30 +179,8 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
             return
         pair = stages.survivors[i]
-        v = vertices_of_pair(kind, stages.elements, pair)
-        if not turns(arcs, v):
-            return
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-        result = impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, _ZERO)
-        if result.status == FREE:
-            return
-        slot = take_slot(stages.counts, _CONTACTS)
-        take_slot(stages.counts, _FOUND)
-        if result.status == UNSURE:
-            take_slot(stages.counts, _UNSURE)
-        contacts = stages.contacts
-        if slot < wp.int64(contacts.pairs.shape[0]):
-            k = wp.int32(slot)
-            contacts.pairs[k] = pair
-            contacts.status[k] = wp.int8(result.status)
-            contacts.decided[k] = wp.int8(result.status)
-            contacts.within_tolerance[k] = result.within_tolerance == 1
-            contacts.toi[k] = result.toi
-            contacts.coordinates[k] = result.coordinates
-            contacts.normal[k] = result.normal
-            stages.order[k] = k
-            stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+        if turns(arcs, vertices_of_pair(kind, stages.elements, pair)):
+            _decide(pair, x0, x1, arcs, kind, stages)
 
     return cull_arcs, decide_arcs
 
@@ -147,6 +190,8 @@ def run_arc_phases(
 ) -> None:
     """Adds the contacts of queued pairs with a turning body, after the other phases, without synchronizing with a GPU.
 
+    On a CPU the culls of :func:`.kernels.batch_culling_kernel` have left the pairs in their batches of the queue.
+
     Args:
         phases: The buffers of vertex-face and edge-edge pairs, with the vertex indices of their second elements.
         x0: Positions at the start of the step, array of vec3 or vec3d.
@@ -154,15 +199,21 @@ def run_arc_phases(
         arcs: The arcs.
         timer: Measures the stage.
     """
-    if x0.device.is_cpu and not arcs.turning.numpy()[0]:
+    device = x0.device
+    if device.is_cpu and not arcs.turning.numpy()[0]:
         return
-    kernels = _kernels(x0.dtype)
     with timer.stage("classify"):
         for phase, elements in phases:
             stages = phase.stages(elements)
-            inputs = [x0, x1, arcs, int(phase.kind)]
+            inputs, outputs = [x0, x1, arcs, int(phase.kind)], [stages]
+            if device.is_cpu:
+                filled = min(len(stages.queue), int(phase.counts.numpy()[Count.QUEUED]))
+                batches = -(-filled // int(BATCH))
+                launch_over(_batch_kernel(x0.dtype), batches, inputs=inputs, outputs=outputs, device=device, chunk=16)
+                continue
+            cull, decide = _kernels(x0.dtype)
             for kernel, queue, count in (
-                (kernels[0], stages.queue, Count.QUEUED),
-                (kernels[1], stages.survivors, Count.SURVIVORS),
+                (cull, stages.queue, Count.QUEUED),
+                (decide, stages.survivors, Count.SURVIVORS),
             ):
-                launch_over_queue(kernel, queue, phase.counts, count, inputs=inputs, outputs=[stages], block_dim=64)
+                launch_over_queue(kernel, queue, phase.counts, count, inputs=inputs, outputs=outputs, block_dim=64)

@@ -301,9 +301,7 @@ class CollisionDetector:
             raise ValueError(f"arcs must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}")
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("arcs: x0 and x1 must not require gradients")
-        for name, x in (("x0", x0), ("x1", x1)):
-            check_finite(x.numpy(), name, self.mesh.vertices)
-        return ArcBounds(arcs, self.mesh.vertices, x0, x1)
+        return ArcBounds(arcs, self.mesh.device_vertices, x0, x1)
 
     def _detect_arcs(
         self, x0: wp.array, x1: wp.array, only: np.ndarray | None, changed: wp.array | None, bounds: ArcBounds

@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 import warp as wp
 
-from ..kernels.arcs import Arcs, any_turns, turns
+from ..kernels.arcs import Arcs, any_turns, are_of_one_group, turns
 from ..kernels.classification import classify
 from ..kernels.closest import contact_at
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
+from ..kernels.pipeline.batch_arc_culling import cull_arc_batch_of
 from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
 from ..kernels.pipeline.batch_classification import OPEN, classify_batch_of
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
@@ -292,10 +293,31 @@ def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
     return cull
 
 
+@wp.func
+def _move_turning_pairs(kind: int, stages: PairStages, arcs: Arcs, first: int, count: int) -> int:
+    """Moves the pairs with a turning vertex to the end of a part of the queue, and returns the number of the others."""
+    straight = int(0)
+    end = int(count)
+    while straight < end:
+        pair = stages.queue[first + straight]
+        if turns(arcs, vertices_of_pair(kind, stages.elements, pair)):
+            end -= 1
+            stages.queue[first + straight] = stages.queue[first + end]
+            stages.queue[first + end] = pair
+        else:
+            straight += 1
+    return straight
+
+
 @made_once
-def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
-    """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position."""
+def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bool) -> wp.Kernel:
+    """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position.
+
+    If a vertex turns, each batch of the queue then begins with the pairs on arcs that are left, for :mod:`.arc_phase`,
+    and (-1, -1) after them. Without ``on_arcs`` nothing turns.
+    """
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+    cull_arc_batch = cull_arc_batch_of(dtype, kind == PairKind.VERTEX_FACE) if on_arcs else None
     kind_number = int(kind)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
@@ -311,19 +333,30 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kerne
     ):
         i = BATCH * (first + wp.tid())
         filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
-        left = cull_batch(x0, x1, stages.elements, stages.queue, i, wp.min(BATCH, filled - i), roundoff)
-        if any_turns(arcs):
-            straight = left
-            while straight != wp.uint64(0):
-                lane = lowest_bit(straight)
-                straight = straight & (straight - wp.uint64(1))
-                if turns(arcs, vertices_of_pair(kind_number, stages.elements, stages.queue[i + lane])):
-                    left = left ^ (wp.uint64(1) << wp.uint64(lane))
+        count = wp.min(BATCH, filled - i)
+        straight = count
+        if wp.static(on_arcs):
+            if any_turns(arcs):
+                straight = _move_turning_pairs(kind_number, stages, arcs, i, count)
+        left = cull_batch(x0, x1, stages.elements, stages.queue, i, straight, roundoff)
         slot = take_slots(stages.counts, _SURVIVORS, count_bits(left))
         while left != wp.uint64(0):
             write(stages.queue[i + lowest_bit(left)], stages.survivors, slot)
             slot += wp.int64(1)
             left = left & (left - wp.uint64(1))
+        if wp.static(on_arcs):
+            if any_turns(arcs):
+                kept = int(0)
+                turning = i + straight
+                left = cull_arc_batch(x0, x1, stages.elements, stages.queue, arcs.deviation, turning, count - straight)
+                while left != wp.uint64(0):
+                    pair = stages.queue[turning + lowest_bit(left)]
+                    if not are_of_one_group(arcs, vertices_of_pair(kind_number, stages.elements, pair)):
+                        stages.queue[i + kept] = pair
+                        kept += 1
+                    left = left & (left - wp.uint64(1))
+                if kept < count:
+                    stages.queue[i + kept] = wp.vec2i(-1, -1)
 
     return cull_batches
 

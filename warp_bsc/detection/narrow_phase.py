@@ -224,6 +224,7 @@ def run_narrow_phases(
         arcs: Pairs with a turning vertex are left out, for :mod:`.arc_phase`; None if nothing turns.
         timer: Measures the stages.
     """
+    on_arcs = arcs is not None
     arcs = Arcs() if arcs is None else arcs
     device = x0.device
     motion = [x0, x1, 0.0 if method == "float" else ROUNDOFF]
@@ -250,7 +251,8 @@ def run_narrow_phases(
 
     with timer.stage("cull"):
         if device.is_cpu:
-            launch_on_cpu(batch_culling_kernel, [arcs], "queue", Count.QUEUED, CULLED)
+            kernel_of = lambda kind, dtype: batch_culling_kernel(kind, dtype, on_arcs)  # noqa: E731
+            launch_on_cpu(kernel_of, [arcs], "queue", Count.QUEUED, CULLED)
         else:
             for kind, s in stages.items():
                 kernel = culling_kernel(kind, x0.dtype)

@@ -1,14 +1,16 @@
 """The motion of bodies that turn: vertices move along arcs, whose distance from their chords has a proven bound."""
 
-import math
+import functools
+import itertools
 
 import numpy as np
 import warp as wp
 
-from .._arguments import as_numpy, checked_coordinates, checked_distance, checked_number
-from ..kernels.arcs import LEVER_ERROR, POSITION_ERROR, TURN_ERROR, on_arc
+from .._arguments import as_numpy, check_finite, checked_coordinates, checked_distance, checked_number
+from ..kernels.arcs import arc_bounds, on_arc
+from ..kernels.motion import double
 from .launch import launch, made_once
-from .settings import NO_GRADIENTS
+from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS
 
 __all__ = ["ArcBounds", "RigidMotion", "points_on_arcs"]
 
@@ -17,14 +19,12 @@ _SMALLEST_TURN = 2.0**-400
 _LARGEST_COORDINATE = 2.0**500
 _DEFAULT_TOLERANCE = 2.0**-12
 """Tolerance as a share of the largest distance of a vertex from its axis."""
-_MISFIT = 2.0**-10
-"""Largest distance of a vertex from where its body would put it at the end, as a share of the distance from the
-centre; and, for positions that were rounded, this share of it of the coordinates."""
+_MISFIT = 2.0**-9
+"""Largest distance of a vertex from where its body would put it at the end, if another vertex is in its place, as a
+share of the distance from the centre; and, for positions that were rounded, this share of it of the coordinates."""
 _ROUNDED_MISFIT = 2.0**-8
 _UP = 1.0 + 2.0**-40
 """Raises a few rounded operations above their exact result."""
-_TINY = 2.0**-1000
-"""More than the underflow of all operations."""
 
 
 @made_once
@@ -61,6 +61,8 @@ class RigidMotion:
     is at x(t) = (1 - t) x0 + t x1 + (R(t) - t R(1) - (1 - t) I)(x0 - centre), where R(t) is the rotation by t times the
     turn: if x1 is where the turn and a translation put it, the centre moves straight and the body turns about it. A
     screw has its centre on its own axis. All other vertices move straight.
+
+    Its arrays are read-only.
 
     Attributes:
         body: Body of each vertex, -1 for those that move straight, int32, shape [vertex_count].
@@ -118,6 +120,9 @@ class RigidMotion:
                 f"body[{which}] must be -1 or one of {len(self.centre)} bodies from 0, not {bodies[which]}"
             )
         self.body = bodies.astype(np.int32)
+        for values in (self.body, self.centre, self.turn):  # copies, as detections keep them on the device
+            values.flags.writeable = False
+        self._on_device: dict[str, tuple[wp.array, wp.array, wp.array]] = {}
         self.tolerance = None if tolerance is None else checked_distance(tolerance, "tolerance", zero=False)
 
     @classmethod
@@ -165,6 +170,13 @@ class RigidMotion:
         angle = 2.0 * np.arctan2(sine, np.abs(scalar))
         turn = np.where(still, 0.0, vector / np.where(still, 1.0, sine) * angle)
         return cls(body, poses[0][:, :3], turn, tolerance=tolerance)
+
+    def on_device(self, device: wp.Device) -> tuple[wp.array, wp.array, wp.array]:
+        """Returns body, centre and turn as Warp arrays of int, vec3d and vec3d, copied once to a device."""
+        if device.alias not in self._on_device:
+            centre, turn = (wp.array(v, dtype=wp.vec3d, device=device) for v in (self.centre, self.turn))
+            self._on_device[device.alias] = wp.array(self.body, dtype=int, device=device), centre, turn
+        return self._on_device[device.alias]
 
     def positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, time: float) -> np.ndarray:
         """Returns the positions of all vertices at a time, rounded, float64, shape [vertex_count, 3].
@@ -219,72 +231,173 @@ def _levers(r: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return across, np.cross(axis, across)
 
 
+@wp.struct
+class _Extent:
+    """How far a motion reaches, and how far vertices are from where arcs take their bodies.
+
+    Attributes:
+        bounds: As of :func:`warp_bsc.kernels.arcs.arc_bounds` for each vertex that has elements, 0 for others.
+        largest: Of all vertices: coordinate at the start, at the end, rounding, distance from the axis; and whether a
+            position is not finite, five numbers.
+        reference: The first vertex of each body.
+        distance: Largest distance of a vertex of each body from its centre at the start.
+        size: Largest coordinate of each body.
+        misfit: Largest distance of a vertex of each body from where arcs take it with the reference.
+    """
+
+    bounds: wp.array[wp.vec3d]
+    largest: wp.array[wp.float64]
+    reference: wp.array[int]
+    distance: wp.array[wp.float64]
+    size: wp.array[wp.float64]
+    misfit: wp.array[wp.float64]
+
+
+@wp.func
+def _raise_to(values: wp.array[wp.float64], i: int, value: wp.float64):
+    if value > values[i]:  # seldom, so that few threads wait for one another
+        wp.atomic_max(values, i, value)
+
+
+@made_once
+def _measure_motion(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that measure a motion, and compare vertices with their bodies, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def measure_motion(
+        # in
+        vertices: wp.array[int],
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        body: wp.array[int],
+        centre: wp.array[wp.vec3d],
+        turn: wp.array[wp.vec3d],
+        # out
+        extent: _Extent,
+    ):
+        vertex = vertices[wp.tid()]
+        start = double(x0[vertex])
+        end = double(x1[vertex])
+        if not (wp.isfinite(start) and wp.isfinite(end)):
+            extent.largest[4] = wp.float64(1.0)
+            return
+        origin = wp.vec3d()
+        axis = wp.vec3d()
+        b = body[vertex]
+        at_start = wp.max(wp.abs(start))
+        at_end = wp.max(wp.abs(end))
+        if b >= 0:
+            origin = centre[b]
+            axis = turn[b]
+            if vertex < extent.reference[b]:
+                wp.atomic_min(extent.reference, b, vertex)
+            _raise_to(extent.distance, b, wp.length(start - origin))
+            _raise_to(extent.size, b, wp.max(at_start, at_end))
+        bounds = arc_bounds(start, end, origin, axis)
+        extent.bounds[vertex] = bounds
+        _raise_to(extent.largest, 0, at_start)
+        _raise_to(extent.largest, 1, at_end)
+        _raise_to(extent.largest, 2, bounds[2])
+        _raise_to(extent.largest, 3, wp.float64(0.5) * bounds[1])
+
+    @wp.func
+    def moved(vertex: int, x0: wp.array[dtype], x1: wp.array[dtype], origin: wp.vec3d, axis: wp.vec3d) -> wp.vec3d:
+        start = double(x0[vertex])
+        r = start - origin
+        turned = wp.quat_rotate(wp.quat_from_axis_angle(wp.normalize(axis), wp.length(axis)), r)
+        return double(x1[vertex]) - start - (turned - r)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def compare_with_body(
+        # in
+        vertices: wp.array[int],
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        body: wp.array[int],
+        centre: wp.array[wp.vec3d],
+        turn: wp.array[wp.vec3d],
+        # in and out
+        extent: _Extent,
+    ):
+        vertex = vertices[wp.tid()]
+        b = body[vertex]
+        if b >= 0 and extent.largest[4] == wp.float64(0.0):
+            of_reference = moved(extent.reference[b], x0, x1, centre[b], turn[b])
+            misfit = wp.length(moved(vertex, x0, x1, centre[b], turn[b]) - of_reference)
+            _raise_to(extent.misfit, b, misfit)
+
+    return measure_motion, compare_with_body
+
+
 class ArcBounds:
     """The motion of a mesh's vertices by a :class:`RigidMotion` in parts of the step, with bounds of their deviation.
 
     Attributes:
         motion: The motion.
-        lever: Bound of the distance of each vertex from its axis, 0 for those that move straight, float64, shape
-            [vertex_count].
         tolerance: Distance within which pairs may be reported that do not collide.
     """
 
-    def __init__(self, motion: RigidMotion, vertices: np.ndarray, x0: wp.array, x1: wp.array):
+    def __init__(self, motion: RigidMotion, vertices: wp.array, x0: wp.array, x1: wp.array):
         """Bounds the motion from one configuration to another.
 
         Args:
             motion: The motion.
-            vertices: The vertices that have elements; positions of others may be anything.
-            x0: Positions at the start, finite for these vertices, Warp array of vec3 or vec3d.
+            vertices: The vertices that have elements, Warp array of int; positions of others may be anything.
+            x0: Positions at the start, Warp array of vec3 or vec3d on the same device.
             x1: Positions at the end, of the same type.
 
         Raises:
-            ValueError: If a coordinate is more than 2^500, the positions at the end are not those of the motion, or
-                the tolerance is too small for their rounding.
+            ValueError: If a position is not finite, a coordinate is more than 2^500, the positions at the end are not
+                those of the motion, or the tolerance is too small for their rounding.
         """
         self.motion = motion
-        self._ends, device = (x0, x1), x0.device
-        self._arrays = [
-            wp.array(motion.body, dtype=int, device=device),
-            *(wp.array(v, dtype=wp.vec3d, device=device) for v in (motion.centre, motion.turn)),
-        ]
-        count = len(motion.body)
-        self.lever, self._lever_angle, self._rounding = np.zeros(count), np.zeros(count), np.zeros(count)
-        start, end = (x.numpy()[vertices].astype(np.float64) for x in (x0, x1))
-        for name, x in (("x0", start), ("x1", end)):
-            if np.abs(x).max(initial=0.0) > _LARGEST_COORDINATE:
-                raise ValueError(f"{name} must have coordinates of at most 2^500 with arcs, not {np.abs(x).max():g}")
-        size = math.sqrt(3.0) * np.maximum(np.abs(start), np.abs(end)).max(axis=1, initial=0.0)
-        body = motion.body[vertices]
-        r, angle = np.zeros_like(start), np.zeros(len(start))
-        turns = body >= 0
-        turn = np.zeros_like(start)
-        r[turns], turn[turns] = (start - motion.centre[body])[turns], motion.turn[body[turns]]
-        angle = np.linalg.norm(turn, axis=1)
-        distance = _UP * np.linalg.norm(r, axis=1)
-        roundoff = 2.0**-53
-        lever = np.linalg.norm(_levers(r, turn)[0], axis=1) + 32.0 * roundoff * distance
-        self.lever[vertices] = np.where(angle > 0.0, _UP * lever, 0.0)
-        self._lever_angle[vertices] = _UP * angle
-        error = POSITION_ERROR * size + (LEVER_ERROR + TURN_ERROR * angle) * distance
-        self._rounding[vertices] = roundoff * _UP * error + _TINY
-        self._check_fit(body, start, end, distance)
-        least = 16.0 * float(self._rounding.max(initial=0.0))  # that parts of the step can reach
+        self._ends, device, bodies = (x0, x1), x0.device, len(motion.centre)
+        self._arrays = motion.on_device(device)
+        extent = _Extent()
+        self._bounds = extent.bounds = wp.zeros(len(motion.body), dtype=wp.vec3d, device=device)
+        extent.reference = wp.full(bodies, len(motion.body), dtype=int, device=device)
+        measured = wp.zeros(5 + 3 * bodies, dtype=wp.float64, device=device)
+        ends = [5 + i * bodies for i in range(4)]
+        extent.largest = measured[:5]
+        extent.distance, extent.size, extent.misfit = (measured[a:b] for a, b in itertools.pairwise(ends))
+        inputs = [vertices, x0, x1, *self._arrays]
+        for kernel in _measure_motion(x0.dtype):
+            launch(kernel, len(vertices), inputs=inputs, outputs=[extent], device=device, record_tape=False)
+        values = measured.numpy()
+        if values[4]:
+            for name, x in (("x0", x0), ("x1", x1)):
+                check_finite(x.numpy(), name, vertices.numpy())
+        for name, size in zip(("x0", "x1"), values[:2], strict=True):
+            if size > _LARGEST_COORDINATE:
+                raise ValueError(f"{name} must have coordinates of at most 2^500 with arcs, not {size:g}")
+        distance, size, misfit = values[5:].reshape(3, bodies)
+        excess = misfit - (_MISFIT * distance + _MISFIT * _ROUNDED_MISFIT * size)
+        if (excess > 0.0).any():
+            worst = int(np.argmax(excess))
+            raise ValueError(
+                f"x1 must be where arcs take body {worst}, up to a translation: a vertex is {misfit[worst]:g} "
+                "away from there"
+            )
+        least = 16.0 * float(values[2])  # that parts of the step can reach
         if motion.tolerance is not None and motion.tolerance < least:
             raise ValueError(
                 f"arcs.tolerance must be at least {least:g}, as positions between the ends are rounded, not "
                 f"{motion.tolerance:g}"
             )
-        largest = float(self.lever.max(initial=0.0))
-        self.tolerance: float = motion.tolerance or max(_DEFAULT_TOLERANCE * largest, least)
+        self.tolerance: float = motion.tolerance or max(_DEFAULT_TOLERANCE * float(values[3]), least)
+
+    @functools.cached_property
+    def lever(self) -> np.ndarray:
+        """Bound of the distance of each vertex from its axis, 0 for those that move straight, shape [vertex_count]."""
+        return 0.5 * self._bounds.numpy()[:, 1]
 
     def deviation(self, level: int) -> np.ndarray:
         """Returns how far each vertex is from its chord at most, in parts of the step that last 2^-level.
 
         The chord is between positions as of :meth:`place`, whose rounding is included. Float64, shape [vertex_count].
         """
-        sagitta = np.minimum((self._lever_angle * 2.0**-level) ** 2 / 8.0, 2.0) * self.lever
-        return _UP * (sagitta + self._rounding)
+        whole, most, rounding = self._bounds.numpy().T
+        return _UP * (np.minimum(whole * 4.0**-level, most) + rounding)
 
     def place(self, time: float) -> wp.array:
         """Returns the positions at a time, Warp array of vec3d on the device of the positions.
@@ -297,30 +410,3 @@ class ArcBounds:
         inputs = [x0, x1, *self._arrays, wp.float64(time)]
         launch(_place_on_arcs(x0.dtype), len(x), inputs=inputs, outputs=[x], device=x0.device, record_tape=False)
         return x
-
-    def _check_fit(self, body: np.ndarray, start: np.ndarray, end: np.ndarray, distance: np.ndarray) -> None:
-        """Raises a ValueError if the positions of a body at the end are not those of its turn and a translation."""
-        turns = np.flatnonzero(body >= 0)
-        if not len(turns):
-            return
-        body, start, end, distance = body[turns], start[turns], end[turns], distance[turns]
-        motion, r = self.motion, start - self.motion.centre[body]
-        turn = motion.turn[body]
-        across, inward = _levers(r, turn)
-        angle = np.linalg.norm(turn, axis=1, keepdims=True)
-        moved = end - start - np.sin(angle) * across - 2.0 * np.sin(0.5 * angle) ** 2 * inward
-        count = len(motion.turn)
-        members = np.maximum(np.bincount(body, minlength=count), 1)
-        mean = np.stack([np.bincount(body, column, minlength=count) / members for column in moved.T], axis=1)
-        misfit = np.linalg.norm(moved - mean[body], axis=1)
-        largest, size = np.zeros(count), np.zeros(count)
-        np.maximum.at(largest, body, distance)
-        np.maximum.at(size, body, np.abs(np.concatenate([start, end], axis=1)).max(axis=1))
-        allowed = _MISFIT * largest + _MISFIT * _ROUNDED_MISFIT * size
-        bad = misfit > allowed[body]
-        if bad.any():
-            worst = int(np.argmax(misfit - allowed[body]))
-            raise ValueError(
-                f"x1 must be where arcs take body {body[worst]}, up to a translation: a vertex is {misfit[worst]:g} "
-                "away from there"
-            )
