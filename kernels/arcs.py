@@ -113,8 +113,8 @@ class Arcs:
         group: Group of each vertex; pairs with a turning vertex within a group of 0 or more are excluded.
         centre: A point of each body's axis at the start.
         turn: Axis of each body times the angle of its turn [rad].
-        deviation: Bound of the distance of each vertex from its chord over the whole step, 0 for those that move
-            straight.
+        bounds: Bounds of how far each vertex is from its chord, see :func:`arc_bounds`.
+        deviation: The same over the whole step, one number, 0 for vertices that move straight.
         tolerance: Distance within which pairs may be reported that do not collide; 0 for :data:`DEFAULT_TOLERANCE`.
     """
 
@@ -123,6 +123,7 @@ class Arcs:
     group: wp.array[int]
     centre: wp.array[wp.vec3d]
     turn: wp.array[wp.vec3d]
+    bounds: wp.array[wp.vec3d]
     deviation: wp.array[wp.float64]
     tolerance: wp.float64
 
@@ -221,37 +222,30 @@ class _PairBounds:
 
 
 @wp.func
-def _bounds_of_pair(
-    kind: int,
-    v: wp.vec4i,
-    # points at the start
-    a: wp.vec3d,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    d: wp.vec3d,
-    # points at the end
-    to_a: wp.vec3d,
-    to_b: wp.vec3d,
-    to_c: wp.vec3d,
-    to_d: wp.vec3d,
-    arcs: Arcs,
-) -> _PairBounds:
-    """Returns the bounds of a pair: of each element, the largest ones of its vertices."""
+def _bounds_of_pair(kind: int, v: wp.vec4i, largest: wp.float64, arcs: Arcs) -> _PairBounds:
+    """Returns the bounds of a pair: of each element, the largest ones of its vertices.
+
+    Args:
+        kind: As of :func:`impact_on_arcs`.
+        v: The vertices of the pair.
+        largest: Its largest coordinate.
+        arcs: The arcs.
+    """
     bounds = _PairBounds()
-    largest = wp.float64(0.0)
     for j in range(4):
-        x0 = wp.where(j == 0, a, wp.where(j == 1, b, wp.where(j == 2, c, d)))
-        x1 = wp.where(j == 0, to_a, wp.where(j == 1, to_b, wp.where(j == 2, to_c, to_d)))
-        centre, turn = _axis_of(arcs, v[j])
-        largest = wp.max(largest, wp.max(wp.max(wp.abs(x0)), wp.max(wp.abs(x1))))
         if j < firsts_of(kind):
-            bounds.first = wp.max(bounds.first, arc_bounds(x0, x1, centre, turn))
+            bounds.first = wp.max(bounds.first, arcs.bounds[v[j]])
         else:
-            bounds.second = wp.max(bounds.second, arc_bounds(x0, x1, centre, turn))
+            bounds.second = wp.max(bounds.second, arcs.bounds[v[j]])
     bounds.rounding = bounds.first[2] + bounds.second[2]
     tolerance = wp.where(arcs.tolerance > _ZERO, arcs.tolerance, DEFAULT_TOLERANCE * largest)
     bounds.tolerance = wp.max(tolerance, _STEPS_OF_ROUNDING * bounds.rounding)
     return bounds
+
+
+@wp.func
+def _largest_coordinate(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
+    return wp.max(wp.max(wp.max(wp.abs(a), wp.abs(b)), wp.max(wp.abs(c), wp.abs(d))))
 
 
 @wp.func
@@ -364,7 +358,8 @@ def impact_on_arcs(
                 searching = False
         else:
             if parts == 1:  # most pairs need no more than the first part
-                bounds = _bounds_of_pair(kind, v, a, b, c, d, to_a, to_b, to_c, to_d, arcs)
+                largest = wp.max(_largest_coordinate(a, b, c, d), _largest_coordinate(to_a, to_b, to_c, to_d))
+                bounds = _bounds_of_pair(kind, v, largest, arcs)
             advance = _SHORTEST * wp.floor(part.toi * length / _SHORTEST)
             found = _ZERO
             if advance == _ZERO:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..kernels.arcs import Arcs, are_of_one_group, distance_at, impact_on_arcs, turns
+from ..kernels.arcs import Arcs, any_turns, are_of_one_group, distance_at, impact_on_arcs, turns
 from ..kernels.ccd import impact_at_distance
 from ..kernels.distance import closest_points
 from ..kernels.min_distance import clears_at_once, closest_at
@@ -144,8 +144,11 @@ def impact_on_arcs_at_distance(
 
 
 @made_once
-def _kernels(dtype: type, on_arcs: bool) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels that cull and decide, for one type of position, with bodies that turn or without."""
+def _kernels(dtype: type, turning: bool) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that cull and decide the pairs with a turning vertex or the others, for one type of position.
+
+    Kernels for both take more registers, which costs more than launches over queues in which nothing turns.
+    """
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull_approaches(
@@ -159,11 +162,16 @@ def _kernels(dtype: type, on_arcs: bool) -> tuple[wp.Kernel, wp.Kernel]:
         # in and out
         stages: PairStages,
     ):
+        if wp.static(turning):
+            if not any_turns(arcs):
+                return
         i = first + wp.tid()
         if not is_filled(i, stages.queue, stages.counts, _QUEUED):
             return
         pair = stages.queue[i]
         v = points_of_pair(kind, stages.elements, pair)
+        if turns(arcs, v) != wp.static(turning):
+            return
         group = distances.group[v[0]]
         if group >= 0 and distances.group[v[3]] == group:
             return
@@ -172,13 +180,12 @@ def _kernels(dtype: type, on_arcs: bool) -> tuple[wp.Kernel, wp.Kernel]:
         points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         distance = distance_of_corners(kind, v, distances.radius) + distances.reach
         reach = distances.reach
-        if wp.static(on_arcs):
-            if turns(arcs, v):
-                if are_of_one_group(arcs, v):
-                    return
-                deviation = distance_of_corners(kind, v, arcs.deviation)
-                distance = ABOVE_SUM * (distance + deviation)
-                reach = ABOVE_SUM * (reach + deviation)
+        if wp.static(turning):
+            if are_of_one_group(arcs, v):
+                return
+            deviation = distance_of_corners(kind, v, arcs.deviation)
+            distance = ABOVE_SUM * (distance + deviation)
+            reach = ABOVE_SUM * (reach + deviation)
         motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
         if clears_at_once(motion, scaled):
             return
@@ -202,22 +209,24 @@ def _kernels(dtype: type, on_arcs: bool) -> tuple[wp.Kernel, wp.Kernel]:
         # in and out
         stages: PairStages,
     ):
+        if wp.static(turning):
+            if not any_turns(arcs):
+                return
         i = first + wp.tid()
         if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
             return
         pair = stages.survivors[i]
         v = points_of_pair(kind, stages.elements, pair)
+        if turns(arcs, v) != wp.static(turning):
+            return
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         a, b, c, d = doubles(a0, b0, c0, d0)
         start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
         result = Impact()
-        straight = bool(True)
-        if wp.static(on_arcs):
-            straight = not turns(arcs, v)
-            if not straight:
-                result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
-        if straight:
+        if wp.static(turning):
+            result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
+        else:
             result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
         status = result.status
         if proximities:
@@ -230,7 +239,7 @@ def _kernels(dtype: type, on_arcs: bool) -> tuple[wp.Kernel, wp.Kernel]:
                 coordinates, normal = closest_at(kind, motion, _ZERO)
                 result.coordinates = coordinates
                 result.normal = normal
-            elif straight or status == FREE:
+            elif not wp.static(turning) or status == FREE:
                 near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
                 if near.status == FREE:
                     return
@@ -281,18 +290,19 @@ def run_approach_phases(
         arcs: The arcs of bodies that turn; None if nothing turns.
         timer: Measures the stages.
     """
-    on_arcs = arcs is not None
+    # pairs with a turning vertex last; on the CPU only where there are some
+    some_turn = arcs is not None and not (x0.device.is_cpu and not arcs.turning.numpy()[0])
+    kernels = [_kernels(x0.dtype, turning) for turning in ((False, True) if some_turn else (False,))]
     arcs = Arcs() if arcs is None else arcs
-    cull, decide = _kernels(x0.dtype, on_arcs)
     with timer.stage("cull"):
         for phase, elements in phases:
-            stages = phase.stages(elements)
-            inputs = [x0, x1, distances, arcs, int(phase.kind)]
-            launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
+            stages, inputs = phase.stages(elements), [x0, x1, distances, arcs, int(phase.kind)]
+            for cull, _decide in kernels:
+                launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
     with timer.stage("classify"):
         for phase, elements in phases:
-            stages = phase.stages(elements)
-            inputs = [x0, x1, distances, arcs, int(phase.kind), proximities, tolerance]
-            launch_over_queue(
-                decide, stages.survivors, phase.counts, Count.SURVIVORS, inputs=inputs, outputs=[stages], block_dim=64
-            )
+            stages, counts = phase.stages(elements), phase.counts
+            options = {"outputs": [stages], "block_dim": 64}
+            options["inputs"] = [x0, x1, distances, arcs, int(phase.kind), proximities, tolerance]
+            for _cull, decide in kernels:
+                launch_over_queue(decide, stages.survivors, counts, Count.SURVIVORS, **options)

@@ -49,6 +49,7 @@ def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance
     arcs.group = wp.array(body, dtype=int, device=device)
     arcs.centre = wp.zeros(bodies, dtype=wp.vec3d, device=device)
     arcs.turn = wp.zeros(bodies, dtype=wp.vec3d, device=device)
+    arcs.bounds = wp.zeros(len(body), dtype=wp.vec3d, device=device)
     arcs.deviation = wp.zeros(len(body), dtype=wp.float64, device=device)
     arcs.tolerance = tolerance
     return arcs
@@ -58,13 +59,19 @@ def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance
 def bound_arc(arcs: Arcs, vertex: int, x0: wp.vec3d, x1: wp.vec3d):
     """Writes how far a vertex is from its chord, and whether it turns, from its positions at both ends of the step."""
     deviation = _ZERO
-    body = arcs.body[vertex]
-    if body >= 0 and wp.isfinite(x0) and wp.isfinite(x1):
-        turn = arcs.turn[body]
+    bounds = wp.vec3d()
+    if wp.isfinite(x0) and wp.isfinite(x1):
+        body = arcs.body[vertex]
+        centre = wp.vec3d()
+        turn = wp.vec3d()
+        if body >= 0:
+            centre = arcs.centre[body]
+            turn = arcs.turn[body]
+        bounds = arc_bounds(x0, x1, centre, turn)
         if wp.length_sq(turn) > _ZERO:
-            bounds = arc_bounds(x0, x1, arcs.centre[body], turn)
             deviation = sagitta_of_part(bounds, _ONE) + bounds[2]
             arcs.turning[0] = 1
+    arcs.bounds[vertex] = bounds
     arcs.deviation[vertex] = deviation
 
 
