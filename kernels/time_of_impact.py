@@ -11,7 +11,7 @@ from .bernstein import THREE, mix, restrict_cubic, restrict_quadratic
 from .classification import constant_signs, verdict
 from .closest import between, closest_coordinates, contact_at
 from .culling import direction_separates
-from .polynomials import Coplanarity, Motion, inside_tests, largest_axis
+from .polynomials import EDGE_EDGE, Coplanarity, Motion, inside_tests, largest_axis
 from .roots import largest
 from .signs import FREE, HIT, UNSURE, certified_sign, certified_sign_cubic
 
@@ -194,6 +194,38 @@ def approximate_contact_time(k: wp.vec4d) -> wp.float64:
 
 
 @wp.func
+def _first_crossing(before: wp.float64, at_start: wp.float64, at_end: wp.float64) -> wp.float64:
+    """Returns when a number that changes linearly falls to zero, if that is earlier than a given time."""
+    if at_end < _ZERO:
+        return wp.min(before, at_start / (at_start - at_end))
+    return before
+
+
+@wp.func
+def approximate_meeting_time(motion: Motion, start: wp.float64, end: wp.float64) -> wp.float64:
+    """Returns an uncertified time of a part of the step at which features meet that stay in a plane, 1 if they do not.
+
+    The direction between their closest points at the start of the part separates them until then, 0 standing for the
+    start of the part and 1 for its end. It may be any number, or NaN, where that leads nowhere.
+    """
+    part = restrict_motion(motion, start, end)
+    coordinates = closest_coordinates(motion.kind, part.u0, part.v0, part.w0)
+    direction = between(motion.kind, coordinates, part.u0, part.v0, part.w0)
+    if motion.kind == EDGE_EDGE:
+        direction = -direction
+    u0 = wp.dot(direction, part.u0)
+    v0 = wp.dot(direction, part.v0)
+    w0 = wp.dot(direction, part.w0)
+    u1 = wp.dot(direction, part.u1)
+    v1 = wp.dot(direction, part.v1)
+    w1 = wp.dot(direction, part.w1)
+    time = _first_crossing(_first_crossing(_ONE, w0, w1), w0 - u0, w1 - u1)
+    if motion.kind == EDGE_EDGE:
+        return _first_crossing(_first_crossing(time, w0 + v0, w1 + v1), w0 - u0 + v0, w1 - u1 + v1)
+    return _first_crossing(time, w0 - v0, w1 - v1)
+
+
+@wp.func
 def power_of_two(x: wp.float64) -> wp.float64:
     """Returns the largest power of two that is at most a positive number."""
     return wp.cast((wp.cast(x, wp.uint64) >> wp.uint64(52)) << wp.uint64(52), wp.float64)
@@ -205,7 +237,8 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
 
     After an interval that is certainly free comes the other half, or one twice as long. An unsure interval becomes
     shorter: it ends half the tolerance before a root of Y, so that it is usually free and the next one, as long as the
-    tolerance, certainly contains contact; or before Y turns back from zero; or it is halved.
+    tolerance, certainly contains contact; or before Y turns back from zero; or, if Y is zero, before the direction
+    between the closest points at its start no longer separates the features; or it is halved.
 
     The search ends at the first interval that certainly contains contact and is short enough: its start is the time of
     impact to within the tolerance. Or it ends at an interval that stays unsure, with an unknown status from there
@@ -245,6 +278,7 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             k = restrict_cubic(y.k, low, high)
             current = status_between(motion, y, k, low, high)
         half = shortest * wp.floor(_HALF * width / shortest)
+        is_planar = largest(k) <= _CUBIC_ERROR * y.bound
         if probing:
             if current == UNSURE:
                 return UNSURE, start, end
@@ -264,12 +298,16 @@ def first_contact(motion: Motion, y: Coplanarity, status: int, tolerance: wp.flo
             ahead = False
             halved = False
             probed = False
-        elif width <= shortest or (width <= _PLANAR * length and largest(k) <= _CUBIC_ERROR * y.bound):
+        elif width <= shortest or (width <= _PLANAR * length and is_planar):
             return UNSURE, start, end
         elif start == _ZERO and not probed:
             probing = True
         else:
-            time = approximate_contact_time(k)
+            time = wp.float64(0.0)
+            if is_planar:  # noqa: SIM108 (of an expression Warp would evaluate both)
+                time = approximate_meeting_time(motion, start, end)
+            else:
+                time = approximate_contact_time(k)
             root = start + shortest * wp.floor(width * time / shortest)
             ahead = False
             passing = False

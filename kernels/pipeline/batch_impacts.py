@@ -45,6 +45,14 @@ _SNIPPET = """
         return -__builtin_convertvector(__builtin_bit_cast(Bools, (unsigned char)lanes), Longs);
     };
 
+    auto restrict_motion = [&](const Motion& m, Doubles start, Doubles end) {
+        Motion part = m;
+        part.u0 = mix_vector(m.u0, m.u1, start), part.u1 = mix_vector(m.u0, m.u1, end);
+        part.v0 = mix_vector(m.v0, m.v1, start), part.v1 = mix_vector(m.v0, m.v1, end);
+        part.w0 = mix_vector(m.w0, m.w1, start), part.w1 = mix_vector(m.w0, m.w1, end);
+        return part;
+    };
+
     struct Query { Motion motion; Coplanarity y; };
 
     // status of some lanes over a part of the time
@@ -56,10 +64,7 @@ _SNIPPET = """
         if (!lanes)
             return found;
         const Motion& m = query.motion;
-        Motion part = m;
-        part.u0 = mix_vector(m.u0, m.u1, start), part.u1 = mix_vector(m.u0, m.u1, end);
-        part.v0 = mix_vector(m.v0, m.v1, start), part.v1 = mix_vector(m.v0, m.v1, end);
-        part.w0 = mix_vector(m.w0, m.w1, start), part.w1 = mix_vector(m.w0, m.w1, end);
+        const Motion part = restrict_motion(m, start, end);
         const Vectors u = times(0.5, plus(part.u0, part.u1)), v = times(0.5, plus(part.v0, part.v1));
         const Vectors w = times(0.5, plus(part.w0, part.w1));
         const int crossing = product(sign(k.k0, k_bound), sign(k.k3, k_bound)).negative;
@@ -113,6 +118,28 @@ _SNIPPET = """
         const Longs along = b * root >= 0.0;
         const Doubles time = where(along, b + root, d0) / where(along, b - d1 + d2, b - root);
         return where(discriminant <= 0.0, zero, least(most(zero, time), one));
+    };
+
+    auto approximate_meeting_time = [&](const Motion& m, Doubles start, Doubles end) -> Doubles {
+        const Motion part = restrict_motion(m, start, end);
+        Vectors direction = between(closest_coordinates(part.u0, part.v0, part.w0), part.u0, part.v0, part.w0);
+        if (!vertex_face)
+            direction = Vectors{-direction.x, -direction.y, -direction.z};
+        const Doubles u0 = dot(direction, part.u0), v0 = dot(direction, part.v0), w0 = dot(direction, part.w0);
+        const Doubles u1 = dot(direction, part.u1), v1 = dot(direction, part.v1), w1 = dot(direction, part.w1);
+        Doubles time = 1.0;
+        auto first_crossing = [&](Doubles at_start, Doubles at_end) {
+            time = where(at_end < 0.0, least(time, at_start / (at_start - at_end)), time);
+        };
+        first_crossing(w0, w1);
+        first_crossing(w0 - u0, w1 - u1);
+        if (vertex_face) {
+            first_crossing(w0 - v0, w1 - v1);
+        } else {
+            first_crossing(w0 + v0, w1 + v1);
+            first_crossing(w0 - u0 + v0, w1 - u1 + v1);
+        }
+        return time;
     };
 
     unsigned long long open = 0;
@@ -189,8 +216,8 @@ _SNIPPET = """
         const int go_on = passed & ~over;
         int search = others & ~(found | passed);
         const Doubles k_size = most(most(absolute(k.k0), absolute(k.k1)), most(absolute(k.k2), absolute(k.k3)));
-        const int stuck = search
-            & bits((width <= shortest) | ((width <= planar * length) & (k_size <= cubic_error * query.y.bound)));
+        const Longs is_planar = k_size <= cubic_error * query.y.bound;
+        const int stuck = search & bits((width <= shortest) | ((width <= planar * length) & is_planar));
         search &= ~stuck;
         const int probe = search & bits(start == 0.0) & ~probed;
         search &= ~probe;
@@ -211,6 +238,8 @@ _SNIPPET = """
             Doubles time = approximate_root(k, search & ~turning);
             if (turning)
                 time = where(lanes_of(turning), approximate_extremum(k), time);
+            if (search & bits(is_planar))
+                time = where(is_planar, approximate_meeting_time(query.motion, start, end), time);
             const Doubles at = start + shortest * __builtin_elementwise_floor(width * time / shortest);
             root = where(lanes_of(search), at, root);
             const int wide = bits(width > length);
