@@ -127,6 +127,17 @@ def queries(gpu: Found, one_core: Found) -> Rows:
     return rows
 
 
+def certify(*runs: Found) -> Rows:
+    """Answers of adversarial queries by method, of all runs together."""
+    titles = {"float": "`float`", "conservative": "`conservative`", "user's kernel": "a kernel with `ccd_*`"}
+    rows = [("answers by", "FREE", "HIT", "UNSURE", "FREE, but colliding", "HIT, but free")]
+    for method in runs[0]["methods"]:
+        answers = [run["methods"][method] for run in runs]
+        sums = (sum(answer[key] for answer in answers) for key in ("free", "hit", "unsure", "missed", "false"))
+        rows.append((titles.get(method, "exact arithmetic on the device"), *(f"{number:,}" for number in sums)))
+    return rows
+
+
 def _rate(number: float) -> str:
     return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
 
@@ -187,27 +198,29 @@ def touching(found: Found) -> Rows:
 # Newton ------------------------------------------------------------------------------------------------------------
 
 
-def newton(*measurements: Found) -> Rows:
+def newton(*measurements: Found, has_times: bool = True) -> Rows:
     """Newton's examples, plain and with the stage."""
-    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
+    quantities = "ms a frame (95th percentile); crossings" if has_times else "crossings"
+    rows = [("example", f"plain: {quantities}", "with `SolverCCD`", "steps")]
     for found in measurements:
         modes: dict[str, dict[str, Found]] = {}
         for run in found["runs"]:
             modes.setdefault(run["example"], {})[run["mode"]] = run
         for name, run in modes.items():
-            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
+            cells = [_newton_cell(run[mode], has_times) for mode in ("plain", "stage")]
             frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
             title = f"`{name}`" + (f", {frames} frames" if frames else "")
             rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
     return rows
 
 
-def _newton_cell(run: Found) -> str:
+def _newton_cell(run: Found, has_times: bool) -> str:
     took = run["measured"]
     if took is None:
         return f"not run: {run['problem']}"
     times = took["milliseconds"]
-    return f"{times['median']:.1f} ({times['percentile_95']:.1f}); {took['most_crossings']:,}"
+    written = f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); " if has_times else ""
+    return f"{written}{took['most_crossings']:,}"
 
 
 def _newton_steps(plain: Found | None, stage: Found | None) -> str:
@@ -405,10 +418,11 @@ TABLES = {
     "front": Table(
         ("detector_gpu", "detector_two_cores", "penetration_bullet", "penetration_drape"), front, has_sources=False
     ),
+    "certify": Table(tuple(f"certify_{seed}_gpu" for seed in range(11, 15)), certify),
     "given_queries": Table(("given_queries_one_core",), given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
     "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), detector_stages),
-    "newton_coupled": Table(("newton_coupled_gpu",), newton),
+    "newton_coupled": Table(("newton_coupled_cpu",), lambda found: newton(found, has_times=False)),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
     "penetration": Table(_PENETRATION, penetration, needs_all=False, has_sources=False),
