@@ -365,6 +365,29 @@ def repair_random(found: Found) -> Rows:
     return rows
 
 
+def repair_shots(found: Found) -> Rows:
+    """Repairs of shots: what collides before and after, moves, edges, and times beside those of the replay."""
+    rows = [
+        ("shot", "collisions", "edges in faces", "largest, mean move", "edges", "an interval; its replay", "multiple")
+    ]
+    for row in found["rows"]:
+        before, left, seconds = row["before"], row["left"], row["seconds"]
+        counts = [f"{before[what]:,} to {left[what]:,}" for what in ("collisions", "intersections")]
+        repairing, finding = (milliseconds(1e3 * seconds[what] / row["intervals"]) for what in ("repairing", "finding"))
+        command = " ".join((row["shot"], *row["options"]))
+        rows.append(
+            (
+                f"`{command}`, {row['intervals']} intervals, {row['vertices']:,} vertices",
+                *counts,
+                f"{row['largest_move']:.2f}, {row['mean_move']:.2f}",
+                f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}",
+                f"{repairing}; {finding}",
+                f"{seconds['repairing'] / seconds['finding']:.1f}",
+            )
+        )
+    return rows
+
+
 def replay_sizes(found: Found) -> Rows:
     """Large, long and crowded scenes."""
     rows = [("scene", "collisions", "wall", "processor", "memory", "file")]
@@ -432,6 +455,7 @@ TABLES = {
     "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
     "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),
     "repair_random": Table(("repair_random_cpu",), repair_random),
+    "repair_shots": Table(("repair_shots_cpu",), repair_shots),
     "replay_sizes": Table(("replay_sizes",), replay_sizes),
     "substeps": Table(("substeps_cpu",), substeps),
     "touching": Table(("touching",), touching),

@@ -16,7 +16,7 @@ import exact_queries
 import numpy as np
 import pytest
 import warp as wp
-from certify_device import KINDS, METHODS, ROWS, Judge, certify_on_device, jobs_of
+from certify_device import KINDS, METHODS, ROWS, Judge, Result, certify_on_device, jobs_of
 from device_queries import LATTICE, Generator, make_lattice_queries
 from lattice_truth import LARGEST, decide_lattice
 from rich.console import Console
@@ -227,6 +227,18 @@ def test_the_host_holds_against_the_checker(monkeypatch, device):
     failures, printed = run(jobs, device, one_in=10)
     assert failures == 20  # of vertex and face in single and double precision
     assert "the checker: HIT; integer_lattice vertex_face, query 50: truth FREE, exact FREE" in printed
+
+
+def test_totals_count_what_float_misses_and_what_it_reports_in_vain():
+    result = Result(checked=1)
+    result.counts[UNSURE, HIT, UNSURE, HIT, FREE] = 5  # exact arithmetic stands for the truth
+    result.counts[FREE, FREE, FREE, UNSURE, HIT] = 2
+    found = certify_device._report({("grazing", True): result}, 0.5, Console(file=io.StringIO()))
+    names = ("free", "hit", "unsure", "missed", "false")
+    expected = {"float": (5, 2, 0, 5, 2), "conservative": (2, 0, 5, 0, 0), "user's kernel": (0, 5, 2, 0, 0)}
+    expected["exact"] = (2, 5, 0, 0, 0)
+    assert found["methods"] == {method: dict(zip(names, numbers, strict=True)) for method, numbers in expected.items()}
+    assert (found["queries"], found["seconds"], found["checked"], found["failures"]) == (7, 0.5, 1, 0)
 
 
 def test_the_command_prints_failures_in_full_and_writes_totals(monkeypatch, capsys, tmp_path, device):
