@@ -68,7 +68,8 @@ def roots_of(cubic):
 
 def draw_signs(path):
     """Draws, for each query, its motion, the coplanarity with its control polygon, and the inside tests."""
-    figure, axes = plt.subplots(3, len(QUERIES), figsize=(12.0, 9.6), constrained_layout=True)
+    heights = {"height_ratios": [1.25, 1.0, 1.0]}
+    figure, axes = plt.subplots(3, len(QUERIES), figsize=(10.0, 4.3), constrained_layout=True, gridspec_kw=heights)
     for column, (title, (moved, start, end)) in enumerate(QUERIES.items()):
         points = np.array([[start, *_TRIANGLE, end, *moved]])
         status = _STATUS[int(bsc.query_vertex_face(points, device="cpu").status[0])]
@@ -91,14 +92,15 @@ def draw_signs(path):
             values = [bernstein(test, np.array([root]))[0] for test in inside]
             tests.plot([root] * 3, values, "k.")
             text = " ".join("+" if value > 0.0 else "\N{MINUS SIGN}" for value in values)
-            tests.annotate(text, (root, -1.45), ha="center", weight="bold")
+            tests.annotate(text, (root, -1.75), ha="center", weight="bold")
         number = f"{len(roots)} root" + "s" * (len(roots) > 1)
         plane.set_title("coplanarity: " + ("all $k_i$ > 0, no root" if cubic.min() > 0.0 else number))
-        tests.set_title("inside tests, and their signs at the roots")
-        tests.set(xlabel="t", ylim=(-1.6, 1.5))
-        plane.set_ylim(-1.4, 0.9)
-        for axis in (plane, tests):
-            axis.legend(loc="lower left" if axis is plane else "upper right", fontsize=8, ncols=3)
+        tests.set_title("inside tests" + (", signs at the roots" if len(roots) else ""))
+        tests.set(xlabel="t", ylim=(-1.9, 1.9))
+        plane.set(ylim=(-1.5, 0.9), xticklabels=[])
+        if column == 0:
+            for axis in (plane, tests):
+                axis.legend(loc="lower left", fontsize=8, ncols=3)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -112,7 +114,8 @@ def draw_motion(scene, moved, start, end):
     scene.plot(*np.array([start, end]).T, color=_POLYGON)
     scene.scatter(*np.array(end)[:, None], color=_POLYGON, s=25)
     scene.view_init(25.0, -60.0)
-    scene.set(xticklabels=[], yticklabels=[], zticklabels=[])
+    scene.set_box_aspect((1.0, 1.0, 0.7), zoom=1.4)
+    scene.set_axis_off()
 
 
 def draw_step(path):
@@ -136,7 +139,7 @@ def draw_step(path):
         cuts.append(end.particle_q.numpy().copy())
     start, predicted, _, result = (cut.reshape(cells + 1, cells + 1, 3)[cells // 2][:, [0, 2]] for cut in cuts)
     report = solver.report
-    figure, axis = plt.subplots(figsize=(10.0, 3.6), constrained_layout=True)
+    figure, axis = plt.subplots(figsize=(10.0, 2.7), constrained_layout=True)
     axis.add_patch(plt.Circle((0.0, 0.0), radius, color="#cccccc"))
     for a, b in zip(start, predicted, strict=True):
         axis.plot(*np.array([a, b]).T, color=_POLYGON, lw=0.5, alpha=0.6)
@@ -144,7 +147,7 @@ def draw_step(path):
     axis.plot(*predicted.T, ".-", color=_POLYGON, label="predicted by VBD")
     axis.plot(*result.T, ".-", color=_CURVE, label="moved by the stage")
     text = f"{report.hits} contacts, {report.iterations} iterations, certified: {report.certified}"
-    axis.set(aspect="equal", xlim=(-0.32, 0.32), ylim=(0.05, 0.225), xlabel="x [m]", ylabel="z [m]", title=text)
+    axis.set(aspect="equal", xlim=(-0.32, 0.32), ylim=(0.07, 0.22), xlabel="x [m]", ylabel="z [m]", title=text)
     axis.legend(loc="lower center", ncols=3)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -127,6 +127,17 @@ def queries(gpu: Found, one_core: Found) -> Rows:
     return rows
 
 
+def certify(*runs: Found) -> Rows:
+    """Answers of adversarial queries by method, of all runs together."""
+    titles = {"float": "`float`", "conservative": "`conservative`", "user's kernel": "a kernel with `ccd_*`"}
+    rows = [("answers by", "FREE", "HIT", "UNSURE", "FREE, but colliding", "HIT, but free")]
+    for method in runs[0]["methods"]:
+        answers = [run["methods"][method] for run in runs]
+        sums = (sum(answer[key] for answer in answers) for key in ("free", "hit", "unsure", "missed", "false"))
+        rows.append((titles.get(method, "exact arithmetic on the device"), *(f"{number:,}" for number in sums)))
+    return rows
+
+
 def _rate(number: float) -> str:
     return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
 
@@ -187,27 +198,29 @@ def touching(found: Found) -> Rows:
 # Newton ------------------------------------------------------------------------------------------------------------
 
 
-def newton(*measurements: Found) -> Rows:
+def newton(*measurements: Found, has_times: bool = True) -> Rows:
     """Newton's examples, plain and with the stage."""
-    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
+    quantities = "ms a frame (95th percentile); crossings" if has_times else "crossings"
+    rows = [("example", f"plain: {quantities}", "with `SolverCCD`", "steps")]
     for found in measurements:
         modes: dict[str, dict[str, Found]] = {}
         for run in found["runs"]:
             modes.setdefault(run["example"], {})[run["mode"]] = run
         for name, run in modes.items():
-            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
+            cells = [_newton_cell(run[mode], has_times) for mode in ("plain", "stage")]
             frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
             title = f"`{name}`" + (f", {frames} frames" if frames else "")
             rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
     return rows
 
 
-def _newton_cell(run: Found) -> str:
+def _newton_cell(run: Found, has_times: bool) -> str:
     took = run["measured"]
     if took is None:
         return f"not run: {run['problem']}"
     times = took["milliseconds"]
-    return f"{times['median']:.1f} ({times['percentile_95']:.1f}); {took['most_crossings']:,}"
+    written = f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); " if has_times else ""
+    return f"{written}{took['most_crossings']:,}"
 
 
 def _newton_steps(plain: Found | None, stage: Found | None) -> str:
@@ -352,6 +365,29 @@ def repair_random(found: Found) -> Rows:
     return rows
 
 
+def repair_shots(found: Found) -> Rows:
+    """Repairs of shots: what collides before and after, moves, edges, and times beside those of the replay."""
+    rows = [
+        ("shot", "collisions", "edges in faces", "largest, mean move", "edges", "an interval; its replay", "multiple")
+    ]
+    for row in found["rows"]:
+        before, left, seconds = row["before"], row["left"], row["seconds"]
+        counts = [f"{before[what]:,} to {left[what]:,}" for what in ("collisions", "intersections")]
+        repairing, finding = (milliseconds(1e3 * seconds[what] / row["intervals"]) for what in ("repairing", "finding"))
+        command = " ".join((row["shot"], *row["options"]))
+        rows.append(
+            (
+                f"`{command}`, {row['intervals']} intervals, {row['vertices']:,} vertices",
+                *counts,
+                f"{row['largest_move']:.2f}, {row['mean_move']:.2f}",
+                f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}",
+                f"{repairing}; {finding}",
+                f"{seconds['repairing'] / seconds['finding']:.1f}",
+            )
+        )
+    return rows
+
+
 def replay_sizes(found: Found) -> Rows:
     """Large, long and crowded scenes."""
     rows = [("scene", "collisions", "wall", "processor", "memory", "file")]
@@ -405,10 +441,11 @@ TABLES = {
     "front": Table(
         ("detector_gpu", "detector_two_cores", "penetration_bullet", "penetration_drape"), front, has_sources=False
     ),
+    "certify": Table(tuple(f"certify_{seed}_gpu" for seed in range(11, 15)), certify),
     "given_queries": Table(("given_queries_one_core",), given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
     "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), detector_stages),
-    "newton_coupled": Table(("newton_coupled_gpu",), newton),
+    "newton_coupled": Table(("newton_coupled_cpu",), lambda found: newton(found, has_times=False)),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
     "penetration": Table(_PENETRATION, penetration, needs_all=False, has_sources=False),
@@ -418,6 +455,7 @@ TABLES = {
     "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
     "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),
     "repair_random": Table(("repair_random_cpu",), repair_random),
+    "repair_shots": Table(("repair_shots_cpu",), repair_shots),
     "replay_sizes": Table(("replay_sizes",), replay_sizes),
     "substeps": Table(("substeps_cpu",), substeps),
     "touching": Table(("touching",), touching),

@@ -122,6 +122,40 @@ def test_queries():
     assert rows[3][1] == f"{rate / 1e6:.3g} million"
 
 
+def test_certificates_of_several_runs():
+    def run(missed):
+        answers = {"free": 1000, "hit": 20, "unsure": 3}
+        return {
+            "methods": {"float": answers | {"missed": missed, "false": 4}, "exact": answers | dict(missed=0, false=0)}
+        }
+
+    _, *rows = tables.certify(run(7), run(8))
+    assert rows == [
+        ("`float`", "2,000", "40", "6", "15", "8"),
+        ("exact arithmetic on the device", "2,000", "40", "6", "0", "0"),
+    ]
+
+
+def test_repairs_of_shots():
+    row = {
+        "shot": "a.usd",
+        "options": ["--min-distance", "0.1"],
+        "before": {"collisions": 1234, "intersections": 5},
+        "left": {"collisions": 1, "intersections": 0},
+        "intervals": 10,
+        "vertices": 5678,
+        "largest_move": 0.123,
+        "mean_move": 0.012,
+        "shortest_edge": 0.8,
+        "longest_edge": 1.234,
+        "seconds": {"finding": 0.2, "repairing": 0.5},
+    }
+    _, cells = tables.repair_shots({"rows": [row]})
+    assert cells[0] == "`a.usd --min-distance 0.1`, 10 intervals, 5,678 vertices"
+    assert cells[1:3] == ("1,234 to 1", "5 to 0")
+    assert cells[3:] == ("0.12, 0.01", "0.80 to 1.23", "50 ms; 20 ms", "2.5")
+
+
 def example(mode, **others):
     took = {
         "frames": 20,
@@ -146,6 +180,8 @@ def test_examples_of_newton():
         ("`cloth_twist`, 20 frames", "12.3 (20.0); 1,234", "12.3 (20.0); 1,234", steps),
         ("`gone`", "not run: a reason", "not run: a reason", ""),
     ]
+    _, row = tables.newton({"runs": [example("plain"), stage]}, has_times=False)
+    assert row == ("`cloth_twist`, 20 frames", "1,234", "1,234", steps)
 
 
 def penetration_run(scene, simulator, problem=None, **others):

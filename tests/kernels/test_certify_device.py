@@ -3,6 +3,7 @@
 import argparse
 import io
 import itertools
+import json
 import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +16,7 @@ import exact_queries
 import numpy as np
 import pytest
 import warp as wp
-from certify_device import KINDS, METHODS, ROWS, Judge, certify_on_device, jobs_of
+from certify_device import KINDS, METHODS, ROWS, Judge, Result, certify_on_device, jobs_of
 from device_queries import LATTICE, Generator, make_lattice_queries
 from lattice_truth import LARGEST, decide_lattice
 from rich.console import Console
@@ -32,8 +33,8 @@ from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 def run(jobs, device, one_in=10_000):
     """Returns the number of failures, and what is printed."""
     console = Console(file=io.StringIO(), width=120)
-    failures = certify_on_device(jobs, device, one_in=one_in, size=1024, pool=ThreadPoolExecutor(1), console=console)
-    return failures, console.file.getvalue()
+    found = certify_on_device(jobs, device, one_in=one_in, size=1024, pool=ThreadPoolExecutor(1), console=console)
+    return found["failures"], console.file.getvalue()
 
 
 # --- Truth on lattices ---
@@ -228,11 +229,33 @@ def test_the_host_holds_against_the_checker(monkeypatch, device):
     assert "the checker: HIT; integer_lattice vertex_face, query 50: truth FREE, exact FREE" in printed
 
 
-def test_the_command_prints_failures_in_full(monkeypatch, capsys, device):
+def test_totals_count_what_float_misses_and_what_it_reports_in_vain():
+    result = Result(checked=1)
+    result.counts[UNSURE, HIT, UNSURE, HIT, FREE] = 5  # exact arithmetic stands for the truth
+    result.counts[FREE, FREE, FREE, UNSURE, HIT] = 2
+    found = certify_device._report({("grazing", True): result}, 0.5, Console(file=io.StringIO()))
+    names = ("free", "hit", "unsure", "missed", "false")
+    expected = {"float": (5, 2, 0, 5, 2), "conservative": (2, 0, 5, 0, 0), "user's kernel": (0, 5, 2, 0, 0)}
+    expected["exact"] = (2, 5, 0, 0, 0)
+    assert found["methods"] == {method: dict(zip(names, numbers, strict=True)) for method, numbers in expected.items()}
+    assert (found["queries"], found["seconds"], found["checked"], found["failures"]) == (7, 0.5, 1, 0)
+
+
+def test_the_command_prints_failures_in_full_and_writes_totals(monkeypatch, capsys, tmp_path, device):
+    path = tmp_path / "certify.json"
     monkeypatch.setattr(certify_device, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
-    monkeypatch.setattr(sys, "argv", ["certify.py", "--device", str(device), "--count", "50", "--lattice", "0:100:7"])
+    options = ["--device", str(device), "--count", "50", "--lattice", "0:100:7", "--json", str(path)]
+    monkeypatch.setattr(sys, "argv", ["certify.py", *options])
     assert certify.main() == 0
-    assert "0 failures" in capsys.readouterr().out
+    printed, found = capsys.readouterr().out, json.loads(path.read_text())
+    assert "0 failures" in printed and f"{found['queries']:,} queries in " in printed
+    assert found["failures"] == 0 and found["record"]["command"].endswith("--lattice 0:100:7")
+    for name, answers in found["methods"].items():
+        numbers = " +".join(f"{number:,}" for number in answers.values())
+        assert re.search(rf"^ {name} +{numbers}", printed, re.MULTILINE)
+        assert answers["free"] + answers["hit"] + answers["unsure"] == found["queries"]
+        assert name == "float" or answers["missed"] == answers["false"] == 0
+    assert found["methods"]["float"]["missed"] > 0
     monkeypatch.setattr(certify_device, "ROUNDOFF", 0.0)
     assert certify.main() == 1
     lines = capsys.readouterr().out.splitlines()
@@ -261,6 +284,7 @@ def test_numbers_that_are_none(text):
     [
         (["--count", "0"], "--count must be at least 1"),
         (["--lattice", "0:9"], "--lattice needs --device"),
+        (["--json", "totals.json"], "--json needs --device"),
         (["--device", "cpu", "--method", "user"], "omit --method"),
         (["--device", "cpu", "--lattice", "9"], "not numbers FIRST:LAST"),
     ],

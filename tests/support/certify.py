@@ -10,7 +10,8 @@ the default options, with tolerances in their range and out of it.
 also what floating point could decide, and leaves out the generators whose queries it nearly always can.
 
 ``python tests/support/certify.py --device cuda:0 --count 100000000`` makes, answers and compares ten billion queries on
-a GPU, see certify_device.py; with ``--lattice 5::1000`` these numbers of {-1, 0, 1}^24 among them.
+a GPU, see certify_device.py; with ``--lattice 5::1000`` these numbers of {-1, 0, 1}^24 among them. ``--json FILE``
+writes the totals as well.
 """
 
 import argparse
@@ -31,6 +32,7 @@ from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.bench.provenance import write_measurement
 from warp_bsc.kernels.exact.polygon import BITS
 
 KINDS = ("vertex_face", "edge_edge")
@@ -245,17 +247,24 @@ def main():
     parser.add_argument(
         "--lattice", type=lattice_range, help="on the device: numbers of {-1, 0, 1}^24, FIRST:LAST:STRIDE"
     )
+    parser.add_argument("--json", metavar="FILE", help="on the device: file to which the totals are written as well")
     arguments = parser.parse_args()
     if arguments.count < 1:
         parser.error(f"--count must be at least 1, not {arguments.count}")
     if arguments.lattice and not arguments.device:
         parser.error("--lattice needs --device")
+    if arguments.json and not arguments.device:
+        parser.error("--json needs --device")
     if arguments.device and arguments.method != "all":
         parser.error("--device runs every method: omit --method")
     wp.config.log_level = wp.LOG_WARNING
     if arguments.device:
         jobs = jobs_of(arguments.count, arguments.seed, arguments.lattice)
-        return 1 if certify_on_device(jobs, arguments.device) else 0
+        found = certify_on_device(jobs, arguments.device)
+        if arguments.json:
+            found = {"benchmark": "certify"} | found
+            write_measurement(arguments.json, found, sys.argv, [wp.get_device(arguments.device)])
+        return 1 if found["failures"] else 0
     if arguments.method != "all":
         certify = certify_exact if arguments.method == "exact" else certify_user
         return 1 if certify(arguments.count, arguments.seed) else 0

@@ -383,7 +383,9 @@ def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, pool=None, cons
         console: Where to print; default: the standard output, 120 columns wide.
 
     Returns:
-        The number of failures. A query may fail on the device and on the host.
+        Plain data for JSON: ``queries``, ``seconds``, ``checked``: queries that the checker has decided, ``failures``,
+        where a query may fail on the device and on the host; ``methods``: by method its answers ``free``, ``hit`` and
+        ``unsure``, and those that are wrong, ``missed`` (FREE, but colliding) and ``false`` (HIT, but free).
     """
     console = console or Console(width=120)
     judge = Judge(device, size or (2**22 if wp.get_device(device).is_cuda else 2**14))
@@ -418,7 +420,7 @@ def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, pool=None, cons
 
 
 def _report(results, seconds, console):
-    """Prints what became of all queries, and returns the number of failures."""
+    """Prints what became of all queries, and returns it as :func:`certify_on_device` does."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), show_edge=False)
     table.add_column("Queries", no_wrap=True)
     for column in ("Type", "Number", "Colliding", "Unsure", "Float missed", "False", "Unknown", "Checked", "Failures"):
@@ -444,12 +446,16 @@ def _report(results, seconds, console):
     table = Table("Method", box=box.SIMPLE_HEAD, padding=(0, 1), show_edge=False)
     for column in ("FREE", "HIT", "UNSURE", "FREE, but colliding", "HIT, but free"):
         table.add_column(column, justify="right", no_wrap=True)
+    methods = {}
     for method, axis in METHODS.items():
         numbers = np.moveaxis(everything.counts, axis, 0).sum(axis=(1, 2, 3, 4))
         of_free, of_hit = (np.moveaxis(everything.of_truth(truth), axis - 1, 0) for truth in (FREE, HIT))
-        table.add_row(method, *(f"{number:,}" for number in (*numbers, of_hit[FREE].sum(), of_free[HIT].sum())))
+        answers = (*numbers, of_hit[FREE].sum(), of_free[HIT].sum())
+        methods[method] = dict(zip(("free", "hit", "unsure", "missed", "false"), map(int, answers), strict=True))
+        table.add_row(method, *(f"{answer:,}" for answer in answers))
     console.print(table)
     number = int(everything.counts.sum())
     rate = f"{number:,} queries in {seconds:.1f} s, {number / seconds:,.0f} a second"
     console.print(f"{rate}; {everything.checked:,} checked on the host, {everything.failed:,} failures")
-    return everything.failed
+    totals = {"queries": number, "seconds": seconds, "checked": everything.checked, "failures": everything.failed}
+    return totals | {"methods": methods}

@@ -4,6 +4,7 @@ Run it as ``python tests/support/draped_shot.py drape.usdc``. ``warp-bsc repair`
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -13,9 +14,9 @@ from pxr import Usd, UsdGeom, Vt
 FRAMES = 60
 
 
-def main() -> None:
-    """Simulates, and writes a frame each 1/60 s."""
-    stage = Usd.Stage.CreateNew(sys.argv[1])
+def write_shot(path: Path) -> None:
+    """Simulates, and writes a frame each 1/60 s to a file."""
+    stage = Usd.Stage.CreateNew(str(path))
     mesh = UsdGeom.Mesh.Define(stage, "/World/Cloth")
     points = mesh.CreatePointsAttr()
     shot = drape(24, 8, 0.2, 0.0008, wp.vec3(-0.4, -0.43, 0.25))
@@ -30,4 +31,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    write_shot(Path(sys.argv[1]))

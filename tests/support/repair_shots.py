@@ -1,0 +1,113 @@
+"""Measures ``warp-bsc repair`` on shots: what collides before and after, how far points move, and the time.
+
+``python tests/support/repair_shots.py`` repairs recorded scenes of ``assets/`` and a cloth that VBD drapes without
+self-contact, on the CPU, each twice; times are those of the faster run. It prints a row for each shot, and ``--json``
+writes them to a file as well.
+"""
+
+import argparse
+import contextlib
+import io
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+from draped_shot import write_shot
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+import warp_bsc as bsc
+from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.cli.main import main as run_command
+from warp_bsc.usd.scene import Scene
+
+ASSETS = Path(__file__).parents[2] / "assets"
+DRAPE = "drape.usdc"
+SHOTS = (
+    ("dancer.usd", ()),
+    ("twisting.usd", ()),
+    ("flamenco.usd", ()),
+    (DRAPE, ()),
+    ("dancer.usd", ("--min-distance", "0.001")),
+)
+"""Files, and options of the command."""
+RUNS = 2
+
+
+def repair(path, output, options):
+    """Runs the command, and returns the results that it prints."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        status = run_command(["repair", str(path), "--output", str(output), "--device", "cpu", "--json", *options])
+    if status:
+        raise SystemExit(f"exit status {status} of the repair of {path}")
+    return json.loads(printed.getvalue())
+
+
+def compare(path, output):
+    """Returns sizes of a shot, and how far its repair moves points and stretches edges.
+
+    Moves are in median lengths of the edges that move, at the first time; those of edges are ratios of their lengths in
+    the repair to those in the shot at the same time.
+    """
+    shot, repaired = (Scene(str(name)) for name in (path, output))
+    segment = shot.interval(0).segment
+    edges = bsc.CollisionMesh(segment.faces, segment.vertex_count, device="cpu").edges
+
+    def positions(scene):
+        return np.stack([*(scene.interval(i).x0 for i in range(len(scene))), scene.interval(len(scene) - 1).x1])
+
+    def lengths(x):
+        ends = x[:, edges]
+        return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2)
+
+    before, after = positions(shot).astype(float), positions(repaired).astype(float)
+    moves = np.linalg.norm(after - before, axis=2)
+    moved = (moves > 0.0).any(axis=0)[edges].any(axis=1)
+    old, new = lengths(before)[:, moved], lengths(after)[:, moved]
+    edge = np.median(old[0])
+    return {
+        "intervals": len(shot),
+        "vertices": segment.vertex_count,
+        "largest_move": float(moves.max() / edge),
+        "mean_move": float(moves[moves > 0.0].mean() / edge),
+        "shortest_edge": float((new / old).min()),
+        "longest_edge": float((new / old).max()),
+    }
+
+
+def main():
+    """Measures all shots."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
+    arguments = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
+    for column in ("Shot", "Before", "Left", "Largest move", "Mean", "Edges", "Finding [s]", "Repairing [s]"):
+        table.add_column(column, justify="left" if column == "Shot" else "right", no_wrap=True)
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        write_shot(folder / DRAPE)
+        for name, options in SHOTS:
+            path, output = (folder if name == DRAPE else ASSETS) / name, folder / "fixed.usdc"
+            runs = [repair(path, output, options) for _ in range(RUNS)]
+            seconds = {key: min(run["seconds"][key] for run in runs) for key in runs[0]["seconds"]}
+            row = {"shot": name, "options": list(options), "before": runs[0]["before"], "left": runs[0]["left"]}
+            row |= compare(path, output) | {"seconds": seconds}
+            rows.append(row)
+            counts = [", ".join(f"{count:,}" for count in row[key].values()) for key in ("before", "left")]
+            moves = [f"{row[key]:.2f}" for key in ("largest_move", "mean_move")]
+            edges = f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}"
+            times = [f"{value:.2f}" for value in seconds.values()]
+            table.add_row(" ".join((name, *options)), *counts, *moves, edges, *times)
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    if arguments.json:
+        write_measurement(arguments.json, {"benchmark": "repair_shots", "rows": rows}, sys.argv, [wp.get_device("cpu")])
+
+
+if __name__ == "__main__":
+    main()
