@@ -12,11 +12,9 @@ from ..kernels.pipeline.corners import (
     PaddedCorners,
     edge_box,
     face_box,
-    paddings_of,
     read_corners,
     read_label,
     read_padded_corners,
-    read_padded_label,
     vertex_box,
 )
 from ..kernels.pipeline.hierarchy import WIDTH, are_apart, count_set_bits, lowest_set_bit
@@ -140,18 +138,14 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         vertices: wp.vec3i
         elements: int  # what it represents, as bits, see :mod:`warp_bsc.kernels.pipeline.corners`
         corners: PaddedCorners if padded else Corners
-        paddings: wp.vec3d
 
     @wp.func
     def cell_at(mesh: FaceHierarchy, place: int) -> Cell:
         cell = Cell()
-        label = wp.vec4i()
+        label = read_label(mesh.corners, place)
         if wp.static(padded):
-            label = read_padded_label(mesh.padded_corners, place)
-            cell.corners = read_padded_corners(mesh.padded_corners, place)
-            cell.paddings = paddings_of(mesh.padded_corners, place)
+            cell.corners = read_padded_corners(mesh.corners, place)
         else:
-            label = read_label(mesh.corners, place)
             cell.corners = read_corners(mesh.corners, place)
         cell.vertices = wp.vec3i(label[0], label[1], label[2])
         cell.elements = label[3]
@@ -171,7 +165,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         """Returns which corners no axis separates from a box, as bits."""
         found = int(0)
         for i in range(3):
-            if not are_apart(vertex_box(a.corners, a.paddings, i, wp.static(swept)), box):
+            if not are_apart(vertex_box(a.corners, i, wp.static(swept)), box):
                 found = found | (1 << i)
         return found
 
@@ -180,7 +174,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         """Returns which sides no axis separates from a box, as bits."""
         found = int(0)
         for i in range(3):
-            if not are_apart(edge_box(a.corners, a.paddings, i, (i + 1) % 3, wp.static(swept)), box):
+            if not are_apart(edge_box(a.corners, i, (i + 1) % 3, wp.static(swept)), box):
                 found = found | (1 << i)
         return found
 
@@ -190,7 +184,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         sought = a.elements & 7 & ~common_corners(a, b)
         if sought == 0 or b.elements & IS_FACE == 0:
             return 0
-        return sought & corners_near(a, face_box(b.corners, b.paddings, wp.static(swept)))
+        return sought & corners_near(a, face_box(b.corners, wp.static(swept)))
 
     @wp.func
     def sides_with_face(a: Cell, b: Cell) -> int:
@@ -198,7 +192,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         sought = (a.elements >> 3) & 7 & ~_sides_at(common_corners(a, b))
         if sought == 0 or b.elements & IS_FACE == 0:
             return 0
-        return sought & sides_near(a, face_box(b.corners, b.paddings, wp.static(swept)))
+        return sought & sides_near(a, face_box(b.corners, wp.static(swept)))
 
     @wp.func
     def vertex_face_pairs(mesh: FaceHierarchy, place: int, other: int) -> int:
@@ -221,7 +215,7 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
             common = _corners_with(b.vertices, a.vertices[i]) | _corners_with(b.vertices, a.vertices[(i + 1) % 3])
             sought = (b.elements >> 3) & 7 & ~_sides_at(common)
             if (a.elements >> (3 + i)) & 1 == 1 and sought != 0:
-                box = edge_box(a.corners, a.paddings, i, (i + 1) % 3, wp.static(swept))
+                box = edge_box(a.corners, i, (i + 1) % 3, wp.static(swept))
                 found = found | ((sought & sides_near(b, box)) << (6 + 3 * i))
         return found
 
@@ -232,9 +226,9 @@ def pair_functions(padded: bool, swept: bool) -> PairFunctions:
         needed = wp.where(mesh.order[other] >= mesh.point_start, 1, 8)
         if a.elements & 1 == 0 or b.elements & needed == 0:
             return 0
-        box = vertex_box(a.corners, a.paddings, 0, wp.static(swept))
+        box = vertex_box(a.corners, 0, wp.static(swept))
         # the ends of a point are one vertex
-        other_box = edge_box(b.corners, b.paddings, 0, 1, wp.static(swept))
+        other_box = edge_box(b.corners, 0, 1, wp.static(swept))
         return wp.where(are_apart(box, other_box), 0, 1)
 
     return PairFunctions(vertex_face_pairs, element_pairs, edge_face_pairs, point_pair)

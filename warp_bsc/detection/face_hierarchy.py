@@ -14,12 +14,13 @@ import warp as wp
 from ..kernels.pipeline.boxes import BoxRows, read_box, union_of_boxes, write_box
 from ..kernels.pipeline.corners import (
     IS_FACE,
+    PADDED_ROW,
     ROW,
     Corners,
     PaddedCorners,
     face_box,
-    stored,
     vertex_box,
+    with_corner,
     write_corners,
     write_padded_corners,
 )
@@ -66,7 +67,6 @@ class FaceHierarchy:
         owned: The elements whose representative the face at each place is.
         edges: Vertices of each edge.
         corners: Corners of the face at each place, see :mod:`warp_bsc.kernels.pipeline.corners`.
-        padded_corners: The same instead, if boxes have a padding.
         places: Level of the faces; where a position is not finite, boxes cover the others.
         clusters: Level above.
         groups: Highest level; without arrays in a small mesh, where all groups are traversed.
@@ -83,7 +83,6 @@ class FaceHierarchy:
     owned: wp.array[int]
     edges: wp.array2d[int]
     corners: wp.array2d[wp.float32]
-    padded_corners: wp.array2d[wp.float64]
     places: HierarchyLevel
     clusters: HierarchyLevel
     groups: HierarchyLevel
@@ -109,18 +108,18 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
     corners_type = PaddedCorners if padded else Corners
 
     @wp.func
-    def paddings_at(padding: wp.array[wp.float64], a: int, b: int, c: int) -> wp.vec3d:
-        """Returns the paddings of three vertices; without paddings the array is not read."""
+    def padding_of(padding: wp.array[wp.float64], a: int, b: int, c: int) -> wp.float64:
+        """Returns the largest padding of three vertices; without paddings the array is not read."""
         if wp.static(padded):
-            return wp.vec3d(padding[a], padding[b], padding[c])
-        return wp.vec3d()
+            return wp.max(wp.max(padding[a], padding[b]), padding[c])
+        return wp.float64(0.0)
 
     @wp.func
-    def write_row(mesh: FaceHierarchy, i: int, label: wp.vec4i, corners: corners_type, paddings: wp.vec3d):
+    def write_row(mesh: FaceHierarchy, i: int, label: wp.vec4i, corners: corners_type):
         if wp.static(padded):
-            write_padded_corners(mesh.padded_corners, i, label, corners, paddings)
+            write_padded_corners(mesh.corners, i, label, corners)
         else:
-            write_corners(mesh.corners, i, label, corners, paddings)
+            write_corners(mesh.corners, i, label, corners)
 
     @wp.func
     def is_finite(x0: wp.array[dtype], x1: wp.array[dtype], vertex: int) -> bool:
@@ -157,32 +156,26 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
             a = mesh.faces[i, 0]
             b = mesh.faces[i, 1]
             c = mesh.faces[i, 2]
-            corners = corners_type()
-            corners[0] = stored(x0[a], corners)
-            corners[1] = stored(x1[a], corners)
-            corners[2] = stored(x0[b], corners)
-            corners[3] = stored(x1[b], corners)
-            corners[4] = stored(x0[c], corners)
-            corners[5] = stored(x1[c], corners)
-            paddings = paddings_at(padding, a, b, c)
+            pad = padding_of(padding, a, b, c)
+            corners = with_corner(corners_type(), 0, x0[a], x1[a], pad)
+            corners = with_corner(corners, 1, x0[b], x1[b], pad)
+            corners = with_corner(corners, 2, x0[c], x1[c], pad)
             a_finite = is_finite(x0, x1, a)
             b_finite = is_finite(x0, x1, b)
             c_finite = is_finite(x0, x1, c)
             owned = mesh.owned[i]
             if a_finite and b_finite and c_finite:
-                box = face_box(corners, paddings, swept)
+                box = face_box(corners, swept)
                 owned = owned | wp.where(mesh.order[i] < mesh.face_count, IS_FACE, 0)
             else:  # the place covers what it represents and is finite
                 owned = finite_elements(owned, a_finite, b_finite, c_finite)
-                largest = wp.max(wp.max(paddings[0], paddings[1]), paddings[2])
-                of_edges = wp.vec3d(largest, largest, largest)
                 if a_finite:
-                    box = union_of_boxes(box, vertex_box(corners, of_edges, 0, swept))
+                    box = union_of_boxes(box, vertex_box(corners, 0, swept))
                 if b_finite:
-                    box = union_of_boxes(box, vertex_box(corners, of_edges, 1, swept))
+                    box = union_of_boxes(box, vertex_box(corners, 1, swept))
                 if c_finite:
-                    box = union_of_boxes(box, vertex_box(corners, of_edges, 2, swept))
-            write_row(mesh, i, wp.vec4i(a, b, c, owned), corners, paddings)
+                    box = union_of_boxes(box, vertex_box(corners, 2, swept))
+            write_row(mesh, i, wp.vec4i(a, b, c, owned), corners)
             has_changed = 1
             if changed:
                 has_changed = changed[a] | changed[b] | changed[c]
@@ -296,10 +289,7 @@ def make_hierarchy(mesh: CollisionMesh, *, padded: bool) -> FaceHierarchy:
     hierarchy.face_count, hierarchy.point_start = len(mesh.faces), len(mesh.faces) + len(mesh.free_edges)
     hierarchy.order, hierarchy.faces, hierarchy.face_edges = places.order, places.faces, places.face_edges
     hierarchy.owned, hierarchy.edges = places.owned, mesh.device_edges
-    if padded:
-        hierarchy.padded_corners = wp.empty((len(order), ROW), dtype=wp.float64, device=device)
-    else:
-        hierarchy.corners = wp.empty((len(order), ROW), dtype=wp.float32, device=device)
+    hierarchy.corners = wp.empty((len(order), PADDED_ROW if padded else ROW), dtype=wp.float32, device=device)
     worlds = None
     if mesh.world is not None and len(order):
         world = mesh.world[mesh.cells[:, 0]][order]
