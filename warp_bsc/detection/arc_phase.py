@@ -16,10 +16,11 @@ from ..kernels.motion import motion_and_distance
 from ..kernels.pipeline.batch_culling import BATCH
 from ..kernels.pipeline.pairs import distance_of_corners, vertices_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot, take_slots
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE
 from .kernels import PairStages
 from .launch import launch_over, launch_over_queue, made_once
-from .narrow_phase import NarrowPhase
+from .narrow_phase import NarrowPhase, launch_over_kinds
 from .settings import NO_FUSED_OPERATIONS, Count
 from .stage_timer import StageTimer
 
@@ -176,13 +177,19 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         x0: wp.array[dtype],
         x1: wp.array[dtype],
         arcs: Arcs,
-        kind: int,
         # in and out
-        stages: PairStages,
+        vertex_face: PairStages,
+        edge_edge: PairStages,
     ):
         if not any_turns(arcs):
             return
         i = first + wp.tid()
+        kind = int(VERTEX_FACE)
+        stages = vertex_face
+        if i >= vertex_face.survivors.shape[0]:
+            i -= vertex_face.survivors.shape[0]
+            kind = int(EDGE_EDGE)
+            stages = edge_edge
         if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
             return
         pair = stages.survivors[i]
@@ -210,17 +217,16 @@ def run_arc_phases(
     if device.is_cpu and not arcs.turning.numpy()[0]:
         return
     with timer.stage("classify"):
-        for phase, elements in phases:
-            stages = phase.stages(elements)
-            inputs, outputs = [x0, x1, arcs, int(phase.kind)], [stages]
-            if device.is_cpu:
+        if device.is_cpu:
+            for phase, elements in phases:
+                stages = phase.stages(elements)
                 filled = min(len(stages.queue), int(phase.counts.numpy()[Count.QUEUED]))
-                batches = -(-filled // int(BATCH))
-                launch_over(_batch_kernel(x0.dtype), batches, inputs=inputs, outputs=outputs, device=device, chunk=16)
-                continue
-            cull, decide = _kernels(x0.dtype)
-            for kernel, queue, count in (
-                (cull, stages.queue, Count.QUEUED),
-                (decide, stages.survivors, Count.SURVIVORS),
-            ):
-                launch_over_queue(kernel, queue, phase.counts, count, inputs=inputs, outputs=outputs, block_dim=64)
+                options = {"inputs": [x0, x1, arcs, int(phase.kind)], "outputs": [stages], "device": device}
+                launch_over(_batch_kernel(x0.dtype), -(-filled // int(BATCH)), chunk=16, **options)
+            return
+        cull, decide = _kernels(x0.dtype)
+        of_kinds = {phase.kind: phase.stages(elements) for phase, elements in phases}
+        for kind, stages in of_kinds.items():
+            options = {"inputs": [x0, x1, arcs, int(kind)], "outputs": [stages], "block_dim": 64}
+            launch_over_queue(cull, stages.queue, stages.counts, Count.QUEUED, **options)
+        launch_over_kinds(decide, of_kinds, "survivors", inputs=[x0, x1, arcs], block_dim=64)

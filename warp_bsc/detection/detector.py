@@ -419,8 +419,12 @@ class CollisionDetector:
     def _capture_on_cuda(
         self, pipeline: DetectionPipeline, x0: wp.array, x1: wp.array, at_once: ArcPipeline | None = None
     ) -> CapturedCollisions:
-        """Adds a detection by a pipeline to the graph that a GPU captures, both kinds of pair side by side."""
-        pipeline.find_contacts(x0, x1, sort=True, side_stream=self._side_stream)
+        """Adds a detection by a pipeline to the graph that a GPU captures.
+
+        Contacts are sorted when they are read, as the graph would sort the whole capacity; in the graph with gradients.
+        """
+        differentiable = x0.requires_grad or x1.requires_grad
+        pipeline.find_contacts(x0, x1, sort=differentiable, side_stream=self._side_stream)
         generation = pipeline.generation
 
         def read() -> Collisions:
@@ -430,6 +434,8 @@ class CollisionDetector:
             overflows = tuple(pipeline.overflows(counts))
             left_to_host = self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values())
             certified = self.method != "float" and not (overflows or counts.not_finite or left_to_host)
+            for narrow_phase in pipeline.narrow_phases:
+                narrow_phase.sort()
             contacts = self._ordered_contacts(pipeline, counts, recycle=True)
             if at_once is not None and self.method == "exact":
                 pipeline.counts = counts
@@ -441,7 +447,7 @@ class CollisionDetector:
                 return read()
 
         arrays = None
-        if x0.requires_grad or x1.requires_grad:
+        if differentiable:
             capacities = [len(narrow_phase.contacts.pairs) for narrow_phase in pipeline.narrow_phases]
             whole = {
                 DistanceKind(narrow_phase.kind): narrow_phase.ordered_contacts(

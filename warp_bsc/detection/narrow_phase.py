@@ -5,7 +5,7 @@ the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipel
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import warp as wp
@@ -32,7 +32,7 @@ from .launch import launch, launch_over, launch_over_queue, max_blocks
 from .settings import TOLERANCE, UNLIMITED, Count, DistanceKind, Method, PairCounts, PairKind, capacity_for
 from .stage_timer import StageTimer
 
-__all__ = ["NarrowPhase", "decide_on_host", "run_narrow_phases"]
+__all__ = ["NarrowPhase", "decide_on_host", "launch_over_kinds", "run_narrow_phases"]
 
 
 class NarrowPhase:
@@ -199,6 +199,27 @@ class NarrowPhase:
         return buffer
 
 
+def launch_over_kinds(
+    kernel: wp.Kernel, stages: Mapping[PairKind, PairStages], buffer: str, *, inputs: list, block_dim: int
+) -> None:
+    """Launches a kernel of a GPU over a buffer of both kinds, or over one after the other if they are too long.
+
+    Args:
+        kernel: The kernel; its last arguments are the stages of vertex-face and of edge-edge pairs.
+        stages: The stages by kind.
+        buffer: Attribute of the stages: the kernel covers the capacity of this buffer, first of vertex-face pairs.
+        inputs: Its arguments between the first entry and the stages.
+        block_dim: Threads of a block.
+    """
+    entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
+    together = [list(stages)] if sum(entries.values()) < 2**31 else [[kind] for kind in stages]
+    for kinds in together:
+        both = [stages[kind] if kind in kinds else PairStages() for kind in PairKind]
+        device = stages[kinds[0]].counts.device
+        blocks, dim = max_blocks(device, block_dim), sum(entries[kind] for kind in kinds)
+        launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
+
+
 def run_narrow_phases(
     narrow_phases: Sequence[tuple[NarrowPhase, wp.array]],
     x0: wp.array,
@@ -231,17 +252,6 @@ def run_narrow_phases(
     kernels = pair_kernels(x0.dtype)
     stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
 
-    def launch_on_gpu(kernel: wp.Kernel, arguments: list, buffer: str, block_dim: int) -> None:
-        """Launches a kernel over a buffer of both kinds, one after the other if they are too long."""
-        entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
-        together = [list(stages)] if sum(entries.values()) < 2**31 else [[kind] for kind in stages]
-        for kinds in together:
-            both = [stages[kind] if kind in kinds else PairStages() for kind in PairKind]
-            dim = sum(entries[kind] for kind in kinds)
-            blocks = max_blocks(device, block_dim)
-            inputs = [*motion, *arguments]
-            launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
-
     def launch_on_cpu(kernel_of: Callable, arguments: list, buffer: str, count: Count, batch: int) -> None:
         """Launches the kernel of each kind over the filled entries of a buffer, many at a time."""
         for kind, s in stages.items():
@@ -261,13 +271,14 @@ def run_narrow_phases(
         if device.is_cpu:
             launch_on_cpu(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
         else:
-            launch_on_gpu(kernels.classify_survivors, [], "survivors", 64)
+            launch_over_kinds(kernels.classify_survivors, stages, "survivors", inputs=motion, block_dim=64)
     with timer.stage("time of impact"):
         arguments = [timed, tolerance]
         if device.is_cpu:
             launch_on_cpu(batch_impact_kernel, arguments, "for_exact", Count.CONTACTS, DECIDED)
         else:
-            launch_on_gpu(kernels.find_impacts, arguments, "for_exact", 32)
+            inputs = [*motion, *arguments]
+            launch_over_kinds(kernels.find_impacts, stages, "for_exact", inputs=inputs, block_dim=32)
     if method == "exact":
         with timer.stage("exact"):
             for narrow_phase, elements in narrow_phases:
