@@ -95,14 +95,20 @@ def test_subnormal_and_huge_queries_are_culled_only_if_free(kind, dtype):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_pair_is_left_where_it_comes_exactly_as_near_as_it_may(kind):
-    """A vertex or an edge that moves across a plane at the distance of the deviations, and a little farther away."""
+    """A vertex or an edge that moves across a plane at the distance of the deviations, whichever vertices have them."""
     base = np.array([[-1.0, -1.0, 0.0], [2.0, -1.0, 0.0], [-1.0, 2.0, 0.0]])
+    firsts = 1 if kind == "vertex_face" else 2
     if kind == "vertex_face":
         start = np.array([[0.0, 0.0, 0.25], *base])
     else:
         start = np.array([[-1.0, 0.0, 0.25], [1.0, 0.0, 0.25], [0.0, -1.0, 0.0], [0.0, 1.0, 0.0]])
     end = start.copy()
-    end[: 1 if kind == "vertex_face" else 2, :2] += 0.125
-    points = np.stack([np.concatenate([start, end])] * 3)
-    deviation = np.full((3, 4), 0.125) * np.array([[1.0], [1.0 - 2.0**-30], [1.0 + 2.0**-30]])
-    assert cull(kind, points, deviation).tolist() == [True, False, True]
+    end[:firsts, :2] += 0.125
+    deviation = []
+    for first in range(firsts):
+        for second in range(firsts, 4):
+            row = np.zeros(4)
+            row[[first, second]] = 0.125
+            deviation += [row, row * (1.0 - 2.0**-30), row * (1.0 + 2.0**-30)]
+    points = np.stack([np.concatenate([start, end])] * len(deviation))
+    assert cull(kind, points, np.array(deviation)).tolist() == [True, False, True] * (len(deviation) // 3)
