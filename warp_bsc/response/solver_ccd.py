@@ -325,7 +325,7 @@ class SolverCCD(CollisionStage):
         if self._work.ends is not None:
             raise NotImplementedError("inversions='prevented' has no gradients: on a tape, pass 'reported' or 'left'")
 
-    def _begin_step(self, state, contacts):
+    def _begin_step(self, state, contacts, dt):
         self._in_substeps, self._inner_contacts = None, None
         if self._forces is not None:
             self._forces.begin(arrays_of(state), remembers=not self.model.requires_grad)
@@ -338,8 +338,11 @@ class SolverCCD(CollisionStage):
             self.report.substeps_omitted = self._reason_to_omit_substeps(in_substeps)
             if self.report.substeps_omitted is not None:
                 return contacts
-        self._in_substeps, self._inner_contacts = in_substeps, inner_contacts
+        self._in_substeps = in_substeps
         in_substeps.begin(state)
+        if inner_contacts.has_all(dt):
+            return contacts
+        self._inner_contacts = inner_contacts
         external = has_external_rigid_solver(self.solver)
         return inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
 
@@ -373,8 +376,9 @@ class SolverCCD(CollisionStage):
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)
         mask = self._mask
-        if self._in_substeps is not None and self._inner_contacts is not None:
-            self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
+        if self._in_substeps is not None:
+            if self._inner_contacts is not None:
+                self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
             solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
             run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
         elif is_recorded(tape, state_out):
@@ -442,6 +446,13 @@ class SolverCCD(CollisionStage):
         if self._counter is not None:
             self._counter.count(None if self._in_substeps is None else self._in_substeps.taken)
         self._count_step()
+
+    @one_at_a_time
+    def notify_model_changed(self, flags: int) -> None:
+        """Notifies the inner solver, and reads masses and flags of particles and gravity again."""
+        super().notify_model_changed(flags)
+        if self._substepping is not None and flags & newton.ModelFlags.MODEL_PROPERTIES:
+            self._substepping[1].read_gravity()
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver, for the contacts that it got."""

@@ -121,7 +121,7 @@ class CollisionStage(CouplingHooks):
             self._mask = mask
             if mask is not None:
                 self._world_mask.begin(start)
-            passed = self._begin_step(state_in, contacts)
+            passed = self._begin_step(state_in, contacts, dt)
         with self._watched(tape, state_in, state_out):
             self._step_inner(state_in, state_out, control, passed, dt, **options)
             with paused_tape():
@@ -163,7 +163,7 @@ class CollisionStage(CouplingHooks):
     def _check_tape(self, tape, state_in, state_out):
         """Raises an error if the step cannot be recorded on a tape."""
 
-    def _begin_step(self, state, contacts):
+    def _begin_step(self, state, contacts, dt):
         """Prepares for a step of the inner solver, and returns its contacts."""
         return contacts
 
