@@ -38,6 +38,7 @@ from .tuning import SUBSTEPS
 from .write_back import count_record, write_back
 
 _COUPLED = "a coupled solver steps the stage"
+_PASSED_ON = "the inner solver has all contacts that were passed on"
 
 
 class SolverCCD(CollisionStage):
@@ -143,7 +144,9 @@ class SolverCCD(CollisionStage):
                 one of its own in the report, see :mod:`.substeps.small_steps`. In steps that may have
                 substeps, and behind Style3D, the stage resolves contacts of particles with shapes alone, also if
                 ``contacts`` are passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that
-                distance. If contacts strain an edge by more than 20% in a step, or a substep, the stage warns once.
+                distance. Not so in short steps, in which weight moves what is at rest by no more than 1% of the median
+                edge length: the inner solver gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If contacts
+                strain an edge by more than 20% in a step, or a substep, the stage warns once.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
                 coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the
@@ -270,12 +273,14 @@ class SolverCCD(CollisionStage):
             self.report.keep_contacts(self._forces.rows, self._forces.published, self._forces.shapes_of_worlds)
             if self._substepping is not None:
                 self._substepping[0].forces = self._forces
+        self._pushes_before: str | None = None  # in all steps
         if self._inner_rows is not None:
-            self.report.impulses_elsewhere = "SolverStyle3D pushes in its iterations"
+            self._pushes_before = "SolverStyle3D pushes in its iterations"
         elif isinstance(self.solver, ContactLayer):
-            self.report.impulses_elsewhere = "the contact layer pushes before the stage"
+            self._pushes_before = "the contact layer pushes before the stage"
         elif has_self_contact(integrator):
-            self.report.impulses_elsewhere = "SolverVBD has self-contact"
+            self._pushes_before = "SolverVBD has self-contact"
+        self.report.impulses_elsewhere = self._pushes_before
         if options.report_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
             if self._substepping is not None:
@@ -376,6 +381,8 @@ class SolverCCD(CollisionStage):
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)
         mask = self._mask
+        has_all = passed is contacts is not None and contacts.soft_contact_max > 0
+        self.report.impulses_elsewhere = self._pushes_before or (_PASSED_ON if has_all else None)
         if self._in_substeps is not None:
             if self._inner_contacts is not None:
                 self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
