@@ -7,7 +7,7 @@ from typing import Literal
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverBase, SolverStyle3D
+from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
@@ -145,7 +145,7 @@ class SolverCCD(CollisionStage):
                 substeps, and behind Style3D, the stage resolves contacts of particles with shapes alone, also if
                 ``contacts`` are passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that
                 distance. Not so in short steps, in which weight moves what is at rest by no more than 1% of the median
-                edge length: the inner solver gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If contacts
+                edge length: ``SolverVBD`` gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If contacts
                 strain an edge by more than 20% in a step, or a substep, the stage warns once.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
@@ -251,6 +251,7 @@ class SolverCCD(CollisionStage):
         self._meter = StrainMeter(self._work)
         self._substepping: tuple[Substeps, InnerContacts] | None = None
         self._in_substeps: Substeps | None = None  # of the step in progress, if it may have some
+        self._has_springs = isinstance(integrator, SolverVBD)  # as contacts: XPBD makes velocities of their depth
         if self.substeps == "auto":
             self.report.substeps_omitted = reason_to_omit_substeps(solver)
         self._inner_rows: Style3DContacts | None = None
@@ -345,7 +346,7 @@ class SolverCCD(CollisionStage):
                 return contacts
         self._in_substeps = in_substeps
         in_substeps.begin(state)
-        if inner_contacts.has_all(dt):
+        if self._has_springs and inner_contacts.is_short(dt):
             return contacts
         self._inner_contacts = inner_contacts
         external = has_external_rigid_solver(self.solver)

@@ -90,8 +90,8 @@ class CollisionStage(CouplingHooks):
             state_in: The state at the start; the inner solver may change it.
             state_out: The state at the end. May be the same, except on a tape.
             control: As for the inner solver.
-            contacts: As for the inner solver. In steps that may have substeps, and are not short, it gets only those
-                that the stage does not resolve, see :mod:`.substeps.inner_contacts`.
+            contacts: As for the inner solver. In steps that may have substeps, but for short ones of VBD, it gets only
+                those that the stage does not resolve, see :mod:`.substeps.inner_contacts`.
             dt: Length of the step [s], more than 0.
             world_mask: Which worlds take part in the step, and as the last entry whether everything that is in all
                 worlds does, shape [world_count + 1], as of :meth:`reset`; None for all. The others end the step in the

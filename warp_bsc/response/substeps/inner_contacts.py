@@ -6,11 +6,11 @@ its elements stretched as far as the iterations of the inner solver leave them, 
 needs substeps. The first step in substeps would start from this stretch, and release its energy at once. So one of the
 two resolves a contact, in whole steps and in substeps alike, and where it can, that is the stage.
 
-Short steps are otherwise: the inner solver gets all contacts. Springs hold there without stretching what rests on them,
-and the solver weighs them against the stiffness of elements, which the projection of the stage does not know: what a
-shape pushes, it strains by the way of the shape in a step, and where elements are stiff, that is much energy. The stage
-then resolves what the springs let through. A step is short if weight moves what is at rest by no more than
-``WEIGHT_STRAIN`` of an edge.
+Short steps of VBD are otherwise: it gets all contacts. Springs hold there without stretching what rests on them, and
+VBD weighs them against the stiffness of elements, which the projection of the stage does not know: what a shape pushes,
+it strains by the way of the shape in a step, and where elements are stiff, that is much energy. The stage then resolves
+what the springs let through. A step is short if weight moves what is at rest by no more than ``WEIGHT_STRAIN`` of an
+edge. XPBD would make a velocity of the depth of a contact, which is higher the shorter the substep.
 """
 
 import newton
@@ -171,8 +171,8 @@ class InnerContacts:
         assert gravity is not None  # a finalized model has one of each world
         self._gravity = float(np.linalg.norm(gravity.numpy().reshape(-1, 3).astype(np.float64), axis=1).max())
 
-    def has_all(self, dt: float) -> bool:
-        """Returns whether the inner solver gets all contacts in a step of this length [s], because it is short.
+    def is_short(self, dt: float) -> bool:
+        """Returns whether a step of this length [s] is so short that springs hold what weight presses on them.
 
         Without gravity, none is: nothing says how far contacts go in a step.
         """
