@@ -251,6 +251,18 @@ def test_what_pushes_before_the_stage_is_named(device):
     assert "self-contact" in bsc.SolverCCD(self_contact).report.impulses_elsewhere
 
 
+def test_contacts_that_the_inner_solver_gets_are_named(device):
+    model = ramp(device, 0.0)
+    contacts = newton.CollisionPipeline(model).contacts()
+    assert contacts.soft_contact_max > 0
+    for substeps, dt, expected in (("auto", 1e-4, True), ("auto", 0.1, False), (None, 0.1, True)):
+        solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=substeps)
+        solver.step(model.state(), model.state(), model.control(), contacts, dt)
+        assert (solver.report.impulses_elsewhere is not None) == expected
+        solver.step(model.state(), model.state(), model.control(), None, dt)
+        assert solver.report.impulses_elsewhere is None
+
+
 def test_members_of_worlds():
     found = members_of_worlds(np.array([-1, 1, 0, 1, -1]), 3)
     assert found.tolist() == [[0, 4, 2, -1], [0, 4, 1, 3], [0, 4, -1, -1]]

@@ -73,6 +73,41 @@ def test_a_step_is_the_same_with_contacts_passed_on(inner, substeps, device):
     np.testing.assert_allclose(passed.velocities, plain.velocities, rtol=0.0, atol=1e-3 * in_any_order)
 
 
+def test_steps_in_which_weight_moves_little_are_short(device):
+    """Weight moves by up to 1% of an edge in them, which is 0.0625 m; without gravity there are none."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -10.0))
+    add_drape(builder)
+    model = finalized(builder, device)
+    contacts = inner_contacts.InnerContacts(ModelMesh(model), moves_bodies=False)
+    longest = (0.000625 / 10.0) ** 0.5
+    assert contacts.is_short(0.99 * longest)
+    assert not contacts.is_short(1.01 * longest)
+    model.set_gravity((0.0, 0.0, 0.0))
+    contacts.read_gravity()
+    assert not contacts.is_short(0.99 * longest)
+
+
+@pytest.mark.parametrize("inner", ["vbd", "xpbd"])
+def test_gravity_that_changes_says_which_steps_are_short(inner, device):
+    """A short step has all contacts; if it becomes a long one, they are taken out, and from XPBD in both."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -1.0))
+    add_drape(builder)
+    model = finalized(builder, device)
+    solver = bsc.SolverCCD(SOLVERS[inner](model))
+    pipeline, states = newton.CollisionPipeline(model), (model.state(), model.state())
+    contacts = pipeline.contacts()
+    pipeline.collide(states[0], contacts)
+    got = []
+    inner_step = solver.solver.step
+    solver.solver.step = lambda *arguments: got.append(arguments[3]) or inner_step(*arguments)
+    solver.step(*states, None, contacts, 1.0 / RATE)
+    assert (got[-1] is contacts) == (inner == "vbd")
+    model.set_gravity((0.0, 0.0, -10.0))
+    solver.notify_model_changed(newton.ModelFlags.MODEL_PROPERTIES)
+    solver.step(*states, None, contacts, 1.0 / RATE)
+    assert got[-1].soft_contact_count.numpy()[0] < contacts.soft_contact_count.numpy()[0]
+
+
 def test_contacts_in_a_graph_are_those_of_each_replay(device):
     if device.is_cuda and not wp.is_conditional_graph_supported():
         pytest.skip("needs conditional nodes")
@@ -199,7 +234,7 @@ def test_forces_are_in_the_rows_of_the_contacts_passed_on(device):
     assert count > 20 and 0 < particles.tolist().index(single) < count - 1
     observables = solver.observables({SolverBase.ObservableKind.CONTACT_F}, contacts=contacts)
     before = contacts.soft_contact_particle.numpy()
-    solver.step(model.state(), model.state(), model.control(), contacts, 1.0 / 240, observables=observables)
+    solver.step(model.state(), model.state(), model.control(), contacts, 1.0 / RATE, observables=observables)
     assert observables.contact_f is not None
     force = observables.contact_f.numpy()[contacts.rigid_contact_max :][:count]
     assert (force[particles == single, 2] < 0.0).all()  # on the box

@@ -61,10 +61,10 @@ def contacts_of(model):
     return contacts
 
 
-def step(solver, model, contacts=None):
+def step(solver, model, contacts=None, dt=DT):
     """The state after a step."""
     start, end = model.state(), model.state()
-    solver.step(start, end, model.control(), contacts, DT)
+    solver.step(start, end, model.control(), contacts, dt)
     return end
 
 
@@ -300,7 +300,7 @@ def test_without_them_contacts_are_refused_in_steps_with_substeps(name, device, 
     contacts, solver = contacts_of(model), bsc.SolverCCD(SOLVERS["vbd"](model), substeps=2)
     monkeypatch.delattr(contacts, name)
     with pytest.raises(RuntimeError, match=rf"newton .* has no Contacts.{name}.*cannot be left out"):
-        step(solver, model, contacts)
+        step(solver, model, contacts, 1.0 / 60.0)
 
 
 def test_counters_in_another_order_are_refused(device):

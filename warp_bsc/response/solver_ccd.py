@@ -7,7 +7,7 @@ from typing import Literal
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverBase, SolverStyle3D
+from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
@@ -38,6 +38,7 @@ from .tuning import SUBSTEPS
 from .write_back import count_record, write_back
 
 _COUPLED = "a coupled solver steps the stage"
+_PASSED_ON = "the inner solver has all contacts that were passed on"
 
 
 class SolverCCD(CollisionStage):
@@ -143,7 +144,9 @@ class SolverCCD(CollisionStage):
                 one of its own in the report, see :mod:`.substeps.small_steps`. In steps that may have
                 substeps, and behind Style3D, the stage resolves contacts of particles with shapes alone, also if
                 ``contacts`` are passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that
-                distance. If contacts strain an edge by more than 20% in a step, or a substep, the stage warns once.
+                distance. Not so in short steps, in which weight moves what is at rest by no more than 1% of the median
+                edge length: ``SolverVBD`` gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If contacts
+                strain an edge by more than 20% in a step, or a substep, the stage warns once.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
                 coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the
@@ -248,6 +251,7 @@ class SolverCCD(CollisionStage):
         self._meter = StrainMeter(self._work)
         self._substepping: tuple[Substeps, InnerContacts] | None = None
         self._in_substeps: Substeps | None = None  # of the step in progress, if it may have some
+        self._has_springs = isinstance(integrator, SolverVBD)  # as contacts: XPBD makes velocities of their depth
         if self.substeps == "auto":
             self.report.substeps_omitted = reason_to_omit_substeps(solver)
         self._inner_rows: Style3DContacts | None = None
@@ -270,12 +274,14 @@ class SolverCCD(CollisionStage):
             self.report.keep_contacts(self._forces.rows, self._forces.published, self._forces.shapes_of_worlds)
             if self._substepping is not None:
                 self._substepping[0].forces = self._forces
+        self._pushes_before: str | None = None  # in all steps
         if self._inner_rows is not None:
-            self.report.impulses_elsewhere = "SolverStyle3D pushes in its iterations"
+            self._pushes_before = "SolverStyle3D pushes in its iterations"
         elif isinstance(self.solver, ContactLayer):
-            self.report.impulses_elsewhere = "the contact layer pushes before the stage"
+            self._pushes_before = "the contact layer pushes before the stage"
         elif has_self_contact(integrator):
-            self.report.impulses_elsewhere = "SolverVBD has self-contact"
+            self._pushes_before = "SolverVBD has self-contact"
+        self.report.impulses_elsewhere = self._pushes_before
         if options.report_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
             if self._substepping is not None:
@@ -325,7 +331,7 @@ class SolverCCD(CollisionStage):
         if self._work.ends is not None:
             raise NotImplementedError("inversions='prevented' has no gradients: on a tape, pass 'reported' or 'left'")
 
-    def _begin_step(self, state, contacts):
+    def _begin_step(self, state, contacts, dt):
         self._in_substeps, self._inner_contacts = None, None
         if self._forces is not None:
             self._forces.begin(arrays_of(state), remembers=not self.model.requires_grad)
@@ -338,8 +344,11 @@ class SolverCCD(CollisionStage):
             self.report.substeps_omitted = self._reason_to_omit_substeps(in_substeps)
             if self.report.substeps_omitted is not None:
                 return contacts
-        self._in_substeps, self._inner_contacts = in_substeps, inner_contacts
+        self._in_substeps = in_substeps
         in_substeps.begin(state)
+        if self._has_springs and inner_contacts.is_short(dt):
+            return contacts
+        self._inner_contacts = inner_contacts
         external = has_external_rigid_solver(self.solver)
         return inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
 
@@ -373,8 +382,11 @@ class SolverCCD(CollisionStage):
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)
         mask = self._mask
-        if self._in_substeps is not None and self._inner_contacts is not None:
-            self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
+        has_all = passed is contacts is not None and contacts.soft_contact_max > 0
+        self.report.impulses_elsewhere = self._pushes_before or (_PASSED_ON if has_all else None)
+        if self._in_substeps is not None:
+            if self._inner_contacts is not None:
+                self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
             solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
             run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
         elif is_recorded(tape, state_out):
@@ -442,6 +454,13 @@ class SolverCCD(CollisionStage):
         if self._counter is not None:
             self._counter.count(None if self._in_substeps is None else self._in_substeps.taken)
         self._count_step()
+
+    @one_at_a_time
+    def notify_model_changed(self, flags: int) -> None:
+        """Notifies the inner solver, and reads masses and flags of particles and gravity again."""
+        super().notify_model_changed(flags)
+        if self._substepping is not None and flags & newton.ModelFlags.MODEL_PROPERTIES:
+            self._substepping[1].read_gravity()
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver, for the contacts that it got."""

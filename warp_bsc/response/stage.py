@@ -90,8 +90,8 @@ class CollisionStage(CouplingHooks):
             state_in: The state at the start; the inner solver may change it.
             state_out: The state at the end. May be the same, except on a tape.
             control: As for the inner solver.
-            contacts: As for the inner solver. In steps that may have substeps, it gets only those that the stage does
-                not resolve, see :mod:`.substeps.inner_contacts`.
+            contacts: As for the inner solver. In steps that may have substeps, but for short ones of VBD, it gets only
+                those that the stage does not resolve, see :mod:`.substeps.inner_contacts`.
             dt: Length of the step [s], more than 0.
             world_mask: Which worlds take part in the step, and as the last entry whether everything that is in all
                 worlds does, shape [world_count + 1], as of :meth:`reset`; None for all. The others end the step in the
@@ -121,7 +121,7 @@ class CollisionStage(CouplingHooks):
             self._mask = mask
             if mask is not None:
                 self._world_mask.begin(start)
-            passed = self._begin_step(state_in, contacts)
+            passed = self._begin_step(state_in, contacts, dt)
         with self._watched(tape, state_in, state_out):
             self._step_inner(state_in, state_out, control, passed, dt, **options)
             with paused_tape():
@@ -163,7 +163,7 @@ class CollisionStage(CouplingHooks):
     def _check_tape(self, tape, state_in, state_out):
         """Raises an error if the step cannot be recorded on a tape."""
 
-    def _begin_step(self, state, contacts):
+    def _begin_step(self, state, contacts, dt):
         """Prepares for a step of the inner solver, and returns its contacts."""
         return contacts
 

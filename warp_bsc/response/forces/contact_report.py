@@ -96,8 +96,8 @@ class ContactReport:
     of threads; :attr:`impulses_complete` is false where that is not enough.
 
     Attributes:
-        impulses_elsewhere: What resolves contacts before the stage, so that its impulses on them are small; None if
-            nothing is known to.
+        impulses_elsewhere: What resolves contacts before the stage in the last step, so that its impulses on them are
+            small; None if nothing is known to.
     """
 
     impulses_elsewhere: str | None = None

@@ -5,6 +5,12 @@ shape. The stage lets particles rest at the shape itself. If both acted, a long 
 its elements stretched as far as the iterations of the inner solver leave them, and the stage would find no contact that
 needs substeps. The first step in substeps would start from this stretch, and release its energy at once. So one of the
 two resolves a contact, in whole steps and in substeps alike, and where it can, that is the stage.
+
+Short steps of VBD are otherwise: it gets all contacts. Springs hold there without stretching what rests on them, and
+VBD weighs them against the stiffness of elements, which the projection of the stage does not know: what a shape pushes,
+it strains by the way of the shape in a step, and where elements are stiff, that is much energy. The stage then resolves
+what the springs let through. A step is short if weight moves what is at rest by no more than ``WEIGHT_STRAIN`` of an
+edge. XPBD would make a velocity of the depth of a contact, which is higher the shorter the substep.
 """
 
 import newton
@@ -15,8 +21,9 @@ from newton import BodyFlags, GeoType
 from ..._private_names.of_newton import contacts_with, soft_contact_arrays, soft_contact_counters
 from ..._private_names.of_warp import struct_fields
 from ...kernels.pipeline.pairs import PairFilter, groups_meet
+from ..options import in_eight_bits, particle_edge_lengths
 from ..state.mesh import ModelMesh, are_infinite_planes
-from ..tuning import SEGMENTS, SHAPE_SAGITTA
+from ..tuning import SEGMENTS, SHAPE_SAGITTA, WEIGHT_STRAIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -153,7 +160,23 @@ class InnerContacts:
             stage.body_world, stage.body_flags = model.body_world, model.body_flags
             stage.body_inv_mass = model.body_inv_mass
         stage.worlds, stage.moves_bodies = model.world_count, int(moves_bodies)
+        lengths = particle_edge_lengths(mesh)
+        self._edge = in_eight_bits(np.median(lengths)) if lengths.any() else 0.0
+        self.read_gravity()
         self._buffers: dict[tuple[int, bool], _Buffers] = {}
+
+    def read_gravity(self) -> None:
+        """Reads the gravity of the model, by which steps are short."""
+        gravity = self._model.gravity
+        assert gravity is not None  # a finalized model has one of each world
+        self._gravity = float(np.linalg.norm(gravity.numpy().reshape(-1, 3).astype(np.float64), axis=1).max())
+
+    def is_short(self, dt: float) -> bool:
+        """Returns whether a step of this length [s] is so short that springs hold what weight presses on them.
+
+        Without gravity, none is: nothing says how far contacts go in a step.
+        """
+        return 0.0 < self._gravity * dt * dt <= WEIGHT_STRAIN * self._edge
 
     def take_out(
         self, contacts: newton.Contacts | None, state: newton.State, *, leaves_bodies: bool

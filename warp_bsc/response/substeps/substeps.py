@@ -17,7 +17,8 @@ iterations converge better than few of many (Macklin et al. 2019). A substep beg
 one before.
 
 Contacts that a program passes on are shared out before the step, see :mod:`.substeps.inner_contacts`: whole steps and
-substeps get the same ones. Those between bodies were found at the start of the step, and remain for all substeps.
+substeps get the same ones, in short steps of VBD all of them. Those between bodies were found at the start of the step,
+and remain for all substeps.
 
 References:
     M. Macklin, K. Storey, M. Lu, P. Terdiman, N. Chentanez, S. Jeschke and M. Mueller, Small Steps in Physics
