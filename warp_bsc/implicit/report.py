@@ -1,10 +1,9 @@
 """The report of implicit steps: how well they were solved, and what became of their gradients."""
 
-import warnings
-
 import numpy as np
 import warp as wp
 
+from .._warnings import warn_caller
 from ..response.adjoint.between_steps import AMBIGUOUS_MOVES
 from .worlds import Worlds
 
@@ -128,4 +127,4 @@ class ImplicitReport:
     def _warn_once(self, subject, message):
         if subject not in self._said:
             self._said.add(subject)
-            warnings.warn(message, stacklevel=5)
+            warn_caller(message)

@@ -1,11 +1,11 @@
 """The report of the collision stage: what it found and did, read from the device on access."""
 
 import functools
-import warnings
 
 import numpy as np
 import warp as wp
 
+from .._warnings import warn_caller
 from ..detection.intersections import find_intersections
 from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
@@ -92,7 +92,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _warn_once(self, subject, message):
         if subject not in self._said:
             self._said.add(subject)
-            warnings.warn(message(), stacklevel=7)
+            warn_caller(message())
 
     def _read(self, values):
         """Returns the only number of an array, and warns: the totals were copied before, on the same stream."""
