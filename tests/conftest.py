@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from benchmark_data import data_folder
 from chromium import CHROMIUM
-from compilation import compile_kernels_once, omit_gradients_of_newton
+from compilation import compile_kernels_once, compile_quickly
 from guarded_memory import guard_memory
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
@@ -69,7 +69,7 @@ def pytest_collection_modifyitems(items):
 
 def pytest_collection_finish():
     """Sets options of modules that are imported, and keeps what they have made out of every collection of garbage."""
-    omit_gradients_of_newton()
+    compile_quickly()
     gc.collect()
     gc.freeze()
 

@@ -23,11 +23,11 @@ FALLING_TRIANGLE = """
     import newton
     import newton.examples
     import warp as wp
-    from compilation import omit_gradients_of_newton
+    from compilation import compile_quickly
     from newton.solvers import SolverXPBD
     from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledADMM
 
-    omit_gradients_of_newton()  # as the tests do, so that both take the same kernels
+    compile_quickly()  # as the tests do, so that both take the same kernels
 
 
     class Derived(SolverXPBD):

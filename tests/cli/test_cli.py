@@ -101,10 +101,12 @@ def test_replay_table_fits_a_terminal(capsys, monkeypatch, falling_scene):
     monkeypatch.setenv("COLUMNS", "80")
     output = run(capsys, "replay", falling_scene)
     lines = output.splitlines()
-    start = next(number for number, line in enumerate(lines) if "Interval" in line)
+    start = next(number for number, line in enumerate(lines) if "Frames" in line)
+    assert lines[start].split() == ["Frames", "Collisions", "First", "contact", "At", "x", "y", "z"]
     assert max(map(len, lines[start : start + 6])) <= 80
     row = next(line for line in lines if line.startswith("3 → 4"))
-    assert row.split()[4:6] == ["3", "3.25"]  # hits and the earliest time
+    assert " 3 /World/Falling, vertex 1, with /World/Floor, " in row and lines[lines.index(row) + 1].strip() == "face 0"
+    assert row.split()[-4:] == ["3.25", "0.6", "-0.5", "0"]  # when and where
     for part in (
         "2 meshes, 7 vertices, 3 faces, 4 intervals; method exact on cpu",
         "Collisions in 1 of 4 intervals: 3 vertex-face and 0 edge-edge pairs.",
@@ -508,11 +510,12 @@ def test_program_whose_standard_output_is_full(safe_scene):
 def test_replay_table_on_a_narrow_terminal(capsys, monkeypatch, falling_scene, columns):
     monkeypatch.setenv("COLUMNS", str(columns))
     lines = run(capsys, "replay", falling_scene).splitlines()
-    start = next(number for number, line in enumerate(lines) if "Interval" in line)
-    assert max(len(line.rstrip()) for line in lines[start : start + 3]) <= columns
+    start = next(number for number, line in enumerate(lines) if "Frames" in line)
+    stop = next(number for number, line in enumerate(lines) if "intervals not listed" in line)
+    assert max(len(line.rstrip()) for line in lines[start:stop]) <= columns
     row = lines[start + 2].split()
-    assert (row[:3], row[4:6]) == (["3", "→", "4"], ["3", "3.25"])  # the interval, hits and the earliest time
-    assert "…" not in lines[start + 2]
+    assert (row[:5], "3.25" in row) == (["3", "→", "4", "3", "/World/Falling,"], True)  # frames, collisions, and when
+    assert "…" not in "".join(lines[start:stop])
 
 
 def test_frames_that_begin_with_a_minus(capsys, scenes):

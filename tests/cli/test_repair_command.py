@@ -1,16 +1,22 @@
 """The command ``warp-bsc repair``: errors by name, and valid partial files."""
 
+import argparse
 import contextlib
 import json
 import os
+import shlex
 import signal
+import time
 
 import pytest
+import warp as wp
 from pxr import Usd
 from replay_files import Page
 from stages import add_mesh, new_stage, save
 
+from warp_bsc.cli import device
 from warp_bsc.cli.main import main
+from warp_bsc.cli.repair import add_to as add_repair
 
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 
@@ -167,6 +173,41 @@ def test_full_disk(tmp_path, capsys):
 
 
 def test_replay_says_how_to_repair(tmp_path, capsys):
+    """With all options that both commands have; pairs of a file become options."""
     path = crossing_twice(tmp_path)
-    assert main(["replay", path, "--device", "cpu"]) == 0
-    assert f"To repair: warp-bsc repair {path} --output shot_repaired.usdc" in capsys.readouterr().out
+    (tmp_path / "pairs.txt").write_text("'/World/Q *' /World/Plate\n")
+    options = ["--device", "cpu", "--no-self", "--strict", "--frames", "0.0:20.0", "--purpose", "default", "proxy"]
+    options += ["--prims", "/World/*", "--ignore", "/World/Quad", "/World/Q 2"]
+    assert main(["replay", path, *options, "--ignore-from", str(tmp_path / "pairs.txt"), "--clearance", "0.1"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("To repair: ")]
+    words = shlex.split(line.removeprefix("To repair: "))
+    assert words[:3] == ["warp-bsc", "repair", path] and words[-2:] == ["--output", "shot_repaired.usdc"]
+    parser = argparse.ArgumentParser()
+    add_repair(parser.add_subparsers(), "")
+    given = parser.parse_args(["repair", path, *options, "--ignore", "/World/Q *", "/World/Plate", *words[-2:]])
+    assert vars(parser.parse_args(words[1:])) == vars(given)
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_a_repair_that_compiles_says_so(tmp_path, capsys, monkeypatch, options):
+    """On standard error, beside the bar, and not in what programs read."""
+    run = __import__("warp_bsc.cli.repair_run", fromlist=["repair_shot"])
+    whole = run.repair_shot
+
+    def compiled(*arguments, **named):
+        (tmp_path / "cache" / "wp_module").mkdir()
+        time.sleep(0.2)
+        yield from whole(*arguments, **named)
+
+    path = crossing_twice(tmp_path)
+    assert repair(path, tmp_path / "first.usdc") == 0  # compiles what is not in the real cache
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    monkeypatch.setattr(device, "_SILENT_SECONDS", 0.02)
+    monkeypatch.setattr(run, "repair_shot", compiled)
+    capsys.readouterr()
+    assert repair(path, tmp_path / "fixed.usdc", *options) == 0
+    printed = capsys.readouterr()
+    assert printed.err.count("Compiling kernels for cpu") == 1 and "Compiling" not in printed.out
+    if options:
+        assert json.loads(printed.out)["output"] == str(tmp_path / "fixed.usdc")

@@ -140,23 +140,30 @@ def in_order(pairs, count):
 
 
 def sorted_face_pairs(mesh, x0, x1, keep_separated=False):
-    """The same from boxes sorted along an axis."""
+    """The same from boxes sorted along an axis, world by world."""
     x0, x1 = x0.astype(np.float32), x1.astype(np.float32)
     lows = np.stack([x[mesh.faces].min(axis=1) for x in (x0, x1)])
     highs = np.stack([x[mesh.faces].max(axis=1) for x in (x0, x1)])
-    order = np.argsort(lows.min(axis=0)[:, 0], kind="stable")
-    lows, highs = lows[:, order], highs[:, order]
-    low, high = lows.min(axis=0), highs.max(axis=0)
-    world = np.zeros(len(order)) if mesh.world is None else mesh.world[mesh.faces[order, 0]]
+    world = np.zeros(len(mesh.faces)) if mesh.world is None else mesh.world[mesh.faces[:, 0]]
     found = []
-    for i, stop in enumerate(np.searchsorted(low[:, 0], high[:, 0], side="right")):
-        others = slice(i + 1, stop)
-        overlap = ((low[i] <= high[others]) & (low[others] <= high[i])).all(axis=1) & (world[others] == world[i])
-        if not keep_separated:
-            below, above = highs[:, i, None] < lows[:, others], lows[:, i, None] > highs[:, others]
-            overlap &= ~(below.all(axis=0) | above.all(axis=0)).any(axis=1)
-        found.append(order[np.stack(np.broadcast_arrays(i, i + 1 + np.flatnonzero(overlap)), axis=1)])
-    return in_order(np.concatenate(found), len(order))
+    for number in np.unique(world):
+        order = np.flatnonzero(world == number)
+        order = order[np.argsort(lows[:, order, 0].min(axis=0), kind="stable")]
+        (low_x, low_y, low_z), (_, high_y, high_z) = (
+            lows[:, order].min(axis=0).T.copy(),
+            highs[:, order].max(axis=0).T.copy(),
+        )
+        for i, stop in enumerate(np.searchsorted(low_x, highs[:, order, 0].max(axis=0), side="right")):
+            others = slice(i + 1, stop)
+            overlap = (low_y[i] <= high_y[others]) & (low_y[others] <= high_y[i])
+            overlap &= (low_z[i] <= high_z[others]) & (low_z[others] <= high_z[i])
+            found.append(order[np.stack(np.broadcast_arrays(i, i + 1 + np.flatnonzero(overlap)), axis=1)])
+    a, b = np.concatenate(found).T
+    if not keep_separated:
+        below, above = highs[:, a] < lows[:, b], lows[:, a] > highs[:, b]
+        together = ~(below.all(axis=0) | above.all(axis=0)).any(axis=1)
+        a, b = a[together], b[together]
+    return in_order(np.stack([a, b], axis=1), len(mesh.faces))
 
 
 @pytest.mark.parametrize("worlds", [1, 3])

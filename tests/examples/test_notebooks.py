@@ -29,7 +29,7 @@ import compilation, newton.solvers, warp
 warp.config.log_level = warp.LOG_WARNING
 warp.set_device({{device!r}})
 compilation.compile_kernels_once()
-compilation.omit_gradients_of_newton()
+compilation.compile_quickly()
 """
 """Runs before the first cell, so that notebooks take the kernels of the other tests."""
 

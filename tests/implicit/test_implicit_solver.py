@@ -53,8 +53,8 @@ def test_gradients_of_steps_that_are_not_solved_warn_and_polish_mends_them(devic
     rough = Rollout(model, iterations=2, polish=0)
     with pytest.warns(UserWarning, match="more than 1% of the weight"), wp.Tape():
         rough.run(rough.begin())
-    report = rough.adjoint.report
-    assert report.steps == rough.steps
+        report = rough.adjoint.report
+        assert report.steps == rough.steps
     assert report.unconverged_steps > 0
     assert report.largest_residuals.max() >= report.residuals.max() > 0.01
     polished = Rollout(model, iterations=2, polish=3)
@@ -81,10 +81,9 @@ def test_a_solve_that_does_not_converge_gives_nan_and_is_counted(device):
     states = rollout.backward()
     free = rollout.model.particle_inv_mass.numpy() > 0.0
     assert np.isnan(states[0].particle_qd.grad.numpy()[free]).all()
-    assert rollout.adjoint.report.failed_solves == 1
+    with pytest.warns(UserWarning, match="did not converge"):
+        assert rollout.adjoint.report.failed_solves == 1
     assert rollout.adjoint.report.solves == 1
-    with pytest.warns(UserWarning, match="did not converge"), wp.Tape():
-        rollout.run(rollout.begin())
 
 
 def test_worlds_are_independent(device):
@@ -214,11 +213,10 @@ def test_pairs_that_self_contact_dropped_give_nan_in_their_world_and_are_counted
     rollout = Rollout(model, dt=1.0 / 240.0, start=(0.3, 0.1, -0.3), **options, **SELF_CONTACT)
     with pytest.warns(UserWarning, match="particle_vertex_contact_buffer_size"):
         gradient = rollout.backward()[0].particle_qd.grad.numpy()
-        rollout.adjoint.report.warn()  # a GPU may have counted only now
+        assert rollout.adjoint.report.overflowed_steps == 1
     free, world = model.particle_inv_mass.numpy() > 0.0, model.particle_world.numpy()
     assert np.isnan(gradient[free & (world == 0)]).all()
     assert np.isfinite(gradient[world == 1]).all()
-    assert rollout.adjoint.report.overflowed_steps == 1
 
 
 @pytest.mark.parametrize("scene", [attached_cloth, colliding_cloths])

@@ -203,9 +203,7 @@ def test_the_stage_names_the_repair_when_a_start_crosses(device):
     solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=2))
     with pytest.warns(UserWarning, match="repair_state"):
         solver.step(model.state(), model.state(), model.control(), None, 1.0 / 480.0)
-        wp.synchronize_device(model.device)
         assert solver.report.crossings > 0
-        solver.report.warn()
     assert "repair_state" in str(solver.report)
 
 

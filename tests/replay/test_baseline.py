@@ -3,6 +3,8 @@
 import json
 
 import pytest
+from chromium import Browser
+from replay_files import Page, replay
 from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 from warp_bsc.cli.main import main
@@ -58,6 +60,60 @@ def test_what_is_new_against_a_baseline(stage, tmp_path, capsys):
         before.write_text(text)
         assert main(["replay", path, *options, str(before)]) == 2
         assert "before.json: not a JSON file of this version's replay" in capsys.readouterr().err
+
+
+@pytest.fixture
+def compared(stage, tmp_path, capsys):
+    """A replay in which a triangle falls through a floor, as it did not in the baseline: the page, and what is new."""
+    before, page = tmp_path / "before.json", tmp_path / "page.html"
+    falling = stage.GetPrimAtPath(FALLS[1]).GetAttribute("points")
+    through = falling.Get(1)
+    falling.Set(falling.Get(0), 1)
+    assert main(["replay", save(stage), "--device", "cpu", "--json", str(before), "--clearance", "0.3"]) == 0
+    falling.Set(through, 1)
+    options = ["--baseline", str(before), "--report", str(page), "--clearance", "0.25"]
+    capsys.readouterr()
+    assert main(["replay", save(stage), "--device", "cpu", *options]) == 0
+    return page, capsys.readouterr().out.split("New against the baseline: ")[1]
+
+
+def test_the_page_marks_what_is_new(compared):
+    path, found = compared
+    page = Page(path.read_text())
+    assert page.data["tiles"][0] == [found.split()[0], "new against the baseline"]
+    assert page.data["has_baseline"] and dict(page.data["facts"])["Baseline"].endswith("before.json")
+    new = {tuple(pair["meshes"]): pair["new"] for pair in page.data["pairs"]}
+    assert new[FALLS] == [["collides", 0, 1], *(["crosses", time, time] for time in (1, 2, 3))]
+    assert new[RESTS] == []
+    names = [mesh["name"] for mesh in page.data["meshes"]]
+    marked = set()
+    for name in page.blocks:
+        if name.startswith(("hits-", "rest-", "near-")):
+            block = page.block(name)
+            columns = block["first"], block["second"], block["new"]
+            marks = {(names[i], names[j], mark) for i, j, mark in zip(*columns, strict=True)}
+            could_be_new = not name.startswith("near-")  # it was near before
+            assert all(mark == (could_be_new and "Falling" in first + second) for first, second, mark in marks)
+            marked |= {(name[:4], bool(mark)) for *_, mark in marks}
+    assert marked >= {("hits", True), ("hits", False), ("rest", True), ("rest", False)}
+
+
+def test_a_page_without_a_baseline_marks_nothing(stage, tmp_path):
+    page = Page(replay(stage)[3].read_text())
+    assert not page.data["has_baseline"] and "new against the baseline" not in json.dumps(page.data["tiles"])
+    assert not any("new" in page.block(name) for name in page.blocks)
+
+
+@pytest.mark.browser
+def test_new_rows_are_shown_alone(compared, tmp_path):
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(compared[0])
+        browser.wait("document.body.dataset.state === 'ready'")
+        assert browser.value("document.querySelectorAll('#pairs .new').length") == 1
+        browser.click("#only-new")
+        badges = browser.value("[...document.querySelectorAll('#rows tr[data-at]')].map((row) => row.innerText)")
+        assert len(badges) > 3 and all("new" in text and "Falling" in text for text in badges)
+        assert browser.console == []
 
 
 @pytest.mark.parametrize(

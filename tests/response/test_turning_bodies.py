@@ -234,7 +234,7 @@ def test_a_strip_without_a_way_out_is_reported(device):
     solver = bsc.SolverCCD(Changed(model, turned(0.5 * np.pi)), substeps=None)
     with pytest.warns(UserWarning, match="not certified.*shape"):
         report, *_ = step_once(solver, model)
-    assert not report.certified and report.remaining > 0
+        assert not report.certified and report.remaining > 0
     assert len(report.uncertified_vertices) > 0 and report.uncertified_bodies.tolist() == [0]
 
 

@@ -13,21 +13,31 @@ try:
 except ImportError:  # Windows, where each process compiles for itself
     fcntl = None
 
-__all__ = ["FOLDER", "QUICK", "compile_kernels_once", "omit_gradients_of_newton"]
+__all__ = ["FOLDER", "QUICK", "compile_kernels_once", "compile_quickly"]
 
 FOLDER = os.path.dirname(__file__)
 """Folder from which a program that a test starts can import this module."""
 
 QUICK = {"cpu_compiler_flags": "-march=native"}
-"""Options of modules with large device functions: LLVM inlines by its own rules, not by Warp's, which take twice as
-long to compile. Such kernels are slower, which does not matter in tests."""
+"""Options of modules with large device functions: LLVM inlines by its own rules, not by Warp's, which take up to twice
+as long to compile. Such kernels are slower, which does not matter in tests."""
 
+LARGE = [
+    "warp_bsc.response.adjoint.kernels",
+    "warp_bsc.response.layer.kernels",
+    "newton._src.solvers.semi_implicit.kernels_body",
+    "newton._src.solvers.semi_implicit.kernels_contact",
+    "newton._src.solvers.vbd.particle_vbd_kernels",
+    "newton._src.solvers.vbd.rigid_vbd_kernels",
+]
+"""Modules that take long to compile, and that no program needs which tests start as users do."""
 
 WITHOUT_GRADIENTS = [
     "newton._src.geometry.inertia",
     "newton._src.geometry.kernels",
     "newton._src.sim.articulation",
     "newton._src.sim.collide",
+    "newton._src.solvers.coupled.admm_utils",
     "newton._src.solvers.featherstone.kernels",
     "newton._src.solvers.style3d.builder",
     "newton._src.solvers.style3d.collision.bvh.kernels",
@@ -40,11 +50,15 @@ WITHOUT_GRADIENTS = [
 """Modules of Newton's kernels through which no test takes a gradient. Their adjoints take a minute to compile."""
 
 
-def omit_gradients_of_newton() -> None:
-    """Leaves the adjoints out of :data:`WITHOUT_GRADIENTS`, in this process."""
-    for name in WITHOUT_GRADIENTS:
+def compile_quickly() -> None:
+    """Gives :data:`LARGE` and :data:`WITHOUT_GRADIENTS` quick options, and leaves the adjoints of the latter out.
+
+    It is for this process; a program that shares its kernels has to call it too.
+    """
+    options = dict.fromkeys(LARGE, QUICK) | dict.fromkeys(WITHOUT_GRADIENTS, QUICK | {"enable_backward": False})
+    for name, chosen in options.items():
         with contextlib.suppress(ImportError):  # in another version of Newton
-            wp.set_module_options({"enable_backward": False}, module=importlib.import_module(name))
+            wp.set_module_options(chosen, module=importlib.import_module(name))
 
 
 def compile_kernels_once() -> None:

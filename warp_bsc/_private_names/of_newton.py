@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from types import ModuleType
 from typing import Any
@@ -11,6 +10,7 @@ import newton
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
+from .._warnings import warn_caller
 from .versions import missing, version_of, warn_if_untested
 
 _TRUNCATION = "_penetration_free_truncation"
@@ -42,10 +42,9 @@ def vbd_truncation(solver: SolverVBD) -> Callable[..., None] | None:
     """
     truncate = getattr(solver, _TRUNCATION, None)
     if truncate is None:
-        warnings.warn(
+        warn_caller(
             f"newton {newton.__version__} has no SolverVBD.{_TRUNCATION}, which warp-bsc replaces: "
-            "self-contact of VBD limits the speed of all particles",
-            stacklevel=4,
+            "self-contact of VBD limits the speed of all particles"
         )
     return truncate
 

@@ -2,12 +2,12 @@
 
 import contextlib
 import functools
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
 import warp as wp
 
+from .._warnings import warn_caller
 from .versions import missing, warn_if_untested
 
 
@@ -56,9 +56,8 @@ def may_run_in_threads(kernel: wp.Kernel) -> bool:
 
 @functools.cache
 def _warn_of_one_thread() -> None:
-    warnings.warn(
-        f"Warp {wp.__version__} does not say how kernels were compiled: warp-bsc runs them on one core of the CPU",
-        stacklevel=4,
+    warn_caller(
+        f"Warp {wp.__version__} does not say how kernels were compiled: warp-bsc runs them on one core of the CPU"
     )
 
 

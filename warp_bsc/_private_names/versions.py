@@ -2,7 +2,8 @@
 
 import functools
 import importlib
-import warnings
+
+from .._warnings import warn_caller
 
 TESTED_VERSIONS = {"warp": ("1.18", "1.19"), "newton": ("1.8",)}
 """Versions with which the tests of this package have passed, by the name of the module."""
@@ -13,10 +14,9 @@ def warn_if_untested(package: str) -> None:
     """Warns, once, if the version of a package, "warp" or "newton", is none of :data:`TESTED_VERSIONS`."""
     version, tested = version_of(package), TESTED_VERSIONS[package]
     if ".".join(version.split(".")[:2]) not in tested:
-        warnings.warn(
+        warn_caller(
             f"warp-bsc relies on undocumented parts of {package}, and was tested with its versions "
-            f"{', '.join(tested)}, not with {version}, which is installed",
-            stacklevel=3,
+            f"{', '.join(tested)}, not with {version}, which is installed"
         )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import rich.console
 import warp as wp
 
 from ..detection import start
@@ -34,9 +35,15 @@ def find_device(name: str | None) -> wp.Device:
 
 
 @contextlib.contextmanager
-def loading_kernels(device: wp.Device) -> Iterator[None]:
-    """Prints a message on standard error if kernels are compiled in the block, and it takes more than two seconds."""
-    console, folder, finished = Console(stderr=True), Path(wp.config.kernel_cache_dir or ""), threading.Event()
+def loading_kernels(device: wp.DeviceLike, console: rich.console.Console | None = None) -> Iterator[None]:
+    """Prints a message if kernels are compiled in the block, and it takes more than two seconds.
+
+    Args:
+        device: The device.
+        console: Where to print it, such as above a bar that shows progress; standard error for None.
+    """
+    console = Console(stderr=True) if console is None else console
+    folder, finished = Path(wp.config.kernel_cache_dir or ""), threading.Event()
     before = _changed_at(folder)
 
     def watch() -> None:

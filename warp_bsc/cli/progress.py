@@ -4,6 +4,7 @@ import json
 import sys
 import time
 
+import rich.console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from .tables import Console, say
@@ -33,6 +34,11 @@ class RunProgress:
         self._task = self._bar.add_task("", total=None, note="")
         self._started = self._last_line = time.monotonic()
         self._first: tuple[int, float] | None = None  # what was done first, and when: before that, things load
+
+    @property
+    def console(self) -> rich.console.Console:
+        """Prints on standard error, on a terminal above the bar."""
+        return self._bar.console
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()

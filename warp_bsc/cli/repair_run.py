@@ -19,6 +19,7 @@ from ..replay.intervals import replay
 from ..replay.results import IntervalResult
 from ..usd.points_layer import PointsLayer
 from ..usd.scene import Scene
+from .device import loading_kernels
 from .error_boundary import describe
 from .interrupts import INTERRUPTS, Interrupted
 from .progress import RunProgress
@@ -128,7 +129,7 @@ class RepairRun:
             yield done
         self.earlier = len(self.stretches)
         started = time.perf_counter()
-        with RunProgress("Repairing") as progress:
+        with RunProgress("Repairing") as progress, loading_kernels(self._device, progress.console):
             progress.show(done, len(scene))
             for stretch in repair_shot(
                 scene,

@@ -32,7 +32,14 @@ from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .options import Commands, add_command
 from .progress import RunProgress
-from .replay_options import DESCRIPTION, EPILOG, add_replay_options, command_of, describe_selection
+from .replay_options import (
+    DESCRIPTION,
+    EPILOG,
+    add_replay_options,
+    command_of,
+    describe_selection,
+    repair_command_of,
+)
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
@@ -170,7 +177,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
         if earlier:
             stack.enter_context(contextlib.closing(earlier))
             earlier_count = earlier.count
-        outputs = _open_outputs(stack, scene, arguments, facts, earlier_count)
+        outputs = _open_outputs(stack, scene, arguments, facts, earlier_count, baseline)
         intervals, interrupt, problems = [], None, []
         works, writing = [], 0.0
 
@@ -227,7 +234,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
                 console = Console()
                 print_replay(console, summary)
                 print_work(console, works, writing)
-                print_repair(console, summary)
+                print_repair(console, summary, repair_command_of(scene, arguments))
                 if baseline:
                     print_new(console, baseline.new_in(summary))
                 if finished and (missing := str(not_listed(summary, with_end=True) or "")):
@@ -299,6 +306,7 @@ def _open_outputs(
     arguments: argparse.Namespace,
     facts: dict[str, Any],
     earlier_count: int,
+    baseline: Baseline | None,
 ) -> list[ReplayOutput]:
     """Opens the files that the options name; the stack discards those that are not finished."""
     makers = (
@@ -309,7 +317,7 @@ def _open_outputs(
         (arguments.csv, lambda path: HitsCsv(path, scene=scene)),
         (arguments.npz, lambda path: HitsNpz(path, facts=facts, interval_count=len(scene))),
         (arguments.overlay, lambda path: Overlay(path, scene=scene, command=command_of(arguments))),
-        (arguments.report, lambda path: ReportPage(path, scene=scene)),
+        (arguments.report, lambda path: ReportPage(path, scene=scene, baseline=baseline)),
     )
     outputs = []
     for path, make in makers:

@@ -3,7 +3,9 @@
 import argparse
 import math
 import shlex
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Literal
 
 from .._atomic_file import STDOUT
@@ -14,7 +16,15 @@ from ..usd.selection import PURPOSES
 from .exit_status import ExitStatus, explain_statuses
 from .options import add_detection_options, add_fail_on, distance, positive
 
-__all__ = ["DESCRIPTION", "EPILOG", "add_replay_options", "add_scene_selection", "command_of", "describe_selection"]
+__all__ = [
+    "DESCRIPTION",
+    "EPILOG",
+    "add_replay_options",
+    "add_scene_selection",
+    "command_of",
+    "describe_selection",
+    "repair_command_of",
+]
 
 DESCRIPTION = """\
 Find the collisions of the meshes of a USD scene, with themselves and with each
@@ -134,7 +144,8 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
         "--baseline",
         metavar="FILE",
         help="compare with the JSON file of an earlier replay with the same options: print which meshes collide, "
-        "cross, are inside others or, with --clearance, are near each other at times at which they were not then",
+        "cross, are inside others or, with --clearance, are near each other at times at which they were not then; "
+        "the page of --report marks them",
     )
     add_fail_on(
         out,
@@ -238,27 +249,40 @@ def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str,
 def command_of(arguments: argparse.Namespace) -> str:
     """Returns the command that finds the same as given options: without those on output and processes, for a shell."""
     words = ["warp-bsc", "replay", arguments.scene]
-    if not arguments.self_collisions:
-        words.append("--no-self")
     if not arguments.intersections:
         words.append("--no-intersections")
-    for name in ("strict", "ignore_initial"):
-        words += [_option(name)] * getattr(arguments, name)
+    words += [_option("ignore_initial")] * arguments.ignore_initial
     for name, default in (("method", "exact"), ("subdivide", 1), ("validate", 0)):
         value = getattr(arguments, name)
         words += [_option(name), str(value)] if value != default else []
     for name in ("clearance", "limit", "ignore_from"):
         value = getattr(arguments, name)
         words += [_option(name), str(value)] if value is not None else []
+    return shlex.join(words + _selection_words(arguments, arguments.ignore))
+
+
+def repair_command_of(scene: Scene, arguments: argparse.Namespace) -> str:
+    """Returns the command that repairs what a replay with given options finds: with those that both commands have.
+
+    ``warp-bsc repair`` reads no pairs from a file, and gets those of ``--ignore-from`` one by one.
+    """
+    words = ["warp-bsc", "repair", arguments.scene, *_selection_words(arguments, scene.selection.ignore)]
+    words += ["--device", arguments.device] if arguments.device else []
+    return shlex.join([*words, "--output", f"{Path(scene.path).stem}_repaired.usdc"])
+
+
+def _selection_words(arguments: argparse.Namespace, ignore: Iterable[Sequence[str]]) -> list[str]:
+    """Returns the options of :func:`add_scene_selection`, with pairs that are to be ignored, as words of a command."""
+    words = ["--no-self"] * (not arguments.self_collisions) + ["--strict"] * arguments.strict
     if frames := arguments.frames:
         numbers = [frames.start, frames.end] + [frames.step] * (frames.step is not None)
         words += ["--frames", ":".join("" if number is None else str(number) for number in numbers)]
     for name in ("between", "purpose", "prims", "exclude", "allow_missing"):
         values = getattr(arguments, name)
         words += [_option(name), *values] if values else []
-    for pair in arguments.ignore:
+    for pair in ignore:
         words += ["--ignore", *pair]
-    return shlex.join(words)
+    return words
 
 
 def _option(name: str) -> str:

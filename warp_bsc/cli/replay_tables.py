@@ -1,20 +1,21 @@
 """Shows the results of a replay on the terminal."""
 
-import shlex
 from collections import defaultdict
-from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
 from ..replay.baseline import NewFinding
-from ..replay.results import IntersectionSummary, IntervalSummary, Work
+from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
 from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
 from .option_names import with_option
 from .tables import LONGEST, count, make_table, say
 
 __all__ = ["print_new", "print_repair", "print_replay", "print_work"]
+
+_WITH_POSITIONS = 60
+"""Least width of a terminal on which the table of intervals has positions."""
 
 _RANGES = 4
 """Most ranges of time in a line."""
@@ -79,12 +80,10 @@ def print_replay(console: Console, summary: Summary) -> None:
         _print_validation(console, summary.validation, scene.has_strands)
 
 
-def print_repair(console: Console, summary: Summary) -> None:
-    """Prints how to repair what a replay found; nothing if it found nothing that moves."""
-    scene = summary.scene
-    if summary.hits and not scene.is_still:
-        path = Path(scene.path)
-        say(console, f"To repair: warp-bsc repair {shlex.join([scene.path])} --output {path.stem}_repaired.usdc")
+def print_repair(console: Console, summary: Summary, command: str) -> None:
+    """Prints the command that repairs what a replay found; nothing if it found nothing that moves."""
+    if summary.hits and not summary.scene.is_still:
+        say(console, f"To repair: {command}")
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:
@@ -156,37 +155,24 @@ def _print_certificate(console: Console, summary: Summary) -> None:
 
 
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
-    """Prints the intervals, those with the most collisions first."""
+    """Prints the intervals, those with the most collisions first: of which prims the first is, when and where."""
     arrow = "->" if console.options.ascii_only else "→"
-    stages = list(dict.fromkeys(stage for interval in listed for stage in interval.stats.milliseconds))
-    at_rest = listed[0].intersections is not None
-    while True:
-        headers = [
-            "Pairs\ntested",
-            "Hits",
-            "Earliest",
-            *["Edges\nin faces"] * at_rest,
-            *("\n".join(stage.rsplit(" ", 1)) for stage in stages),
-        ]
-        notes = ["edges through faces and touching them are those at the start"] * at_rest
-        notes += ["times of the stages in milliseconds"] * bool(stages)
-        caption = "; ".join(["The worst first", *notes]) + "."
-        table = make_table("Interval", *headers, caption=caption)
-        table.columns[0].no_wrap = True
-        for interval in listed:
-            assert interval.earliest  # it collides
-            table.add_row(
-                Text(f"{interval.start:g} {arrow} {interval.end:g}"),
-                f"{interval.pairs_tested:,}",
-                f"{interval.hits:,}",
-                f"{round(interval.earliest.time, 6):.6g}",
-                *(f"{found.crossings + found.touches:,}" for found in (interval.intersections or ())[:1]),
-                *(f"{times[stage]:,.1f}" if (times := interval.stats.milliseconds) else "" for stage in stages),
-            )
-        wide = console.options.update(width=1000)
-        if not stages or console.measure(table, options=wide).maximum <= console.width:
-            break
-        stages.pop()  # the least interesting stage, as the table is too wide
+    has_room = console.width >= _WITH_POSITIONS
+    table = make_table("Frames", "Collisions", "First contact", "At", *("x", "y", "z") * has_room)
+    table.columns[0].no_wrap = True
+    prims = table.columns[2]
+    prims.justify, prims.no_wrap, prims.overflow = "left", False, "fold"
+    for interval in listed:
+        first = interval.earliest
+        assert first  # it collides
+        others = len(interval.mesh_pairs) - 1
+        table.add_row(
+            Text(f"{interval.start:g} {arrow} {interval.end:g}"),
+            f"{interval.hits:,}",
+            Text(_contact(first) + f"; also {count(others, 'other pair')}" * (others > 0)),
+            f"{round(first.time, 6):.6g}",
+            *(f"{coordinate:.4g}" for coordinate in first.position * has_room),
+        )
     console.print(table)
 
 
@@ -212,9 +198,7 @@ def _print_collisions(console: Console, summary: Summary) -> None:
         say(console, f"  and {len(summary.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
     contact = colliding[0].earliest
     assert contact  # it collides
-    (first, second), (first_element, second_element) = contact.meshes, contact.elements
-    other = "its" if first == second else f"{second},"
-    say(console, f"The first at time {contact.time:.6g}: {first}, {first_element}, with {other} {second_element}.")
+    say(console, f"The first at time {contact.time:.6g}: {_contact(contact)}.")
     worst = summary.worst[0]
     pairs = "pair" if worst.hits == 1 else "pairs"
     say(console, f"The most from time {worst.start:g} to {worst.end:g}: {worst.hits:,} {pairs}.")
@@ -273,9 +257,8 @@ def _print_proximities(console: Console, summary: Summary, clearance: float) -> 
     )
     table = make_table("Nearest elements", "Distance", "Time", "x", "y", "z", caption="The nearest of all times.")
     for found in nearest[:LONGEST]:
-        (first, second), (element, other) = found.meshes, found.elements
         table.add_row(
-            Text(f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"),
+            Text(_contact(found)),
             f"{found.distance:.6g}",
             f"{found.time:g}",
             *(f"{coordinate:.4g}" for coordinate in found.position),
@@ -293,6 +276,12 @@ def _intersecting(found: IntersectionSummary) -> str:
         (sum(found.inside.values()), "part", "inside"),
     ]
     return ", ".join(f"{count(number, one)} {how}" for number, one, how in numbers if number)
+
+
+def _contact(found: Contact | Nearest) -> str:
+    """Returns the prims and the elements of two that meet, or are nearest, in words."""
+    (first, second), (element, other) = found.meshes, found.elements
+    return f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"
 
 
 def _pair(meshes: tuple[str, str]) -> str:

@@ -1,10 +1,9 @@
 """The report of implicit steps: how well they were solved, and what became of their gradients."""
 
-import warnings
-
 import numpy as np
 import warp as wp
 
+from .._warnings import warn_caller
 from ..response.adjoint.between_steps import AMBIGUOUS_MOVES
 from .worlds import Worlds
 
@@ -37,12 +36,12 @@ class ImplicitReport:
     @property
     def residuals(self) -> np.ndarray:
         """Residual of the last step on a tape, relative to the weight, float64, shape [n]."""
-        return self.device_residuals.numpy()[0]
+        return self._read(self.device_residuals)[0]
 
     @property
     def largest_residuals(self) -> np.ndarray:
         """Largest residual of all steps on tapes, relative to the weight, float64, shape [n]."""
-        return self.device_residuals.numpy()[1]
+        return self._read(self.device_residuals)[1]
 
     @property
     def steps(self) -> int:
@@ -91,7 +90,13 @@ class ImplicitReport:
         return self._count(5)
 
     def _count(self, i):
-        return int(self.device_counts.numpy()[i])
+        return int(self._read(self.device_counts)[i])
+
+    def _read(self, array):
+        """Returns an array on the host, and warns: the counts were copied before, on the same stream."""
+        values = array.numpy()
+        self.warn()
+        return values
 
     def copy_counts(self) -> None:
         """Begins to copy the counts to the host, for :meth:`warn`."""
@@ -122,4 +127,4 @@ class ImplicitReport:
     def _warn_once(self, subject, message):
         if subject not in self._said:
             self._said.add(subject)
-            warnings.warn(message, stacklevel=4)
+            warn_caller(message)

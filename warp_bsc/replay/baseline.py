@@ -3,7 +3,6 @@
 import json
 import os
 from collections import defaultdict
-from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple
 
 import orjson
@@ -39,7 +38,11 @@ class NewFinding(NamedTuple):
 
 
 class Baseline:
-    """The times at which meshes collided, intersected and were near each other in an earlier replay."""
+    """The times at which meshes collided, intersected and were near each other in an earlier replay.
+
+    Attributes:
+        path: The file of that replay.
+    """
 
     def __init__(self, path: str | os.PathLike, *, method: str, clearance: float | None, options: dict[str, Any]):
         """Reads the JSON file of an earlier replay.
@@ -55,6 +58,7 @@ class Baseline:
             ValueError: If it is not the file of a complete replay with the same options, with intersections if these
                 are compared, and with at least the same clearance.
         """
+        self.path = os.fspath(path)
         self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {
             event: defaultdict(list) for event in ("collides", "crosses", "is inside", "is near")
         }
@@ -90,45 +94,34 @@ class Baseline:
                 raise ValueError(f"{path}: written with other options; cannot compare: {difference}")
 
     def new_in(self, summary: Summary) -> list[NewFinding]:
-        """Returns what meshes do in a replay and did not do in the earlier one at that time.
-
-        Meshes that crossed at a time, or one of which was inside the other, count as near each other then.
-        """
-        new = [
-            NewFinding("collides", meshes, interval.start, interval.end)
-            for interval in summary.intervals
-            for meshes in interval.mesh_pairs
-            if not any(
-                since < interval.end and interval.start < until
-                for since, until in self._spans["collides"][tuple(sorted(meshes))]
-            )
-        ]
+        """Returns what meshes do in a replay and did not do in the earlier one at that time."""
+        found: list[NewFinding] = []
+        for interval in summary.intervals:
+            found += [NewFinding("collides", meshes, interval.start, interval.end) for meshes in interval.mesh_pairs]
         for sample in summary.intersections:
             crossing = [meshes for meshes, (crossings, _) in sample.mesh_pairs.items() if crossings]
-            new += self._new_at(sample.time, "crosses", crossing)
-            new += self._new_at(sample.time, "is inside", sample.inside)
+            found += [NewFinding("crosses", meshes, sample.time, sample.time) for meshes in crossing]
+            found += [NewFinding("is inside", meshes, sample.time, sample.time) for meshes in sample.inside]
         for sample in summary.proximities:
             near = [nearest.meshes for nearest in sample.nearest]
-            new += self._new_at(sample.time, "is near", near, ("crosses", "is inside"))
-        return new
+            found += [NewFinding("is near", meshes, sample.time, sample.time) for meshes in near]
+        return [finding for finding in found if self.lacks(finding)]
+
+    def lacks(self, finding: NewFinding) -> bool:
+        """Returns whether the meshes did not do that at that time in the earlier replay.
+
+        Meshes that crossed at a time, or one of which was inside the other, were near each other then.
+        """
+        what, meshes, start, end = finding
+        events = [what, *(("crosses", "is inside") if what == "is near" else ())]
+        spans = [span for event in events for span in self._spans[event].get(tuple(sorted(meshes)), ())]
+        if what == "collides":  # intervals that only meet are two
+            return not any(since < end and start < until for since, until in spans)
+        return not any(since <= start <= until for since, until in spans)
 
     def _add(self, event: Event, span: dict) -> None:
         meshes = tuple(sorted(self._names[mesh] for mesh in span["mesh"]))
         self._spans[event][meshes].append((span["since"], span["until"]))
-
-    def _new_at(
-        self, time: float, event: Event, pairs: Iterable[tuple[str, str]], including: tuple[Event, ...] = ()
-    ) -> list[NewFinding]:
-        """Returns the pairs of meshes of an event at a time at which there was neither it nor one that includes it."""
-        return [
-            NewFinding(event, meshes, time, time)
-            for meshes in pairs
-            if not any(
-                since <= time <= until
-                for earlier in (event, *including)
-                for since, until in self._spans[earlier][tuple(sorted(meshes))]
-            )
-        ]
 
 
 def _read(path: str | os.PathLike) -> dict[str, Any]:

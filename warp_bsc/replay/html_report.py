@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..usd.scene import Scene
+from .baseline import Baseline, Event, NewFinding
 from .depths import DepthFinder
 from .html_page import block, fill_page, inert, shared_part, spread
 from .limit import not_listed
@@ -43,12 +44,13 @@ _AtRest = SceneIntersections | SceneProximities
 class ReportPage(RecordFile):
     """A page with a timeline, every interval in 3D, and a table of all collisions, intersections and proximities."""
 
-    def __init__(self, path: str | os.PathLike, *, scene: Scene):
+    def __init__(self, path: str | os.PathLike, *, scene: Scene, baseline: Baseline | None = None):
         """Opens the file.
 
         Args:
             path: The file.
             scene: The scene.
+            baseline: An earlier replay; the page marks what it does not contain. None marks nothing.
 
         Raises:
             OSError: If it cannot be written.
@@ -56,6 +58,7 @@ class ReportPage(RecordFile):
         super().__init__(path)
         page = fill_page(shared_part("page.html"), map(shared_part, _SCRIPTS), report_title(scene))
         self._before, self._between, self._after = page
+        self._baseline = baseline
         self._most_rows = int(np.clip(_ALL_ROWS // (2 * len(scene)), _FEWEST_ROWS, _MOST_ROWS))
         self._views = ViewBlocks(len(scene))
         self._depth_finder = DepthFinder()
@@ -87,6 +90,7 @@ class ReportPage(RecordFile):
             arrays |= {"kind": contacts.kind[rows], "toi": contacts.toi[rows].astype(np.float32)}
             if contacts.phase is not None and contacts.separate is not None:
                 arrays |= {"phase": contacts.phase[rows], "separate": contacts.separate[rows]}
+            arrays |= self._new("collides", contacts, rows, interval.start, interval.end)
             yield block(f"hits-{index}", {"of": len(contacts)}, arrays)
         at_rest, near = result.intersections or (), result.proximities or ()
         rest_rows, text = self._at_rest("rest", index, at_rest[0], numbers) if at_rest else (0, "")
@@ -109,7 +113,7 @@ class ReportPage(RecordFile):
                 numbers = np.array([self._meshes[mesh.name] for mesh in last.segment.meshes])
                 counts[name], more = self._at_rest(name, len(intervals), last, numbers)
                 text += more
-        data = report_data(summary, self._largest_depths(summary))
+        data = report_data(summary, self._largest_depths(summary), self._baseline)
         data["rows"] = [*self._rows[: len(intervals)], (0, counts["rest"], counts["near"])]
         data["meshes"] = self._facts
         data["center"] = self._center.tolist() if self._center is not None else [0.0, 0.0, 0.0]
@@ -140,6 +144,22 @@ class ReportPage(RecordFile):
         columns = (meshes[:, 0], meshes[:, 1], 4 * elements[:, 0] + elements[:, 1], *indices.reshape(-1, 4).T)
         return dict(zip(_COLUMNS, columns, strict=True)) | {"position": self._placed(pairs.position[rows])}
 
+    def _new(self, what: Event, pairs: ScenePairs, rows: np.ndarray, start: float, end: float) -> dict[str, np.ndarray]:
+        """Returns the array that says which rows are not in the baseline; nothing without a baseline."""
+        if self._baseline is None:
+            return {}
+        both, which = np.unique(pairs.meshes[rows], axis=0, return_inverse=True)
+        names = [mesh.name for mesh in pairs.segment.meshes]
+        lacks = [self._baseline.lacks(NewFinding(what, (names[i], names[j]), start, end)) for i, j in both]
+        return {"new": np.array(lacks, dtype=int)[which.reshape(-1)]}
+
+    def _new_intersections(self, found: SceneIntersections, rows: np.ndarray, kind: np.ndarray) -> dict:
+        """Returns the array of :meth:`_new` for intersections of several kinds; edges that only touch are not new."""
+        crosses, inside = (self._new(what, found, rows, found.time, found.time) for what in ("crosses", "is inside"))
+        if not crosses:
+            return {}
+        return {"new": np.select([kind == _CROSSES, kind == _INSIDE], [crosses["new"], inside["new"]], 0)}
+
     def _at_rest(self, name: str, index: int, found: _AtRest, numbers: np.ndarray) -> tuple[int, str]:
         """Returns the number of rows and the block of intersections or proximities at one time; no block for none."""
         if not len(found):
@@ -149,17 +169,20 @@ class ReportPage(RecordFile):
         facts = {"of": len(found)}
         if isinstance(found, SceneProximities):
             arrays |= {"kind": np.full(len(rows), _PROXIMITY), "distance": found.distance[rows]}
+            arrays |= self._new("is near", found, rows, found.time, found.time)
         else:
             kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
+            kind = np.where(rows < found.edge_rows.stop, kind, _INSIDE)
             cuts = spread(len(found.cuts.points), self._most_rows)
             step, points = moving_points(*(self._from_center(found.cuts.points[cuts])).transpose(1, 0, 2))
             arrays |= {
-                "kind": np.where(rows < found.edge_rows.stop, kind, _INSIDE),
+                "kind": kind,
                 "curve_start": points["start"],
                 "curve_end": points["end"],
                 "curve_meshes": numbers[found.cuts.meshes[cuts]] if len(cuts) else cuts,
                 "through": np.flatnonzero(np.isin(rows, found.of_curves)),
             }
+            arrays |= self._new_intersections(found, rows, kind)
             facts |= {"curves": len(found.cuts.points), "curve_step": step}
         return len(rows), block(f"{name}-{index}", facts, arrays)
 

@@ -1,8 +1,10 @@
 """The data of a replay's page beside its blocks: title, numbers, charts, pairs of meshes, facts."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..usd.scene import Scene
+from .baseline import Baseline, NewFinding
 from .summary import CERTIFIED_FOR, Summary
 
 __all__ = ["MAX_PAIRS", "Depths", "report_data", "report_title"]
@@ -22,18 +24,21 @@ def report_title(scene: Scene) -> str:
     return f"Collisions in {Path(scene.path).name}"
 
 
-def report_data(summary: Summary, depths: Depths) -> dict:
+def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> dict:
     """Returns the data of the whole replay that the page's script shows.
 
     Args:
         summary: The replay.
         depths: The depth of each two meshes that intersect.
+        baseline: The earlier replay with which the page compares; None without one.
     """
+    new = None if baseline is None else baseline.new_in(summary)
     scene = summary.scene
     named = [(f"Mesh {name}", shown) for name in scene.names if (shown := scene.display_names[name])]
     looked = bool(summary.intersections)
     intersecting = sum(not at.is_empty for at in summary.intersections)
-    tiles = [
+    tiles = [] if new is None else [(f"{len(new):,}", "new against the baseline")]
+    tiles += [
         (f"{summary.hits:,}", "collisions"),
         (f"{len(summary.colliding):,} of {len(summary.intervals):,}", "intervals with collisions"),
     ]
@@ -71,11 +76,13 @@ def report_data(summary: Summary, depths: Depths) -> dict:
         "rest": [(at.time, at.crossings, at.touches, sum(at.inside.values())) for at in summary.intersections],
         "near": [(at.time, at.pairs) for at in summary.proximities],
         "toi": summary.toi_counts,
-        "pairs": _pairs_of_meshes(summary, depths),
+        "pairs": _pairs_of_meshes(summary, depths, new or ()),
+        "has_baseline": new is not None,
         "up_axis": scene.up_axis,
         "facts": [
             ("File", scene.path),
             *scene.comments,
+            *([("Baseline", baseline.path)] if baseline else ()),
             ("Up axis", scene.up_axis),
             ("Metres per unit", f"{scene.meters_per_unit:g}"),
             ("Time codes per second", f"{scene.time_codes_per_second:g}"),
@@ -138,8 +145,10 @@ def _plural(word: str, count: int, ending: str = "s") -> str:
     return word if count == 1 else word + ending
 
 
-def _pairs_of_meshes(summary: Summary, depths: Depths) -> list[dict]:
+def _pairs_of_meshes(summary: Summary, depths: Depths, new: Iterable[NewFinding]) -> list[dict]:
     """Returns the pairs of meshes with collisions, intersections or proximities, and the spans of time of each kind.
+
+    ``new`` is what a baseline does not contain.
 
     The deepest come first, then those with the most collisions. A pair has at most :data:`_MAX_ROWS` spans of each
     kind; the numbers ``more`` count the others.
@@ -157,11 +166,16 @@ def _pairs_of_meshes(summary: Summary, depths: Depths) -> list[dict]:
         spans_of(span.meshes)[2].append((span.since, span.until, span.most, span.trend, inner))
     for span in summary.proximity_spans:
         spans_of(span.meshes)[3].append((span.since, span.until, span.distance))
+    new_of: dict[tuple[str, str], list[tuple[str, float, float]]] = {}
+    for what, meshes, start, end in new:
+        new_of.setdefault((min(meshes), max(meshes)), []).append((what, start, end))
     order = sorted(spans, key=lambda key: (-depths.get(key, (0.0, 0.0))[0], -hits.get(key, 0)))
-    return [_pair(spans[key], hits.get(key, 0), depths.get(key)) for key in order[:MAX_PAIRS]]
+    return [_pair(spans[key], hits.get(key, 0), depths.get(key), new_of.get(key, [])) for key in order[:MAX_PAIRS]]
 
 
-def _pair(spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tuple[float, float] | None) -> dict:
+def _pair(
+    spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tuple[float, float] | None, new: list
+) -> dict:
     meshes, collisions, at_rest, near = spans
     return {
         "meshes": meshes,
@@ -173,4 +187,6 @@ def _pair(spans: tuple[tuple[str, str], list, list, list], hits: int, depth: tup
         "more_rest": max(0, len(at_rest) - _MAX_ROWS),
         "near": near[:_MAX_ROWS],
         "more_near": max(0, len(near) - _MAX_ROWS),
+        "new": new[:_MAX_ROWS],
+        "more_new": max(0, len(new) - _MAX_ROWS),
     }

@@ -39,12 +39,14 @@ class Contact:
         elements: The two elements, in the prims' own numbers, such as ``"vertex 12"``, ``"face 3"`` or ``"edge 4-5"``.
         toi: Time of impact, 0 at the start of the interval and 1 at its end.
         time: The same as a time code.
+        position: Point in which they meet, in world space and the scene's unit of length.
     """
 
     meshes: tuple[str, str]
     elements: tuple[str, str]
     toi: float
     time: float
+    position: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -239,6 +241,7 @@ def summarize(
             contacts.element_names(row)[0],
             float(contacts.toi[first]),
             float(contacts.time[first]),
+            tuple(contacts.position[first].tolist()),
         )
     at_rest = None
     if intersections:

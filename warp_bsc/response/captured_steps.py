@@ -111,9 +111,14 @@ class CapturedSteps:
         lost = self._count_lost()
         wp.capture_launch(self._graph)
         if self._count_lost() == lost:
+            if self._report is not None:
+                self._report.warn()
             return True
         for x, saved in self._saved:
             x.assign(saved)
+        if self._report is not None:
+            self._report.copy_totals()
+            wp.synchronize_device(self._device)  # so that the next step does not warn of one that was taken back
         self.retaken += 1
         return False
 
@@ -121,4 +126,4 @@ class CapturedSteps:
         """Returns the steps so far for which the buffers of a graph may have been too small."""
         report, layer = self._report, self._layer
         lost = 0 if layer is None else layer.skipped_steps
-        return lost if report is None else lost + report.totals.undetected_steps + report.gradients.lost_steps
+        return lost if report is None else lost + report.count_lost()

@@ -148,7 +148,10 @@ def checked_substeps(substeps) -> int | Literal["auto"] | None:
         return substeps
     if isinstance(substeps, str):
         raise ValueError(f"substeps takes 2 substeps or more, or 'auto', not {given(substeps)}")
-    return checked_integer(substeps, "substeps", 2, MAX_SUBSTEPS)
+    try:
+        return checked_integer(substeps, "substeps", 2, MAX_SUBSTEPS)
+    except ValueError as error:
+        raise ValueError(f"{error}: pass None for none, 2 to {MAX_SUBSTEPS}, or 'auto'") from None
 
 
 def checked_capacity(report_contacts, model: newton.Model) -> int:

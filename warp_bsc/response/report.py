@@ -1,11 +1,11 @@
 """The report of the collision stage: what it found and did, read from the device on access."""
 
 import functools
-import warnings
 
 import numpy as np
 import warp as wp
 
+from .._warnings import warn_caller
 from ..detection.intersections import find_intersections
 from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
@@ -31,6 +31,8 @@ _LAYER_WARNING = "contacts passed the contact layer in one step: results jump th
 
 class SolverReport(ReportViews, WorldsOfReport):
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
+
+    Numbers of steps that something is wrong with are warned of once each, see :meth:`warn`.
 
     :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
 
@@ -62,10 +64,16 @@ class SolverReport(ReportViews, WorldsOfReport):
         """Copies the totals to the host, without waiting for the device, also in a CUDA graph."""
         wp.copy(self._host_totals, self.total_values)
 
+    def count_lost(self) -> int:
+        """Returns the steps on a tape so far that the buffers of a graph were too small for; warns of nothing."""
+        totals = dict(zip(StepTotals.vars, self.total_values.numpy().tolist(), strict=True))
+        return totals["undetected_steps"] + totals["lost_gradients"]
+
     def warn(self) -> None:
         """Warns once each of steps not certified, strain above 0.2, crossings, inversions, and wrong gradients.
 
-        Known is what the host knows already; the device is only waited for to warn.
+        Known is what the host knows already; the device is only waited for to warn. A step on a GPU may end before the
+        host knows of it: then the next one warns, or the first number that is read, which waits for the device.
         """
         known = dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True))
         if known["uncertified_steps"] and self._responds:
@@ -84,7 +92,13 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _warn_once(self, subject, message):
         if subject not in self._said:
             self._said.add(subject)
-            warnings.warn(message(), stacklevel=6)
+            warn_caller(message())
+
+    def _read(self, values):
+        """Returns the only number of an array, and warns: the totals were copied before, on the same stream."""
+        value = values.numpy()[0].item()
+        self.warn()
+        return value
 
     def _strain_warning(self):
         advice = "take shorter steps"
@@ -106,13 +120,12 @@ class SolverReport(ReportViews, WorldsOfReport):
         without a response, neither is one with such an end. With ``inversions="prevented"``, :attr:`inversions` is 0 in
         a certified step. :attr:`uncertified_vertices` lists the particles concerned.
         """
-        self.warn()
-        return bool(_read(self._work.results[Result.CERTIFIED]))
+        return bool(self._read(self._work.results[Result.CERTIFIED]))
 
     @property
     def hits(self) -> int:
         """Contacts of the motion that the inner solver predicted in the last step, without those excluded."""
-        return _read(self._work.results[Result.FIRST_HITS])
+        return self._read(self._work.results[Result.FIRST_HITS])
 
     @property
     def remaining(self) -> int:
@@ -120,7 +133,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         With a response, they could not be resolved, because kinematic vertices leave no space.
         """
-        return _read(self._work.results[Result.REMAINING])
+        return self._read(self._work.results[Result.REMAINING])
 
     @property
     def excluded(self) -> int:
@@ -128,7 +141,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
         """
-        return _read(self._work.results[Result.EXCLUDED])
+        return self._read(self._work.results[Result.EXCLUDED])
 
     @property
     def filtered(self) -> int:
@@ -140,7 +153,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         so do contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from colliding. In a
         CUDA graph the number is a lower bound if its queues are too small. :attr:`worlds` has the numbers by world.
         """
-        return _read(self._work.results[Result.FILTERED])
+        return self._read(self._work.results[Result.FILTERED])
 
     @property
     def body_contacts(self) -> int:
@@ -150,7 +163,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
         the response moves no bodies, and counts nothing that it keeps apart (``bodies="separated"``).
         """
-        return _read(self._work.results[Result.BODY_CONTACTS])
+        return self._read(self._work.results[Result.BODY_CONTACTS])
 
     @property
     def crossings(self) -> int:
@@ -159,7 +172,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         Only pairs that floating point certifies to cross count; :attr:`intersections` lists all of them. In a CUDA
         graph the number is a lower bound if there are more candidates than its queues hold.
         """
-        return _read(self._work.results[Result.CROSSINGS])
+        return self._read(self._work.results[Result.CROSSINGS])
 
     @property
     def inversions(self) -> int:
@@ -188,7 +201,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _read_inversions(self, result):
         if self._work.tetrahedra is None:
             raise RuntimeError(_NOT_WATCHED)
-        return _read(self._work.results[result])
+        return self._read(self._work.results[result])
 
     @property
     def not_finite(self) -> int:
@@ -196,7 +209,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         They stood where they were at the start. Without a response they are left as the inner solver made them.
         """
-        return _read(self._work.results[Result.NOT_FINITE])
+        return self._read(self._work.results[Result.NOT_FINITE])
 
     @property
     def uncertified_vertices(self) -> np.ndarray:
@@ -249,12 +262,12 @@ class SolverReport(ReportViews, WorldsOfReport):
         This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
         :class:`.captured_steps.CapturedSteps`. Without a tape, a search without buffers completes the detection.
         """
-        return bool(_read(self._work.results[Result.UNDETECTED]))
+        return bool(self._read(self._work.results[Result.UNDETECTED]))
 
     @property
     def iterations(self) -> int:
         """Iterations of detection and projection, division or truncation in the last step; 0 without a response."""
-        return _read(self._work.results[Result.ITERATIONS])
+        return self._read(self._work.results[Result.ITERATIONS])
 
     @property
     def truncated(self) -> int:
@@ -310,7 +323,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def substeps(self) -> int:
         """Substeps of the last step, the most of all worlds; 0 if it was not taken in substeps."""
-        return _read(self.last_substeps)
+        return self._read(self.last_substeps)
 
     @property
     def strain(self) -> float:
@@ -320,7 +333,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         compression, and the change of length of an edge in a soft body, as a share of its length at rest. Of a step in
         substeps, it is that of a substep.
         """
-        return float(self.last_strain.numpy()[0])
+        return self._read(self.last_strain)
 
     @property
     def totals(self) -> Totals:
@@ -330,7 +343,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
-        layerless = 0 if self.layerless_steps is None else _read(self.layerless_steps)
+        layerless = 0 if self.layerless_steps is None else self._read(self.layerless_steps)
         grazing, lost_steps, outrun, ambiguous = self._read_totals()[-4:]
         return GradientTotals(grazing, lost_steps, layerless, outrun, ambiguous)
 
@@ -340,7 +353,9 @@ class SolverReport(ReportViews, WorldsOfReport):
         return None if self.thickness is None else float(self.thickness.numpy()[0])
 
     def _read_totals(self):
-        return list(map(int, self.total_values.numpy()))
+        values = self.total_values.numpy().tolist()
+        self.warn()
+        return values
 
     def __str__(self) -> str:
         """Returns the steps so far, in one line, and what crosses at the start of the last."""
@@ -401,9 +416,6 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _count_vertices(self, bit):
         vertices = self._work.vertices
         counts = [vertices.outcome] + ([vertices.bodies.outcome] if vertices.bodies.outcome else [])
-        return sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in counts)
-
-
-def _read(values):
-    """Returns the only element of an array."""
-    return int(values.numpy()[0])
+        count = sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in counts)
+        self.warn()
+        return count

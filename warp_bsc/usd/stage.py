@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import tempfile
-import warnings
 import weakref
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 from pxr import Ar, Sdf, Usd
 
 from .._arguments import given
+from .._warnings import warn_caller
 from .unreadable import LeftOut, UnreadableError, collecting, describe_error, in_one_line
 
 __all__ = ["check_stage", "given_stage", "name_of", "open_stage", "write_for_others"]
@@ -56,7 +56,7 @@ def write_for_others(stage: Usd.Stage, owner: Any) -> str:
     weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
     path = os.path.join(folder, "stage.usdc")
     stage.Flatten().Export(path)
-    warnings.warn(f"{name_of(stage)}: flattened into {path}, for other processes", stacklevel=3)
+    warn_caller(f"{name_of(stage)}: flattened into {path}, for other processes")
     return path
 
 

@@ -51,7 +51,8 @@ class Playback:
             warnings.filterwarnings("ignore", "contacts strained")  # which the spreading mends
             warnings.filterwarnings("ignore", "edges pass through")  # of a first frame that could not be freed
             self._stage.step(self._start, self._end, None, None, 1.0)
-        return self._end.particle_q.numpy().copy(), self._stage.report.certified
+            certified = self._stage.report.certified  # which warns as a step does
+        return self._end.particle_q.numpy().copy(), certified
 
 
 class _Given(SolverBase):

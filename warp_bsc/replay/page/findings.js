@@ -29,6 +29,7 @@ function fillTable() {
     { title: "Kind", class: "kind", key: (row) => rows.kind[row], fill: (cell, row) => {
       const kind = rows.kind[row];
       addKey(cell, { class: kind === PROXIMITY ? "fourth" : kind >= AT_REST ? "third" : kind ? "second" : "first" }, KINDS[kind]);
+      if (rows.isNew[row]) add(cell, "span", { class: "new", title: "Not in the baseline" }, "new");
     } },
     side("First", "first", false),
     side("Second", "second", true),
@@ -92,6 +93,7 @@ function filterRows() {
   for (let row = 0; row < rows.count; row += 1) {
     const [first, second] = [rows.first[row], rows.second[row]];
     if (state.kind !== "" && rows.kind[row] !== Number(state.kind)) continue;
+    if (state.onlyNew && !rows.isNew[row]) continue;
     if (state.only && rows.interval[row] !== state.interval) continue;
     if (selected.length && !((selected.length < 2 && second === selected[0]) || (first === selected[0] && (selected.length < 2 || second === selected[1])) || (selected.length > 1 && first === selected[1] && second === selected[0]))) continue;
     if (words.length) {
@@ -118,6 +120,7 @@ function fillPairs() {
       if (first === second) add(cell, "span", { class: "element" }, "with itself");
       else addPrim(cell, numbers.get(second));
       const tools = add(cell, "span", { class: "tools" });
+      if (pairs[row].new.length) add(tools, "span", { class: "new", title: "Not in the baseline" }, "new");
       add(tools, "a", { class: "element", href: addressOf(-1, first === second ? [first] : [first, second]) }, "Rows");
       addMeshButtons(tools, [...new Set([numbers.get(first), numbers.get(second)])]);
     } },
@@ -140,6 +143,9 @@ function fillPairs() {
   if (data.near.length) columns.push({ title: "Proximities at rest", class: "wide-only", key: (row) => pairs[row].near.reduce((smallest, span) => Math.min(smallest, span[2]), Infinity), fill: (cell, row) => {
     const { near, more_near } = pairs[row];
     fillSpans(cell, near.map(([since, until, distance]) => `${range(since, until)}: ${short(Number(distance.toPrecision(6)))}`), more_near);
+  } });
+  if (data.has_baseline) columns.splice(2, 0, { title: "New", class: "wide-only", key: (row) => pairs[row].new.length + pairs[row].more_new, fill: (cell, row) => {
+    fillSpans(cell, pairs[row].new.map(([what, start, end]) => `${what} ${start === end ? `at ${short(start)}` : `in ${short(start)} to ${short(end)}`}`), pairs[row].more_new);
   } });
   byId("pairs-count").textContent = pairs.length ? `${plural(pairs.length, "pair")}, the deepest first` : "";
   byId("pairs-panel").hidden = !pairs.length;

@@ -3,7 +3,7 @@
 
 // --- The state: the interval in the view, and the filters of the table. The address contains it after the #. ---
 
-const state = { interval: -1, prims: [], text: "", kind: "", only: false, isReady: false };
+const state = { interval: -1, prims: [], text: "", kind: "", only: false, onlyNew: false, isReady: false };
 const LAST = data.intervals.length - 1;
 const edgesAt = (index) => (data.rest[index] ? data.rest[index][1] + data.rest[index][2] : 0);
 const insideAt = (index) => (data.rest[index] ? data.rest[index][3] : 0);
@@ -78,6 +78,7 @@ function fillText() {
   fillHead();
   byId("nothing").textContent = data.nothing;
   byId("nothing").hidden = !data.nothing;
+  byId("only-new-label").hidden = !data.has_baseline;
   for (const id of ["tiles", "timeline", "findings", "pairs-panel", "impacts-panel", "steps"]) byId(id).hidden = Boolean(data.nothing);
   if (data.validation) {
     byId("validation-panel").hidden = false;
@@ -98,6 +99,7 @@ function listen() {
   });
   byId("kind").addEventListener("change", (event) => { state.kind = event.target.value; filterRows(); });
   byId("only-interval").addEventListener("change", (event) => { state.only = event.target.checked; filterRows(); });
+  byId("only-new").addEventListener("change", (event) => { state.onlyNew = event.target.checked; filterRows(); });
   byId("save-csv").addEventListener("click", saveCsv);
   byId("copy-paths").addEventListener("click", copyPaths);
   byId("previous").addEventListener("click", () => stepInterval(-1));

@@ -20,6 +20,7 @@ async function loadRows() {
     position: new Float32Array(3 * total), // from the page's center
     phase: new Int8Array(total).fill(-1),
     separate: new Int8Array(total).fill(-1),
+    isNew: new Uint8Array(total), // against the baseline
   };
   const numbers = ["first", "second", "first_0", "first_1", "second_0", "second_1"];
   for (const key of numbers) rows[key] = new Int32Array(total);
@@ -45,6 +46,7 @@ async function loadRows() {
       }
       rows.position.set(block.position, 3 * at);
       if (block.distance) rows.distance.set(block.distance, at);
+      if (block.new) rows.isNew.set(block.new, at);
       if (block.phase) rows.phase.set(block.phase, at);
       if (block.separate) rows.separate.set(block.separate, at);
       at += length;
