@@ -317,7 +317,7 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bo
     and (-1, -1) after them. Without ``on_arcs`` nothing turns.
     """
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
-    cull_arc_batch = cull_arc_batch_of(dtype, kind == PairKind.VERTEX_FACE) if on_arcs else None
+    cull_arc_batch = cull_arc_batch_of(dtype, kind == PairKind.VERTEX_FACE)
     kind_number = int(kind)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)

@@ -200,7 +200,12 @@ class NarrowPhase:
 
 
 def launch_over_kinds(
-    kernel: wp.Kernel, stages: Mapping[PairKind, PairStages], buffer: str, *, inputs: list, block_dim: int
+    kernel: wp.Kernel,
+    stages: Mapping[PairKind | DistanceKind, PairStages],
+    buffer: str,
+    *,
+    inputs: list,
+    block_dim: int,
 ) -> None:
     """Launches a kernel of a GPU over a buffer of both kinds, or over one after the other if they are too long.
 

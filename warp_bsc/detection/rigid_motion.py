@@ -27,6 +27,9 @@ _UP = 1.0 + 2.0**-40
 """Raises a few rounded operations above their exact result."""
 
 
+_Copy = tuple[wp.array, wp.array, wp.array]
+
+
 @made_once
 def _place_on_arcs(dtype: type) -> wp.Kernel:
     """Returns the kernel that computes positions at a time, for one type of position."""
@@ -122,7 +125,7 @@ class RigidMotion:
         self.body = bodies.astype(np.int32)
         for values in (self.body, self.centre, self.turn):  # copies, as detections keep them on the device
             values.flags.writeable = False
-        self._on_device: dict[str, tuple[wp.array, wp.array, wp.array]] = {}
+        self._copies: dict[str, _Copy] = {}
         self.tolerance = None if tolerance is None else checked_distance(tolerance, "tolerance", zero=False)
 
     @classmethod
@@ -170,13 +173,6 @@ class RigidMotion:
         angle = 2.0 * np.arctan2(sine, np.abs(scalar))
         turn = np.where(still, 0.0, vector / np.where(still, 1.0, sine) * angle)
         return cls(body, poses[0][:, :3], turn, tolerance=tolerance)
-
-    def on_device(self, device: wp.Device) -> tuple[wp.array, wp.array, wp.array]:
-        """Returns body, centre and turn as Warp arrays of int, vec3d and vec3d, copied once to a device."""
-        if device.alias not in self._on_device:
-            centre, turn = (wp.array(v, dtype=wp.vec3d, device=device) for v in (self.centre, self.turn))
-            self._on_device[device.alias] = wp.array(self.body, dtype=int, device=device), centre, turn
-        return self._on_device[device.alias]
 
     def positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, time: float) -> np.ndarray:
         """Returns the positions of all vertices at a time, rounded, float64, shape [vertex_count, 3].
@@ -329,6 +325,14 @@ def _measure_motion(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
     return measure_motion, compare_with_body
 
 
+def _copy_of(motion: RigidMotion, device: wp.Device) -> _Copy:
+    """Returns body, centre and turn as Warp arrays of int, vec3d and vec3d, copied to a device once."""
+    if device.alias not in motion._copies:
+        centre, turn = (wp.array(v, dtype=wp.vec3d, device=device) for v in (motion.centre, motion.turn))
+        motion._copies[device.alias] = wp.array(motion.body, dtype=int, device=device), centre, turn
+    return motion._copies[device.alias]
+
+
 class ArcBounds:
     """The motion of a mesh's vertices by a :class:`RigidMotion` in parts of the step, with bounds of their deviation.
 
@@ -352,7 +356,7 @@ class ArcBounds:
         """
         self.motion = motion
         self._ends, device, bodies = (x0, x1), x0.device, len(motion.centre)
-        self._arrays = motion.on_device(device)
+        self._arrays = _copy_of(motion, device)
         extent = _Extent()
         self._bounds = extent.bounds = wp.zeros(len(motion.body), dtype=wp.vec3d, device=device)
         extent.reference = wp.full(bodies, len(motion.body), dtype=int, device=device)

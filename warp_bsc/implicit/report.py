@@ -99,7 +99,7 @@ class ImplicitReport:
         return values
 
     def copy_counts(self) -> None:
-        """Begins to copy the counts to the host, for :meth:`warn`."""
+        """Begins to copy the counts to the host, for ``warn``."""
         wp.copy(self._host, self.device_counts)
 
     def warn(self) -> None:

@@ -32,7 +32,7 @@ _LAYER_WARNING = "contacts passed the contact layer in one step: results jump th
 class SolverReport(ReportViews, WorldsOfReport):
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
-    Numbers of steps that something is wrong with are warned of once each, see :meth:`warn`.
+    Of steps that are not certified, strain, cross or invert something it warns once each.
 
     :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
 
