@@ -259,24 +259,10 @@ def _sagittas(bounds: _PairBounds, length: wp.float64) -> wp.float64:
 
 
 @wp.func
-def _closing_speed(
-    kind: int,
-    part: Impact,
-    # points at the start of the part
-    p: wp.vec3d,
-    q: wp.vec3d,
-    r: wp.vec3d,
-    s: wp.vec3d,
-    # points at its end
-    end_p: wp.vec3d,
-    end_q: wp.vec3d,
-    end_r: wp.vec3d,
-    end_s: wp.vec3d,
-) -> wp.float64:
-    """Returns by how much the contact points of a part approach each other along its normal, about."""
+def _closing_way(kind: int, part: Impact, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.float64:
+    """Returns by how much contact points approach each other along the normal, from the ways of a pair's points."""
     weights = contact_weights(kind, part.coordinates)
-    moved = weights[0] * (end_p - p) + weights[1] * (end_q - q) + weights[2] * (end_r - r) + weights[3] * (end_s - s)
-    return -wp.dot(part.normal, moved)
+    return -wp.dot(part.normal, weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s)
 
 
 @wp.func
@@ -400,7 +386,7 @@ def impact_on_arcs(
                 result.toi = start + advance
                 searching = False
             else:
-                speed = _closing_speed(kind, part, p, q, r, s, end_p, end_q, end_r, end_s) / length
+                speed = _closing_way(kind, part, end_p - p, end_q - q, end_r - r, end_s - s) / length
                 length = _HALF * length
                 if advance > _ZERO:
                     # arcs are at most two deviations apart then, and about to meet: a part as long as that takes

@@ -50,14 +50,14 @@ _NEWTON_STEPS = wp.constant(3)
 _PLANE_NEWTON_STEPS = wp.constant(6)
 _STEPS_TO_PLANE = wp.constant(3)
 _UNKNOWN = wp.constant(wp.float64(-1.0))
-_AWAY = wp.constant(wp.float64(1.0 + 2.0**-38))
-_SMALLEST = wp.constant(wp.float64(2.0**-400))
+AWAY = wp.constant(wp.float64(1.0 + 2.0**-38))
+SMALLEST = wp.constant(wp.float64(2.0**-400))
 
 
 @wp.func
 def clears_at_once(motion: Motion, distance: wp.float64) -> bool:
     """Returns whether the direction through the centroids, or the plane, keeps the features of a motion apart."""
-    far = wp.max(distance, _SMALLEST)
+    far = wp.max(distance, SMALLEST)
     return direction_clears(motion, unit_scale(centroid_direction(motion)), far) or plane_clears(motion, far)
 
 
@@ -174,8 +174,8 @@ def begin_search(motion: Motion, distance: wp.float64, tolerance: wp.float64) ->
     """Returns the search of :func:`min_distance_impact`, whose arguments these are, before its first part."""
     search = Search()
     search.length = clamped_tolerance(tolerance)
-    search.near = wp.where(distance >= _SMALLEST, distance, _ZERO)
-    search.far = wp.max(distance, _SMALLEST)
+    search.near = wp.where(distance >= SMALLEST, distance, _ZERO)
+    search.far = wp.max(distance, SMALLEST)
     if motion.roundoff == _ZERO:
         search.near = distance
         search.far = distance
@@ -267,7 +267,7 @@ def _cleared_until(motion: Motion, direction: wp.vec3d, start: wp.float64, dista
     if not _lowest_at(motion.kind, u, v, w, start) - bound > needed:
         return start
     # not certain, but checked: a little more than needed
-    more = needed * _AWAY + _TWO * bound
+    more = needed * AWAY + _TWO * bound
     end = _first_below(w - u, more, _first_below(w, more, _ONE))
     if motion.kind == VERTEX_FACE:
         end = _first_below(w - v, more, end)

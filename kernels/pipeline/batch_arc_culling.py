@@ -1,9 +1,10 @@
 """The cull of many pairs with a turning vertex at once, by SIMD instructions of a CPU.
 
 Their chords must stay farther apart than the bounds of the deviations of both elements together, see
-:mod:`warp_bsc.kernels.arcs`. That is shown by the plane of the pair, by the direction through the centroids, or by that
-between the closest points at half time: the first and second proofs of :mod:`warp_bsc.kernels.clearance`, for the whole
-step, by the same operations for eight pairs. Pairs that :mod:`.simd_query` cannot use are left.
+:mod:`warp_bsc.kernels.arcs`. That is shown for the whole step by the plane of the pair or the direction through the
+centroids, the first two proofs of :mod:`warp_bsc.kernels.clearance`; or by directions between the closest points at a
+few times, each for the times around its own, as in the advancement of :mod:`warp_bsc.kernels.min_distance`. Bounds are
+theirs. Pairs that :mod:`.simd_query` cannot use are left.
 """
 
 import functools
@@ -11,13 +12,12 @@ import functools
 import warp as wp
 
 from ..clearance import INFLATED, NORMAL_ERROR, PLANE_ERROR
+from ..min_distance import AWAY, SHORTEST, SMALLEST
 from ..signs import ROUNDOFF
+from .pairs import ABOVE_SUM
 from .simd import native_for_pairs
 from .simd_query import QUERY, QUERY_CONSTANTS
 
-_SMALLEST = 2.0**-400
-"""Distance of pairs without one, as in :mod:`warp_bsc.kernels.min_distance`: above the underflow of the proofs."""
-_ABOVE_SUM = 1.0 + 2.0**-50
 _ROUNDS = 4
 """Times at which directions are tried: the start, the end, and the middle of what remains."""
 
@@ -26,11 +26,11 @@ _CONSTANTS = QUERY_CONSTANTS | {
     "inflated": float(INFLATED),
     "normal_error": float(NORMAL_ERROR),
     "plane_error": float(PLANE_ERROR),
-    "smallest": _SMALLEST,
-    "above_sum": _ABOVE_SUM,
+    "smallest": float(SMALLEST),
+    "above_sum": float(ABOVE_SUM),
     "rounds": _ROUNDS,
-    "away": 1.0 + 2.0**-38,
-    "shortest": 2.0**-40,
+    "away": float(AWAY),
+    "shortest": float(SHORTEST),
 }
 
 _SNIPPET = """

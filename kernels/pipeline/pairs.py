@@ -13,6 +13,9 @@ import warp as wp
 
 from ..polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
 
+ABOVE_SUM = wp.constant(wp.float64(1.0 + 2.0**-50))
+"""Raises a distance so that a rounded sum is at least the exact one."""
+
 
 @wp.struct
 class PairFilter:

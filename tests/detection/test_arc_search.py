@@ -348,6 +348,8 @@ def test_what_does_not_fit_is_an_error(device):
     x1[:3] = moved(x0[:3], 0.0, Z)
     body = np.array([0, 0, 0, -1, -1, -1])
     detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6))
+    with pytest.raises(ValueError, match="read-only"):
+        bsc.RigidMotion(body, [[0.0, 0, 0]], [Z]).turn[0] = 0.0
     detector.detect(x0, x1 + [0, 0, 3.0] * (body >= 0)[:, None], arcs=bsc.RigidMotion(body, [[0.0, 0, 0]], [Z]))
     for error, end, arcs in (
         ("x1 must be where arcs take body 0", x1, bsc.RigidMotion(body, [[0.0, 0, 0]], [1.1 * Z])),

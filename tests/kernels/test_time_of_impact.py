@@ -185,6 +185,26 @@ def test_no_contact_is_before_the_time_of_impact(kind, dtype):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_times_in_a_plane_are_as_near_as_others(kind):
+    """Of features that stay in one plane no time is certain, but the bound is near the contact."""
+    rng = np.random.default_rng(12)
+    points = rng.uniform(-1.0, 1.0, (400, 8, 3))
+    points[:, 4:] = points[:, :4]
+    first = 1 if kind == "vertex_face" else 2
+    points[:, 4 : 4 + first] += rng.uniform(-3.0, 3.0, (400, 1, 3))
+    points[..., 2] = 0.25
+    truth = TRUTH[kind](points)
+    later = (truth[:, 0] > 0.01) & (truth[:, 0] < 1.0)
+    assert later.sum() > 50
+    query = getattr(bsc, f"query_{kind}")
+    devices = ["cpu", *(str(device) for device in wp.get_cuda_devices())]
+    for found in (impacts(kind, points), *(query(points, method="conservative", device=device) for device in devices)):
+        assert (found.status[later] == UNSURE).all()
+        assert (found.toi[later] <= truth[later, 1]).all()
+        assert (truth[later, 0] - found.toi[later] < 4.0 * 2.0**-20).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_contacts_of_degenerate_features_are_valid(kind):
     """Collapsed triangles, parallel edges and points that do not move still give coordinates and a unit normal."""
     for name in (

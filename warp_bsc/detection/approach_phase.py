@@ -17,7 +17,7 @@ from ..kernels.ccd import impact_at_distance
 from ..kernels.distance import closest_points
 from ..kernels.min_distance import clears_at_once, closest_at
 from ..kernels.motion import doubles, motion_and_distance
-from ..kernels.pipeline.pairs import distance_of_corners, firsts_of, points_of_pair
+from ..kernels.pipeline.pairs import ABOVE_SUM, distance_of_corners, firsts_of, points_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF
@@ -31,7 +31,6 @@ from .settings import NO_FUSED_OPERATIONS, TOLERANCE, Count
 from .stage_timer import StageTimer
 
 __all__ = [
-    "ABOVE_SUM",
     "MinDistances",
     "distances_of_pair",
     "impact_on_arcs_at_distance",
@@ -47,8 +46,6 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 """Share of its distance at the start that a pair must keep: the search certifies it for a pair at rest."""
 SHARE_ON_ARCS = wp.constant(wp.float64(1.0 - 2.0**-6))
 """Share of its minimum distance that a pair keeps on arcs, between the start and the end of the step."""
-ABOVE_SUM = wp.constant(wp.float64(1.0 + 2.0**-50))
-"""Raises a distance so that a rounded sum is at least the exact one."""
 _ZERO = wp.constant(wp.float64(0.0))
 _TWO = wp.constant(wp.float64(2.0))
 

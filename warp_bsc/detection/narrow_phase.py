@@ -5,6 +5,7 @@ the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipel
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -16,13 +17,11 @@ from ..kernels.pipeline.batch_classification import BATCH as CLASSIFIED
 from ..kernels.pipeline.batch_culling import BATCH as CULLED
 from ..kernels.pipeline.batch_impacts import BATCH as DECIDED
 from ..kernels.signs import FREE, HIT, ROUNDOFF
+from .batch_kernels import batch_classification_kernel, batch_culling_kernel, batch_impact_kernel
 from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
 from .exact_stage import launch_exact_stage
 from .kernels import (
     PairStages,
-    batch_classification_kernel,
-    batch_culling_kernel,
-    batch_impact_kernel,
     culling_kernel,
     gather_contacts,
     pad_keys,
@@ -266,8 +265,8 @@ def run_narrow_phases(
 
     with timer.stage("cull"):
         if device.is_cpu:
-            kernel_of = lambda kind, dtype: batch_culling_kernel(kind, dtype, on_arcs)  # noqa: E731
-            launch_on_cpu(kernel_of, [arcs], "queue", Count.QUEUED, CULLED)
+            cull = functools.partial(batch_culling_kernel, on_arcs=on_arcs)
+            launch_on_cpu(cull, [arcs], "queue", Count.QUEUED, CULLED)
         else:
             for kind, s in stages.items():
                 kernel = culling_kernel(kind, x0.dtype)

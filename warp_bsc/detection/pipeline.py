@@ -5,7 +5,8 @@ import warp as wp
 
 from .._arguments import checked_choice, checked_distance, checked_integer
 from ..kernels.arcs import Arcs
-from .approach_phase import ABOVE_SUM, MinDistances, run_approach_phases
+from ..kernels.pipeline.pairs import ABOVE_SUM
+from .approach_phase import MinDistances, run_approach_phases
 from .arc_phase import run_arc_phases
 from .broad_phase import BroadPhase, make_broad_phase
 from .distance_phase import run_distance_phases

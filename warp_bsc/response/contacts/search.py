@@ -4,7 +4,7 @@ import functools
 
 import warp as wp
 
-from ...detection.approach_phase import ABOVE_SUM, impact_on_arcs_at_distance
+from ...detection.approach_phase import impact_on_arcs_at_distance
 from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.element_pairs import filtered_pairs, pair_functions
 from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
@@ -15,7 +15,7 @@ from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
 from ...kernels.motion import motion_and_distance, relative_motion
 from ...kernels.pipeline.hierarchy import lowest_set_bit
-from ...kernels.pipeline.pairs import distance_of_corners
+from ...kernels.pipeline.pairs import ABOVE_SUM, distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import Impact, impact
