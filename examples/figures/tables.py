@@ -229,6 +229,8 @@ def _newton_steps(plain: Found | None, stage: Found | None) -> str:
         return ""
     steps = stage["stage"]
     words = [f"{steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,} certified"]
+    if steps["substepped_steps"]:
+        words.append(f"{steps['substepped_steps']:,} in substeps")
     words.append(f"{steps['truncated_steps'] or 'none'} truncated")
     if steps["frozen_steps"]:
         words.append(f"{steps['frozen_steps']} with frozen vertices")

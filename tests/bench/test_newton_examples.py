@@ -24,6 +24,7 @@ FALLING_TRIANGLE = """
     import newton.examples
     import warp as wp
     from compilation import compile_quickly
+    from newton._src.solvers import SolverXPBD as OwnSolver  # which a stage does not take the place of
     from newton.solvers import SolverXPBD
     from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledADMM
 
@@ -56,6 +57,8 @@ FALLING_TRIANGLE = """
             else:
                 self.solver = (Derived if args.derived else SolverXPBD)(self.model, iterations=1)
                 assert isinstance(self.solver, SolverXPBD) and not isinstance(self.model, SolverXPBD)
+                solver = getattr(self.solver, "solver", self.solver)  # before the stage
+                assert type(solver) is (Derived if args.derived else OwnSolver), type(solver)
             self.state_0, self.state_1 = self.model.state(), self.model.state()
             self.frames = 0
 

@@ -104,16 +104,19 @@ def _refuse_download(*arguments, **options):
 class _StagedType(type):
     """The type of solver classes whose instances come with the collision stage behind them.
 
-    They are subclasses of Newton's, so that examples may read their attributes and derive from them.
+    They are subclasses of Newton's, so that examples may read their attributes and derive from them. What they make is
+    of Newton's class itself, as a user's solver is: the stage takes no substeps in CUDA graphs behind others.
     """
 
     stages: list[Any]
+    original: type
 
     def __call__(cls, *arguments, **options):
         """Makes a solver and returns the stage behind it, or the solver if it has no particles."""
         from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
 
-        solver = super().__call__(*arguments, **options)
+        is_derived = "original" not in cls.__dict__
+        solver = super().__call__(*arguments, **options) if is_derived else cls.original(*arguments, **options)
         if not solver.model.particle_count:
             return solver
         stage = SolverCCD(solver)
@@ -121,10 +124,11 @@ class _StagedType(type):
         return stage
 
     def __instancecheck__(cls, instance):
-        """Returns whether an instance, or the solver before a stage, is of the class."""
+        """Returns whether an instance, or the solver before a stage, is of the class, or of Newton's in its place."""
         from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
 
-        return super().__instancecheck__(instance.solver if isinstance(instance, SolverCCD) else instance)
+        solver = instance.solver if isinstance(instance, SolverCCD) else instance
+        return super().__instancecheck__(solver) or isinstance(solver, cls.__dict__.get("original", ()))
 
 
 def _stage_solvers(stages: list[Any]) -> None:
@@ -138,7 +142,7 @@ def _stage_solvers(stages: list[Any]) -> None:
 
     for name in SOLVERS:
         solver = getattr(newton.solvers, name)
-        names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages}
+        names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages, "original": solver}
         replace_name(newton.solvers, name, _StagedType(name, (solver,), names))
 
 
