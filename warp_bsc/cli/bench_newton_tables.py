@@ -66,9 +66,9 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
     sizes |= {run.example: run.measured for run in runs if run.measured and run.measured.stage}
     if sizes:
         console.print()
-        headers = ("Partic-\nles", "Trian-\ngles", "Frames", "Steps", "In sub-\nsteps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
+        stage = ("Steps", "In sub-\nsteps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
         caption = "Steps of the stage: all, in substeps, not certified, with paths truncated, with vertices frozen."
-        table = make_table("Example", *headers, caption=caption)
+        table = make_table("Example", "Partic-\nles", "Trian-\ngles", "Frames", *stage, caption=caption)
         for name, took in sizes.items():
             counts = [took.particles, took.triangles, took.frames, *(asdict(took.stage).values() if took.stage else ())]
             table.add_row(Text(name), *(f"{number:,}" for number in counts))
