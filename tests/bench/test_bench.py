@@ -87,10 +87,8 @@ def test_agrees_with_the_ipc_toolkit(name):
     pytest.importorskip("ipctk")
     measured = benchmark_detector(load_scene(name), device="cpu", repeat=1, compare=True)
     other = measured.ipc_toolkit
-    # its boxes are rounded outwards, ours of single precision are what they are
-    for kind in ("vertex_face", "edge_edge"):
-        candidates = getattr(measured, kind).candidates
-        assert candidates <= getattr(other, f"{kind}_candidates") <= 1.01 * candidates
+    for kind in ("vertex_face", "edge_edge"):  # its candidates are boxes that meet, ours are what the culls leave of them
+        assert 0 < getattr(measured, kind).candidates < getattr(other, f"{kind}_candidates")
     assert other.step_size == pytest.approx(measured.earliest_toi, abs=0.05)
 
 

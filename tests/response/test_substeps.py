@@ -457,6 +457,54 @@ def test_layers_in_reach_of_self_contact_fly_on_together(device):
     assert np.allclose(rollout.velocities, [3.0, 0.0, -10.0], atol=1e-3)
 
 
+def test_the_limit_stays_in_worlds_in_which_nothing_is_fast(device):
+    """Two layers move slowly as one, so that VBD cuts the path of the one behind, unless another patch is fast."""
+    longest = 0.5 * 0.85 * 0.0035
+    slow = 0.5 * longest / DT
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for place in ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0004), (0.5, 0.0, 0.0)):
+        add_patch(world, 3, 0.02, place, velocity=(0.0, 0.0, slow))
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for _ in range(2):
+        builder.add_world(world)
+    builder.color()
+    model = builder.finalize(device=device)
+    model.soft_contact_ke = 1e-6  # the layers do not push each other apart
+
+    def ways(speed, lift=True):
+        """The way of each patch of each world in a step in which the last patch has a speed."""
+        velocities = model.particle_qd.numpy().reshape(2, 3, -1, 3)
+        velocities[1, 2, :, 2] = speed
+        rollout = Rollout(model, bsc.SolverCCD(vbd_with_self_contact(model), lift_speed_limit=lift))
+        rollout.states[0].particle_qd.assign(velocities.reshape(-1, 3))
+        rollout.step()
+        return (rollout.positions - model.particle_q.numpy()).reshape(2, 3, -1, 3)[..., 2]
+
+    kept, lifted = ways(slow), ways(4.0 * slow)
+    assert np.array_equal(kept, ways(slow, lift=False)) and np.array_equal(lifted[0], kept[0])
+    assert kept[1, 0].max() < 0.75 * slow * DT  # the layer behind
+    assert np.allclose(lifted[1, :2], slow * DT, rtol=1e-3)
+    assert np.allclose(lifted[1, 2], 4.0 * slow * DT, rtol=1e-4)
+    assert ways(4.0 * slow, lift=False).max() < 0.7 * 4.0 * slow * DT
+
+
+@pytest.mark.parametrize("source", ["gravity", "force"])
+def test_what_gravity_and_forces_move_is_fast(source, device):
+    longest = 0.5 * 0.85 * 0.0035
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -4.0 * longest / DT**2 if source == "gravity" else 0.0))
+    add_patch(builder, 3, 0.02, (0.0, 0.0, 0.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(vbd_with_self_contact(model))
+    start, end = model.state(), model.state()
+    if source == "force":
+        force = -4.0 * longest / DT**2 * model.particle_mass.numpy()
+        start.particle_f.assign(force[:, None] * np.float32([0.0, 0.0, 1.0]))
+    solver.step(start, end, model.control(), None, DT)
+    ways = end.particle_q.numpy() - model.particle_q.numpy()
+    assert np.allclose(ways[:, 2], -4.0 * longest, rtol=1e-3)
+
+
 def test_self_contact_without_its_limit_still_pushes(device):
     """Two patches nearer than the margin part by VBD's forces alone, which the stage would not add."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))

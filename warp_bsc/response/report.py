@@ -41,7 +41,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     or frozen.
 
     Attributes:
-        speed_limit_lifted: Whether the inner solver is VBD with self-contact, without its speed limit.
+        speed_limit_lifted: Whether the inner solver is VBD with self-contact, whose limit is lifted where it brakes.
         substeps_omitted: Why ``substeps="auto"`` takes no substeps here; None if it can, or was not given.
     """
 
@@ -371,7 +371,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         if totals.strained_steps:
             line += f", {totals.strained_steps} in which contacts strained an edge by more than {float(MAX_STRAIN):.0%}"
         if self.speed_limit_lifted:
-            line += ", without VBD's speed limit"
+            line += ", VBD's speed limit lifted where it brakes"
         if totals.inverting_steps:
             line += f", {totals.inverting_steps} that inverted tetrahedra"
         if self.crossings:

@@ -17,7 +17,7 @@ from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
 from .forces.contact_forces import ContactForces
-from .integration.vbd_speed_limit import has_self_contact, has_speed_limit, without_speed_limit
+from .integration.vbd_speed_limit import SpeedLimit, has_self_contact, has_speed_limit
 from .integration.wrapped_solver import innermost
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
@@ -178,11 +178,12 @@ class SolverCCD(CollisionStage):
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
-            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say, so that the stage alone
-                keeps them apart. Otherwise VBD cuts the path of every particle, see
-                :mod:`.integration.vbd_speed_limit`. If its iterations are too few for the step, VBD does not hold heavy
-                bodies, and only the limit brakes them: they sink faster without it, behind the stage or not. Has no
-                effect on other solvers; ``report.speed_limit_lifted`` is true where it has.
+            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say in the steps in which it
+                would brake one, so that the stage alone keeps them apart. Otherwise VBD cuts the path of every
+                particle in every step, see :class:`.integration.vbd_speed_limit.SpeedLimit`. If its iterations are too
+                few for the step, VBD does not hold heavy bodies, and only the limit brakes them: they sink faster
+                without it, behind the stage or not. Has no effect on other solvers; ``report.speed_limit_lifted`` is
+                true where it has.
             max_iterations: Iterations of detect and project, 0 to 40; what still collides then is divided, see
                 :mod:`.schedule`. Fewer bound the time of a step, and leave more vertices with cut paths.
             report_contacts: Whether ``report`` has the contacts of each step and their impulses, see
@@ -244,8 +245,9 @@ class SolverCCD(CollisionStage):
             )
         if isinstance(self.solver, ContactLayer):
             self.report.layerless_steps, self.report.thickness = self.solver.skipped, self.solver.thickness_values
-        self._limited = integrator if options.lift_speed_limit and has_speed_limit(integrator) else None
-        self.report.speed_limit_lifted = self._limited is not None
+        lifts = options.lift_speed_limit
+        self._speed_limit = SpeedLimit(integrator) if lifts and has_speed_limit(integrator) else None
+        self.report.speed_limit_lifted = self._speed_limit is not None
         self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
@@ -373,8 +375,9 @@ class SolverCCD(CollisionStage):
 
     def _step_solver(self, *arguments, **options):
         with contextlib.ExitStack() as stack:
-            if self._limited is not None:
-                stack.enter_context(without_speed_limit(self._limited))
+            if self._speed_limit is not None:
+                state_in, dt = arguments[0], arguments[-1]
+                stack.enter_context(self._speed_limit.lifted(state_in, dt))
             if self._coupled is None and (self._substepping is not None or self._inner_rows is not None):
                 stack.enter_context(with_contacts(self.solver, self._inner_rows))
             self.solver.step(*arguments, **options)

@@ -98,6 +98,11 @@ PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""
 
+# VBD's speed limit
+FAST_PATH = 0.75
+"""Path of a particle in a step from which it is fast, as a share of the longest that VBD's self-contact leaves it: what
+is cut to the longest is fast in the next step."""
+
 # substeps
 SUBSTEPS = (2, 4, 8, 16, 32)
 """Numbers of substeps that ``"auto"`` chooses from; a CUDA graph contains the substep of each."""

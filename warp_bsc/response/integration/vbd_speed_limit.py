@@ -1,11 +1,72 @@
 """The speed limit of VBD's self-contact, lifted where the collision stage certifies the motion instead."""
 
 import contextlib
+from collections.abc import Iterator
 from typing import TypeGuard
 
+import newton
+import warp as wp
+from newton import ParticleFlags
 from newton.solvers import SolverBase, SolverVBD
 
-from ..._private_names.of_newton import vbd_truncation, vbd_truncation_replaced
+from ..._private_names.of_newton import displacements_since_detection, vbd_truncation, vbd_truncation_replaced
+from ..tuning import FAST_PATH
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def find_fast_worlds(
+    # in
+    velocities: wp.array[wp.vec3],
+    forces: wp.array[wp.vec3],
+    inverse_masses: wp.array[float],
+    flags: wp.array[wp.int32],
+    world_of: wp.array[int],
+    gravity: wp.array[wp.vec3],
+    dt: float,
+    path: float,
+    # out
+    is_fast: wp.array[int],
+):
+    """Marks the worlds in which a particle moves farther in a step than a path; the last is what is in no world.
+
+    What moves it is its velocity, gravity and the forces of the program.
+    """
+    i = wp.tid()
+    if inverse_masses[i] == 0.0 or (flags[i] & int(ParticleFlags.ACTIVE)) == 0:
+        return
+    world = world_of[i]
+    acceleration = gravity[wp.where(world < 0, gravity.shape[0] - 1, world)]
+    if forces:
+        acceleration += inverse_masses[i] * forces[i]
+    if dt * wp.length(velocities[i] + dt * acceleration) > path:
+        is_fast[wp.where(world < 0, is_fast.shape[0] - 1, world)] = 1
+
+
+@wp.kernel
+def keep_displacements(displacements: wp.array[wp.vec3], kept: wp.array[wp.vec3]):
+    """Copies displacements before they are cut; a launch, as a tape would record a copy."""
+    i = wp.tid()
+    kept[i] = displacements[i]
+
+
+@wp.kernel
+def undo_cuts(
+    # in
+    is_fast: wp.array[int],
+    world_of: wp.array[int],
+    start: wp.array[wp.vec3],
+    kept: wp.array[wp.vec3],
+    # out
+    displacements: wp.array[wp.vec3],
+    positions: wp.array[wp.vec3],
+):
+    """Restores the displacements of fast worlds."""
+    i = wp.tid()
+    if is_fast[wp.where(world_of[i] < 0, is_fast.shape[0] - 1, world_of[i])] == 1:
+        displacements[i] = kept[i]
+        positions[i] = start[i] + kept[i]
 
 
 def has_self_contact(solver: SolverBase) -> TypeGuard[SolverVBD]:
@@ -14,34 +75,59 @@ def has_self_contact(solver: SolverBase) -> TypeGuard[SolverVBD]:
 
 
 def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:
-    """Returns whether a solver is VBD with self-contact, whose limit can be lifted; warns if this Newton forbids it.
-
-    Self-contact cuts the path of every particle, near something or not. The path between two detections is at most
-    ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
-    other.
-    """
+    """Returns whether a solver is VBD with self-contact, whose limit can be lifted; warns if this Newton forbids it."""
     return has_self_contact(solver) and vbd_truncation(solver) is not None
 
 
-@contextlib.contextmanager
-def without_speed_limit(solver: SolverVBD):
-    """Lets VBD step with the forces of its self-contact, but without its cuts of displacements.
+class SpeedLimit:
+    """Lifts the limit of VBD's self-contact in steps in which it would brake.
 
-    The solver cuts nothing where it has no self-contact, so that it has none for the time of a cut. Cuts before rigid
-    shapes remain.
+    Self-contact cuts the path of every particle, near something or not. The path between two detections is at most
+    ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
+    other. Where velocity, gravity and the forces of the program take a particle farther in a step than three quarters
+    of that, nothing in its world is cut in this step: VBD's forces move it, and the stage alone keeps elements apart.
+    Elsewhere the cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes
+    back what the forces did.
 
-    Args:
-        solver: A solver for which :func:`has_speed_limit` is true.
+    Cuts before rigid shapes stay in any case.
     """
-    truncate = vbd_truncation(solver)
-    assert truncate is not None
 
-    def truncate_without_self_contact(*arguments, **options):
-        solver.particle_enable_self_contact = False
-        try:
-            truncate(*arguments, **options)
-        finally:
-            solver.particle_enable_self_contact = True
+    def __init__(self, solver: SolverVBD):
+        """Allocates buffers for a solver for which :func:`has_speed_limit` is true."""
+        self._solver, model = solver, solver.model
+        self._is_fast = wp.zeros(model.world_count + 1, dtype=int, device=model.device)
+        self._kept = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
 
-    with vbd_truncation_replaced(solver, truncate_without_self_contact):
-        yield
+    @contextlib.contextmanager
+    def lifted(self, state: newton.State, dt: float) -> Iterator[None]:
+        """Lets VBD step without its limit in worlds in which something is fast at the start of the step.
+
+        Args:
+            state: The state at the start of the step.
+            dt: Length of the step [s].
+        """
+        solver, model = self._solver, self._solver.model
+        world_of = model.particle_world
+        path = 0.5 * solver.dat_conservative_bound_relaxation
+        path *= solver.particle_self_contact_margin + solver.particle_self_contact_gap
+        start, displacements, cut = displacements_since_detection(solver)
+        options = {"dim": model.particle_count, "device": model.device, "record_tape": False}
+        self._is_fast.zero_()
+        inputs = [state.particle_qd, state.particle_f, model.particle_inv_mass, model.particle_flags, world_of]
+        inputs += [model.gravity, dt, FAST_PATH * path]
+        wp.launch(find_fast_worlds, inputs=inputs, outputs=[self._is_fast], **options)
+
+        def cut_what_is_slow(state, contacts):
+            if solver.rigid_soft_enable_dat:
+                solver.particle_enable_self_contact = False  # so that only shapes cut what is kept
+                try:
+                    cut(state, contacts)
+                finally:
+                    solver.particle_enable_self_contact = True
+            wp.launch(keep_displacements, inputs=[displacements], outputs=[self._kept], **options)
+            cut(state, contacts)
+            inputs = [self._is_fast, world_of, start, self._kept]
+            wp.launch(undo_cuts, inputs=inputs, outputs=[displacements, state.particle_q], **options)
+
+        with vbd_truncation_replaced(solver, cut_what_is_slow):
+            yield
