@@ -27,7 +27,6 @@ LARGE = [
     "warp_bsc.response.layer.kernels",
     "newton._src.solvers.semi_implicit.kernels_body",
     "newton._src.solvers.semi_implicit.kernels_contact",
-    "newton._src.solvers.vbd.particle_vbd_kernels",
     "newton._src.solvers.vbd.rigid_vbd_kernels",
 ]
 """Modules that take long to compile, and that no program needs which tests start as users do."""
