@@ -81,46 +81,6 @@ _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
 
 
-@wp.struct
-class _TurnAtTime:
-    """What the points of a body share at a time: the axis, and the factors of p and q, see the module.
-
-    Attributes:
-        axis: The unit vector along the axis, 0 if the body does not turn.
-        sine: Factor of p.
-        versine: Factor of q.
-    """
-
-    axis: wp.vec3d
-    sine: wp.float64
-    versine: wp.float64
-
-
-@wp.func
-def _turn_at_time(turn: wp.vec3d, time: wp.float64) -> _TurnAtTime:
-    """Returns what the points of a body share at a time."""
-    result = _TurnAtTime()
-    angle = wp.length(turn)
-    if angle != _ZERO:
-        half = wp.sin(_HALF * (time * angle))
-        whole_half = wp.sin(_HALF * angle)
-        result.axis = turn / angle
-        result.sine = wp.sin(time * angle) - time * wp.sin(angle)
-        result.versine = _TWO * (half * half - time * (whole_half * whole_half))
-    return result
-
-
-@wp.func
-def _on_turn(x0: wp.vec3d, x1: wp.vec3d, centre: wp.vec3d, at: _TurnAtTime, time: wp.float64) -> wp.vec3d:
-    """Returns the position of a point at a time, as :func:`on_arc` does."""
-    straight = (_ONE - time) * x0 + time * x1
-    if at.axis[0] == _ZERO and at.axis[1] == _ZERO and at.axis[2] == _ZERO:
-        return straight
-    across = wp.cross(at.axis, x0 - centre)
-    inward = wp.cross(at.axis, across)
-    return straight + (at.sine * across + at.versine * inward)
-
-
 @wp.func
 def on_arc(x0: Any, x1: Any, centre: wp.vec3d, turn: wp.vec3d, time: wp.float64) -> wp.vec3d:
     """Returns the position of a point of a turning body at a time, with the error that the module bounds.
@@ -132,7 +92,19 @@ def on_arc(x0: Any, x1: Any, centre: wp.vec3d, turn: wp.vec3d, time: wp.float64)
         turn: The axis times the angle of the whole turn [rad].
         time: The time, 0 at the start and 1 at the end; 1 - time is exact.
     """
-    return _on_turn(double(x0), double(x1), centre, _turn_at_time(turn, time), time)
+    start = double(x0)
+    straight = (_ONE - time) * start + time * double(x1)
+    angle = wp.length(turn)
+    if angle == _ZERO:
+        return straight
+    axis = turn / angle
+    across = wp.cross(axis, start - centre)
+    inward = wp.cross(axis, across)
+    half = wp.sin(_HALF * (time * angle))
+    whole_half = wp.sin(_HALF * angle)
+    sine = wp.sin(time * angle) - time * wp.sin(angle)
+    versine = _TWO * (half * half - time * (whole_half * whole_half))
+    return straight + (sine * across + versine * inward)
 
 
 @wp.struct
@@ -231,41 +203,6 @@ def on_arc_of(arcs: Arcs, vertex: int, x0: Any, x1: Any, time: wp.float64) -> wp
     """Returns the position of a vertex at a time, see :func:`on_arc`."""
     centre, turn = _axis_of(arcs, vertex)
     return on_arc(x0, x1, centre, turn, time)
-
-
-@wp.func
-def _pair_on_arcs(
-    arcs: Arcs,
-    v: wp.vec4i,
-    # points at the start
-    a: wp.vec3d,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    d: wp.vec3d,
-    # points at the end
-    to_a: wp.vec3d,
-    to_b: wp.vec3d,
-    to_c: wp.vec3d,
-    to_d: wp.vec3d,
-    time: wp.float64,
-):
-    """Returns the positions of the vertices of a pair at a time: sines, the most of the work, once for each body."""
-    centre, turn = _axis_of(arcs, v[0])
-    at = _turn_at_time(turn, time)
-    p = _on_turn(a, to_a, centre, at, time)
-    if arcs.body[v[1]] != arcs.body[v[0]]:
-        centre, turn = _axis_of(arcs, v[1])
-        at = _turn_at_time(turn, time)
-    q = _on_turn(b, to_b, centre, at, time)
-    if arcs.body[v[2]] != arcs.body[v[1]]:
-        centre, turn = _axis_of(arcs, v[2])
-        at = _turn_at_time(turn, time)
-    r = _on_turn(c, to_c, centre, at, time)
-    if arcs.body[v[3]] != arcs.body[v[2]]:
-        centre, turn = _axis_of(arcs, v[3])
-        at = _turn_at_time(turn, time)
-    s = _on_turn(d, to_d, centre, at, time)
-    return p, q, r, s
 
 
 @wp.func
@@ -409,7 +346,10 @@ def impact_on_arcs(
         end_r = to_c
         end_s = to_d
         if end < _ONE:
-            end_p, end_q, end_r, end_s = _pair_on_arcs(arcs, v, a, b, c, d, to_a, to_b, to_c, to_d, end)
+            end_p = on_arc_of(arcs, v[0], a, to_a, end)
+            end_q = on_arc_of(arcs, v[1], b, to_b, end)
+            end_r = on_arc_of(arcs, v[2], c, to_c, end)
+            end_s = on_arc_of(arcs, v[3], d, to_d, end)
         deviation = distance_of_corners(kind, v, arcs.deviation)
         if length < _ONE:
             deviation = _sagittas(bounds, length) + bounds.rounding
@@ -455,7 +395,10 @@ def impact_on_arcs(
                         length = wp.min(length, expected)
                     start += advance
                     length = wp.min(length, _ONE - start)
-                    p, q, r, s = _pair_on_arcs(arcs, v, a, b, c, d, to_a, to_b, to_c, to_d, start)
+                    p = on_arc_of(arcs, v[0], a, to_a, start)
+                    q = on_arc_of(arcs, v[1], b, to_b, start)
+                    r = on_arc_of(arcs, v[2], c, to_c, start)
+                    s = on_arc_of(arcs, v[3], d, to_d, start)
                 else:
                     # the first part that may be free at all
                     needed = _HALF * (found - min_distance) - bounds.rounding
