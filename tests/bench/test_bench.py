@@ -87,7 +87,7 @@ def test_agrees_with_the_ipc_toolkit(name):
     pytest.importorskip("ipctk")
     measured = benchmark_detector(load_scene(name), device="cpu", repeat=1, compare=True)
     other = measured.ipc_toolkit
-    for kind in ("vertex_face", "edge_edge"):  # its candidates are boxes that meet, ours are what the culls leave of them
+    for kind in ("vertex_face", "edge_edge"):  # its candidates are boxes that meet, ours what culls leave of them
         assert 0 < getattr(measured, kind).candidates < getattr(other, f"{kind}_candidates")
     assert other.step_size == pytest.approx(measured.earliest_toi, abs=0.05)
 

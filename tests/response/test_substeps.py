@@ -488,6 +488,27 @@ def test_the_limit_stays_in_worlds_in_which_nothing_is_fast(device):
     assert ways(4.0 * slow, lift=False).max() < 0.7 * 4.0 * slow * DT
 
 
+@pytest.mark.parametrize("substeps", ["auto", None])
+def test_a_graph_lifts_the_limit_in_steps_in_which_something_is_fast(substeps, device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_patch(builder, 3, 0.02, (0.0, 0.0, 0.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(vbd_with_self_contact(model), substeps=substeps)
+    start, end, control = model.state(), model.state(), model.control()
+    solver.step(start, end, control, None, DT)
+    with wp.ScopedCapture(device) as capture:
+        solver.step(start, end, control, None, DT)
+    ways = []
+    longest = 0.5 * 0.85 * 0.0035
+    for speed in (0.5 * longest / DT, 40.0, 0.0):
+        start.particle_q.assign(model.particle_q)
+        start.particle_qd.fill_(wp.vec3(0.0, 0.0, speed))
+        wp.capture_launch(capture.graph)
+        ways.append((end.particle_q.numpy() - model.particle_q.numpy())[:, 2] - speed * DT)
+    assert np.allclose(ways, 0.0, atol=1e-4)
+
+
 @pytest.mark.parametrize("source", ["gravity", "force"])
 def test_what_gravity_and_forces_move_is_fast(source, device):
     longest = 0.5 * 0.85 * 0.0035

@@ -11,7 +11,7 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, with_contacts
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, may_allocate, with_contacts
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
@@ -374,13 +374,16 @@ class SolverCCD(CollisionStage):
             self._in_substeps.take_whole_step(*arguments, **options)
 
     def _step_solver(self, *arguments, **options):
+        step = functools.partial(self.solver.step, *arguments, **options)
         with contextlib.ExitStack() as stack:
-            if self._speed_limit is not None:
-                state_in, dt = arguments[0], arguments[-1]
-                stack.enter_context(self._speed_limit.lifted(state_in, dt))
             if self._coupled is None and (self._substepping is not None or self._inner_rows is not None):
                 stack.enter_context(with_contacts(self.solver, self._inner_rows))
-            self.solver.step(*arguments, **options)
+            if self._speed_limit is None:
+                step()
+            else:
+                state_in, dt = arguments[0], arguments[-1]
+                can_branch = not (self.mesh.device.is_capturing and may_allocate(self.solver))
+                self._speed_limit.step(step, state_in, dt, can_branch=can_branch)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)

@@ -1,7 +1,7 @@
 """The speed limit of VBD's self-contact, lifted where the collision stage certifies the motion instead."""
 
-import contextlib
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable
 from typing import TypeGuard
 
 import newton
@@ -28,6 +28,7 @@ def find_fast_worlds(
     path: float,
     # out
     is_fast: wp.array[int],
+    any_is_fast: wp.array[int],
 ):
     """Marks the worlds in which a particle moves farther in a step than a path; the last is what is in no world.
 
@@ -42,6 +43,7 @@ def find_fast_worlds(
         acceleration += inverse_masses[i] * forces[i]
     if dt * wp.length(velocities[i] + dt * acceleration) > path:
         is_fast[wp.where(world < 0, is_fast.shape[0] - 1, world)] = 1
+        any_is_fast[0] = 1
 
 
 @wp.kernel
@@ -95,39 +97,59 @@ class SpeedLimit:
     def __init__(self, solver: SolverVBD):
         """Allocates buffers for a solver for which :func:`has_speed_limit` is true."""
         self._solver, model = solver, solver.model
-        self._is_fast = wp.zeros(model.world_count + 1, dtype=int, device=model.device)
+        # by world, what is in no world, and whether any of them is fast
+        self._fast_worlds = wp.zeros(model.world_count + 2, dtype=int, device=model.device)
+        self._is_fast, self._any_is_fast = self._fast_worlds[:-1], self._fast_worlds[-1:]
         self._kept = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
 
-    @contextlib.contextmanager
-    def lifted(self, state: newton.State, dt: float) -> Iterator[None]:
-        """Lets VBD step without its limit in worlds in which something is fast at the start of the step.
+    def step(self, step: Callable[[], None], state: newton.State, dt: float, *, can_branch: bool) -> None:
+        """Takes a step of VBD without its limit in worlds in which something is fast at the start of the step.
 
         Args:
+            step: Steps VBD.
             state: The state at the start of the step.
             dt: Length of the step [s].
+            can_branch: Whether a graph may contain the step twice, with and without the limit, of which it takes one.
+                The step with both, for each world, launches twice as many kernels to cut.
         """
         solver, model = self._solver, self._solver.model
-        world_of = model.particle_world
         path = 0.5 * solver.dat_conservative_bound_relaxation
         path *= solver.particle_self_contact_margin + solver.particle_self_contact_gap
-        start, displacements, cut = displacements_since_detection(solver)
-        options = {"dim": model.particle_count, "device": model.device, "record_tape": False}
-        self._is_fast.zero_()
-        inputs = [state.particle_qd, state.particle_f, model.particle_inv_mass, model.particle_flags, world_of]
-        inputs += [model.gravity, dt, FAST_PATH * path]
-        wp.launch(find_fast_worlds, inputs=inputs, outputs=[self._is_fast], **options)
+        self._fast_worlds.zero_()
+        inputs = [state.particle_qd, state.particle_f, model.particle_inv_mass, model.particle_flags]
+        inputs += [model.particle_world, model.gravity, dt, FAST_PATH * path]
+        self._launch(find_fast_worlds, inputs, [self._is_fast, self._any_is_fast])
+        if not can_branch:
+            self._step_with(self._cut_where_slow, step)
+            return
+        cut = self._cut_where_slow if model.world_count > 1 else self._cut_before_shapes
+        wp.capture_if(self._any_is_fast, lambda: self._step_with(cut, step), step)
 
-        def cut_what_is_slow(state, contacts):
-            if solver.rigid_soft_enable_dat:
-                solver.particle_enable_self_contact = False  # so that only shapes cut what is kept
-                try:
-                    cut(state, contacts)
-                finally:
-                    solver.particle_enable_self_contact = True
-            wp.launch(keep_displacements, inputs=[displacements], outputs=[self._kept], **options)
+    def _launch(self, kernel, inputs, outputs):
+        model = self._solver.model
+        options = {"device": model.device, "record_tape": False}
+        wp.launch(kernel, model.particle_count, inputs=inputs, outputs=outputs, **options)
+
+    def _step_with(self, cut, step):
+        """Takes a step in which VBD cuts displacements by another function."""
+        start, displacements, own_cut = displacements_since_detection(self._solver)
+        with vbd_truncation_replaced(self._solver, functools.partial(cut, start, displacements, own_cut)):
+            step()
+
+    def _cut_before_shapes(self, start, displacements, cut, state, contacts):
+        """Cuts displacements as VBD does without self-contact."""
+        solver = self._solver
+        solver.particle_enable_self_contact = False
+        try:
             cut(state, contacts)
-            inputs = [self._is_fast, world_of, start, self._kept]
-            wp.launch(undo_cuts, inputs=inputs, outputs=[displacements, state.particle_q], **options)
+        finally:
+            solver.particle_enable_self_contact = True
 
-        with vbd_truncation_replaced(solver, cut_what_is_slow):
-            yield
+    def _cut_where_slow(self, start, displacements, cut, state, contacts):
+        """Cuts displacements as VBD does, in fast worlds as it does without self-contact."""
+        if self._solver.rigid_soft_enable_dat:
+            self._cut_before_shapes(start, displacements, cut, state, contacts)
+        self._launch(keep_displacements, [displacements], [self._kept])
+        cut(state, contacts)
+        inputs = [self._is_fast, self._solver.model.particle_world, start, self._kept]
+        self._launch(undo_cuts, inputs, [displacements, state.particle_q])
