@@ -198,29 +198,27 @@ def touching(found: Found) -> Rows:
 # Newton ------------------------------------------------------------------------------------------------------------
 
 
-def newton(*measurements: Found, has_times: bool = True) -> Rows:
+def newton(*measurements: Found) -> Rows:
     """Newton's examples, plain and with the stage."""
-    quantities = "ms a frame (95th percentile); crossings" if has_times else "crossings"
-    rows = [("example", f"plain: {quantities}", "with `SolverCCD`", "steps")]
+    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
     for found in measurements:
         modes: dict[str, dict[str, Found]] = {}
         for run in found["runs"]:
             modes.setdefault(run["example"], {})[run["mode"]] = run
         for name, run in modes.items():
-            cells = [_newton_cell(run[mode], has_times) for mode in ("plain", "stage")]
+            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
             frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
             title = f"`{name}`" + (f", {frames} frames" if frames else "")
             rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
     return rows
 
 
-def _newton_cell(run: Found, has_times: bool) -> str:
+def _newton_cell(run: Found) -> str:
     took = run["measured"]
     if took is None:
         return f"not run: {run['problem']}"
     times = took["milliseconds"]
-    written = f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); " if has_times else ""
-    return f"{written}{took['most_crossings']:,}"
+    return f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); {took['most_crossings']:,}"
 
 
 def _newton_steps(plain: Found | None, stage: Found | None) -> str:
@@ -447,7 +445,7 @@ TABLES = {
     "given_queries": Table(("given_queries_one_core",), given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
     "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), detector_stages),
-    "newton_coupled": Table(("newton_coupled_cpu",), lambda found: newton(found, has_times=False)),
+    "newton_coupled": Table(("newton_coupled_gpu",), newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
     "paper": Table(("paper_cpu",), paper),
     "penetration": Table(_PENETRATION, penetration, needs_all=False, has_sources=False),

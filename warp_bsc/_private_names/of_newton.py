@@ -14,6 +14,7 @@ from .._warnings import warn_caller
 from .versions import missing, version_of, warn_if_untested
 
 _TRUNCATION = "_penetration_free_truncation"
+_CUTS = "pos_prev_collision_detection", "particle_displacements", _TRUNCATION
 _OVERFLOW = "_soft_contact_source_overflow"
 
 
@@ -35,18 +36,21 @@ def replace_name(module: ModuleType, name: str, value: object) -> None:
 def vbd_truncation(solver: SolverVBD) -> Callable[..., None] | None:
     """Returns the method by which VBD cuts displacements of particles; None, with a warning, if it is gone.
 
-    Contract: ``SolverVBD._penetration_free_truncation`` makes all cuts by self-contact. It reads
-    ``particle_enable_self_contact`` when it is called, and without self-contact it cuts before rigid shapes only.
+    Contract: ``SolverVBD._penetration_free_truncation`` makes all cuts by self-contact, see also
+    :func:`displacements_since_detection`. It reads ``particle_enable_self_contact`` when it is called, and without
+    self-contact it cuts before rigid shapes only.
 
-    Without the method, the speed limit of VBD's self-contact stays, and ``report.speed_limit_lifted`` is False.
+    Without the method, or what it cuts, the speed limit of VBD's self-contact stays, and ``report.speed_limit_lifted``
+    is False.
     """
-    truncate = getattr(solver, _TRUNCATION, None)
-    if truncate is None:
-        warn_caller(
-            f"newton {newton.__version__} has no SolverVBD.{_TRUNCATION}, which warp-bsc replaces: "
-            "self-contact of VBD limits the speed of all particles"
-        )
-    return truncate
+    for name in _CUTS:
+        if not hasattr(solver, name):
+            warn_caller(
+                f"newton {newton.__version__} has no SolverVBD.{name}, which warp-bsc replaces: "
+                "self-contact of VBD limits the speed of all particles"
+            )
+            return None
+    return getattr(solver, _TRUNCATION)
 
 
 @contextlib.contextmanager
@@ -75,11 +79,10 @@ def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array
     Raises:
         RuntimeError: If VBD has not all of them: polish could move particles through each other.
     """
-    names = "pos_prev_collision_detection", "particle_displacements", _TRUNCATION
-    for name in names:
+    for name in _CUTS:
         if not hasattr(solver, name):
             raise missing("newton", f"SolverVBD.{name}", "polish has no use with self-contact")
-    start, displacements, cut = (getattr(solver, name) for name in names)
+    start, displacements, cut = (getattr(solver, name) for name in _CUTS)
     return start, displacements, cut
 
 

@@ -180,7 +180,7 @@ class SolverCCD(CollisionStage):
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say in the steps in which it
                 would brake one, so that the stage alone keeps them apart. Otherwise VBD cuts the path of every
-                particle in every step, see :class:`.integration.vbd_speed_limit.SpeedLimit`. If its iterations are too
+                particle in every step, see :mod:`.integration.vbd_speed_limit`. If its iterations are too
                 few for the step, VBD does not hold heavy bodies, and only the limit brakes them: they sink faster
                 without it, behind the stage or not. Has no effect on other solvers; ``report.speed_limit_lifted`` is
                 true where it has.

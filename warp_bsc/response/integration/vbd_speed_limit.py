@@ -1,4 +1,14 @@
-"""The speed limit of VBD's self-contact, lifted where the collision stage certifies the motion instead."""
+"""The speed limit of VBD's self-contact, lifted where the collision stage certifies the motion instead.
+
+Self-contact cuts the path of every particle, near something or not. The path between two detections is at most
+``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
+other. Where velocity, gravity and the forces of the program take a particle farther in a step than three quarters
+of that, nothing in its world is cut in this step: VBD's forces move it, and the stage alone keeps elements apart.
+Elsewhere the cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes
+back what the forces did.
+
+Cuts before rigid shapes stay in any case.
+"""
 
 import functools
 from collections.abc import Callable
@@ -82,17 +92,7 @@ def has_speed_limit(solver: SolverBase) -> TypeGuard[SolverVBD]:
 
 
 class SpeedLimit:
-    """Lifts the limit of VBD's self-contact in steps in which it would brake.
-
-    Self-contact cuts the path of every particle, near something or not. The path between two detections is at most
-    ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
-    other. Where velocity, gravity and the forces of the program take a particle farther in a step than three quarters
-    of that, nothing in its world is cut in this step: VBD's forces move it, and the stage alone keeps elements apart.
-    Elsewhere the cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes
-    back what the forces did.
-
-    Cuts before rigid shapes stay in any case.
-    """
+    """Lifts the limit of VBD's self-contact in steps in which it would brake."""
 
     def __init__(self, solver: SolverVBD):
         """Allocates buffers for a solver for which :func:`has_speed_limit` is true."""
