@@ -15,6 +15,7 @@ from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kerne
 
 import warp_bsc.usd.scene  # noqa: F401 (before OpenUSD, which reads the variables that it sets: no mapped files)
 
+gc.disable()  # until all tests are collected: each collection would look at all kernels imported so far
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 compile_kernels_once()
@@ -70,6 +71,7 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     """Sets options of modules that are imported, and keeps what they have made out of every collection of garbage."""
     compile_quickly()
+    gc.enable()
     gc.collect()
     gc.freeze()
 

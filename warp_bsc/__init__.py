@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ._garbage import paused_collection
 from ._version import __version__ as __version__
 
 _KERNELS = Path(__file__).parents[1] / "kernels" / "__init__.py"
@@ -154,4 +155,6 @@ def __getattr__(name):
         return importlib.import_module(f".{name}", __name__)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
+    with paused_collection():
+        module = importlib.import_module(f".{_MODULES[name]}", __name__)
+    return getattr(module, name)

@@ -3,6 +3,7 @@
 import os
 import sys
 
+from ._garbage import paused_collection
 from .cli.error_boundary import run_guarded
 from .cli.interrupts import INTERRUPTS
 
@@ -21,7 +22,8 @@ def main() -> int:
 
 
 def _load_and_run() -> int:
-    with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
+    # a library that is interrupted while it loads raises other errors, or none
+    with paused_collection(), INTERRUPTS.held():
         from .cli.main import run  # noqa: PLC0415 (slow: an error meanwhile must not end in a traceback)
     INTERRUPTS.check()
     return run(sys.argv[1:])

@@ -480,6 +480,9 @@ def test_the_limit_stays_in_worlds_in_which_nothing_is_fast(device):
         rollout.step()
         return (rollout.positions - model.particle_q.numpy()).reshape(2, 3, -1, 3)[..., 2]
 
+    corner = np.zeros(16)
+    corner[0] = 1.5 * slow
+    assert np.array_equal(ways(slow + corner), ways(slow + corner, lift=False))  # one that trembles alone is not fast
     kept, lifted = ways(slow), ways(4.0 * slow)
     assert np.array_equal(kept, ways(slow, lift=False)) and np.array_equal(lifted[0], kept[0])
     assert kept[1, 0].max() < 0.75 * slow * DT  # the layer behind

@@ -15,6 +15,7 @@ from typing import Any
 
 import warp as wp
 
+from .._garbage import paused_collection
 from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals, describe_download
 
 __all__ = ["SOLVERS", "serve"]
@@ -62,10 +63,11 @@ def serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> N
 
 def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None]) -> ExampleMeasurement:
     """Runs an example as the main module, with the frame loop that measures."""
-    import newton.examples  # noqa: PLC0415 (slow)
-    import newton.utils  # noqa: PLC0415 (slow)
+    with paused_collection():
+        import newton.examples  # noqa: PLC0415 (slow)
+        import newton.utils  # noqa: PLC0415 (slow)
 
-    from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
+        from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
     measurements: list[ExampleMeasurement] = []
     stages: list[Any] = []

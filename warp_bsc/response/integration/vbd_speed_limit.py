@@ -2,9 +2,9 @@
 
 Self-contact cuts the path of every particle, near something or not. The path between two detections is at most
 ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
-other. Where velocity, gravity and the forces of the program take a particle farther in a step than three quarters
-of that, nothing in its world is cut in this step: VBD's forces move it, and the stage alone keeps elements apart.
-Elsewhere the cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes
+other. Where velocity, gravity and the forces of the program take a triangle farther in a step than nine tenths of that,
+nothing in its world is cut in this step: VBD's forces move it, and the stage alone keeps elements apart. Elsewhere the
+cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes
 back what the forces did.
 
 Cuts before rigid shapes stay in any case.
@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import TypeGuard
 
 import newton
+import numpy as np
 import warp as wp
 from newton import ParticleFlags
 from newton.solvers import SolverBase, SolverVBD
@@ -34,24 +35,31 @@ def find_fast_worlds(
     flags: wp.array[wp.int32],
     world_of: wp.array[int],
     gravity: wp.array[wp.vec3],
+    elements: wp.array[wp.vec3i],
     dt: float,
     path: float,
     # out
     is_fast: wp.array[int],
     any_is_fast: wp.array[int],
 ):
-    """Marks the worlds in which a particle moves farther in a step than a path; the last is what is in no world.
+    """Marks the worlds in which an element moves farther in a step than a path; the last is what is in no world.
 
-    What moves it is its velocity, gravity and the forces of the program.
+    An element moves as its three particles do in the mean, so that one that trembles alone is not fast. What moves
+    them is their velocity, gravity and the forces of the program.
     """
-    i = wp.tid()
-    if inverse_masses[i] == 0.0 or (flags[i] & int(ParticleFlags.ACTIVE)) == 0:
-        return
-    world = world_of[i]
-    acceleration = gravity[wp.where(world < 0, gravity.shape[0] - 1, world)]
-    if forces:
-        acceleration += inverse_masses[i] * forces[i]
-    if dt * wp.length(velocities[i] + dt * acceleration) > path:
+    element = elements[wp.tid()]
+    way = wp.vec3()
+    movable = int(0)
+    for j in range(3):
+        i = element[j]
+        if inverse_masses[i] > 0.0 and (flags[i] & int(ParticleFlags.ACTIVE)) != 0:
+            acceleration = gravity[wp.where(world_of[i] < 0, gravity.shape[0] - 1, world_of[i])]
+            if forces:
+                acceleration += inverse_masses[i] * forces[i]
+            way += dt * (velocities[i] + dt * acceleration)
+            movable += 1
+    if wp.length(way) > float(movable) * path:
+        world = world_of[element[0]]
         is_fast[wp.where(world < 0, is_fast.shape[0] - 1, world)] = 1
         any_is_fast[0] = 1
 
@@ -100,6 +108,10 @@ class SpeedLimit:
         # by world, what is in no world, and whether any of them is fast
         self._fast_worlds = wp.zeros(model.world_count + 2, dtype=int, device=model.device)
         self._is_fast, self._any_is_fast = self._fast_worlds[:-1], self._fast_worlds[-1:]
+        faces = model.tri_indices.numpy().reshape(-1, 3)
+        others = np.setdiff1d(np.arange(model.particle_count), faces)
+        elements = np.concatenate([faces, np.stack([others] * 3, axis=1)])
+        self._elements = wp.array(elements, dtype=wp.vec3i, device=model.device)
         self._kept = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
 
     def step(self, step: Callable[[], None], state: newton.State, dt: float, *, can_branch: bool) -> None:
@@ -117,18 +129,18 @@ class SpeedLimit:
         path *= solver.particle_self_contact_margin + solver.particle_self_contact_gap
         self._fast_worlds.zero_()
         inputs = [state.particle_qd, state.particle_f, model.particle_inv_mass, model.particle_flags]
-        inputs += [model.particle_world, model.gravity, dt, FAST_PATH * path]
-        self._launch(find_fast_worlds, inputs, [self._is_fast, self._any_is_fast])
+        inputs += [model.particle_world, model.gravity, self._elements, dt, FAST_PATH * path]
+        self._launch(find_fast_worlds, inputs, [self._is_fast, self._any_is_fast], len(self._elements))
         if not can_branch:
             self._step_with(self._cut_where_slow, step)
             return
         cut = self._cut_where_slow if model.world_count > 1 else self._cut_before_shapes
         wp.capture_if(self._any_is_fast, lambda: self._step_with(cut, step), step)
 
-    def _launch(self, kernel, inputs, outputs):
+    def _launch(self, kernel, inputs, outputs, size=None):
         model = self._solver.model
-        options = {"device": model.device, "record_tape": False}
-        wp.launch(kernel, model.particle_count, inputs=inputs, outputs=outputs, **options)
+        size = model.particle_count if size is None else size
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=model.device, record_tape=False)
 
     def _step_with(self, cut, step):
         """Takes a step in which VBD cuts displacements by another function."""

@@ -1,0 +1,42 @@
+"""Imports pause the collection of garbage, and leave it as it was."""
+
+import gc
+import subprocess
+import sys
+
+import pytest
+
+from warp_bsc._garbage import paused_collection
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_it_is_left_as_it_was(enabled):
+    (gc.enable if enabled else gc.disable)()
+    frozen = gc.get_freeze_count()
+    try:
+        with pytest.raises(KeyError), paused_collection():
+            assert not gc.isenabled()
+            raise KeyError
+        assert gc.isenabled() is enabled and gc.get_freeze_count() == frozen
+    finally:
+        gc.enable()
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_garbage_of_before_is_collected_after(frozen):
+    code = f"""
+import gc, weakref
+if {frozen}:
+    gc.freeze()
+import warp_bsc
+class Loop: pass
+loop = Loop()
+loop.self = loop
+gone = weakref.ref(loop)
+del loop
+warp_bsc.CollisionDetector
+count = gc.get_freeze_count()
+gc.collect()
+assert gone() is None and gc.isenabled() and (count > 0) is {frozen}, (gone(), count)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
