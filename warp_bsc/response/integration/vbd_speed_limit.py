@@ -108,7 +108,7 @@ class SpeedLimit:
         # by world, what is in no world, and whether any of them is fast
         self._fast_worlds = wp.zeros(model.world_count + 2, dtype=int, device=model.device)
         self._is_fast, self._any_is_fast = self._fast_worlds[:-1], self._fast_worlds[-1:]
-        faces = model.tri_indices.numpy().reshape(-1, 3)
+        faces = np.zeros((0, 3), dtype=int) if model.tri_indices is None else model.tri_indices.numpy().reshape(-1, 3)
         others = np.setdiff1d(np.arange(model.particle_count), faces)
         elements = np.concatenate([faces, np.stack([others] * 3, axis=1)])
         self._elements = wp.array(elements, dtype=wp.vec3i, device=model.device)
