@@ -44,7 +44,13 @@ PRINTED = re.findall(
 PRINTED.append("paper/example_twisting")
 FIGURES = sorted(set((FOLDER / "figures").glob("*.py")) - {FOLDER / "figures" / "film.py"})
 FRAMES = 2
-RUN_LONGER = ["example_cloth_bullet", "example_diffsim_push", "example_diffsim_throw", "example_gripper", "example_propeller"]
+RUN_LONGER = [
+    "example_cloth_bullet",
+    "example_diffsim_push",
+    "example_diffsim_throw",
+    "example_gripper",
+    "example_propeller",
+]
 RUN_LONGER += [f"example_diffsim_{name}" for name in BEHIND_VBD]
 """Examples that other tests run with the same options, and for more frames."""
 COMPARED = ["particle_q", "particle_qd", "particle_mass", "tri_indices", "tri_materials"]
