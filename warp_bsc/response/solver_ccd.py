@@ -179,11 +179,11 @@ class SolverCCD(CollisionStage):
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
             lift_speed_limit: Whether VBD with self-contact moves particles as its forces say in the steps in which it
-                would brake one, so that the stage alone keeps them apart. Otherwise VBD cuts the path of every
-                particle in every step, see :mod:`.integration.vbd_speed_limit`. If its iterations are too
-                few for the step, VBD does not hold heavy bodies, and only the limit brakes them: they sink faster
-                without it, behind the stage or not. Has no effect on other solvers; ``report.speed_limit_lifted`` is
-                true where it has.
+                would brake something, so that the stage alone keeps them apart. Otherwise VBD cuts the path of every
+                particle in every step, see :mod:`.integration.vbd_speed_limit`. If its iterations are too few for the
+                step, VBD does not hold heavy bodies, and only the limit brakes them: they sink faster without it,
+                behind the stage or not. Has no effect on other solvers; ``report.speed_limit_lifted`` is true where it
+                has.
             max_iterations: Iterations of detect and project, 0 to 40; what still collides then is divided, see
                 :mod:`.schedule`. Fewer bound the time of a step, and leave more vertices with cut paths.
             report_contacts: Whether ``report`` has the contacts of each step and their impulses, see

@@ -4,8 +4,8 @@ Self-contact cuts the path of every particle, near something or not. The path be
 ``0.5 * dat_conservative_bound_relaxation * (margin + gap)``, and ends at planes between features that are near each
 other. Where velocity, gravity and the forces of the program take a triangle farther in a step than nine tenths of that,
 nothing in its world is cut in this step: VBD's forces move it, and the stage alone keeps elements apart. Elsewhere the
-cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes
-back what the forces did.
+cuts stay. They damp cloth that is pressed until it jams, which otherwise trembles, as the stage takes back what the
+forces did.
 
 Cuts before rigid shapes stay in any case.
 """
