@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+import warp_bsc
 from warp_bsc._garbage import paused_collection
 
 
@@ -40,3 +41,10 @@ gc.collect()
 assert gone() is None and gc.isenabled() and (count > 0) is {frozen}, (gone(), count)
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_name_that_is_imported_pauses_nothing(monkeypatch):
+    """It would make all objects of the program old again and again, and count those that are frozen."""
+    assert warp_bsc.CollisionDetector
+    monkeypatch.setattr(warp_bsc, "paused_collection", lambda: pytest.fail("paused"))
+    assert warp_bsc.CollisionDetector

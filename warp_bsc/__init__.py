@@ -1,5 +1,6 @@
 """Continuous collision detection for deforming triangle meshes: no missed collision, no dropped pair."""
 
+import contextlib
 import importlib
 import importlib.util
 import sys
@@ -155,6 +156,6 @@ def __getattr__(name):
         return importlib.import_module(f".{name}", __name__)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with paused_collection():
-        module = importlib.import_module(f".{_MODULES[name]}", __name__)
-    return getattr(module, name)
+    module = f"{__name__}.{_MODULES[name]}"
+    with contextlib.nullcontext() if module in sys.modules else paused_collection():
+        return getattr(importlib.import_module(module), name)
