@@ -74,6 +74,7 @@ def pytest_collection_finish():
     gc.enable()
     gc.collect()
     gc.freeze()
+    gc.set_threshold(100_000, 20, 20)  # each launch makes objects, and few of them are garbage in cycles
 
 
 @pytest.fixture(scope="session", autouse=True)

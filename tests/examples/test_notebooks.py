@@ -25,13 +25,17 @@ SITE = "https://warp-bsc.github.io/warp-bsc/main/"
 SETUP = f"""
 import sys
 sys.path.append({compilation.FOLDER!r})
-import compilation, newton.solvers, warp
+import compilation, warp
 warp.config.log_level = warp.LOG_WARNING
 warp.set_device({{device!r}})
 compilation.compile_kernels_once()
-compilation.compile_quickly()
 """
 """Runs before the first cell, so that notebooks take the kernels of the other tests."""
+SETUP_OF_NEWTON = """
+import newton.solvers
+compilation.compile_quickly()
+"""
+"""The same for kernels of Newton's solvers, whose import takes seconds."""
 
 each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
 
@@ -57,7 +61,8 @@ def execute(name, size, values, monkeypatch):
     notebook = read(FOLDER / f"{name}.ipynb")
     (cell,) = (cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
     cell.source = f"{cell.source.partition(' = ')[0]} = {size}"
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(SETUP.format(device=str(wp.get_device()))))
+    setup = SETUP.format(device=str(wp.get_device())) + SETUP_OF_NEWTON * ("newton" in name)
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(setup))
     notebook.cells.append(nbformat.v4.new_code_cell(f"import json; print(json.dumps([{', '.join(values)}]))"))
     monkeypatch.setenv("PATH", sysconfig.get_path("scripts"), prepend=os.pathsep)  # of the command
     nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(FOLDER)}}).execute()
