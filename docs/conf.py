@@ -4,6 +4,7 @@ The theme, that of Newton's and NumPy's pages, has a switcher of versions. Guide
 """
 
 import functools
+import gc
 import importlib
 import os
 import re
@@ -18,6 +19,8 @@ from sphinx.util.nodes import make_refnode
 
 import warp_bsc
 from warp_bsc.cli.main import _build_parser
+
+gc.disable()  # a build makes trees that stay, and takes a quarter longer if they are looked at again and again
 
 ROOT = Path(__file__).resolve().parents[1]
 REPOSITORY = "https://github.com/warp-bsc/warp-bsc"
