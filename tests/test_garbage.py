@@ -48,3 +48,17 @@ def test_a_name_that_is_imported_pauses_nothing(monkeypatch):
     assert warp_bsc.CollisionDetector
     monkeypatch.setattr(warp_bsc, "paused_collection", lambda: pytest.fail("paused"))
     assert warp_bsc.CollisionDetector
+
+
+def test_a_name_is_imported_in_a_pause():
+    code = """
+import gc, sys, warp_bsc
+seen = []
+class Finder:
+    def find_spec(name, path, target=None):
+        seen.append(gc.isenabled())
+sys.meta_path.insert(0, Finder)
+warp_bsc.CollisionDetector
+assert len(seen) > 10 and not any(seen) and gc.isenabled(), seen
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -26,6 +26,12 @@ from ..tuning import FAST_PATH
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def _flag_of(is_fast: wp.array[int], world: int) -> int:
+    """Returns the place of a world's flag: the last for what is in no world."""
+    return wp.where(world < 0, is_fast.shape[0] - 1, world)
+
+
 @wp.kernel
 def find_fast_worlds(
     # in
@@ -42,7 +48,7 @@ def find_fast_worlds(
     is_fast: wp.array[int],
     any_is_fast: wp.array[int],
 ):
-    """Marks the worlds in which an element moves farther in a step than a path; the last is what is in no world.
+    """Marks the worlds in which an element moves farther in a step than a path.
 
     An element moves as its three particles do in the mean, so that one that trembles alone is not fast. What moves
     them is their velocity, gravity and the forces of the program.
@@ -59,8 +65,7 @@ def find_fast_worlds(
             way += dt * (velocities[i] + dt * acceleration)
             movable += 1
     if wp.length(way) > float(movable) * path:
-        world = world_of[element[0]]
-        is_fast[wp.where(world < 0, is_fast.shape[0] - 1, world)] = 1
+        is_fast[_flag_of(is_fast, world_of[element[0]])] = 1
         any_is_fast[0] = 1
 
 
@@ -84,7 +89,7 @@ def undo_cuts(
 ):
     """Restores the displacements of fast worlds."""
     i = wp.tid()
-    if is_fast[wp.where(world_of[i] < 0, is_fast.shape[0] - 1, world_of[i])] == 1:
+    if is_fast[_flag_of(is_fast, world_of[i])] == 1:
         displacements[i] = kept[i]
         positions[i] = start[i] + kept[i]
 
