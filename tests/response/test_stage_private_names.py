@@ -197,6 +197,20 @@ def test_which_steps_allocate(kind, device):
     assert (totals[0] != totals[1]) is allocates
 
 
+@pytest.mark.parametrize("kind", ["rigid", "soft"])
+def test_which_contacts_have_room(kind, device):
+    model = sheet_above_sphere(device, body=True)
+    solver, smaller = SolverVBD(model), newton.CollisionPipeline(model).contacts()
+    larger = newton.CollisionPipeline(model, **{f"{kind}_contact_max": 5000}).contacts()
+    states, control = [model.state(), model.state()], model.control()
+    assert of_newton.has_room(solver, None)
+    solver.step(*states, control, smaller, DT)
+    assert of_newton.has_room(solver, smaller)
+    assert not of_newton.has_room(solver, larger)
+    solver.step(*states, control, larger, DT)
+    assert of_newton.has_room(solver, smaller) and of_newton.has_room(solver, larger)
+
+
 def test_style3d_takes_substeps_in_a_graph(device):
     """Also on a GPU, where its steps allocate memory, a graph takes a given number of substeps."""
     model, ends = sheet_above_sphere(device), []

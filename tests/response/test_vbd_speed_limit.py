@@ -1,5 +1,7 @@
 """The speed limit of VBD's self-contact: lifted where it brakes, kept where nothing is fast."""
 
+import contextlib
+
 import newton
 import numpy as np
 import pytest
@@ -103,6 +105,31 @@ def test_a_graph_lifts_the_limit_in_steps_in_which_something_is_fast(inner, subs
         wp.capture_launch(capture.graph)
         ways.append((end.particle_q.numpy() - model.particle_q.numpy())[:, 2] - speed * DT)
     assert np.allclose(ways, 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("self_contact", [True, False])
+def test_a_graph_begins_with_a_step_in_which_vbd_allocates(self_contact, device):
+    """Buffers for contacts grow in the first step with them, which a condition in a graph must not contain."""
+    builder = newton.ModelBuilder()
+    builder.add_shape_sphere(builder.add_body(xform=wp.transform((1.0, 0.0, 0.0))), radius=0.05)
+    add_patch(builder, 3, 0.02, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, 40.0))
+    builder.color()
+    ends = []
+    for in_graph in (False, True):
+        model = builder.finalize(device=device)
+        vbd = vbd_with_self_contact(model) if self_contact else SolverVBD(model, iterations=3)
+        pipeline = newton.CollisionPipeline(model, soft_contact_max=5000, rigid_contact_max=500)
+        solver, contacts = bsc.SolverCCD(vbd), pipeline.contacts()
+        start, end, control = model.state(), model.state(), model.control()
+        pipeline.collide(start, contacts)
+        with wp.ScopedCapture(device) if in_graph else contextlib.nullcontext() as capture:
+            solver.step(start, end, control, contacts, DT)
+        if capture is not None:
+            wp.capture_launch(capture.graph)
+        assert solver.report.certified
+        ends.append(end.particle_q.numpy())
+    assert np.array_equal(*ends)
+    assert np.allclose(ends[0][:, 2], 40.0 * DT, atol=1e-3)
 
 
 @pytest.mark.parametrize("source", ["gravity", "force"])

@@ -134,12 +134,27 @@ def may_allocate(solver: SolverBase) -> bool:
     """Returns whether a step of a solver may allocate memory, which the body of a condition in a CUDA graph must not.
 
     Contract: ``SolverVBD``, and ``SolverStyle3D`` on a CPU, allocate nothing in a step unless they have a collision
-    pipeline of their own. On a GPU the inner products of Style3D allocate. Every other solver, and every class derived
-    from these, counts as one that allocates. Where the contract is broken, Warp raises an error when the step is
-    captured.
+    pipeline of their own, or :func:`has_room` is false. On a GPU the inner products of Style3D allocate. Every other
+    solver, and every class derived from these, counts as one that allocates. Where the contract is broken, Warp raises
+    an error when the step is captured.
     """
     allocates_nothing = type(solver) is SolverVBD or (type(solver) is SolverStyle3D and solver.device.is_cpu)
     return not allocates_nothing or solver.collision_pipeline is not None
+
+
+def has_room(solver: SolverBase, contacts: newton.Contacts | None) -> bool:
+    """Returns whether the buffers of a solver suffice for contacts, so that a step with them need not allocate larger.
+
+    Contract: ``SolverVBD`` that integrates bodies has the array ``body_body_contact_penalty_k``, one row for each rigid
+    contact, and every ``SolverVBD`` has ``body_particle_contact_penalty_k``, one for each soft contact. A step with
+    contacts of which there may be more replaces these, and others of their size. Where they are gone, there is no room.
+    """
+    if contacts is None or not isinstance(solver, SolverVBD):
+        return True
+    capacities = {"body_particle_contact_penalty_k": contacts.soft_contact_max}
+    if solver.model.body_count and not has_external_rigid_solver(solver):
+        capacities["body_body_contact_penalty_k"] = contacts.rigid_contact_max
+    return all(len(getattr(solver, name, ())) >= capacity for name, capacity in capacities.items())
 
 
 @contextlib.contextmanager

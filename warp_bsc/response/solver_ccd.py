@@ -11,7 +11,7 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, may_allocate, with_contacts
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, has_room, may_allocate, with_contacts
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
@@ -371,7 +371,7 @@ class SolverCCD(CollisionStage):
         if self._in_substeps is None:
             self._step_solver(*arguments, **options)
         else:
-            self._in_substeps.take_whole_step(*arguments, **options)
+            self._in_substeps.take_whole_step(*arguments, can_branch=self._can_branch(*arguments), **options)
 
     def _step_solver(self, *arguments, **options):
         step = functools.partial(self.solver.step, *arguments, **options)
@@ -382,8 +382,12 @@ class SolverCCD(CollisionStage):
                 step()
             else:
                 state_in, dt = arguments[0], arguments[-1]
-                can_branch = not (self.mesh.device.is_capturing and may_allocate(self.solver))
-                self._speed_limit.step(step, state_in, dt, can_branch=can_branch)
+                self._speed_limit.step(step, state_in, dt, can_branch=self._can_branch(*arguments))
+
+    def _can_branch(self, state_in, state_out, control, contacts, dt):
+        """Returns whether the body of a condition may step the inner solver: not if it allocates memory in a graph."""
+        allocates = may_allocate(self.solver) or not has_room(self.solver, contacts)
+        return not (self.mesh.device.is_capturing and allocates)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         device, end = self.mesh.device, arrays_of(state_out)

@@ -157,9 +157,12 @@ class Substeps:
             outputs = [self._needs_whole_step, self._strain, self._final_strain, self._is_chosen, self._must_choose]
             self._work.launch(kernels.begin_step, self._work.worlds, inputs, outputs)
 
-    def take_whole_step(self, *arguments, **options) -> None:
-        """Steps the inner solver, with its arguments, unless all worlds have predicted substeps, and need no more."""
-        if self._extrapolates and not options:
+    def take_whole_step(self, *arguments, can_branch: bool, **options) -> None:
+        """Steps the inner solver, with its arguments, unless all worlds have predicted substeps, and need no more.
+
+        Where a step cannot be in the body of a condition, the inner solver takes it in any case.
+        """
+        if self._extrapolates and can_branch and not options:
             wp.capture_if(self._needs_whole_step, lambda: self._step(*arguments))
         else:
             self._step(*arguments, **options)
