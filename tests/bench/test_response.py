@@ -114,6 +114,15 @@ def test_every_scene_is_built_for_a_solver_or_says_why_not(solver, device):
     assert missing == expected[solver]
 
 
+@pytest.mark.parametrize("solver", ["vbd", "semi-implicit"])
+def test_the_length_of_steps(solver, device):
+    options = {"solver": solver, "device": device, "seconds": 0.02, "reference_rate": 1900}
+    own = 60 if solver == "vbd" else 60 * SEMI_IMPLICIT_STEPS
+    for rate, expected in ((None, own), (240, 240)):
+        assert measure("box_edge", "plain", rate=rate, **options).rate == expected
+    assert measure("box_edge", REFERENCE, rate=240, **options).rate == max(1900, own)
+
+
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_each_configuration_runs(configuration, device):
     frames = []
@@ -199,6 +208,7 @@ def test_positions_that_are_not_finite(device, monkeypatch):
         ({"configuration": "both"}, "configuration must be one of plain, .*, not 'both'"),
         ({"solver": "mpm"}, "solver must be one of vbd, xpbd, style3d, semi-implicit, not 'mpm'"),
         ({"seconds": 0.0}, "seconds must be finite and more than 0, not 0.0"),
+        ({"rate": 0}, "rate must be at least 1, not 0"),
         ({"reference_rate": 0}, "reference_rate must be at least 1, not 0"),
         ({"perturb": np.inf}, "perturb must be finite and more than 0, not inf"),
     ],

@@ -83,7 +83,7 @@ def test_tables(capsys, monkeypatch, measured):
 
 def test_json(capsys, tmp_path, measured):
     arguments = ["sphere", "pile", "--configurations", "plain,stage", "--perturb", "1e-6", "--seconds", "0.5"]
-    arguments += ["--reference-rate", "960", "--solver", "xpbd"]
+    arguments += ["--rate", "240", "--reference-rate", "960", "--solver", "xpbd"]
     found = json.loads(run(capsys, *arguments, "--json").out)
     names = [(row["scene"], row["solver"], row["configuration"]) for row in found["runs"]]
     assert names == [(scene, "xpbd", name) for scene in ("sphere", "pile") for name in ("plain", "stage")]
@@ -95,7 +95,7 @@ def test_json(capsys, tmp_path, measured):
     assert first["problem"] is first["measured"]["spread"] is third["measured"] is None
     assert third["problem"] == "a reason [red]"
     assert second["measured"]["spread"] == {"distance": 1e-6, "stretch_at_end": 0.25, "stretch_at_most": 1.5}
-    options = {"seconds": 0.5, "reference_rate": 960, "solver": "xpbd", "perturb": 1e-6}
+    options = {"seconds": 0.5, "rate": 240, "reference_rate": 960, "solver": "xpbd", "perturb": 1e-6}
     assert all(call.items() >= options.items() for call in measured)
 
     path = tmp_path / "found.json"
@@ -163,6 +163,7 @@ def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measure
         (["--seconds", "0"], "--seconds: must be a finite number more than 0, not 0"),
         (["--perturb", "far"], "--perturb: must be a finite number more than 0"),
         (["--perturb", "1e-6", "--configurations", "plain"], "--perturb runs the configuration stage a second time"),
+        (["--rate", "0"], "--rate: must be an integer of at least 1"),
         (["--reference-rate", "0"], "--reference-rate: must be an integer of at least 1"),
         (["--json", "sphere"], "--json sphere: this is a scene; name scenes before the options"),
         (["--json", "gone/found.json"], "there is no folder gone"),

@@ -62,7 +62,7 @@ REFERENCE_RATE = 1920
 """Default number of steps a second of the reference."""
 
 SEMI_IMPLICIT_STEPS = 32
-"""Steps of the semi-implicit solver in place of one, in all configurations: it is explicit, and bursts at larger ones.
+"""Steps of the semi-implicit solver in place of one, where no rate is given: it is explicit, and bursts at larger ones.
 """
 
 WARM_UP = 2
@@ -163,6 +163,7 @@ def measure_response(
     solver: str = "vbd",
     device: str | wp.Device | None = None,
     seconds: float | None = None,
+    rate: int | None = None,
     reference_rate: int = REFERENCE_RATE,
     perturb: float | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -175,6 +176,8 @@ def measure_response(
         solver: One of :data:`SOLVERS`.
         device: The Warp device; default: the current one.
         seconds: Simulated time [s]; default: that of the scene. There are at least four steps, and an even number.
+        rate: Steps a second of the other configurations; default: that of the scene, and of the semi-implicit solver
+            :data:`SEMI_IMPLICIT_STEPS` times as many.
         reference_rate: Steps a second of the reference.
         perturb: Distance [m]: the configuration ``stage`` runs a second time with all particles moved that far along x,
             see :class:`Spread`.
@@ -195,8 +198,9 @@ def measure_response(
             raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
     if seconds is not None and not 0.0 < seconds < math.inf:
         raise ValueError(f"seconds must be finite and more than 0, not {seconds}")
-    if reference_rate < 1:
-        raise ValueError(f"reference_rate must be at least 1, not {reference_rate}")
+    for name, number in (("rate", rate), ("reference_rate", reference_rate)):
+        if number is not None and number < 1:
+            raise ValueError(f"{name} must be at least 1, not {number}")
     if perturb is not None and not 0.0 < perturb < math.inf:
         raise ValueError(f"perturb must be finite and more than 0, not {perturb}")
     from .response_scenes import NotRunnable  # noqa: PLC0415 (imports Newton)
@@ -211,7 +215,7 @@ def measure_response(
             if progress:
                 progress(number * steps + done, passes * steps)
 
-        return _measure(scene, configuration, solver, seconds, reference_rate, offset, show)
+        return _measure(scene, configuration, solver, seconds, rate, reference_rate, offset, show)
 
     try:
         with wp.ScopedDevice(device), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -235,6 +239,7 @@ def _measure(
     configuration: str,
     solver: str,
     seconds: float | None,
+    rate: int | None,
     reference_rate: int,
     offset: float,
     progress: Callable[[int, int], None],
@@ -244,9 +249,12 @@ def _measure(
     from .response_simulation import Simulation, energy_gained  # noqa: PLC0415 (imports Newton)
 
     built = build_scene(scene, solver)
-    rate = reference_rate if configuration == REFERENCE else built.rate
-    if solver == "semi-implicit":
-        rate = max(rate, SEMI_IMPLICIT_STEPS * built.rate)
+    is_explicit = solver == "semi-implicit"
+    own_rate = SEMI_IMPLICIT_STEPS * built.rate if is_explicit else built.rate
+    if configuration == REFERENCE:
+        rate = max(reference_rate, own_rate) if is_explicit else reference_rate
+    elif rate is None:
+        rate = own_rate
     simulation = Simulation(
         built,
         solver,

@@ -40,8 +40,9 @@ of 1/120 s. The configurations:
   stage+contacts  the same with Newton's contacts
   reference       SolverCCD without substeps, at a small step: slow
 Ropes have particle_radius, without which nothing collides with springs. The
-semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations. A
-scene that the solver cannot run is a row, and a line below says why."""
+semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations, unless
+--rate is given. A scene that the solver cannot run is a row, and a line below
+says why."""
 
 _EPILOG = f"""\
 scenes:
@@ -50,6 +51,7 @@ scenes:
 
 examples:
   warp-bsc bench response --no-reference
+  warp-bsc bench response box_edge --rate 240 --no-reference
   warp-bsc bench response sphere box_edge --device cuda:0
   warp-bsc bench response sphere --configurations stage --perturb 1e-6
   warp-bsc bench response --solver xpbd --json response.json
@@ -81,6 +83,12 @@ def add_to(commands: Commands, summary: str) -> None:
         action=argparse.BooleanOptionalAction,
         default=True,
         help="whether the reference is among the default configurations",
+    )
+    command.add_argument(
+        "--rate",
+        type=positive,
+        metavar="N",
+        help="steps a second of the other configurations (default: that of the scene)",
     )
     command.add_argument(
         "--reference-rate",
@@ -181,6 +189,7 @@ def _measure(
                     solver=arguments.solver,
                     device=device,
                     seconds=arguments.seconds,
+                    rate=arguments.rate,
                     reference_rate=arguments.reference_rate,
                     perturb=arguments.perturb,
                     progress=show,
