@@ -78,7 +78,7 @@ def test_samples_of_a_state(device):
 
 def test_the_measures_of_a_run():
     times = [1.0, 1.0, 4.0]
-    found = ResponseMeasurement("cpu", 3, 1, 60, 5, 1.0, 2.0, 3.0, None, 0, None, None, times)
+    found = ResponseMeasurement("cpu", 3, 1, 60, 5, 1.0, 2.0, 3.0, None, 0, 0, None, None, times)
     assert (found.median, found.mean) == (1.0, 2.0)
 
 
@@ -140,17 +140,21 @@ def test_each_configuration_runs(configuration, device):
         assert found.uncertified_steps is found.substeps is None
     else:
         assert (found.crossings, found.uncertified_steps) == (0, 0)
+        assert found.collisions == (None if configuration == REFERENCE else 0)
         assert found.substeps == 1.0 if configuration == REFERENCE else found.substeps > 1.0
     assert found.spread is None
 
 
 def test_a_program_moves_bodies_and_particles(device):
-    """A fast ball takes the cloth with it, which it passes without the stage; the mouth of a tube rises."""
+    """A fast ball takes the cloth with it, which it passes without the stage."""
     ball = measure("ball", "stage", device=device, seconds=0.05)
     assert ball.energy_gained is None
-    assert (ball.crossings, ball.uncertified_steps) == (0, 0)
+    assert (ball.crossings, ball.collisions, ball.uncertified_steps) == (0, 0, 0)
     assert ball.stretch_at_most > 5.0
-    assert measure("ball", "plain", device=device, seconds=0.05).stretch_at_most < ball.stretch_at_most
+    passing = measure("ball", "plain", device=device, seconds=0.05)
+    assert passing.stretch_at_most < ball.stretch_at_most
+    assert passing.collisions > 10
+    assert passing.crossings == 0  # it is beyond the cloth at the end
 
 
 def test_worlds_are_reset(device):

@@ -104,6 +104,8 @@ class ResponseMeasurement:
         energy_gained: Largest rise of the kinetic and gravitational energy of a world above its least value so far
             [J]; None where a program moves something. A rebound of what is strained counts.
         crossings: Crossings of cloth, soft bodies and springs at the end, also with rigid shapes.
+        collisions: Vertex-face and edge-edge pairs that meet on the straight way of a step, at least one of them not of
+            a rigid shape, in all steps together; None for the reference, which has too many.
         uncertified_steps: Steps that were not certified; None without a stage.
         substeps: Mean number of substeps of a step, 1 for a step that was not taken in substeps; None without a stage.
         milliseconds: Time of each step but the first :data:`WARM_UP` [ms], with Newton's contacts; two steps are timed
@@ -121,6 +123,7 @@ class ResponseMeasurement:
     rest_speed: float
     energy_gained: float | None
     crossings: int
+    collisions: int | None
     uncertified_steps: int | None
     substeps: float | None
     milliseconds: list[float]
@@ -248,7 +251,7 @@ def _measure(
     from .response_scenes import build_scene  # noqa: PLC0415 (imports Newton)
     from .response_simulation import Simulation, energy_gained  # noqa: PLC0415 (imports Newton)
 
-    built = build_scene(scene, solver)
+    built = build_scene(scene, solver, rate or 60)
     is_explicit = solver == "semi-implicit"
     own_rate = SEMI_IMPLICIT_STEPS * built.rate if is_explicit else built.rate
     if configuration == REFERENCE:
@@ -263,6 +266,7 @@ def _measure(
         has_contacts=configuration not in ("stage", REFERENCE),
         stage_options=_STAGES.get(configuration),
         offset=offset,
+        counts_collisions=configuration != REFERENCE,
     )
     steps = simulation.run(built.seconds if seconds is None else seconds, progress)
     stage, samples, last = simulation.stage, simulation.samples, max(1, steps // 10)
@@ -277,6 +281,7 @@ def _measure(
         rest_speed=1e3 * float(np.mean(samples.speed[-last:])),
         energy_gained=None if built.motion else energy_gained(np.array(samples.energy), samples.restarts),
         crossings=simulation.count_crossings(),
+        collisions=sum(simulation.collisions) if configuration != REFERENCE else None,
         uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
         substeps=float(np.mean(simulation.substeps)) if stage else None,
         milliseconds=simulation.milliseconds[WARM_UP:],

@@ -1,5 +1,6 @@
 """Steps a scene of the bench of contact with a solver and a stage, and samples each state."""
 
+import functools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -126,6 +127,8 @@ class Simulation:
         samples: What was measured of each state.
         milliseconds: Time of each step [ms]; two steps are timed together.
         substeps: Substeps of each step, 1 for a step that was not taken in substeps.
+        collisions: Pairs that meet on straight ways in each step, see :class:`.crossings.CrossingCounter`; empty if
+            they are not counted.
     """
 
     def __init__(
@@ -140,6 +143,7 @@ class Simulation:
         offset: float = 0.0,
         inner: Any = None,
         samples: Any = None,
+        counts_collisions: bool = False,
     ):
         """Makes the solver and the states.
 
@@ -154,6 +158,7 @@ class Simulation:
             inner: The solver that is stepped, behind the stage if there is one; default: that of the bench of contact.
             samples: What the states are given to, with a method ``add`` as that of :class:`Samples`; default:
                 :class:`Samples`.
+            counts_collisions: Whether collisions of each step are counted; it takes a detection, which is not timed.
         """
         model = scene.model
         self._scene, self._model, self._rate, self._offset = scene, model, rate, offset
@@ -175,6 +180,7 @@ class Simulation:
         self._ends = [(model.state(), wp.zeros(1, dtype=int)) for _ in self._states]  # copies of both ends of a pair
         self._graph: wp.Graph | None = None
         self.samples, self.milliseconds, self.substeps = samples or Samples(model), [], []
+        self._counts_collisions, self.collisions = counts_collisions, []
 
     def run(self, seconds: float, progress: Callable[[int, int], None]) -> int:
         """Takes all steps, at least four and an even number, and returns how many.
@@ -187,22 +193,32 @@ class Simulation:
         self._mover = _Mover(scene, self._rate, steps, self._offset, poses_in_both=self._poses_in_both)
         resets = {2 * round(0.5 * t * self._rate): worlds for t, worlds in scene.resets.items()}
         samples.add(self._states[0])
+        if self._counts_collisions:
+            self._counter.begin(self._states[0])
         for step in range(0, steps, 2):
             progress(step, steps)
             if step in resets:
                 self._reset(resets[step])
                 samples.restart(self._states[0], resets[step])
+                if self._counts_collisions:
+                    self._counter.begin(self._states[0])
             self.milliseconds += [0.5 * self._take_pair()] * 2
             for i, (state, taken) in enumerate(self._ends):
                 if not samples.add(state):
                     raise NotFinite(f"positions are not finite after step {step + i + 1} of {steps}")
                 self.substeps.append(max(1, int(taken.numpy()[0])))
+                if self._counts_collisions:
+                    self.collisions.append(self._counter.count_collisions(state))
         progress(steps, steps)
         return steps
 
+    @functools.cached_property
+    def _counter(self):
+        return CrossingCounter(self._model, strands=self._scene.strands)
+
     def count_crossings(self) -> int:
         """Returns the number of crossings now, see :class:`.crossings.CrossingCounter`."""
-        return CrossingCounter(self._model, strands=self._scene.strands).count(self._states[0])
+        return self._counter.count(self._states[0])
 
     def _take_pair(self) -> float:
         """Takes two steps, and returns their time [ms]."""

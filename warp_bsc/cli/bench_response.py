@@ -31,9 +31,10 @@ Run scenes in which cloth, soft bodies, ropes and a ball touch, at 1/60 s, and
 measure what each configuration of a solver and the collision stage makes of
 them: the largest stretch of an edge, at the end and at most; the speed at rest;
 the energy that is gained, where nothing does work; the edges that cross faces
-at the end, found in exact arithmetic; the steps that were not certified; the
-substeps of a step, and its time, on a GPU in a CUDA graph. The balls take steps
-of 1/120 s. The configurations:
+at the end, and the pairs that meet on the straight way of a step, found in
+exact arithmetic; the substeps of a step, and its time, on a GPU in a CUDA
+graph; and the steps that were not certified. The balls take steps of 1/120 s.
+The configurations:
   plain           the solver with Newton's contacts
   self-contact    the same with VBD's own contacts between particles
   stage           SolverCCD with default arguments, without Newton's contacts
