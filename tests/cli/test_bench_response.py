@@ -83,7 +83,7 @@ def test_tables(capsys, monkeypatch, measured):
     ]
     assert "289 particles, 512 triangles, 150 steps of 1/60 s or 4,800 steps of 1/1920 s" in lines
     assert "stage: 2 steps not certified" in lines
-    assert "stage, particles moved by 1e-06 m: stretch differs by 0.25 at the end, 1.50 at most" in lines
+    assert "stage, moved by 1e-06 m: stretch differs by 0.25 at the end, 1.50 at most" in lines
     assert "plain: not run: a reason [red]" in lines
     assert not any("Interrupted" in line for line in lines)
 

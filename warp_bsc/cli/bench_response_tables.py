@@ -81,7 +81,7 @@ def _print_scene(console: Console, runs: Sequence[ResponseRun]) -> None:
         if run.measured.spread:
             spread = run.measured.spread
             notes.append(
-                f"{run.configuration}, particles moved by {spread.distance:g} m: stretch differs by "
+                f"{run.configuration}, moved by {spread.distance:g} m: stretch differs by "
                 f"{spread.stretch_at_end:.2f} at the end, {spread.stretch_at_most:.2f} at most"
             )
     console.print(table)
