@@ -79,7 +79,7 @@ def test_tables(capsys, monkeypatch, measured):
         ["reference", "12.35", "1,234", "40.0", "0.0028", "1,040", "1.0", "11.50", "508.25"],
         ["plain"],
         ["stage", "12.35", "1,234", "40.0", "0.0028", "1,040", "12,345", "11.50", "508.25"],
-        ["reference", "12.35", "1,234", "40.0", "0.0028", "1,040", "11.50", "508.25"],
+        ["reference", "12.35", "1,234", "40.0", "0.0028", "1,040", "12,345", "11.50", "508.25"],
     ]
     assert "289 particles, 512 triangles, 150 steps of 1/60 s or 4,800 steps of 1/1920 s" in lines
     assert "stage: 2 steps not certified" in lines
