@@ -3,10 +3,12 @@
 ``python tests/support/implicit_accuracy.py`` prints, for each scene and number of iterations, the largest residual of a
 step, and the error of the derivatives by velocities and materials, relative to the largest component. Each is that of
 the best of three lengths of the central difference, as float32 rounds short ones and long ones are not linear.
+``--json`` writes them to a file as well.
 """
 
 import argparse
 import functools
+import sys
 import warnings
 
 import newton
@@ -17,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
+from warp_bsc.bench.provenance import write_measurement
 
 LENGTHS = 3.0, 1.0, 0.3
 """Lengths of central differences, in units of each array."""
@@ -105,17 +108,23 @@ def main():
     parser.add_argument("scenes", nargs="*", default=list(SCENES), help=f"of {', '.join(SCENES)}; default: all")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--json", metavar="FILE", help="file to which the errors are written as well")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore", "a step of VBD|contacts strained|contacts passed")
     wp.config.quiet = True
-    console, table = Console(), Table("scene", "iterations", "polish", "residual", "errors")
+    console, table, rows = Console(), Table("scene", "iterations", "polish", "residual", "errors"), []
     for scene in arguments.scenes:
         for iterations, polish in ((10, 0), (20, 0), (20, 3)):
-            (_, residual), *errors = compare(scene, iterations, polish, arguments.steps, arguments.device)
+            (_, residual), *errors = found = list(compare(scene, iterations, polish, arguments.steps, arguments.device))
+            row = {"scene": scene, "iterations": iterations, "polish": polish}
+            rows.append(row | {name: float(value) for name, value in found})
             text = ", ".join(f"{name} {100.0 * error:.2g}%" for name, error in errors)
             table.add_row(scene, str(iterations), str(polish), f"{residual:.1e}", text)
             console.print(f"{scene} {iterations} {polish}: {residual:.1e}; {text}")
     console.print(table)
+    if arguments.json:
+        found = {"benchmark": "implicit_accuracy", "steps": arguments.steps, "rows": rows}
+        write_measurement(arguments.json, found, sys.argv, [wp.get_device(arguments.device)])
 
 
 if __name__ == "__main__":

@@ -2,11 +2,13 @@
 
     python tests/support/implicit_time.py --device cuda:0
 
-Steps of 1/60 s with 20 iterations of VBD. On a GPU all steps, and their way back, are one CUDA graph.
+Steps of 1/60 s with 20 iterations of VBD. On a GPU all steps, and their way back, are one CUDA graph. ``--json`` writes
+the times to a file as well.
 """
 
 import argparse
 import statistics
+import sys
 import time
 
 import newton
@@ -17,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
+from warp_bsc.bench.provenance import write_measurement
 
 DT, ITERATIONS = 1.0 / 60.0, 20
 
@@ -115,7 +118,7 @@ def milliseconds(function, device, repeats):
 
 
 def measure(scene, device, steps, repeats):
-    """Returns milliseconds a step of VBD, of it on a tape, of the way back, and of VBD with ``polish=3``; failures."""
+    """Returns milliseconds a step of VBD, of it on a tape, of the way back, and of VBD with ``polish=3``, as data."""
 
     def run(method, polish=None):
         rollout = Rollout(SCENES[scene](), device, steps)
@@ -130,7 +133,8 @@ def measure(scene, device, steps, repeats):
     both, report = run(Rollout.back, 0)
     polished, _ = run(Rollout.step, 3)
     assert report is not None
-    return plain, taped, both - taped, polished, report.failed_solves
+    times = {"vbd": plain, "on a tape": taped, "back": both - taped, "polish=3": polished}
+    return {"scene": scene, "milliseconds": times, "failed_solves": int(report.failed_solves)}
 
 
 def main():
@@ -140,16 +144,20 @@ def main():
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--json", metavar="FILE", help="file to which the times are written as well")
     arguments = parser.parse_args()
     wp.config.quiet = True
     device = wp.get_device(arguments.device)
-    table = Table("scene", "VBD", "on a tape", "back", "back / VBD", "VBD, polish=3", "failed solves")
+    table, rows = Table("scene", "VBD", "on a tape", "back", "VBD, polish=3", "back / VBD", "failed solves"), []
     for scene in (scene for scene in SCENES if any(part in scene for part in arguments.scenes)):
-        plain, taped, back, polished, failed = measure(scene, device, arguments.steps, arguments.repeats)
-        figures = f"{plain:.2f}", f"{taped:.2f}", f"{back:.2f}", f"{back / plain:.2f}", f"{polished:.2f}", str(failed)
-        table.add_row(scene, *figures)
+        rows.append(measure(scene, device, arguments.steps, arguments.repeats))
+        times = rows[-1]["milliseconds"]
+        figures = [f"{time:.2f}" for time in (*times.values(), times["back"] / times["vbd"])]
+        table.add_row(scene, *figures, str(rows[-1]["failed_solves"]))
         Console().print(scene, *figures)
     Console().print(table)
+    if arguments.json:
+        write_measurement(arguments.json, {"benchmark": "implicit_time", "rows": rows}, sys.argv, [device])
 
 
 if __name__ == "__main__":
