@@ -19,7 +19,8 @@ gc.disable()  # until all tests are collected: each collection would look at all
 wp.config.log_level = wp.LOG_WARNING
 wp.init()
 compile_kernels_once()
-hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=60)
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=30)
+hypothesis.settings.register_profile("new", deadline=None, max_examples=300)  # each night: --hypothesis-profile=new
 hypothesis.settings.load_profile("repeatable")
 
 

@@ -2,27 +2,33 @@
 
     python examples/figures/tables.py              # --check: writes nothing, and fails if the page would change
 
-A table of ``docs/measurements.md``, ``docs/index.md`` or ``README.md`` stands between ``<!-- table: NAME -->`` and
-``<!-- end -->``, on the page of measurements with a line below it that says where its figures come from. Its files are
-in ``warp_bsc/bench/measurements``; where one is missing, the table stays as it is.
+A table of a page stands between ``<!-- table: NAME -->`` and ``<!-- end -->``, with lines below it that say where its
+figures come from. Its files are in ``warp_bsc/bench/measurements``; where one is missing, the table stays as it is.
 """
 
 import argparse
 import json
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
-from typing import Any
+
+import table_rows
+from table_rows import Found, Rows
 
 from warp_bsc._atomic_file import OutputFile
-from warp_bsc.bench.penetration import SCENES, SIMULATORS
+from warp_bsc.bench.penetration import SCENES
 from warp_bsc.bench.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "docs" / "measurements.md", ROOT / "docs" / "index.md", ROOT / "README.md"]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "docs" / "index.md",
+    ROOT / "docs" / "measurements.md",
+    ROOT / "docs" / "newton" / "configuration.md",
+    ROOT / "docs" / "newton" / "gradients_vbd.md",
+]
 MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
 _COMPARED = {
     "detector": {"ipctk": "IPC Toolkit"},
@@ -34,15 +40,10 @@ _BUSY = 2.0
 """Load of a machine before a measurement from which on the line below its table says so."""
 _BLOCK = re.compile(r"(<!-- table: (\S+) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
-Found = dict[str, Any]
-"""A measurement: what a command wrote with --json."""
-Rows = list[tuple[str, ...]]
-"""The rows of a table, the header first."""
-
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the page.
+    """A table of a page.
 
     Attributes:
         files: Names of its measurements, without ending.
@@ -57,410 +58,44 @@ class Table:
     has_sources: bool = True
 
 
-def milliseconds(value: float) -> str:
-    """Returns a time with three digits, in seconds from 0.1 s on."""
-    return f"{value / 1e3:.3g} s" if value >= 100.0 else f"{value:.3g} ms"
-
-
-def digits(value: float) -> str:
-    """Returns a number with two digits, more if it is large."""
-    return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:,.0f}"
-
-
-def _counts(values: Any) -> str:
-    """Returns the smallest and the largest of some numbers."""
-    return f"{min(values):,} to {max(values):,}"
-
-
-# Detection ---------------------------------------------------------------------------------------------------------
-
-
-_MESHES = {"227.ply": "cloth-funnel", "cloth_ball92.ply": "cloth-ball"}
-"""Names of the scenes of two frames by their first file; the ends of paths, as these differ from machine to machine."""
-
-
-def _scene_name(scene: Found) -> str:
-    name, _, worlds = scene["scene"].partition(" in ")
-    first = Path(name.split(",")[0]).name
-    title = _MESHES.get(first, first.partition(":")[0]) + (f" in {worlds}" if worlds else "")
-    return f"{title}, {scene['triangles']:,} triangles"
-
-
-def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
-    """Detections on a GPU and on the CPU, beside the IPC Toolkit."""
-    rows = [("scene", "candidates", "hits", "GPU", "two cores", "one core", "IPC Toolkit, two cores", "one core")]
-    for scenes in zip(gpu["scenes"], two_cores["scenes"], one_core["scenes"], strict=False):
-        first = scenes[0]
-        times = [scene["milliseconds"]["detect"] for scene in scenes]
-        times += [
-            scene["ipc_toolkit"]["build_milliseconds"] + scene["ipc_toolkit"]["step_milliseconds"]
-            for scene in scenes[1:]
-        ]
-        counts = [f"{first[name]:,}" for name in ("candidates", "hits")]
-        rows.append((_scene_name(first), *counts, *map(milliseconds, times)))
-    return rows
-
-
-def detector_stages(gpu: Found, worlds: Found) -> Rows:
-    """Where the time of a detection goes on a GPU."""
-    stages = [stage for stage in gpu["scenes"][0]["milliseconds"]["stages"] if stage not in ("sort", "exact")]
-    rows = [("scene", "whole graph", *stages)]
-    for scene in (*gpu["scenes"], *worlds["scenes"]):
-        took = scene["milliseconds"]
-        numbers = [took["cuda_graph"], *(took["stages"][stage] for stage in stages)]
-        rows.append((f"{_scene_name(scene)}, {scene['hits']:,} hits", *(f"{number:.2f}" for number in numbers)))
-    return rows
-
-
-def queries(gpu: Found, one_core: Found) -> Rows:
-    """Elementary queries a second."""
-    titles = {
-        "status": "one kernel that calls `ccd_edge_edge` or `ccd_vertex_face`",
-        "queued": "a second kernel decides the survivors",
-        "exact": "queries that are UNSURE in floating point, in exact arithmetic",
-    }
-    rows = [("queries", "edge-edge, a second", "vertex-face, a second")]
-    for mode, title in titles.items():
-        for found, place in ((gpu, ""), (one_core, ", on one core of the CPU")):
-            rates = {kind["kind"]: kind["modes"][mode]["queries_per_second"] for kind in found["kinds"]}
-            rows.append((title + place, *(_rate(rates[kind]) for kind in ("edge-edge", "vertex-face"))))
-    return rows
-
-
-def certify(*runs: Found) -> Rows:
-    """Answers of adversarial queries by method, of all runs together."""
-    titles = {"float": "`float`", "conservative": "`conservative`", "user's kernel": "a kernel with `ccd_*`"}
-    rows = [("answers by", "FREE", "HIT", "UNSURE", "FREE, but colliding", "HIT, but free")]
-    for method in runs[0]["methods"]:
-        answers = [run["methods"][method] for run in runs]
-        sums = (sum(answer[key] for answer in answers) for key in ("free", "hit", "unsure", "missed", "false"))
-        rows.append((titles.get(method, "exact arithmetic on the device"), *(f"{number:,}" for number in sums)))
-    return rows
-
-
-def _rate(number: float) -> str:
-    return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
-
-
-def given_queries(found: Found) -> Rows:
-    """Times of a query of public files by method, on one core."""
-    methods = ("float", "conservative", "exact")
-    rows = [
-        ("queries", "collide", *(f"`{name}`" for name in methods), "cubic solver", "`float` / cubic", "`exact` / cubic")
-    ]
-    titles = {"queries": "hand-made", "cloth-funnel": "simulated (cloth-funnel)"}
-    for row in found["queries"]:
-        took = row["nanoseconds"]
-        rows.append(
-            (
-                f"{titles.get(row['name'], row['name'])}, {row['queries']:,} {row['kind']}",
-                f"{100.0 * row['hits'] / row['queries']:.0f}%",
-                *(digits(took[name]) for name in (*methods, "cubic")),
-                *(digits(took[name] / took["cubic"]) for name in ("float", "exact")),
-            )
-        )
-    return rows
-
-
-def paper(found: Found) -> Rows:
-    """Times of a query on one core in the scenes of the paper."""
-    methods = {"float": "`float`", "conservative": "`conservative`", "exact": "`exact`", "cubic": "cubic solver"}
-    rows = [("scene", *methods.values(), "cubic / `float`", "slowest query, `float` / cubic")]
-    for scene in found["scenes"]:
-        timing = scene["timings"][0]
-        took, worst = timing["nanoseconds"], timing["worst"]
-        slowest = (worst[method]["nanoseconds"][method] for method in ("float", "cubic"))
-        rows.append(
-            (
-                f"{scene['name']}, {scene['triangles']:,} triangles",
-                *(f"{took[method]:.1f}" for method in methods),
-                f"{took['cubic'] / took['float']:.1f}",
-                " / ".join(f"{time:.0f}" for time in slowest),
-            )
-        )
-    return rows
-
-
-def touching(found: Found) -> Rows:
-    """Sheets that touch exactly."""
-    titles = {
-        "intersections": "`find_intersections`",
-        "at a distance, at rest": "`exact` at their minimum distance, at rest",
-        "at a distance, moving": "the same, moving together",
-    }
-    rows = [("flat sheets in the same plane", "pairs", "wrong of those checked", "time")]
-    for row in found["rows"]:
-        title = f"{titles[row['question']]}: {row['sheets']} sheets of {row['faces']:,} faces"
-        rows.append((title, f"{row['pairs']:,}", str(row["wrong"]), f"{digits(row['seconds'])} s"))
-    return rows
-
-
-# Newton ------------------------------------------------------------------------------------------------------------
-
-
-def newton(*measurements: Found) -> Rows:
-    """Newton's examples, plain and with the stage."""
-    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
-    for found in measurements:
-        modes: dict[str, dict[str, Found]] = {}
-        for run in found["runs"]:
-            modes.setdefault(run["example"], {})[run["mode"]] = run
-        for name, run in modes.items():
-            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
-            frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
-            title = f"`{name}`" + (f", {frames} frames" if frames else "")
-            rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
-    return rows
-
-
-def _newton_cell(run: Found) -> str:
-    took = run["measured"]
-    if took is None:
-        return f"not run: {run['problem']}"
-    times = took["milliseconds"]
-    return f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); {took['most_crossings']:,}"
-
-
-def _newton_steps(plain: Found | None, stage: Found | None) -> str:
-    """Returns what the stage reports, and how the example's own tests end."""
-    if stage is None or stage["stage"] is None:
-        return ""
-    steps = stage["stage"]
-    words = [f"{steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,} certified"]
-    if steps["substepped_steps"]:
-        words.append(f"{steps['substepped_steps']:,} in substeps")
-    words.append(f"{steps['truncated_steps'] or 'none'} truncated")
-    if steps["frozen_steps"]:
-        words.append(f"{steps['frozen_steps']} with frozen vertices")
-    tests = [_newton_tests(took) for took in (plain, stage) if took]
-    return f"{', '.join(words)}; tests {' / '.join(dict.fromkeys(tests))}"
-
-
-def _newton_tests(took: Found) -> str:
-    ends = [took["test_post_step"], took["test_final"]]
-    if all(end is None for end in ends):
-        return "none"
-    return "ok" if all(end in (None, "ok") for end in ends) else "fail"
-
-
-def substeps(found: Found) -> Rows:
-    """Steps in substeps: stretch, distance from the reference, stress and time."""
-    columns = list(dict.fromkeys((run["rate"], run["substeps"]) for run in found["runs"]))
-    rows = [("", *(f"1/{rate} s, {_quoted(count)}" for rate, count in columns))]
-    titles = {
-        ("drape", "largest stretch [%]"): "a cloth drapes over a sphere: stretch [%]",
-        ("drape", "distance [mm]"): "distance from the reference [mm]",
-        ("drape", "time [s]"): "time [s]",
-        ("sleeve", "largest stretch [%]"): "a cylinder moves into a sleeve a third narrower: stretch [%]",
-        ("blocks", "stress on the lower plate [Pa]"): "two plates press two blocks to half their height: stress [Pa]",
-    }
-    for (scene, quantity), title in titles.items():
-        measured = {(run["rate"], run["substeps"]): run["measured"] for run in found["runs"] if run["scene"] == scene}
-        rows.append((title, *(digits(measured[column][quantity]) for column in columns)))
-    return rows
-
-
-def _quoted(count: int | str | None) -> str:
-    return "none" if count is None else f'`"{count}"`' if isinstance(count, str) else str(count)
-
-
-def penetration(*measurements: Found) -> Rows:
-    """Who penetrates, where: crossings in the worst frame and in all, and pairs that meet on the way."""
-    return _by_scene(
-        measurements,
-        lambda took: f"{max(took['crossings']):,}; {sum(took['crossings']):,}; {took['collisions']:,}",
-    )
-
-
-def penetration_costs(*measurements: Found) -> Rows:
-    """What simulators keep of speed, tetrahedra and lengths, and their time."""
-
-    def cell(took: Found) -> str:
-        kept = "" if took["speed_kept"] is None else f"{digits(100.0 * took['speed_kept'])}% kept, "
-        inverted = f"{max(took['inverted'])} inverted, " if max(took["inverted"]) else ""
-        return f"{kept}{inverted}{digits(took['stretch'])}%, {digits(took['milliseconds']['median'])} ms"
-
-    return _by_scene(measurements, cell)
-
-
-def penetration_simulators(*measurements: Found) -> Rows:
-    """Settings and claims of simulators, and what they did not run."""
-    rows = [("simulator", "version", "settings", "says of penetration", "not run")]
-    for name, simulator in _joined(measurements, "simulators").items():
-        runs = [run for found in measurements for run in found["runs"] if run["simulator"] == name]
-        versions = {run["measured"]["version"] for run in runs if run["measured"]}
-        missing: dict[str, list[str]] = {}
-        for run in runs:
-            if run["problem"]:
-                missing.setdefault(run["problem"].partition(": ")[0], []).append(run["scene"])
-        scenes = [
-            f"{reason} ({', '.join(names) if len(names) < len(runs) else 'all'})" for reason, names in missing.items()
-        ]
-        claims = SIMULATORS[name].claims or "nothing"  # not measured
-        rows.append((simulator["title"], ", ".join(versions), simulator["settings"], claims, "; ".join(scenes)))
-    return rows
-
-
-def _joined(measurements: Sequence[Found], key: str) -> Found:
-    """Returns what measurements have at a key, together."""
-    return {name: value for found in measurements for name, value in found[key].items()}
-
-
-def _by_scene(measurements: Sequence[Found], cell: Callable[[Found], str]) -> Rows:
-    """Returns a row for each simulator, and a column for each scene."""
-    runs = {(run["scene"], run["simulator"]): run["measured"] for found in measurements for run in found["runs"]}
-    scenes = _joined(measurements, "scenes")
-    rows = [("simulator", *scenes)]
-    for name, simulator in _joined(measurements, "simulators").items():
-        measured = [runs.get((scene, name)) for scene in scenes]
-        rows.append((simulator["title"], *("not run" if took is None else cell(took) for took in measured)))
-    return rows
-
-
-# Repair and replay -------------------------------------------------------------------------------------------------
-
-
-def repair_named(found: Found, *kinds: str) -> Rows:
-    """Repairs of known meshes or files, each with every hint that was tried."""
-    rows = [("`bsc.repair`", "vertices", "crossings", "largest, mean move", "strain", "time")]
-    for run in found["runs"]:
-        if run["kind"] in kinds:
-            for attempt in run["attempts"]:
-                hint = "" if attempt["hint"] == "none" else f", `{attempt['hint']}=`"
-                rows.append((f"{Path(run['name']).stem}{hint}", f"{run['vertices']:,}", *_repair_cells(run, attempt)))
-    return rows
-
-
-def _repair_cells(run: Found, attempt: Found) -> tuple[str, ...]:
-    return (
-        f"{run['crossings']:,} to {attempt['crossings']:,}",
-        f"{digits(attempt['largest_move'])}, {digits(attempt['mean_move'])}",
-        f"{digits(100.0 * attempt['strain'])}%",
-        f"{attempt['seconds']:.2f} s",
-    )
-
-
-def repair_random(found: Found) -> Rows:
-    """Random damage by kind."""
-    costs = "largest move, median and most", "strain, median and most", "more than 10%", "median time"
-    rows = [("kind", "freed", "crossings", *costs)]
-    kinds: dict[str, list[Found]] = {}
-    for run in found["runs"]:
-        if run["kind"] not in (KNOWN_MESH, FILE):
-            kinds.setdefault(run["kind"], []).append(run)
-    for kind, runs in kinds.items():
-        first = [run["attempts"][0] for run in runs]
-        moves, strains = ([attempt[name] for attempt in first] for name in ("largest_move", "strain"))
-        rows.append(
-            (
-                kind,
-                f"{sum(attempt['crossings'] == 0 for attempt in first)} of {len(runs)}",
-                _counts([run["crossings"] for run in runs]),
-                f"{digits(median(moves))}, {digits(max(moves))}",
-                f"{digits(100.0 * median(strains))}, {digits(100.0 * max(strains))}%",
-                str(sum(strain > 0.1 for strain in strains)),
-                f"{median(attempt['seconds'] for attempt in first):.2f} s",
-            )
-        )
-    return rows
-
-
-def repair_shots(found: Found) -> Rows:
-    """Repairs of shots: what collides before and after, moves, edges, and times beside those of the replay."""
-    rows = [
-        ("shot", "collisions", "edges in faces", "largest, mean move", "edges", "an interval; its replay", "multiple")
-    ]
-    for row in found["rows"]:
-        before, left, seconds = row["before"], row["left"], row["seconds"]
-        counts = [f"{before[what]:,} to {left[what]:,}" for what in ("collisions", "intersections")]
-        repairing, finding = (milliseconds(1e3 * seconds[what] / row["intervals"]) for what in ("repairing", "finding"))
-        command = " ".join((row["shot"], *row["options"]))
-        rows.append(
-            (
-                f"`{command}`, {row['intervals']} intervals, {row['vertices']:,} vertices",
-                *counts,
-                f"{row['largest_move']:.2f}, {row['mean_move']:.2f}",
-                f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}",
-                f"{repairing}; {finding}",
-                f"{seconds['repairing'] / seconds['finding']:.1f}",
-            )
-        )
-    return rows
-
-
-def replay_sizes(found: Found) -> Rows:
-    """Large, long and crowded scenes."""
-    rows = [("scene", "collisions", "wall", "processor", "memory", "file")]
-    for row in found["rows"]:
-        sizes = f"{row['memory'] / 1e9:.2f} GB", f"{row['size'] / 1e6:.1f} MB"
-        times = f"{row['wall']:.1f} s", f"{row['cpu']:.1f} s"
-        rows.append((f"`{row['scene']}`: {row['description']}", f"{row['hits']:,}", *times, *sizes))
-    return rows
-
-
-# The page ----------------------------------------------------------------------------------------------------------
-
-
 _PENETRATION = tuple(f"penetration_{scene}" for scene in SCENES)
-
-
-def front(gpu: Found, two_cores: Found, bullet: Found, drape: Found) -> Rows:
-    """What the front page shows."""
-    balls = {}
-    for name, found in (("gpu", gpu), ("cpu", two_cores)):
-        balls[name] = next(scene for scene in found["scenes"] if _scene_name(scene).startswith("cloth-ball"))
-    ball, peer = balls["cpu"], balls["cpu"]["ipc_toolkit"]
-    took = balls["gpu"]["milliseconds"]["cuda_graph"]
-    size = (
-        f"{ball['triangles']:,} triangles, {ball['candidates'] / 1e6:.1f} million candidates, {ball['hits']:,} contacts"
-    )
-    rows = [
-        ("measured", ""),
-        (
-            f"{size}: all, with time and normal",
-            f"{took:.1f} ms on an {gpu['record']['gpus'][0].removeprefix('NVIDIA ')}",
-        ),
-        (
-            "the same on two cores",
-            f"{milliseconds(ball['milliseconds']['detect'])} (IPC Toolkit, the earliest time alone: "
-            f"{milliseconds(peer['build_milliseconds'] + peer['step_milliseconds'])})",
-        ),
-    ]
-    names = {"vbd": "VBD", "vbd-self-contact": "with its self-contact", "ccd-vbd": "with `SolverCCD`"}
-    for found, title, what in (
-        (bullet, "a patch of cloth is shot at a sheet: pairs that pass through", "collisions"),
-        (drape, "a cloth drapes over a ball: edges through faces, worst frame", "crossings"),
-    ):
-        runs = {run["simulator"]: run["measured"][what] for run in found["runs"] if run["measured"]}
-        counts = {name: value if isinstance(value, int) else max(value) for name, value in runs.items()}
-        rows.append((title, ", ".join(f"{names[name]} {counts[name]:,}" for name in names)))
-    return rows
+_SHORT = tuple(f"response_short_{rate}" for rate in (120, 180, 240, 480, 960))
 
 
 TABLES = {
     "front": Table(
-        ("detector_gpu", "detector_two_cores", "penetration_bullet", "penetration_drape"), front, has_sources=False
+        ("detector_gpu", "detector_two_cores", "penetration_bullet", "penetration_drape"),
+        table_rows.front,
+        has_sources=False,
     ),
-    "certify": Table(tuple(f"certify_{seed}_gpu" for seed in range(11, 15)), certify),
-    "given_queries": Table(("given_queries_one_core",), given_queries),
-    "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), detector),
-    "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), detector_stages),
-    "newton_coupled": Table(("newton_coupled_gpu",), newton),
-    "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), newton),
-    "paper": Table(("paper_cpu",), paper),
-    "penetration": Table(_PENETRATION, penetration, needs_all=False, has_sources=False),
-    "penetration_costs": Table(_PENETRATION, penetration_costs, needs_all=False, has_sources=False),
-    "penetration_simulators": Table(_PENETRATION, penetration_simulators, needs_all=False),
-    "queries": Table(("queries_gpu", "queries_one_core"), queries),
-    "repair_drape": Table(("repair_drape_cpu",), lambda found: repair_named(found, FILE)),
-    "repair_known": Table(("repair_bodies_cpu",), lambda found: repair_named(found, KNOWN_MESH, FILE)),
-    "repair_random": Table(("repair_random_cpu",), repair_random),
-    "repair_shots": Table(("repair_shots_cpu",), repair_shots),
-    "replay_sizes": Table(("replay_sizes",), replay_sizes),
-    "substeps": Table(("substeps_cpu",), substeps),
-    "touching": Table(("touching",), touching),
+    "certify": Table(tuple(f"certify_{seed}_gpu" for seed in range(11, 15)), table_rows.certify),
+    "given_queries": Table(("given_queries_one_core",), table_rows.given_queries),
+    "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), table_rows.detector),
+    "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), table_rows.detector_stages),
+    "newton_coupled": Table(("newton_coupled_gpu",), table_rows.newton),
+    "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), table_rows.newton),
+    "implicit_accuracy": Table(("implicit_accuracy_cpu",), table_rows.implicit_accuracy),
+    "implicit_time_cpu": Table(("implicit_time_cpu",), table_rows.implicit_time),
+    "implicit_time_gpu": Table(("implicit_time_gpu",), table_rows.implicit_time),
+    "paper": Table(("paper_cpu",), table_rows.paper),
+    "penetration": Table(_PENETRATION, table_rows.penetration, needs_all=False, has_sources=False),
+    "penetration_costs": Table(_PENETRATION, table_rows.penetration_costs, needs_all=False, has_sources=False),
+    "penetration_simulators": Table(_PENETRATION, table_rows.penetration_simulators, needs_all=False),
+    "queries": Table(("queries_gpu", "queries_one_core"), table_rows.queries),
+    "repair_drape": Table(("repair_drape_cpu",), lambda found: table_rows.repair_named(found, FILE)),
+    "repair_known": Table(("repair_bodies_cpu",), lambda found: table_rows.repair_named(found, KNOWN_MESH, FILE)),
+    "repair_random": Table(("repair_random_cpu",), table_rows.repair_random),
+    "repair_shots": Table(("repair_shots_cpu",), table_rows.repair_shots),
+    "replay_sizes": Table(("replay_sizes",), table_rows.replay_sizes),
+    "response_cpu": Table(("response_cpu", "response_gpu"), table_rows.response),
+    "response_gpu": Table(("response_gpu",), lambda found: table_rows.response(found, found)),
+    "response_short": Table(_SHORT, table_rows.response_by_rate),
+    "response_style3d_cpu": Table(("response_style3d_cpu", "response_style3d_gpu"), table_rows.response),
+    "response_style3d_gpu": Table(("response_style3d_gpu",), lambda found: table_rows.response(found, found)),
+    "substeps": Table(("substeps_cpu",), table_rows.substeps),
+    "touching": Table(("touching",), table_rows.touching),
 }
-"""The tables of the page by name."""
+"""The tables of all pages by name."""
 
 
 def load(name: str) -> Found | None:
@@ -511,7 +146,19 @@ def make(name: str) -> str | None:
     text = "".join(f"| {' | '.join(line)} |\n" for line in lines)
     if not table.has_sources:
         return text
-    return text + "\n" + "  \n".join(dict.fromkeys(map(describe, measurements))) + "\n"
+    return text + "\n" + "  \n".join(_joined(list(dict.fromkeys(map(describe, measurements))))) + "\n"
+
+
+def _joined(lines: list[str]) -> list[str]:
+    """Returns lines that differ in one word as one line, with all of these words."""
+    words = [line.split(" ") for line in lines]
+    differing = {i for line in words for i, word in enumerate(line) if i >= len(words[0]) or word != words[0][i]}
+    if len(differing) != 1 or len({len(line) for line in words}) != 1:
+        return lines
+    (place,) = differing
+    end = "`:" if words[0][place].endswith("`:") else ""  # of the command
+    words[0][place] = "|".join(line[place].removesuffix(end) for line in words) + end
+    return [" ".join(words[0])]
 
 
 def update(page: str) -> tuple[str, list[str]]:
