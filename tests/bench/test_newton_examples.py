@@ -212,9 +212,10 @@ def test_an_example_that_fails_is_a_row(write_example, in_this_process, device, 
             "failed: the process was ended by SIGKILL",
             marks=pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals"),
         ),
-        (
+        pytest.param(
             "import os; print('a {'); os.write(2, b'no room\\n\\n'); os._exit(3)",
             "failed: the process ended with status 3: no room",
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["crash", "exit"],

@@ -46,6 +46,7 @@ def test_what_is_free_without_a_hint(device):
     assert run.keeps_free is True
 
 
+@pytest.mark.slow
 def test_what_needs_a_hint_is_repaired_with_each(device):
     run = measure_repair(KNOWN_MESH, "cross", cross(), device=device)
     assert [attempt.hint for attempt in run.attempts] == ["none", "order", "x_previous"]

@@ -400,7 +400,9 @@ def unread():
         yield pipe
 
 
-@pytest.mark.parametrize(("command", "options"), [("query", []), ("replay", ["--json"])])
+@pytest.mark.parametrize(
+    ("command", "options"), [pytest.param("query", [], marks=pytest.mark.slow), ("replay", ["--json"])]
+)
 def test_nobody_reads_the_output(tmp_path, safe_scene, unread, command, options):
     path = write_queries(tmp_path) if command == "query" else safe_scene
     with open(tmp_path / "errors", "wb") as errors:
@@ -413,7 +415,7 @@ def test_nobody_reads_the_error(unread):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
-@pytest.mark.parametrize("options", [[], ["--json"]], ids=["table", "json"])
+@pytest.mark.parametrize("options", [[], pytest.param(["--json"], marks=pytest.mark.slow)], ids=["table", "json"])
 def test_no_room_for_the_output(tmp_path, options):
     path = write_queries(tmp_path)
     with open("/dev/full", "wb") as full, open(tmp_path / "errors", "wb") as errors:

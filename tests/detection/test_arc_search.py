@@ -378,6 +378,7 @@ def blade_and_post():
     )
 
 
+@pytest.mark.slow
 def test_one_pass_finds_what_parts_of_the_step_do(device, monkeypatch):
     """In random scenes with turns of at most a quarter, the same pairs up to the tolerance, at times that agree."""
     pairs = 0

@@ -41,7 +41,8 @@ PAPER_SCENES = {
 PRINTED = re.findall(
     r"^python examples/(example_\w+)\.py", (FOLDER.parent / "docs" / "newton.md").read_text(), re.MULTILINE
 )
-FIGURES = sorted(set((FOLDER / "figures").glob("*.py")) - {FOLDER / "figures" / "film.py"})
+_IMPORTED = {FOLDER / "figures" / name for name in ("film.py", "table_rows.py")}
+FIGURES = sorted(set((FOLDER / "figures").glob("*.py")) - _IMPORTED)
 FRAMES = 2
 RUN_LONGER = [
     "example_cloth_bullet",
@@ -260,7 +261,7 @@ def test_a_propeller_throws_a_cloth_that_passes_it_without_stage(capsys):
 
 
 @pytest.mark.parametrize("robot", ["featherstone", "mujoco"])
-@pytest.mark.parametrize("friction", [0.5, 0.05])
+@pytest.mark.parametrize("friction", [0.5, pytest.param(0.05, marks=pytest.mark.slow)])
 def test_gripper_lifts_cloth_that_does_not_slip(robot, friction):
     if robot == "mujoco":
         pytest.importorskip("mujoco_warp")

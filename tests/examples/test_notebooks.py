@@ -97,7 +97,6 @@ def test_behind_newton(monkeypatch):
     assert pictures == 2
 
 
-@pytest.mark.slow
 def test_repair_and_replay(monkeypatch):
     counts = ["hits", "intersections[0].crossings", "intersections[1].crossings"]
     values = [f"[[s.{count} for s in summaries[name]] for name in summaries]" for count in counts]

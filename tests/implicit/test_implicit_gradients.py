@@ -152,6 +152,7 @@ class Reference:
         return (self.rollout.weights * np.stack([x, v])).sum()
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_a_reference_in_float64(device):
     model = hanging_cloth(device, n=2)
     arrays = {"tri_materials": model.tri_materials, "edge_bending_properties": model.edge_bending_properties}

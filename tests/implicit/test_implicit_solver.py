@@ -241,6 +241,7 @@ def test_gradients_in_a_graph_are_those_without(scene):
             np.testing.assert_array_equal(*gradients)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*of the weight")
 @pytest.mark.parametrize("scene", [cloth_on_slope, colliding_cloths])
 def test_many_tapes_take_no_more_memory(scene, device):

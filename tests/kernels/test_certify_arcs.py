@@ -19,6 +19,7 @@ def test_no_collision_on_arcs_is_missed_and_nothing_farther_apart_than_the_toler
         assert (verdict.missed, verdict.late, verdict.beyond) == (0, 0, 0), (name, verdict)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("mpmath") is None, reason="needs mpmath, of the extra dev")
 def test_intervals_of_numpy_prove_what_those_of_mpmath_do():
     rng = np.random.default_rng(2)

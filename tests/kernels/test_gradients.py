@@ -478,6 +478,7 @@ def test_positions_that_would_lose_their_gradients_are_refused(device):
         detector.detect(x, x)
 
 
+@pytest.mark.slow
 def test_many_iterations_do_not_take_more_memory(device):
     x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, 1], [0.3, 0.2, 2], [0.2, 0.3, 2]], dtype=np.float32)
     end = x.copy()

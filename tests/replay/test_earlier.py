@@ -53,6 +53,7 @@ def kill(scene, folder, count, *more):
     assert process.returncode == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_killed_twice_and_resumed(tmp_path, scene, capsys):
     """Once alone, then with workers, which go on from the first time."""
     longer = ("--subdivide", "4")

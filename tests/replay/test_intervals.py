@@ -108,6 +108,7 @@ PROGRAMS = [
 """Programs that import the package in one order or another."""
 
 
+@pytest.mark.slow
 def test_the_function_is_found_whatever_is_imported():
     """In a process of its own, which forgets all modules of the package before each program."""
     ends = "; from warp_bsc import replay; assert bsc.replay is replay; print(replay.__module__, replay.__name__)"

@@ -194,7 +194,7 @@ def in_small_disk(folder, size, command):
 
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare here")
-@pytest.mark.parametrize("size", [600_000, 1_600_000])
+@pytest.mark.parametrize("size", [600_000, pytest.param(1_600_000, marks=pytest.mark.slow)])
 def test_full_disk_has_room_for_all_files(tmp_path, size):
     stage = new_stage(tmp_path / "scene.usda")
     add_floor(stage)

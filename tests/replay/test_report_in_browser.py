@@ -37,7 +37,7 @@ def choose_camera(browser, number):
     browser.value(f"(byId('camera').value = '{number}', {change}, new Promise((done) => setTimeout(done, 200)))")
 
 
-@pytest.mark.parametrize("up_axis", ["Y", "Z"])
+@pytest.mark.parametrize("up_axis", [pytest.param("Y", marks=pytest.mark.slow), "Z"])
 def test_view_is_that_of_the_chosen_camera(tmp_path, browser, up_axis):
     """A small triangle is where OpenUSD's frustum has it, at the start, in the middle and at the end of an interval."""
     stage = new_stage(tmp_path / "scene.usda", up_axis=up_axis)

@@ -138,6 +138,7 @@ def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
     assert len(re.findall(r"^  \S+:\d+ on cpu: \d+ intervals?, \d+\.\d+ s$", printed, re.MULTILINE)) == 2
 
 
+@pytest.mark.slow
 def test_workers_compare_with_a_baseline(tmp_path, waves):
     run(waves, tmp_path / "1")
     baseline = tmp_path / "1" / "hits.json"
@@ -178,6 +179,7 @@ def test_a_worker_that_is_killed(waves):
     assert found == list(enumerate(alone))
 
 
+@pytest.mark.slow
 def test_a_call_that_kills_every_worker(tmp_path):
     """The error names it, and the calls before it are answered."""
     calls = deque(
@@ -205,7 +207,9 @@ def children_of(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds processes in /proc")
-@pytest.mark.parametrize("number", [getattr(signal, "SIGKILL", signal.SIGTERM), signal.SIGINT])
+@pytest.mark.parametrize(
+    "number", [pytest.param(getattr(signal, "SIGKILL", signal.SIGTERM), marks=pytest.mark.slow), signal.SIGINT]
+)
 def test_workers_end_with_the_process_that_started_them(tmp_path, waves, number):
     """They say nothing, even if a Ctrl-C, which the terminal sends to all of them, comes while they start.
 

@@ -117,7 +117,7 @@ def test_a_ball_dropped_on_a_pinned_sheet(device):
     assert lowest < -0.1 and rollout.states[0].body_qd.numpy()[0, 2] > 0.0  # thrown back
 
 
-@pytest.mark.parametrize(("rate", "steps"), [(240, 300), (960, 600)])
+@pytest.mark.parametrize(("rate", "steps"), [(240, 300), pytest.param(960, 600, marks=pytest.mark.slow)])
 def test_a_box_at_rest_on_a_sheet(rate, steps, device):
     """It comes to rest on the pinned sheet that it stretches, and stays: it moves by less than 1 mm/s."""
     builder = newton.ModelBuilder()
@@ -177,7 +177,9 @@ def test_friction_slows_a_box_on_a_held_sheet(friction, device):
     np.testing.assert_allclose(rollout.states[0].body_qd.numpy()[0, 0], 1.0 - friction * 9.81 * time, atol=2e-3)
 
 
-@pytest.mark.parametrize(("speed", "spin"), [(60.0, (0.0, 0.0, 0.0)), (3.0, (100.0, 50.0, 300.0))])
+@pytest.mark.parametrize(
+    ("speed", "spin"), [pytest.param(60.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (3.0, (100.0, 50.0, 300.0))]
+)
 def test_fast_bodies_and_spinning_ones_are_certified(speed, spin, device):
     model = ball_and_sheet(device, fixed=True, speed=speed, spin=spin, n=8)
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.5))
@@ -343,7 +345,9 @@ def lowest_vertex(rollout, state):
     return rollout.vertices(state)[rollout.model.particle_count :, 2].min()
 
 
-@pytest.mark.parametrize(("tilt", "substeps"), [(0.0, None), (0.5, None), (0.5, "auto")])
+@pytest.mark.parametrize(
+    ("tilt", "substeps"), [(0.0, None), (0.5, None), pytest.param(0.5, "auto", marks=pytest.mark.slow)]
+)
 def test_the_ground_stops_a_box_if_asked(tilt, substeps, device):
     model = box_above_ground(device, tilt=tilt, velocity=(0.5, 0.0, -4.0 * tilt))
     rollout = Rollout(model, bsc.SolverCCD(free(model), bodies="separated", friction=0.5, substeps=substeps))

@@ -354,7 +354,10 @@ class Push:
         return sum(end @ direction for end, direction in zip(ends, along, strict=True))
 
 
-@pytest.mark.parametrize("contact_layer, length", [(False, 1.0), (True, 1.0), (True, 5.0)])
+@pytest.mark.parametrize(
+    "contact_layer, length",
+    [pytest.param(False, 1.0, marks=pytest.mark.slow), (True, 1.0), pytest.param(True, 5.0, marks=pytest.mark.slow)],
+)
 def test_gradient_of_a_rollout_is_that_of_central_differences(contact_layer, length, device):
     """By the path of a paddle, the mass of a body, and coefficients.
 

@@ -43,9 +43,9 @@ def step_forces(model, solver, dt, steps):
     "inner, substeps, rate",
     [
         ("vbd", None, 240),
-        ("vbd", 2, 120),
+        pytest.param("vbd", 2, 120, marks=pytest.mark.slow),
         ("vbd", "auto", 120),
-        ("xpbd", None, 240),
+        pytest.param("xpbd", None, 240, marks=pytest.mark.slow),
         ("xpbd", 2, 240),
         ("semi_implicit", None, 960),
         ("semi_implicit", 2, 480),

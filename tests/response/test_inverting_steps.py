@@ -2,9 +2,11 @@
 
 import sys
 
+import pytest
 from inverting_steps import MODES, main
 
 
+@pytest.mark.slow
 def test_a_row_for_each_mode(monkeypatch, capsys):
     """Alone and behind the stage, VBD inverts tetrahedra, as the report says; with prevention it does not."""
     monkeypatch.setattr(sys, "argv", ["inverting_steps.py", "throw", "--steps", "2"])

@@ -1,6 +1,7 @@
 """Piles of sheets come to rest without gaining energy."""
 
 import numpy as np
+import pytest
 from pile_energy import gained, rest
 
 
@@ -13,6 +14,7 @@ def test_a_pile_gains_no_energy(device):
     assert report.totals.uncertified_steps == 0 and report.totals.frozen_steps == 0
 
 
+@pytest.mark.slow
 def test_a_pile_has_the_same_bits_again(device):
     """Contacts come in the order of threads, and some touch at the start and have no dividing plane."""
     ends = []

@@ -109,6 +109,7 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
     np.testing.assert_array_equal(queued[0], queueless[0])
 
 
+@pytest.mark.slow
 def test_proximities_of_the_hierarchy_are_those_of_trees(monkeypatch):
     """With the nearest faces found without a queue, constraints are the same, and layers fall to the same positions."""
     monkeypatch.setattr("warp_bsc.response.step.proximities.add_proximities", record_proximities(found := []))

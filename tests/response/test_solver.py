@@ -15,7 +15,7 @@ SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is
 
 
 @pytest.mark.parametrize("inner", SOLVERS)
-@pytest.mark.parametrize("speed", [10.0, 60.0])
+@pytest.mark.parametrize("speed", [pytest.param(10.0, marks=pytest.mark.slow), 60.0])
 def test_nothing_passes_through(inner, speed, device):
     model = bullet(speed, device=device)
     through = Rollout(model, SOLVERS[inner](model))

@@ -266,6 +266,7 @@ def test_grazing_contacts_are_flagged_and_gradients_finite(device):
         assert np.abs(array.grad.numpy()).max() < 1e6
 
 
+@pytest.mark.slow
 def test_many_tape_iterations_take_no_more_memory(device):
     resource = pytest.importorskip("resource")  # of POSIX
     scene = Throw(device, friction=0.3, steps=1)

@@ -55,7 +55,7 @@ def roll(model, steps, **options):
     return rollout, max(stretch)
 
 
-@pytest.mark.parametrize("sheets", [1, 2])
+@pytest.mark.parametrize("sheets", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_drape_stretches_hardly_without_substeps(sheets, device):
     model = drape(device, sheets=sheets)
     rollout, stretch = roll(model, 60)

@@ -169,7 +169,9 @@ def test_a_propeller_throws_a_cloth(device):
     assert np.linalg.norm(states[0].particle_qd.numpy(), axis=1).max() > 2.0
 
 
-@pytest.mark.parametrize("options", [{}, {"min_distance": 0.003}], ids=["touch", "distance"])
+@pytest.mark.parametrize(
+    "options", [pytest.param({}, marks=pytest.mark.slow), {"min_distance": 0.003}], ids=["touch", "distance"]
+)
 def test_random_bars_push_a_cloth_off_their_arcs(options, device):
     """Turns of up to 150 degrees about any axis, of bars that the program moves and of dynamic ones."""
     with_contacts = 0

@@ -6,6 +6,7 @@ import pytest
 from worlds_throughput import SOLVERS, build, main
 
 
+@pytest.mark.slow
 def test_a_row_for_each_solver_and_number_of_worlds(device, monkeypatch, capsys):
     """Behind the stage all steps are certified, and the exact detector finds no crossing; behind VBD alone it does."""
     arguments = ["worlds_throughput.py", "--worlds", "1", "2", "--steps", "20", "--device", str(device)]

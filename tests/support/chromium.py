@@ -130,12 +130,20 @@ class Browser:
     def click(self, selector: str, number: int = 0) -> None:
         """Clicks in the middle of an element, one of those that a selector selects."""
         element = f"document.querySelectorAll({json.dumps(selector)})[{number}]"
-        # What listens to scrolling has done so two frames later.
+        # It is clicked once it stays where it is for two frames, with nothing above it: what listens to scrolling has
+        # done so then, and what the last click opened has its place.
         x, y = self.value(
             f"(async () => {{ {element}.scrollIntoView({{block: 'center'}});"
-            "for (let i = 0; i < 2; i += 1) await new Promise(requestAnimationFrame);"
-            f"const box = {element}.getBoundingClientRect();"
-            "return [box.left + box.width / 2, box.top + box.height / 2]; })()"
+            "let at = [], still = 0;"
+            "for (let i = 0; i < 60 && still < 2; i += 1) {"
+            "  await new Promise(requestAnimationFrame);"
+            f"  const element = {element}, box = element.getBoundingClientRect();"  # rows are made anew as it scrolls
+            "  const now = [box.left + box.width / 2, box.top + box.height / 2];"
+            "  const top = document.elementFromPoint(...now);"
+            "  const isOnTop = top && (element.contains(top) || top.contains(element));"
+            "  still = isOnTop && now[0] === at[0] && now[1] === at[1] ? still + 1 : 0; at = now;"
+            "}"
+            "return at; })()"
         )
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)

@@ -84,7 +84,7 @@ def bind_animation(stage, path, prim, most):
     UsdSkel.BindingAPI.Apply(prim).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
 
 
-@pytest.mark.parametrize("own_animation", [True, False])
+@pytest.mark.parametrize("own_animation", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_crowd_of_instances_is_the_same_crowd_without(tmp_path, own_animation):
     write_character(tmp_path / "character.usda", own_animation=own_animation)
     found = []
