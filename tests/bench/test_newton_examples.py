@@ -290,6 +290,7 @@ def test_positions_that_are_not_finite(write_example, in_this_process, device):
     assert (found.first_frame_not_finite, found.most_crossings) == (1, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signal 0 asks for a process only on POSIX")
 def test_an_interrupt_ends_the_process(write_example, device, tmp_path):
     def interrupt(*_):

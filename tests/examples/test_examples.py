@@ -296,6 +296,7 @@ def test_self_contact_of_newton_limits_speed_and_the_stage_does_not(monkeypatch,
     assert pytest.approx(0.8925) == program.LIMIT
 
 
+@pytest.mark.slow
 def test_a_cylinder_widens_a_sleeve():
     """No vertex is frozen where the cylinder comes, and none is stretched as if it were."""
     program = load_module(FOLDER / "substeps.py")
@@ -366,6 +367,7 @@ def test_frame_that_does_not_fit_into_a_graph_is_repeated(monkeypatch, capsys):
         example.test_final()
 
 
+@pytest.mark.slow
 def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypatch):
     expected, example = (run(THROW, frames) for frames in (3, 2))
 

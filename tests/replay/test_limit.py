@@ -133,6 +133,7 @@ def test_a_limit_that_leaves_nothing_out_says_nothing(tmp_path, capsys):
     assert "#" not in (tmp_path / "hits.csv").read_text()
 
 
+@pytest.mark.slow
 def test_limited_files_are_the_same_from_workers_and_resumed(tmp_path, waves, capsys):
     def run(folder, *more, status=0):
         named = [word for option, name in zip(OPTIONS, OUTPUTS, strict=True) for word in (option, str(folder / name))]

@@ -147,6 +147,7 @@ def test_crossings_at_the_end_of_a_turn_are_found(stage):
     assert crossings == [[0, 0], [0, 2], [2, 0]]
 
 
+@pytest.mark.slow
 def test_workers_write_the_same_bytes(stage, tmp_path):
     add_mesh(stage, "/World/Pin", PIN)
     spinning(stage, 0, 180, 540, 600)

@@ -30,7 +30,11 @@ OPTIONS = {
 }
 
 
-RUNS = [*((target, "default") for target in THROWS), ("sphere", "substeps"), ("sheet", "distance"), ("box", "radius")]
+RUNS = [(target, "default") for target in THROWS]
+RUNS += [
+    pytest.param(*run, marks=pytest.mark.slow)
+    for run in (("sphere", "substeps"), ("sheet", "distance"), ("box", "radius"))
+]
 
 
 @pytest.mark.parametrize("target, options", RUNS)

@@ -369,6 +369,7 @@ def test_what_is_not_read_is_named(stage, capsys):
     assert found["hits"] > 0
 
 
+@pytest.mark.slow
 def test_selection_and_workers(stage, tmp_path):
     add_rope(stage, "/World/Rope", lowered(ALONG, 1, 0.5, -0.5, 0.5), [0.25])
     add_points(stage, "/World/Dust", lowered([(0.25, -1.0, 0.0)], 1, 0.5, 0, 0.5), [0.25])
