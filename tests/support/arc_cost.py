@@ -3,11 +3,12 @@
 ``python tests/support/arc_cost.py --device cuda:0`` prints the median time of ``detect(arcs=)`` and of ``detect`` on
 the same motion, a cloth around a ball that turns, and of steps of three scenes by arcs and by chords, on a GPU in CUDA
 graphs: a ball that turns in a cloth (``--degrees`` a step), the same ball that moves straight, so that nothing turns,
-and dynamic boxes that tumble on a sheet.
+and dynamic boxes that tumble on a sheet. ``--json`` writes the times to a file as well.
 """
 
 import argparse
 import contextlib
+import sys
 import time
 from unittest import mock
 
@@ -21,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
+from warp_bsc.bench.provenance import write_measurement
 from warp_bsc.response.state import motion
 
 DT = 1.0 / 240.0
@@ -134,13 +136,16 @@ def main():
     parser.add_argument("--cells", type=int, default=60, help="cells along a side of a cloth")
     parser.add_argument("--degrees", type=float, default=3.0, help="turn of the ball in a step")
     parser.add_argument("--steps", type=int, default=80)
+    parser.add_argument("--json", metavar="FILE", help="file to which the times are written as well")
     args = parser.parse_args()
     device = wp.get_device(args.device)
-    table = Table(box=box.SIMPLE)
+    table, rows = Table(box=box.SIMPLE), []
     for column in ("", "arcs [ms]", "chords [ms]", "ratio", "contacts, or steps not certified, by each"):
         table.add_column(column)
 
     def add(name, times, results):
+        rows.append({"name": name, "milliseconds": dict(zip(("arcs", "chords"), times, strict=True))})
+        rows[-1]["contacts" if name == "detect" else "uncertified_steps"] = list(results)
         table.add_row(name, *(f"{t:.2f}" for t in times), f"{times[0] / times[1]:.2f}", ", ".join(map(str, results)))
 
     add("detect", *detections(args.cells, args.degrees, 20, device))
@@ -152,6 +157,9 @@ def main():
         found = [steps(build(args.cells, device), turn, args.steps, on_arcs) for on_arcs in (True, False)]
         add(name, *zip(*found, strict=True))
     Console(width=120).print(table)
+    if args.json:
+        found = {"benchmark": "arc_cost", "cells": args.cells, "degrees": args.degrees, "rows": rows}
+        write_measurement(args.json, found, sys.argv, [device])
 
 
 if __name__ == "__main__":

@@ -5,10 +5,12 @@
 Scenes with soft bodies of ``warp-bsc bench response`` at 1/60 s, examples of Newton that are given by their names, at
 the length of their steps, and a block that is thrown at a ball at 20 m/s. Each is stepped by VBD alone, with Newton's
 contacts, and with stages that leave, report and prevent inversions. Times are of the processor, without the first step.
+``--json`` writes the rows to a file as well.
 """
 
 import argparse
 import importlib
+import sys
 import time
 
 import newton
@@ -18,6 +20,7 @@ import warp as wp
 from newton.viewer import ViewerNull
 
 import warp_bsc as bsc
+from warp_bsc.bench.provenance import write_measurement
 from warp_bsc.bench.response_scenes import SCENES, build_scene
 from warp_bsc.bench.response_simulation import Simulation
 from warp_bsc.response.state.mesh import ModelMesh
@@ -125,7 +128,9 @@ def main():
     names = ["throw", *SCENES, *EXAMPLES]
     parser.add_argument("scenes", nargs="*", default=["throw"], choices=names, metavar="SCENE", help=", ".join(names))
     parser.add_argument("--steps", type=int, default=60, help="rounded up to pairs, or frames of examples")
+    parser.add_argument("--json", metavar="FILE", help="file to which the rows are written as well")
     options = parser.parse_args()
+    rows = []
     wp.config.log_level = wp.LOG_WARNING
     print(
         f"{'scene':28}{'mode':11}{'steps':>6}{'ms':>8}{'mean':>8}{'inverting steps':>17}{'tets':>8}{'left':>6}  report"
@@ -134,9 +139,15 @@ def main():
         for mode in MODES:
             solver = run(name, mode, options.steps)
             times, counts = 1e3 * np.array(solver.seconds[1:]), np.array(solver.inverting)
+            rows.append({"scene": name, "mode": mode, "steps": len(counts), "milliseconds": float(times.mean())})
+            rows[-1] |= {"inverting_steps": int(np.count_nonzero(counts)), "inverted": int(counts.sum())}
+            rows[-1]["truncated_steps"] = None if mode == "plain" else solver.report.totals.truncated_steps
             row = f"{name:28}{mode:11}{len(counts):>6}{np.median(times):>8.1f}{times.mean():>8.1f}"
             row += f"{np.count_nonzero(counts):>17}{counts.sum():>8}{solver.inverted:>6}"
             print(f"{row}  {'' if mode == 'plain' else solver.report}", flush=True)
+    if options.json:
+        found = {"benchmark": "inverting_steps", "rows": rows}
+        write_measurement(options.json, found, sys.argv, [wp.get_device()])
 
 
 if __name__ == "__main__":

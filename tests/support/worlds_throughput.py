@@ -4,10 +4,11 @@
 
 Each world has a cloth of 200 triangles that falls from its own place on a fixed sphere and the ground. VBD gets
 Newton's contacts, the stage none. The exact detector counts the edges that cross faces of cloth or sphere once a tenth
-of the steps. On a GPU, a pair of steps is a CUDA graph.
+of the steps. On a GPU, a pair of steps is a CUDA graph. ``--json`` writes the rows to a file as well.
 """
 
 import argparse
+import sys
 import time
 
 import newton
@@ -16,6 +17,7 @@ import warp as wp
 
 import warp_bsc as bsc
 from warp_bsc.bench.crossings import CrossingCounter
+from warp_bsc.bench.provenance import write_measurement
 
 DT = 1.0 / 120.0  # [s]
 CELLS, SIDE, RADIUS = 10, 0.5, 0.2  # m
@@ -119,11 +121,13 @@ def main():
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64], help="on a GPU, also 1024 4096")
     parser.add_argument("--steps", type=int, default=100, help="a multiple of 20")
     parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+    parser.add_argument("--json", metavar="FILE", help="file to which the rows are written as well")
     options = parser.parse_args()
     if options.steps < 20 or options.steps % 20:
         parser.error(f"--steps must be a multiple of 20, not {options.steps}")
     wp.config.log_level = wp.LOG_WARNING
     with wp.ScopedDevice(options.device or wp.get_preferred_device()):
+        rows = []
         print(f"{'solver':30}{'worlds':>7}{'steps/s':>10}{'by processor':>14}{'crossings':>11}{'uncertified':>13}")
         for worlds in options.worlds:
             model = build(worlds)
@@ -131,7 +135,13 @@ def main():
             for name, make_solver in SOLVERS.items():
                 by_clock, by_processor, crossings, uncertified = measure(make_solver, model, counter, options.steps)
                 row = f"{name:30}{worlds:>7}{by_clock:>10.3g}{by_processor:>14.3g}{crossings:>11}"
+                rates = {"clock": by_clock, "processor": by_processor}
+                rows.append({"solver": name, "worlds": worlds, "steps_per_second": rates})
+                rows[-1] |= {"crossings": crossings, "uncertified_steps": uncertified}
                 print(f"{row}{'-' if uncertified is None else uncertified:>13}", flush=True)
+        if options.json:
+            found = {"benchmark": "worlds_throughput", "steps": options.steps, "rows": rows}
+            write_measurement(options.json, found, sys.argv, [wp.get_device()])
 
 
 if __name__ == "__main__":
