@@ -258,7 +258,7 @@ def _response_cell(took: Found) -> str:
 
 def _stretch_and_speed(took: Found) -> str:
     stretches = ", ".join(digits(took[f"stretch_at_{when}"]) for when in ("end", "most"))
-    return f"{stretches}%; {took['rest_speed']:,.0f}"
+    return f"{stretches}%; {took['rest_speed']:,.0f} mm/s"
 
 
 def _what_passed(took: Found) -> list[str]:
@@ -324,6 +324,62 @@ def implicit_time(found: Found) -> Rows:
     for row in found["rows"]:
         title = row["scene"].replace("hanging", "a hanging cloth").replace("on a sphere", "a cloth on a sphere")
         rows.append((title, *(_three(time) for time in row["milliseconds"].values())))
+    return rows
+
+
+def arc_cost(small: Found, large: Found) -> Rows:
+    """Times of steps and detections by arcs, beside those by chords."""
+    degrees = f"{small['degrees']:g} degrees"
+    titles = {
+        f"ball, {degrees} a step": f"a cloth on a ball that the program turns by {degrees} a step",
+        "ball, nothing turns": "the same, the ball does not turn",
+        "boxes that tumble": "nine boxes that tumble on a sheet",
+        "detect": "one `detect(arcs=)` of the first: nearly all contacts are on arcs",
+    }
+    rows = [("scene", "triangles of the cloth", "arcs", "chords", "ratio")]
+    for found in (small, large):
+        times = {row["name"]: row["milliseconds"] for row in found["rows"]}
+        for name, title in titles.items():
+            arcs, chords = times[name]["arcs"], times[name]["chords"]
+            ratio = f"{arcs / chords:.2f}"
+            rows.append((title, f"{2 * found['cells'] ** 2:,}", milliseconds(arcs), milliseconds(chords), ratio))
+    return rows
+
+
+def worlds_throughput(found: Found) -> Rows:
+    """Steps a second by the number of worlds, and crossings."""
+    titles = {
+        "VBD": "VBD, Newton's contacts",
+        "VBD, self-contact": "with VBD's self-contact",
+        "SolverCCD(VBD), default": "`SolverCCD`, default",
+        "SolverCCD(VBD), substeps=None": "`SolverCCD`, `substeps=None`",
+    }
+    clock = "processor" if not found["record"]["gpus"] else "clock"
+    cells = {
+        (row["solver"], row["worlds"]): f"{_three(row['steps_per_second'][clock])} ({row['crossings']:,})"
+        for row in found["rows"]
+    }
+    worlds = list(dict.fromkeys(number for _, number in cells))
+    rows = [("worlds", *(f"{number:,}" for number in worlds))]
+    return rows + [(title, *(cells[name, number] for number in worlds)) for name, title in titles.items()]
+
+
+def inverting_steps(*measurements: Found) -> Rows:
+    """Tetrahedra that steps invert, by what the stage does about them, and times of steps."""
+    titles = {"plain": "VBD, Newton's contacts", "left": '`"left"`', "reported": '`"reported"`'}
+    titles |= {"prevented": '`"prevented"`'}
+    scenes = {"throw": "throw: a block of 2,560 tetrahedra flies at a ball at 20 m/s"}
+    rows = [("scene, steps", *titles.values())]
+    runs: dict[tuple[str, int], dict[str, Found]] = {}
+    for run in (run for found in measurements for run in found["rows"]):
+        runs.setdefault((run["scene"], run["steps"]), {})[run["mode"]] = run
+    for (scene, steps), modes in runs.items():
+        cells = []
+        for run in (modes[mode] for mode in titles):
+            many = f" in {run['inverting_steps']} steps" if run["inverted"] else ""
+            cut = f", {run['truncated_steps']} steps with cut paths" if run["truncated_steps"] else ""
+            cells.append(f"{run['inverted']:,}{many} ({_three(run['milliseconds'])} ms){cut}")
+        rows.append((f"{scenes.get(scene, scene)}, {steps:,}", *cells))
     return rows
 
 

@@ -22,12 +22,12 @@ from warp_bsc.bench.penetration import SCENES
 from warp_bsc.bench.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
+_GUIDES = "configuration", "contacts", "gradients_vbd", "reports", "turning_bodies"
 PAGES = [
     ROOT / "README.md",
     ROOT / "docs" / "index.md",
     ROOT / "docs" / "measurements.md",
-    ROOT / "docs" / "newton" / "configuration.md",
-    ROOT / "docs" / "newton" / "gradients_vbd.md",
+    *(ROOT / "docs" / "newton" / f"{name}.md" for name in _GUIDES),
 ]
 MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
 _COMPARED = {
@@ -59,6 +59,7 @@ class Table:
 
 
 _PENETRATION = tuple(f"penetration_{scene}" for scene in SCENES)
+_INVERTING = tuple(f"inverting_steps_{name}" for name in ("scenes", "hanging", "dropping"))
 _SHORT = tuple(f"response_short_{rate}" for rate in (120, 180, 240, 480, 960))
 
 
@@ -68,6 +69,7 @@ TABLES = {
         table_rows.front,
         has_sources=False,
     ),
+    "arc_cost_cpu": Table(("arc_cost_cpu", "arc_cost_large_cpu"), table_rows.arc_cost),
     "certify": Table(tuple(f"certify_{seed}_gpu" for seed in range(11, 15)), table_rows.certify),
     "given_queries": Table(("given_queries_one_core",), table_rows.given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), table_rows.detector),
@@ -77,6 +79,7 @@ TABLES = {
     "implicit_accuracy": Table(("implicit_accuracy_cpu",), table_rows.implicit_accuracy),
     "implicit_time_cpu": Table(("implicit_time_cpu",), table_rows.implicit_time),
     "implicit_time_gpu": Table(("implicit_time_gpu",), table_rows.implicit_time),
+    "inverting_steps": Table(_INVERTING, table_rows.inverting_steps),
     "paper": Table(("paper_cpu",), table_rows.paper),
     "penetration": Table(_PENETRATION, table_rows.penetration, needs_all=False, has_sources=False),
     "penetration_costs": Table(_PENETRATION, table_rows.penetration_costs, needs_all=False, has_sources=False),
@@ -94,6 +97,7 @@ TABLES = {
     "response_style3d_gpu": Table(("response_style3d_gpu",), lambda found: table_rows.response(found, found)),
     "substeps": Table(("substeps_cpu",), table_rows.substeps),
     "touching": Table(("touching",), table_rows.touching),
+    "worlds_throughput_cpu": Table(("worlds_throughput_cpu",), table_rows.worlds_throughput),
 }
 """The tables of all pages by name."""
 

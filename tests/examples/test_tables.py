@@ -236,6 +236,90 @@ def test_penetration():
     ]
 
 
+def contact_run(scene, configuration, **others):
+    took = {
+        "rate": 60,
+        "stretch_at_end": 3.06,
+        "stretch_at_most": 15.9,
+        "rest_speed": 1234.5,
+        "energy_gained": 0.0123,
+        "crossings": 0,
+        "collisions": 0,
+        "uncertified_steps": None,
+        "substeps": None,
+        "milliseconds": {"median": 8.123, "mean": 123.4, "worst": 200.0},
+    }
+    return {"scene": scene, "configuration": configuration, "problem": None, "measured": took | others}
+
+
+def test_scenes_in_contact():
+    plain = contact_run("ball", "plain", crossings=1234, collisions=56)
+    stage = contact_run("ball", "stage", uncertified_steps=2, substeps=12.6)
+    reference = contact_run("ball", "reference", rate=1920, collisions=None, substeps=1.0)
+    head, row = rows_of.response({"runs": [plain, stage]}, {"runs": [reference]})
+    assert head == ("scene", "Newton's contacts", "`SolverCCD`, default", "reference, 1/1920 s")
+    moves = "3.1, 16%; 1,234 mm/s"
+    assert row == (
+        "ball: moved by the program at 40 m/s",
+        f"{moves}; 8.12 ms; 1,234 crossings; 56 pairs meet",
+        f"{moves}; 8.12 (123) ms; 2 steps not certified",
+        moves,
+    )
+    runs = [
+        contact_run("ball", name, rate=rate) for rate in (240, 120) for name in ("plain", "stage", "stage+contacts")
+    ]
+    _, first, second = rows_of.response_by_rate({"runs": runs[:3]}, {"runs": runs[3:]})
+    assert first == ("ball, 1/120 s", *["3.1, 16%; 12 mJ; 123 ms"] * 3) and second[0] == "ball, 1/240 s"
+
+
+def test_gradients_through_vbd():
+    errors = {"residual": 0.0123, "velocity": 45.69, "tri_materials": 0.001, "particle_mass": 0.02}
+    found = {
+        "rows": [{"scene": "hanging", "iterations": n, "polish": p} | errors for n, p in ((10, 0), (20, 0), (20, 3))]
+    }
+    found["rows"] += [
+        row | {"scene": name} for name in ("slope", "block", "drape", "patches") for row in found["rows"][:3]
+    ]
+    row = rows_of.implicit_accuracy(found)[1]
+    assert row == ("a hanging cloth", *["0.012; 4,569%"] * 3, "stretch 0.10%, mass 2.0%")
+    times = {"vbd": 0.7421, "on a tape": 1.0, "back": 12.34, "polish=3": 123.4}
+    _, row = rows_of.implicit_time({"rows": [{"scene": "hanging, 800 triangles", "milliseconds": times}]})
+    assert row == ("a hanging cloth, 800 triangles", "0.742", "1.00", "12.3", "123")
+
+
+def test_arcs_worlds_and_inversions():
+    names = "detect", "ball, 3 degrees a step", "ball, nothing turns", "boxes that tumble"
+    times = [{"name": name, "milliseconds": {"arcs": 3.0, "chords": 2.0}} for name in names]
+    found = {"cells": 60, "degrees": 3.0, "rows": times}
+    _, *rows = rows_of.arc_cost(found, found | {"cells": 150})
+    assert [row[1] for row in rows] == ["7,200"] * 4 + ["45,000"] * 4
+    assert rows[0][0].endswith("turns by 3 degrees a step") and rows[0][2:] == ("3 ms", "2 ms", "1.50")
+
+    solvers = "VBD", "VBD, self-contact", "SolverCCD(VBD), default", "SolverCCD(VBD), substeps=None"
+    rates = {"clock": 1234.0, "processor": 56.7}
+    row = {"worlds": 1024, "steps_per_second": rates, "crossings": 5929}
+    found = {"record": {"gpus": []}, "rows": [{"solver": name} | row for name in solvers]}
+    head, *rows = rows_of.worlds_throughput(found)
+    assert head == ("worlds", "1,024") and {row[1] for row in rows} == {"56.7 (5,929)"}
+    found["record"]["gpus"] = ["NVIDIA X"]
+    assert rows_of.worlds_throughput(found)[1] == ("VBD, Newton's contacts", "1,234 (5,929)")
+
+    run = {
+        "scene": "pile",
+        "steps": 120,
+        "milliseconds": 4.56,
+        "inverting_steps": 0,
+        "inverted": 0,
+        "truncated_steps": 0,
+    }
+    runs = [run | {"mode": mode} for mode in ("plain", "left", "reported", "prevented")]
+    runs[1] |= {"inverting_steps": 3, "inverted": 1234}
+    runs[3] |= {"truncated_steps": 4}
+    _, row = rows_of.inverting_steps({"rows": runs})
+    assert row[0] == "pile, 120" and row[1] == row[3] == "0 (4.56 ms)"
+    assert row[2] == "1,234 in 3 steps (4.56 ms)" and row[4] == "0 (4.56 ms), 4 steps with cut paths"
+
+
 def test_the_picture_of_penetration(tmp_path, monkeypatch):
     figure = load("penetration")
     numbers = figure.count(PENETRATION, lambda took: max(took["crossings"]))

@@ -198,7 +198,7 @@ def test_which_steps_allocate(kind, device):
 
 
 @pytest.mark.parametrize("kind", ["rigid", "soft"])
-def test_which_contacts_have_room(kind, device):
+def test_which_contacts_have_room(kind, device, monkeypatch):
     model = sheet_above_sphere(device, body=True)
     solver, smaller = SolverVBD(model), newton.CollisionPipeline(model).contacts()
     larger = newton.CollisionPipeline(model, **{f"{kind}_contact_max": 5000}).contacts()
@@ -209,6 +209,8 @@ def test_which_contacts_have_room(kind, device):
     assert not of_newton.has_room(solver, larger)
     solver.step(*states, control, larger, DT)
     assert of_newton.has_room(solver, smaller) and of_newton.has_room(solver, larger)
+    monkeypatch.delattr(solver, "body_body_contact_penalty_k" if kind == "rigid" else "body_particle_contact_penalty_k")
+    assert not of_newton.has_room(solver, smaller)
 
 
 def test_style3d_takes_substeps_in_a_graph(device):
