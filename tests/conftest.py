@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 from benchmark_data import data_folder
 from chromium import CHROMIUM
-from compilation import compile_kernels_once, compile_quickly
+from compilation import compile_for_gpus, compile_kernels_once, compile_quickly
 from guarded_memory import guard_memory
 from sanitized_kernels import SANITIZED, restart_with_sanitizers, sanitize_kernels, sanitizers_available
 
@@ -27,6 +27,9 @@ hypothesis.settings.load_profile("repeatable")
 def pytest_addoption(parser):
     """Adds the options that look for access out of bounds."""
     parser.addoption("--guard-memory", action="store_true", help="crash on access out of bounds of an array on the CPU")
+    parser.addoption(
+        "--compile-for", type=int, metavar="ARCH", help="at the end compile for GPUs, such as 75, what was loaded"
+    )
     parser.addoption("--sanitize", action="store_true", help="run kernels on the CPU under Address and UB sanitizers")
     parser.addoption("--warp-debug", action="store_true", help="run all kernels in Warp's debug mode, which asserts")
 
@@ -44,6 +47,8 @@ def pytest_configure(config):
             config.pluginmanager.getplugin("capturemanager").stop_global_capturing()
             restart_with_sanitizers()
         sanitize_kernels()
+    if config.getoption("--compile-for") and getattr(config.option, "numprocesses", None):
+        raise pytest.UsageError("--compile-for compiles what one process has loaded: omit -n")
     if config.getoption("--guard-memory"):
         guard_memory()
     if config.getoption("--warp-debug"):
@@ -76,6 +81,16 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)  # each launch makes objects, and few of them are garbage in cycles
+
+
+def pytest_sessionfinish(session):
+    """Compiles for GPUs if asked, and fails if a kernel does not compile."""
+    arch = session.config.getoption("--compile-for")
+    problems = compile_for_gpus(arch) if arch else {}
+    for name, problem in problems.items():
+        print(f"\n{name} does not compile for sm_{arch}: {problem}")
+    if problems:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.fixture(scope="session", autouse=True)

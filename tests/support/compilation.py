@@ -1,9 +1,10 @@
-"""Compilation of the tests' kernels: options that make it quick, and no module compiled by two processes at once."""
+"""Compilation of the tests' kernels: quick options, no module compiled by two processes at once, for absent GPUs."""
 
 import contextlib
 import functools
 import importlib
 import os
+import tempfile
 import zlib
 
 import warp as wp
@@ -13,7 +14,7 @@ try:
 except ImportError:  # Windows, where each process compiles for itself
     fcntl = None
 
-__all__ = ["FOLDER", "QUICK", "compile_kernels_once", "compile_quickly"]
+__all__ = ["FOLDER", "QUICK", "compile_for_gpus", "compile_kernels_once", "compile_quickly"]
 
 FOLDER = os.path.dirname(__file__)
 """Folder from which a program that a test starts can import this module."""
@@ -47,6 +48,32 @@ WITHOUT_GRADIENTS = [
     "newton._src.viewer.kernels",
 ]
 """Modules of Newton's kernels through which no test takes a gradient. Their adjoints take a minute to compile."""
+
+
+FOR_CPUS = {"warp_bsc.detection.batch_kernels", "warp_bsc.detection.wide_tree"}
+"""Modules of Python whose kernels run on CPUs alone."""
+
+
+def compile_for_gpus(arch: int) -> dict[str, str]:
+    """Compiles the kernels of warp-bsc that this process has loaded for GPUs of a compute capability, such as 75.
+
+    It needs NVRTC, which is part of Warp for Linux and Windows, but no GPU. Returns problems by module.
+    """
+    problems = {}
+    for name, module in sorted(wp._src.context.user_modules.items()):
+        kernels = list(module.kernels.values())
+        places = {kernel.func.__module__ for kernel in kernels}
+        is_ours = any(place.startswith("warp_bsc.") for place in places)
+        if not module.execs or not is_ours or places <= FOR_CPUS:
+            continue
+        for kernel in kernels:
+            kernel.options.pop("cluster_dim", None)  # GPUs without clusters ignore it, compiling ahead of time does not
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                wp.compile_aot_module(module, device=None, arch=arch, module_dir=folder, use_ptx=True)
+        except Exception as problem:
+            problems[name] = str(problem)
+    return problems
 
 
 def compile_quickly() -> None:
