@@ -62,7 +62,7 @@ def compile_for_gpus(arch: int) -> dict[str, str]:
     problems = {}
     for name, module in sorted(wp._src.context.user_modules.items()):
         kernels = list(module.kernels.values())
-        places = {kernel.func.__module__ for kernel in kernels}
+        places = {kernel.func.__module__ or "" for kernel in kernels}  # "": made of text
         is_ours = any(place.startswith("warp_bsc.") for place in places)
         if not module.execs or not is_ours or places <= FOR_CPUS:
             continue
