@@ -80,6 +80,7 @@ def test_json_has_everything(capsys):
     assert list(scene["stage_milliseconds"])[:2] == ["broad phase", "cull"]
 
 
+@pytest.mark.slow
 def test_tables_files_and_figure(capsys, monkeypatch, tmp_path):
     pytest.importorskip("matplotlib")
     monkeypatch.setenv("COLUMNS", "100")

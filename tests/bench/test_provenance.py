@@ -113,6 +113,7 @@ def test_a_file_is_complete_or_absent(tmp_path):
         write_measurement(tmp_path / "gone" / "a.json", {}, ["x"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("benchmark", ["queries --count 100 --repeat 1", "detector cloth:1000 --repeat 1"])
 def test_quick_benchmarks_write_and_print_it(capsys, tmp_path, benchmark):
     """Those that report many runs are tested with their tables."""

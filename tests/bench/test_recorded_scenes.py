@@ -37,6 +37,7 @@ def test_size_and_motion(name):
         assert low > 0.6 and high < 1.6
 
 
+@pytest.mark.slow
 @each_scene
 def test_collisions(name):
     hits, pairs = 0, set()

@@ -104,14 +104,8 @@ def seconds(scene, tmp_path_factory):
     return time.perf_counter() - start
 
 
-@pytest.mark.parametrize(
-    ("number", "times"),
-    [
-        pytest.param(signal.SIGTERM, 1, marks=pytest.mark.slow),
-        (signal.SIGINT, 1),
-        pytest.param(signal.SIGKILL, 2, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGTERM, 1), (signal.SIGINT, 1), (signal.SIGKILL, 2)])
 def test_stopped_at_random_moments(tmp_path, scene, seconds, number, times):
     moments = random.Random(number)
     for place in range(times):

@@ -133,6 +133,7 @@ def test_docstring_prints_its_command(path):
     assert re.findall(r"python (examples/\S+\.py)", path.read_text())[0] == name
 
 
+@pytest.mark.slow
 def test_scripts_without_a_viewer_start(tmp_path):
     """From any folder, by their path alone."""
     command = [sys.executable, FOLDER / "paper" / "record_scenes.py", "--help"]
@@ -272,6 +273,7 @@ def test_gripper_lifts_cloth_that_does_not_slip(robot, friction):
     assert report.totals.truncated_steps == 0 or friction < 0.5
 
 
+@pytest.mark.slow
 def test_contacts_are_drawn(monkeypatch):
     drawn = []
     monkeypatch.setattr(ViewerNull, "log_arrows", lambda self, name, *arguments, **options: drawn.append(name))
