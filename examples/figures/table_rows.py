@@ -257,8 +257,11 @@ def _response_cell(took: Found) -> str:
 
 
 def _stretch_and_speed(took: Found) -> str:
-    stretches = ", ".join(digits(took[f"stretch_at_{when}"]) for when in ("end", "most"))
-    return f"{stretches}%; {took['rest_speed']:,.0f} mm/s"
+    return f"{_stretches(took)}; {took['rest_speed']:,.0f} mm/s"
+
+
+def _stretches(took: Found) -> str:
+    return f"{digits(took['stretch_at_end'])}, {digits(took['stretch_at_most'])}%"
 
 
 def _what_passed(took: Found) -> list[str]:
@@ -285,10 +288,8 @@ def response_by_rate(*measurements: Found) -> Rows:
         cells = []
         for took in (runs[scene, rate][name] for name in titles):
             gained = f"{digits(1e3 * took['energy_gained'])} mJ"
-            stretches = ", ".join(digits(took[f"stretch_at_{when}"]) for when in ("end", "most"))
-            cells.append(
-                "; ".join([f"{stretches}%", gained, f"{digits(took['milliseconds']['mean'])} ms", *_what_passed(took)])
-            )
+            time = f"{digits(took['milliseconds']['mean'])} ms"
+            cells.append("; ".join([_stretches(took), gained, time, *_what_passed(took)]))
         rows.append((f"{scene}, 1/{rate} s", *cells))
     return rows
 

@@ -59,7 +59,7 @@ def compile_for_gpus(arch: int) -> dict[str, str]:
 
     It needs NVRTC, which is part of Warp for Linux and Windows, but no GPU. Returns problems by module.
     """
-    problems = {}
+    problems, compiled = {}, 0
     for name, module in sorted(wp._src.context.user_modules.items()):
         kernels = list(module.kernels.values())
         places = {kernel.func.__module__ or "" for kernel in kernels}  # "": made of text
@@ -69,11 +69,12 @@ def compile_for_gpus(arch: int) -> dict[str, str]:
         for kernel in kernels:
             kernel.options.pop("cluster_dim", None)  # GPUs without clusters ignore it, compiling ahead of time does not
         try:
+            compiled += 1
             with tempfile.TemporaryDirectory() as folder:
                 wp.compile_aot_module(module, device=None, arch=arch, module_dir=folder, use_ptx=True)
         except Exception as problem:
             problems[name] = str(problem)
-    return problems
+    return problems if compiled else {"warp_bsc": "no kernel of it was loaded"}
 
 
 def compile_quickly() -> None:
