@@ -325,6 +325,66 @@ def test_a_body_collides_with_what_is_tied_to_it(device, broad_phase):
     np.testing.assert_allclose(found.vertex_face_toi, 0.5, atol=0.02)
 
 
+@pytest.mark.parametrize("angle", [0.5, 2.0])
+def test_pairs_within_a_body_that_deforms_are_looked_at(angle, device):
+    """Along the axis deformations turn into themselves: pairs collide as on straight paths in the frame of the body."""
+    rng = np.random.default_rng(int(angle))
+    x0 = [2.0, 0.0, 0.0] + [0.05, 0.05, 0.002] * rng.uniform(-1.0, 1.0, (20, 1, 3))
+    x0 = (x0 + [0.1, 0.1, 0.0005] * rng.uniform(-1.0, 1.0, (20, 3, 3))).reshape(-1, 3)
+    end = x0 + 2.0**-9.1 * rng.uniform(-1.0, 1.0, (len(x0), 1)) * Z  # as far as a body may deform, twice the distance
+    mesh = bsc.CollisionMesh(np.arange(len(x0)).reshape(-1, 3), len(x0), device=device)
+    arcs = bsc.RigidMotion([0] * len(x0), [[0.0, 0, 0]], [angle * Z], tolerance=1e-5)
+    found = bsc.CollisionDetector(mesh).detect(x0, moved(end, 0.0, angle * Z), arcs=arcs)
+    assert found.certified
+    for kind in KINDS:
+        pairs, corners = pairs_of(mesh, kind)
+        rows = np.concatenate([x0[corners], end[corners]], axis=1)
+        one, other = np.split(rows.reshape(-1, 2, 4, 3), [1 + KINDS.index(kind)], axis=2)
+        overlap = (one.min(axis=(1, 2)) <= other.max(axis=(1, 2))).all(axis=1)
+        overlap &= (other.min(axis=(1, 2)) <= one.max(axis=(1, 2))).all(axis=1)
+        pairs, rows = pairs[overlap], rows[overlap]
+        collide = getattr(bsc.checker, kind)(rows)
+        reported = set(map(tuple, getattr(found, kind).tolist()))
+        assert set(map(tuple, pairs[collide].tolist())) <= reported
+        assert 0 < collide.sum() <= len(reported) <= 1.05 * collide.sum()  # what comes within the tolerance
+
+
+def two_plates(gap):
+    """Two parallel triangles, one above the other."""
+    plate = np.array([[1, 0, 0], [1.2, 0, 0], [1, 0.2, 0]])
+    return np.concatenate([plate, plate + np.array([0.03, 0.03, gap])])
+
+
+@pytest.mark.parametrize("turns", [1.0, 3.0])
+def test_pairs_within_a_body_that_is_rigid_up_to_rounding_are_left_out(turns, device):
+    """Two plates that touch, with positions and poses in single precision: nothing is found, all is certified."""
+    x0 = two_plates(0.0).astype(np.float32) + np.float32(10.0)
+    turn = np.float32([0.3, -0.4, 0.7]) * np.float32(turns)
+    x1 = moved(x0.astype(float), 9.5, turn.astype(float), [3.0, 0, 0]).astype(np.float32)
+    mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
+    arcs = bsc.RigidMotion([0] * 6, np.full((1, 3), 9.5), turn[None])
+    found = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1, arcs=arcs)
+    assert found.certified and found.earliest_toi == 2.0
+
+
+def test_arcs_without_bodies_change_nothing(device):
+    mesh, x0, x1, _ = blade_and_post()
+    mesh = bsc.CollisionMesh(mesh.faces, 6, device=device)
+    x1[:3] += [0.5, 2.0, 0.0]
+    detector = bsc.CollisionDetector(mesh)
+    expected = detector.detect(x0, x1)
+    assert len(expected.edge_edge)
+    start, end = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
+    for centre, body in ((np.zeros((0, 3)), [-1] * 6), (np.zeros((2, 3)), np.full(6, -1))):
+        arcs = bsc.RigidMotion(body, centre, centre)
+        with wp.ScopedCapture(device) as capture:
+            captured = detector.capture(start, end, arcs=arcs)
+        wp.capture_launch(capture.graph)
+        for found in (detector.detect(x0, x1, arcs=arcs), captured.read()):
+            assert found.edge_edge.tolist() == expected.edge_edge.tolist()
+            assert found.vertex_face.tolist() == expected.vertex_face.tolist()
+
+
 def test_poses_give_the_turn_between_them():
     rng = np.random.default_rng(4)
     turn = rng.standard_normal((5, 3))
@@ -418,6 +478,29 @@ def test_a_graph_detects_on_arcs(device):
         for kind in KINDS:
             rows = [] if offset else getattr(expected, kind).tolist()
             assert getattr(found, kind).tolist() == rows
+
+
+def test_a_graph_in_which_a_body_deforms_finds_its_pairs_or_is_not_certified(device):
+    """Two plates of a body, rigid before the capture; in the replay the second passes through the first."""
+    x0 = two_plates(0.001)
+    x1, sinks = moved(x0, 0.0, 0.5 * Z), [[0.0] * 3] * 3 + [[0, 0, -0.0015]] * 3
+    detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device))
+    arcs = bsc.RigidMotion([0] * 6, [[0.0] * 3], [0.5 * Z])
+    assert detector.detect(x0, x1, arcs=arcs).certified
+    start, end = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
+    with wp.ScopedCapture(device) as capture:
+        captured = detector.capture(start, end, arcs=arcs)
+    for off, sunk in ((0.0, False), (sinks, True)):
+        end.assign(x1 + off)
+        wp.capture_launch(capture.graph)
+        found = captured.read()
+        assert found.certified == (device.is_cpu or not sunk)
+        assert found.vertex_face.tolist() == ([[3, 0]] if device.is_cpu and sunk else [])
+    # what a GPU measures in the graph
+    bounds = detector._arc_pipeline.bounds
+    for off, rigid in ((0.0, True), (sinks, False)):
+        bounds.measure(start, wp.array(x1 + off, dtype=wp.vec3d, device=device))
+        assert bounds.are_rigid().tolist() == [rigid]
 
 
 @pytest.mark.gpu

@@ -80,15 +80,23 @@ class ArcPipeline:
         return False
 
     def set_motion(self, bounds: ArcBounds) -> None:
-        """Copies centres, turns and tolerance of a motion of the same bodies to the device."""
+        """Copies centres, turns, tolerance and rigid bodies of a motion of the same bodies to the device."""
         self.bounds = bounds
+        self._arcs.group.assign(bounds.body)
         self._arcs.centre.assign(bounds.motion.centre)
         self._arcs.turn.assign(bounds.motion.turn)
         self._arcs.tolerance = bounds.tolerance
 
+    def leaves_out_rigid_bodies_alone(self) -> bool:
+        """Returns whether all bodies within which pairs are left out were rigid in the last run of a CUDA graph."""
+        body = self.bounds.body
+        return bool(self.bounds.are_rigid()[body[body >= 0]].all())
+
     def bound(self, x0: wp.array, x1: wp.array) -> None:
         """Bounds the arcs from one configuration to another; before each run, also in a CUDA graph."""
         arcs = self._arcs
+        if x0.device.is_capturing:
+            self.bounds.measure(x0, x1)
         arcs.turning.zero_()
         inputs = [x0, x1, arcs]
         launch(_bound_arcs(x0.dtype), len(x0), inputs=inputs, device=x0.device, record_tape=False)

@@ -3,8 +3,8 @@
 In a part of the step, no pair collides on its arcs whose chords stay farther apart than the bounds of their deviations
 together, see :mod:`warp_bsc.kernels.arcs`. Parts are halved for the vertices of the other pairs, until these bounds are
 at most half of the tolerance: then the pair is reported, whose arcs come within twice the bounds of each other. Pairs
-without a turning body are those of :mod:`.detector` alone, and pairs within a body stay as they are. Turns of up to a
-quarter, without minimum distances, take less time in one pass, see :mod:`.arc_pipeline`.
+without a turning body are those of :mod:`.detector` alone, and pairs within a rigid body stay as they are. Turns of up
+to a quarter, without minimum distances, take less time in one pass, see :mod:`.arc_pipeline`.
 """
 
 import dataclasses
@@ -102,6 +102,7 @@ class ArcSearch:
             timer: Measures the stages.
         """
         self._bounds, self._changed, self._timer = bounds, changed, timer
+        self._pipeline.set_bodies(bounds.body)
         self._deviations: dict[int, np.ndarray] = {}
         self._counts: Counts | None = None
         self._found: dict[DistanceKind, list[HostContacts]] = {kind: [] for kind in self._elements}

@@ -102,8 +102,9 @@ class Collisions:
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides
             as well. False for method "float", and if a buffer overflowed, a position was not finite, or a pair was
-            left to the host in a CUDA graph. Pairs that groups and masks of the mesh leave out are not covered;
-            ``stats.filtered`` counts those whose swept boxes overlap.
+            left to the host in a CUDA graph, or in one of a GPU a body deforms that was rigid when it was captured.
+            Pairs that groups and masks of the mesh leave out are not covered; ``stats.filtered`` counts those whose
+            swept boxes overlap. Nor are pairs within a rigid body on arcs, see :class:`.RigidMotion`.
         overflows: Each buffer that was too small, so that collisions are missing, with its count and capacity. Only a
             detection in a CUDA graph can overflow: detect once outside a graph, which enlarges the buffers, and capture
             again.

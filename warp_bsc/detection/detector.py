@@ -112,8 +112,9 @@ class CollisionDetector:
         With ``arcs``, the vertices of turning bodies move along arcs, and no collision on these is missed. A pair with
         such a vertex may be reported that does not collide, if it comes within ``arcs.tolerance`` of that, whatever the
         method. Its time of impact is a lower bound, before which it does not collide; its coordinates and normal are
-        those of points within that distance. Pairs within one body are not looked at, as they stay as they are; pairs
-        without a turning body are those found without ``arcs``. Counts are those of all parts of the step together.
+        those of points within that distance. Pairs within a body that is rigid up to rounding, see
+        :class:`.RigidMotion`, are left out, as they stay as they are; pairs without a turning body are those found
+        without ``arcs``. Counts are those of all parts of the step together. Without a body ``arcs`` change nothing.
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
@@ -127,17 +128,18 @@ class CollisionDetector:
         Raises:
             TypeError: If the positions are no arrays of numbers, or ``arcs`` is no :class:`.RigidMotion`.
             ValueError: If they or ``only`` have another shape or type, if the positions differ in type, or if they are
-                not finite; with ``arcs``, also if it is for another number of vertices, ``x1`` is not where it takes
-                its bodies, coordinates are more than 2^500, its tolerance is too small for the rounding of positions,
-                or the positions require gradients.
+                not finite; with ``arcs``, also if it is for another number of vertices, ``x1`` is too far from where it
+                takes its bodies, coordinates are more than 2^500, its tolerance is too small for the rounding of
+                positions, or the positions require gradients.
             RuntimeError: If the device captures a graph, see :meth:`capture`.
         """
         if self.mesh.device.is_capturing:
             raise RuntimeError(f"{self.mesh.device} captures a graph: call capture(x0, x1) there instead of detect")
         x0, x1 = self._checked_positions(x0, x1)
         changed = None if only is None else self._checked_vertices(only)
+        arcs = self._checked_arcs(arcs)
         if arcs is not None:
-            return self._detect_arcs(x0, x1, only, changed, self._checked_arcs(arcs, x0, x1))
+            return self._detect_arcs(x0, x1, only, changed, self._bounds_of(arcs, x0, x1))
         self._has_run = True
         return self._run(self._pipeline, x0, x1, changed)
 
@@ -184,7 +186,7 @@ class CollisionDetector:
                 CPU it must not require gradients.
             x1: Positions at the end, of the same type.
             arcs: The bodies that turn and how, as of :meth:`detect`, in each replay alike. On a GPU, detect with them
-                once before; ``x1`` then is not checked to be where they take the bodies, and arcs end there.
+                once before; a replay in which a body is not rigid that was rigid then is not certified.
 
         Raises:
             TypeError: If the positions are no arrays of numbers, or ``arcs`` is no :class:`.RigidMotion`.
@@ -199,8 +201,7 @@ class CollisionDetector:
         if not device.is_capturing:
             raise RuntimeError(f"{device} captures no graph: call capture(x0, x1) within wp.ScopedCapture, or detect")
         x0, x1 = self._checked_positions(x0, x1)
-        if arcs is not None:
-            check_instance(arcs, "arcs", RigidMotion, "a RigidMotion")
+        arcs = self._checked_arcs(arcs)
         if device.is_cpu:
             return self._capture_on_cpu(x0, x1, arcs)
         if arcs is None:
@@ -294,11 +295,17 @@ class CollisionDetector:
         """Returns a finder of intersections that shares trees with this detector on a CPU, and its lock."""
         return IntersectionFinder(self.mesh, self._pipeline.broad_phase)
 
-    def _checked_arcs(self, arcs: RigidMotion, x0: wp.array, x1: wp.array) -> ArcBounds:
-        """Returns the motion of turning bodies from one configuration to another, with bounds."""
+    def _checked_arcs(self, arcs: RigidMotion | None) -> RigidMotion | None:
+        """Returns the motion of bodies, None if no vertex has one."""
+        if arcs is None:
+            return None
         check_instance(arcs, "arcs", RigidMotion, "a RigidMotion")
         if len(arcs.body) != self.mesh.vertex_count:
             raise ValueError(f"arcs must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}")
+        return arcs if (arcs.body >= 0).any() else None
+
+    def _bounds_of(self, arcs: RigidMotion, x0: wp.array, x1: wp.array) -> ArcBounds:
+        """Returns the motion of turning bodies from one configuration to another, with bounds."""
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("arcs: x0 and x1 must not require gradients")
         return ArcBounds(arcs, self.mesh.device_vertices, x0, x1)
@@ -437,9 +444,10 @@ class CollisionDetector:
             for narrow_phase in pipeline.narrow_phases:
                 narrow_phase.sort()
             contacts = self._ordered_contacts(pipeline, counts, recycle=True)
-            if at_once is not None and self.method == "exact":
+            if at_once is not None:
                 pipeline.counts = counts
-                certified = certified and not at_once.has_unsure_pairs(contacts)
+                certified = certified and at_once.leaves_out_rigid_bodies_alone()
+                certified = certified and not (self.method == "exact" and at_once.has_unsure_pairs(contacts))
             return Collisions(certified, overflows, arrays, self.method, counts, contacts, StageTimer(None))
 
         def read_alone() -> Collisions:

@@ -50,9 +50,9 @@ _SUBDIVIDED = wp.constant(int(Count.SUBDIVIDED))
 
 @wp.func
 def _are_of_one_body(corners: wp.vec4i, body: wp.array[int]) -> bool:
-    """Returns whether all points of a pair belong to one body."""
-    of_first = body[corners[0]]
-    return body[corners[1]] == of_first and body[corners[2]] == of_first and body[corners[3]] == of_first
+    """Returns whether all points of a pair belong to one body, from -1."""
+    b = body[corners[0]]
+    return b >= -1 and body[corners[1]] == b and body[corners[2]] == b and body[corners[3]] == b
 
 
 @wp.func
@@ -285,7 +285,8 @@ def run_distance_phases(
         rings: Vertices whose elements are excluded.
         method: One of :data:`METHODS`; with "exact", pairs that stay UNSURE are left to
             :func:`decide_distances_on_host`.
-        body: Body of each vertex, array of int: pairs whose vertices are all of one body are excluded. None for none.
+        body: Body of each vertex, array of int: pairs whose vertices are all of one body from -1 are excluded. None for
+            none.
         timed: Whether to find times of impact within the tolerance.
         tolerance: Tolerance of the times of impact, as a share of the step.
         timer: Measures the stages.

@@ -147,8 +147,8 @@ class DetectionPipeline:
             rings: Pairs within this number of edges are excluded, see :class:`CollisionDetector`.
             min_distances: Minimum distances of a response, see :mod:`.approach_phase`, in place of those from radii and
                 ``min_distance``; None for these.
-            body: Body of each vertex, int, shape [vertex_count]: pairs whose vertices are all of one body are excluded,
-                and :meth:`add_to_radius` must be called before each run. None for none.
+            body: Body of each vertex, int, shape [vertex_count]: pairs whose vertices are all of one body from -1 are
+                excluded, and :meth:`add_to_radius` must be called before each run. None for none.
             arcs: The arcs of bodies that turn, which the caller writes before each run; with them, pairs keep the
                 distances of ``min_distances`` or none. None if nothing turns.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
@@ -230,6 +230,11 @@ class DetectionPipeline:
         """
         self._filtered_of_worlds = counts
         self._broad_phase.count_filtered_by_world(counts)
+
+    def set_bodies(self, body: np.ndarray) -> None:
+        """Sets the body of each vertex for the next runs of a pipeline that has some."""
+        assert self._body is not None
+        self._body.assign(body)
 
     def add_to_radius(self, deviation: np.ndarray) -> None:
         """Sets the minimum distance of each pair, for the next runs, to at least what it is with larger radii.

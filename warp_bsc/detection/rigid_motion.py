@@ -23,6 +23,14 @@ _MISFIT = 2.0**-9
 """Largest distance of a vertex from where its body would put it at the end, if another vertex is in its place, as a
 share of the distance from the centre; and, for positions that were rounded, this share of it of the coordinates."""
 _ROUNDED_MISFIT = 2.0**-8
+_ROUNDING = 2.0**-18
+"""The same of a body that is rigid up to rounding, as a share of its coordinates, of the distance from the centre, and
+of that distance for each radian. With u = 2^-24 and S the largest coordinate, a position that is rounded to single
+precision is off by less than 2 u S, one that is also rotated in it by 12 u of the distance more. A quaternion that is
+rounded turns by 2 u, a vector by u for each radian. Two vertices, which may be twice the distance apart, and two ends
+make at most 8 u S, and 56 + 2 angle u of the distance; the constant is 64 u."""
+NOT_RIGID = -2
+"""In place of the body of a vertex: pairs within this body are looked at."""
 _UP = 1.0 + 2.0**-40
 """Raises a few rounded operations above their exact result."""
 
@@ -64,6 +72,11 @@ class RigidMotion:
     is at x(t) = (1 - t) x0 + t x1 + (R(t) - t R(1) - (1 - t) I)(x0 - centre), where R(t) is the rotation by t times the
     turn: if x1 is where the turn and a translation put it, the centre moves straight and the body turns about it. A
     screw has its centre on its own axis. All other vertices move straight.
+
+    A body is rigid if each of its vertices is there, up to one translation of the body and up to rounding: 2^-18 of the
+    body's largest coordinate, of the largest distance of a vertex from the centre, and of that distance for each radian
+    of the turn, together. Detections leave out pairs within a rigid body, as their distance does not change by more
+    than twice that. A body may deform by up to 2^-9 of that distance; pairs within it are then looked at as others are.
 
     Its arrays are read-only.
 
@@ -339,6 +352,8 @@ class ArcBounds:
     Attributes:
         motion: The motion.
         tolerance: Distance within which pairs may be reported that do not collide.
+        body: Body of each vertex, within which pairs are left out: -1 for vertices that move straight, and
+            :data:`NOT_RIGID` for those of a body that deforms, int32, shape [vertex_count].
     """
 
     def __init__(self, motion: RigidMotion, vertices: wp.array, x0: wp.array, x1: wp.array):
@@ -355,19 +370,17 @@ class ArcBounds:
                 those of the motion, or the tolerance is too small for their rounding.
         """
         self.motion = motion
-        self._ends, device, bodies = (x0, x1), x0.device, len(motion.centre)
-        self._arrays = _copy_of(motion, device)
-        extent = _Extent()
-        self._bounds = extent.bounds = wp.zeros(len(motion.body), dtype=wp.vec3d, device=device)
-        extent.reference = wp.full(bodies, len(motion.body), dtype=int, device=device)
-        measured = wp.zeros(5 + 3 * bodies, dtype=wp.float64, device=device)
+        self._vertices, self._arrays = vertices, _copy_of(motion, x0.device)
+        bodies, count = len(motion.centre), len(motion.body)
+        self._extent = extent = _Extent()
+        extent.bounds = wp.zeros(count, dtype=wp.vec3d, device=x0.device)
+        extent.reference = wp.empty(bodies, dtype=int, device=x0.device)
+        self._measured = wp.empty(5 + 3 * bodies, dtype=wp.float64, device=x0.device)
         ends = [5 + i * bodies for i in range(4)]
-        extent.largest = measured[:5]
-        extent.distance, extent.size, extent.misfit = (measured[a:b] for a, b in itertools.pairwise(ends))
-        inputs = [vertices, x0, x1, *self._arrays]
-        for kernel in _measure_motion(x0.dtype):
-            launch(kernel, len(vertices), inputs=inputs, outputs=[extent], device=device, record_tape=False)
-        values = measured.numpy()
+        extent.largest = self._measured[:5]
+        extent.distance, extent.size, extent.misfit = (self._measured[a:b] for a, b in itertools.pairwise(ends))
+        self.measure(x0, x1)
+        values = self._measured.numpy()
         if values[4]:
             for name, x in (("x0", x0), ("x1", x1)):
                 check_finite(x.numpy(), name, vertices.numpy())
@@ -382,6 +395,7 @@ class ArcBounds:
                 f"x1 must be where arcs take body {worst}, up to a translation: a vertex is {misfit[worst]:g} "
                 "away from there"
             )
+        self.body = np.where(np.append(self.are_rigid(), True)[motion.body], motion.body, NOT_RIGID).astype(np.int32)
         least = 16.0 * float(values[2])  # that parts of the step can reach
         if motion.tolerance is not None and motion.tolerance < least:
             raise ValueError(
@@ -390,17 +404,33 @@ class ArcBounds:
             )
         self.tolerance: float = motion.tolerance or max(_DEFAULT_TOLERANCE * float(values[3]), least)
 
+    def measure(self, x0: wp.array, x1: wp.array) -> None:
+        """Measures the motion from one configuration to another, without synchronizing; also in a CUDA graph."""
+        self._ends, extent = (x0, x1), self._extent
+        extent.reference.fill_(len(self.motion.body))
+        self._measured.zero_()
+        inputs = [self._vertices, x0, x1, *self._arrays]
+        for kernel in _measure_motion(x0.dtype):
+            launch(kernel, len(self._vertices), inputs=inputs, outputs=[extent], device=x0.device, record_tape=False)
+
+    def are_rigid(self) -> np.ndarray:
+        """Returns which bodies were rigid up to rounding when they were measured last, bool, shape [body_count]."""
+        measured = self._measured.numpy()
+        distance, size, misfit = measured[5:].reshape(3, -1)
+        angle = np.linalg.norm(self.motion.turn, axis=1)
+        return (measured[4] == 0.0) & (misfit <= _ROUNDING * (size + (1.0 + angle) * distance))
+
     @functools.cached_property
     def lever(self) -> np.ndarray:
         """Bound of the distance of each vertex from its axis, 0 for those that move straight, shape [vertex_count]."""
-        return 0.5 * self._bounds.numpy()[:, 1]
+        return 0.5 * self._extent.bounds.numpy()[:, 1]
 
     def deviation(self, level: int) -> np.ndarray:
         """Returns how far each vertex is from its chord at most, in parts of the step that last 2^-level.
 
         The chord is between positions as of :meth:`place`, whose rounding is included. Float64, shape [vertex_count].
         """
-        whole, most, rounding = self._bounds.numpy().T
+        whole, most, rounding = self._extent.bounds.numpy().T
         return _UP * (np.minimum(whole * 4.0**-level, most) + rounding)
 
     def place(self, time: float) -> wp.array:
