@@ -32,10 +32,12 @@ class Inversion:
     Attributes:
         status: FREE, HIT (it inverts) or UNSURE.
         toi: Time of inversion, a lower bound in [0, 1]; 2 where the status is FREE.
+        within_tolerance: 1 where the tetrahedron certainly inverts at most the tolerance after that time.
     """
 
     status: int
     toi: wp.float64
+    within_tolerance: int
 
 
 @wp.func
@@ -103,7 +105,10 @@ def first_inversion(
             is_negative = certified_sign(k[0], bound) < 0 or certified_sign(k[3], bound) < 0
             if is_negative:
                 result.status = HIT
-            if width <= shortest or (is_negative and width <= length):
+            if is_negative and width <= length:
+                result.within_tolerance = 1
+                break
+            if width <= shortest:
                 break
             end = start + shortest * wp.floor(_HALF * width / shortest)
     result.toi = start

@@ -98,8 +98,8 @@ class Verdict:
         exact_wrong: Results by method "exact" that are not true.
         missed: Tetrahedra that invert, and that "conservative" does not find.
         late: Times after the inversion, of any method that certifies.
-        early: Times of certified inversions, of "random" and "small_moves", that are too early by more than the
-            tolerance.
+        early: Times that are too early by more than the tolerance: of method "exact", of those said to be within it,
+            and of certified inversions of "random" and "small_moves".
     """
 
     inverting: int
@@ -127,9 +127,10 @@ def judge(kind, points, device="cpu") -> Verdict:
         found[method] = np.isin(np.arange(n), inversions.tets)
         late += int((inversions.toi > bounds[inversions.tets, 1]).sum())
         status[inversions.tets] = inversions.status
+        timely = inversions.within_tolerance | (method == "exact")
         if kind in ("random", "small_moves"):
-            hit = inversions.status == 1
-            early += int((inversions.toi[hit] < bounds[inversions.tets[hit], 0] - 2.0**-20).sum())
+            timely |= inversions.status == 1
+        early += int((inversions.toi < bounds[inversions.tets, 0] - 2.0**-20)[timely].sum())
     return Verdict(
         inverting=int(truth.sum()),
         unsure=int((status == 2).sum()),

@@ -27,14 +27,16 @@ class Inversions:
         tets: Their rows in ``mesh.tets``, sorted, int32, shape [n].
         status: Certified status by floating point, for any method: 1 HIT, 2 UNSURE; 0 FREE only by method "float";
             int8, shape [n].
-        toi: Time before which the volume is certainly positive, as a share of the step, float64, shape [n]: the time of
-            inversion to within the tolerance, or where floating point cannot certify more. By method "float" it is
-            computed, not certain.
+        toi: Time before which the volume is certainly positive, as a share of the step, float64, shape [n]; by method
+            "float" it is computed, not certain.
+        within_tolerance: Whether that is the time of inversion to within the tolerance, bool, shape [n]. By method
+            "exact" it is; by the others it may be earlier where floating point cannot certify more.
     """
 
     tets: np.ndarray
     status: np.ndarray
     toi: np.ndarray
+    within_tolerance: np.ndarray
 
 
 @made_once
@@ -54,6 +56,7 @@ def _classify(dtype: type) -> wp.Kernel:
         # out
         status: wp.array[wp.int8],
         toi: wp.array[wp.float64],
+        within_tolerance: wp.array[bool],
     ):
         i = first + wp.tid()
         a = tets[i, 0]
@@ -74,6 +77,7 @@ def _classify(dtype: type) -> wp.Kernel:
         )
         status[i] = wp.int8(found.status)
         toi[i] = found.toi
+        within_tolerance[i] = found.within_tolerance == 1
 
     return classify
 
@@ -133,10 +137,11 @@ def inversions_of_motion(
     device, tets, n = mesh.device, mesh.device_tets, len(mesh.tets)
     status = wp.zeros(n, dtype=wp.int8, device=device)
     toi = wp.zeros(n, dtype=wp.float64, device=device)
+    within_tolerance = wp.zeros(n, dtype=bool, device=device)
 
     def classify(roundoff):
         inputs = [x0, x1, tets, roundoff, wp.float64(tolerance)]
-        launch_over(_classify(x0.dtype), n, inputs=inputs, outputs=[status, toi], device=device)
+        launch_over(_classify(x0.dtype), n, inputs=inputs, outputs=[status, toi, within_tolerance], device=device)
         return status.numpy().copy()  # on the CPU, the array itself
 
     certified = classify(ROUNDOFF)
@@ -149,7 +154,14 @@ def inversions_of_motion(
     elif method == "exact":
         inverts = _decided(mesh, x0, x1, status) == HIT
     (found,) = np.nonzero(inverts)
-    return Inversions(found.astype(np.int32), certified[found], toi.numpy()[found])
+    times, are_within = toi.numpy()[found], within_tolerance.numpy()[found]
+    if method == "exact" and not are_within.all():
+        status.assign(np.where(inverts & ~within_tolerance.numpy(), np.int8(UNSURE), np.int8(FREE)))
+        at_start = _decided(mesh, x0, x0, status)[found] == HIT  # their time is 0, as no earlier one is
+        left = ~are_within & ~at_start
+        times[left] = checker.tetrahedron_toi(_points(mesh.tets[found[left]], x0, x1))[:, 0]
+        are_within[:] = True
+    return Inversions(found.astype(np.int32), certified[found], times, are_within)
 
 
 def _decided(mesh: CollisionMesh, x0: wp.array, x1: wp.array, status: wp.array) -> np.ndarray:
@@ -164,7 +176,10 @@ def _decided(mesh: CollisionMesh, x0: wp.array, x1: wp.array, status: wp.array) 
     decided = status.numpy()
     (left,) = np.nonzero(decided == UNSURE)
     if len(left):
-        corners = mesh.tets[left]
-        points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
-        decided[left] = np.where(checker.tetrahedron(points), HIT, FREE)
+        decided[left] = np.where(checker.tetrahedron(_points(mesh.tets[left], x0, x1)), HIT, FREE)
     return decided
+
+
+def _points(corners: np.ndarray, x0: wp.array, x1: wp.array) -> np.ndarray:
+    """Returns the positions of tetrahedra at both ends, shape [n, 8, 3]."""
+    return np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
