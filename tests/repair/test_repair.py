@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 import warp_bsc as bsc
 from warp_bsc.bench.repair_scenes import KINDS, KNOWN, damaged
+from warp_bsc.repair.closest import closest_points, exit_distances
+from warp_bsc.repair.surface import Surface
 
 
 def crossings(faces, x):
@@ -109,6 +111,35 @@ def test_seams_stay_closed():
     assert result.certified
     assert result.moved[seam].any()
     assert (result.x[seam] == result.x[seam + len(scene.x)]).all()
+
+
+def test_no_mesh_of_no_faces_is_built(device, monkeypatch):
+    """On a GPU, Warp 1.19 corrupts its memory by one: arrays that are made later would hold other values."""
+
+    class Mesh(wp.Mesh):
+        def __init__(self, points, indices, *arguments, **options):
+            assert len(indices), "a mesh of no faces"
+            super().__init__(points, indices, *arguments, **options)
+
+    monkeypatch.setattr(wp, "Mesh", Mesh)
+    scene = KNOWN["corner"]()
+    everything = np.ones(len(scene.x), bool)
+    for options in ({}, {"order": scene.layer}):
+        result = bsc.repair(scene.faces, scene.x, fixed=everything, device=device, **options)
+        assert result.crossings == result.crossings_before > 0
+    edges = [[0, 1], [2, 3]]
+    mesh = bsc.CollisionMesh(np.zeros((0, 3), int), 4, edges=edges, device=device)
+    x = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.5, -0.5, 0.001), (0.5, 0.5, 0.001)])
+    for options in ({}, {"min_distance": 0.01}, {"min_distance": 0.01, "order": edges}):
+        result = bsc.repair(mesh, x, **options)
+        assert result.near == 0 and result.near_before == len(options.keys() & {"min_distance"})
+    surface = Surface(mesh, x, np.zeros(4, bool))
+    with pytest.raises(ValueError, match="faces must not be empty"):
+        closest_points(surface, surface.home, np.zeros(0, int), surface.home)
+    with pytest.raises(ValueError, match="faces must not be empty"):
+        exit_distances(surface, surface.home, np.zeros(0, int), surface.home, np.eye(3))
+    arrays = [wp.full(1000, value, dtype=int, device=device) for value in range(100)]
+    assert all((array.numpy() == value).all() for value, array in enumerate(arrays))
 
 
 def test_warp_arrays_come_back_as_warp_arrays():

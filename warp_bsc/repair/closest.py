@@ -18,7 +18,7 @@ def closest_points(
     Args:
         surface: The surface.
         x: Its positions, in units, shape [m, 3].
-        faces: Numbers of the faces, int.
+        faces: Numbers of the faces, at least one, int.
         points: Points, in units, shape [n, 3].
     """
     target = _part(surface, x, faces)
@@ -41,7 +41,7 @@ def exit_distances(
     Args:
         surface: The surface.
         x: Its positions, in units, shape [m, 3].
-        faces: Numbers of the faces, int.
+        faces: Numbers of the faces, at least one, int.
         points: Points, in units, shape [n, 3].
         directions: Directions of length 1, shape [k, 3].
     """
@@ -53,5 +53,11 @@ def exit_distances(
 
 
 def _part(surface: Surface, x: np.ndarray, faces: np.ndarray) -> wp.Mesh:
-    """Returns some faces as a mesh that Warp can search."""
+    """Returns some faces as a mesh that Warp can search.
+
+    Raises:
+        ValueError: If there are none: a mesh of no faces corrupts the memory of a GPU (Warp 1.19, its issue 1765).
+    """
+    if not len(faces):
+        raise ValueError("faces must not be empty")
     return wp.Mesh(surface.array(x, wp.vec3), surface.array(surface.mesh.faces[faces].ravel(), int))
