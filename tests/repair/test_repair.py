@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_bsc as bsc
+from warp_bsc import checker
 from warp_bsc.bench.repair_scenes import KINDS, KNOWN, damaged
 from warp_bsc.repair.closest import closest_points, exit_distances
 from warp_bsc.repair.surface import Surface
@@ -140,6 +141,42 @@ def test_no_mesh_of_no_faces_is_built(device, monkeypatch):
         exit_distances(surface, surface.home, np.zeros(0, int), surface.home, np.eye(3))
     arrays = [wp.full(1000, value, dtype=int, device=device) for value in range(100)]
     assert all((array.numpy() == value).all() for value, array in enumerate(arrays))
+
+
+def panel(cells, place):
+    """A square of 1 m, its corner at a place: faces and positions."""
+    x = np.array([(i / cells, j / cells, 0.0) for j in range(cells + 1) for i in range(cells + 1)]) + place
+    corners = [j * (cells + 1) + i for j in range(cells) for i in range(cells)]
+    up = cells + 1
+    faces = [[[a, a + 1, a + up + 1], [a, a + up + 1, a + up]] for a in corners]
+    return np.concatenate(faces), x
+
+
+@pytest.mark.parametrize(
+    ("cells", "place", "at_borders", "elsewhere"),
+    [
+        (1, (0.0, 0.0, 0.0), 20, 0),  # a panel that is there twice
+        (1, (1.0, 0.0, 0.0), 12, 0),  # a seam
+        (1, (1.0, 1.0, 0.0), 12, 0),  # a corner
+        (3, (0.0, 0.0, 0.0), 192, 64),
+    ],
+)
+def test_what_touches_at_borders_in_one_place_does_not_count(cells, place, at_borders, elsewhere):
+    """As the guarantees say; surfaces that touch elsewhere are not certified."""
+    (faces, x), (others, y) = panel(cells, (0.0, 0.0, 0.0)), panel(cells, place)
+    faces, x = np.concatenate([faces, others + len(x)]), np.concatenate([x, y])
+    result = bsc.repair(faces, x, device="cpu")
+    assert result.certified == (elsewhere == 0) and result.crossings == elsewhere
+    edges = bsc.CollisionMesh(faces, len(x), device="cpu").edges
+    ends, corners = np.repeat(edges, len(faces), axis=0), np.tile(faces, (len(edges), 1))
+    apart = (ends[:, :, None] != corners[:, None, :]).all(axis=(1, 2))
+    ends, corners = ends[apart], corners[apart]
+    meet = checker.edge_face_crossings(result.x[ends], result.x[corners])
+    places = np.unique(result.x, axis=0, return_inverse=True)[1].reshape(-1)
+    places[((x[:, :2] != np.floor(x[:, :2])).all(axis=1))] = -1  # inside a panel
+    ends, corners = places[ends[meet]], places[corners[meet]]
+    share = ((ends[:, :, None] == corners[:, None, :]) & (ends[:, :, None] >= 0)).any(axis=(1, 2))
+    assert (share.sum(), (~share).sum()) == (at_borders, elsewhere)
 
 
 def test_warp_arrays_come_back_as_warp_arrays():

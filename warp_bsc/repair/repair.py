@@ -46,7 +46,9 @@ def repair(
             for contour in result.unresolved:
                 print(contour.kind, contour.reason, contour.elements)
 
-    Vertices of borders that have the same position are one vertex: the two sides of a seam do not part.
+    Vertices of borders that have the same position, the same layer and the same world are one vertex: the two sides of
+    a seam do not part. Pairs of elements that share such a vertex are excluded, as all pairs that share a vertex: they
+    touch, and do not count. Faces that lie on each other with all of their corners at borders are among them.
 
     Args:
         mesh: The mesh, or its faces: vertex indices, integers, shape [face_count, 3]. Its radii are not counted.
