@@ -1,6 +1,7 @@
 """A stage with a minimum distance: exact queries say of each step, as stored, what came nearer than it may."""
 
 import contextlib
+import warnings
 
 import newton
 import numpy as np
@@ -78,6 +79,46 @@ def test_ropes_and_points(device):
         hits += rollout.solver.report.hits
         assert rollout.solver.report.certified
     assert hits > 40 and rollout.near == rollout.approaches == 0
+
+
+def construct(model, make=bsc.SolverCCD, **options):
+    """Returns what the construction of a stage warns of."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        make(Changed(model), **options)
+    assert all(warning.filename == __file__ for warning in said)
+    return [str(warning.message) for warning in said]
+
+
+@pytest.mark.parametrize("make", [bsc.SolverCCD, bsc.CollisionMonitor])
+def test_ropes_and_points_without_a_distance_are_named(make, device):
+    (said,) = construct(strands(device, worlds=2), make)
+    assert said.startswith("36 springs and 6 particles without faces and springs take no part")
+    assert "min_distance='model'" in said
+    for options in ({"min_distance": 0.0}, {"min_distance": "model"}, {"particle_radius": 0.004}):
+        assert not construct(strands(device), make, **options)
+
+
+def test_only_what_could_meet_something_is_named(device):
+    """Not cloth, nor a particle that is alone in its world, is not active, or that a filter leaves out."""
+
+    def loose(count, worlds=1, cloth=False, **options):
+        world = newton.ModelBuilder()
+        world.add_ground_plane()
+        for i in range(count):
+            world.add_particle(wp.vec3(0.1 * i, 0.0, 1.0), wp.vec3(), 0.01, **options)
+        if cloth:
+            add_patch(world, 2, 0.04, (0.0, 0.0, 0.5))
+        builder = newton.ModelBuilder()
+        builder.replicate(world, worlds)
+        builder.color()
+        return builder.finalize(device=device)
+
+    assert not construct(loose(0, cloth=True)) and not construct(loose(1, worlds=3))
+    assert construct(loose(2))[0].startswith("2 particles") and construct(loose(1, cloth=True))[0].startswith("1 part")
+    assert not construct(loose(2, cloth=True, flags=0))
+    mask = np.array([0] + [1] * 9)
+    assert not construct(loose(1, cloth=True), collision_filter=bsc.CollisionFilter(particle_mask=mask))
 
 
 def test_without_queues(device, monkeypatch):

@@ -63,6 +63,7 @@ class CollisionMonitor(CollisionStage):
         distances = KeptDistances.of(self.model, min_distance, particle_radius)
         collision_filter = checked_filter(collision_filter, self.model)
         mesh = ModelMesh(self.model, strands=distances.any, collision_filter=collision_filter)
+        self._warn_of_unseen(mesh, distances)
         if distances.any:
             mesh.distances = mesh.min_distances(distances, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)

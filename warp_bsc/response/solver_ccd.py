@@ -161,8 +161,10 @@ class SolverCCD(CollisionStage):
                 infinite planes: a pair that started farther apart stays so, and one that started closer comes no
                 closer. Neighbours, elements that an edge of the mesh joins, only do not touch. The stage moves pairs
                 apart to this distance and ``separation``. Springs and particles without faces take part. None or 0:
-                pairs do not touch. ``"model"``: pairs keep the thickness that the model has, the radii of particles, or
-                ``particle_radius`` where that is given, and the margins of shapes (``model.shape_margin``).
+                pairs do not touch, and springs and particles without faces take no part; None warns where there are
+                some that could meet something. ``"model"``: pairs keep the thickness that the model has, the radii of
+                particles, or ``particle_radius`` where that is given, and the margins of shapes
+                (``model.shape_margin``).
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all: pairs keep the sum of
                 their radii beside ``min_distance``. That of an edge or a face is the largest one of its vertices, that
                 of a shape 0, or its margin with ``min_distance="model"``.
@@ -221,6 +223,7 @@ class SolverCCD(CollisionStage):
         separates, keeps_distances = options.bodies == "separated", options.distances.any
         filters = {"collision_filter": collision_filter, "separates_bodies": separates}
         mesh = ModelMesh(self.model, strands=keeps_distances, **filters)
+        self._warn_of_unseen(mesh, options.distances)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
         if keeps_distances:
             mesh.distances = mesh.min_distances(options.distances, reach=self.separation)

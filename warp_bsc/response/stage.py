@@ -10,11 +10,13 @@ import warp as wp
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .._private_names.of_warp import paused_tape
+from .._warnings import warn_caller
 from .adjoint.between_steps import BetweenSteps
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
 from .schedule import MAX_ITERATIONS, Loop
-from .state.mesh import ModelMesh
+from .state.kept_distances import KeptDistances
+from .state.mesh import ModelMesh, unseen_strands
 from .state.motion import ModelMotion, arrays_of
 from .state.workspace import Workspace
 from .step import prepare
@@ -58,6 +60,17 @@ class CollisionStage(CouplingHooks):
         if not model.requires_grad:
             motion.remember(self._work.vertices.x1)
         self.report = SolverReport(self._work, responds=responds)
+
+    def _warn_of_unseen(self, mesh: ModelMesh, distances: KeptDistances):
+        """Warns of springs and particles that take no part, unless the program chose that by a number."""
+        unseen = None if distances.any or distances.is_chosen else unseen_strands(mesh)
+        if unseen is not None:
+            but = ", which steps on a tape do not take" if self.model.requires_grad else ""
+            warn_caller(
+                f"{unseen} take no part: faces and springs do not stop them, and certificates do not cover them. Pass "
+                f"min_distance='model', for the radii of particles and the margins of shapes, or a number{but}; "
+                "min_distance=0 leaves them out without this warning"
+            )
 
     def _watch_between_steps(self, *, bodies: bool):
         """Keeps gradients apart of what a program moves between steps; ``bodies`` as of :class:`BetweenSteps`."""

@@ -21,11 +21,13 @@ class KeptDistances:
         minimum: Of all pairs [m].
         radii: Radius of each particle [m], float64, shape [particle_count].
         margins: Margin of each shape [m], float64, shape [shape_count].
+        is_chosen: Whether the program gave a number for the minimum, be it 0.
     """
 
     minimum: float
     radii: np.ndarray
     margins: np.ndarray
+    is_chosen: bool
 
     @classmethod
     def of(cls, model: newton.Model, min_distance: Any = None, particle_radius: Any = None) -> "KeptDistances":
@@ -38,10 +40,11 @@ class KeptDistances:
             if particle_radius is None:
                 particle_radius = _of_model(model.particle_radius, "particle_radius", model.particle_count)
             min_distance = None
+        is_chosen = min_distance is not None
         minimum = 0.0 if min_distance is None else checked_distance(min_distance, "min_distance")
         radii = 0.0 if particle_radius is None else particle_radius
         radii = checked_distances(radii, "particle_radius", model.particle_count)
-        return cls(minimum, np.broadcast_to(radii, model.particle_count), margins)
+        return cls(minimum, np.broadcast_to(radii, model.particle_count), margins, is_chosen)
 
     @property
     def any(self) -> bool:

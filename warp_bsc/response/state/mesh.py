@@ -326,11 +326,11 @@ def _strands(model, faces):
     bare = np.ones(count, dtype=bool)
     bare[faces[faces < count]] = False
     bare[elements_of(model.tet_indices, 4)] = False
-    if not model.spring_count:
-        return None, np.flatnonzero(bare)
-    springs = model.spring_indices.numpy().reshape(-1, 2)
-    lengths = model.spring_rest_length.numpy()
+    springs = elements_of(model.spring_indices, 2)
     taken = bare[springs].any(axis=1)
+    if not taken.any():
+        return None, np.flatnonzero(bare)
+    lengths = model.spring_rest_length.numpy()
     springs, lengths = springs[taken], lengths[taken]
     neighbours = [{} for _ in range(count)]
     for (a, b), length in zip(springs.tolist(), lengths.tolist(), strict=True):
@@ -343,6 +343,27 @@ def _strands(model, faces):
     kept = [not is_chord(a, b, length) for (a, b), length in zip(springs.tolist(), lengths.tolist(), strict=True)]
     bare[springs] = False
     return springs[kept], np.flatnonzero(bare)
+
+
+def unseen_strands(mesh: ModelMesh) -> str | None:
+    """Returns which springs and particles that could meet something a mesh without strands lacks, None if none.
+
+    Particles that are not active or that a filter leaves out of all pairs do not count, nor does what is alone in its
+    world.
+    """
+    model = mesh.model
+    springs, points = _strands(model, mesh.faces)
+    springs = np.zeros((0, 2), dtype=int) if springs is None else springs
+    meets = (host_array(model.particle_flags) & ParticleFlags.ACTIVE) != 0
+    if mesh.group is not None and mesh.mask is not None:
+        meets &= ((mesh.group != 0) & (mesh.mask != 0))[: len(meets)]
+    world, size = mesh.device_world.numpy(), max(1, model.world_count)
+    lacking = [world[springs[meets[springs].any(axis=1), 0]], world[points[meets[points]]]]
+    has_others = np.bincount(np.concatenate(lacking), minlength=size) > 1
+    has_others[world[mesh.faces[:, 0]]] = True
+    names = "springs", "particles without faces and springs"
+    numbers = [np.count_nonzero(has_others[worlds]) for worlds in lacking]
+    return " and ".join(f"{n} {name}" for n, name in zip(numbers, names, strict=True) if n) or None
 
 
 def _tessellate(model, shape, shape_type, scale, segments):
