@@ -726,7 +726,7 @@ VALUES: dict[str, list[str]] = {
     "--min-distance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--max-move": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--fail-on": ["", "x", "collisions,x"],
-    "--frames": ["", "x", "1", "3:1", "1:1", "1:2:0", "1:2:-1", "nan:2", "1:inf", "1:2:3:4"],
+    "--frames": ["", "x", "1", "3:1", "1:2:0", "1:2:-1", "nan:2", "1:inf", "1:2:3:4"],
     "--validate": [*NUMERIC, "ALL"],
     "--workers": [*NUMERIC, "head:8786", "tcp://", "://head:8786"],
     "--modes": ["", "x", "plain,x"],

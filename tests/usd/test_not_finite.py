@@ -68,16 +68,19 @@ def transform(prim, name, when):
 
 
 def check_left_out(stage, when, names, why):
-    """Check that meshes are there until the interval that ends at a bad time, named, and no longer after it."""
+    """Check that meshes are there but in the intervals that end or start at a bad time, and named."""
     scene = Scene(save(stage))
-    since = 0 if when in ("static", "always", 0) else when - 1
+    is_always = when in ("static", "always")
+    since, until = (0, LAST) if is_always else (max(0, when - 1), min(LAST, when + 1))
     present = [{mesh.name for mesh in interval.segment.meshes} for interval in scene]
     others = {"/World/Floor", "/World/Falling"}
     assert len(present) == LAST and all(others <= found for found in present)
-    assert [set(names) & found for found in present] == [set(names)] * since + [set()] * (LAST - since)
+    missing = [set(names) & found for found in present]
+    assert missing == [set(names)] * since + [set()] * (until - since) + [set(names)] * (LAST - until)
     assert len(scene.left_out) == len(names)
     for name, sentence in zip(sorted(names), sorted(scene.left_out), strict=True):
-        assert sentence.startswith(f"from time {since} on: {name}: " if since else f"{name}: ")
+        end = f"to {until}" if until < LAST else "on"
+        assert sentence.startswith(f"{name}: " if is_always else f"from time {since} {end}: {name}: ")
         assert why in sentence
     with pytest.raises(ValueError, match=f"{names[0].split('[')[0]}.*{why}"):
         list(Scene(save(stage), strict=True))
@@ -178,7 +181,7 @@ def add_model(stage):
 
 ORIGIN, BROKEN = Gf.Vec3f(0), Gf.Vec3f(0, NAN, 0)
 NO_INVERSE, NOT_FINITE = "the bind transform of joint a/b has no inverse", "is not finite"
-SKINS = {  # how to break it, since when, and what is said
+SKINS = {  # how to break it, when, and what is said
     "translations": (lambda r, s, a, b, h: a.GetTranslationsAttr().Set([ORIGIN, BROKEN, ORIGIN], 2), 2, NOT_FINITE),
     "rotations": (
         lambda r, s, a, b, h: a.GetRotationsAttr().Set([Gf.Quatf(1), Gf.Quatf(NAN, 0, 0, 0), Gf.Quatf(1)], 2),
@@ -194,29 +197,31 @@ SKINS = {  # how to break it, since when, and what is said
     # its in-between takes its place up to a weight of 0.5
     "offsets": (lambda r, s, a, b, h: h.GetOffsetsAttr().Set([BROKEN]), LAST, NOT_FINITE),
     "offsets of an in-between": (
-        lambda r, s, a, b, h: h.GetInbetween("between").SetOffsets([BROKEN]), 0, NOT_FINITE,
+        lambda r, s, a, b, h: h.GetInbetween("between").SetOffsets([BROKEN]), "static", NOT_FINITE,
     ),
     "weight of an in-between": (
-        lambda r, s, a, b, h: h.GetInbetween("between").SetWeight(NAN), 0, "the weight of an in-between",
+        lambda r, s, a, b, h: h.GetInbetween("between").SetWeight(NAN), "static", "the weight of an in-between",
     ),
     "weights of joints": (
-        lambda r, s, a, b, h: b.GetJointWeightsAttr().Set([0.5, 0.5, NAN, 0.5, 0.5, 0.5]), 0, NOT_FINITE,
+        lambda r, s, a, b, h: b.GetJointWeightsAttr().Set([0.5, 0.5, NAN, 0.5, 0.5, 0.5]), "static", NOT_FINITE,
     ),
     "bind transforms": (
         lambda r, s, a, b, h: s.GetBindTransformsAttr().Set([Gf.Matrix4d(1), matrix(1, 1, NAN), Gf.Matrix4d(1)]),
-        0,
+        "static",
         NO_INVERSE,
     ),
     "bind transforms without inverse": (
         lambda r, s, a, b, h: s.GetBindTransformsAttr().Set([Gf.Matrix4d(1), Gf.Matrix4d(0), Gf.Matrix4d(1)]),
-        0,
+        "static",
         NO_INVERSE,
     ),
     "bind transform of the mesh": (
-        lambda r, s, a, b, h: b.CreateGeomBindTransformAttr(matrix(3, 0, INF)), 0, NOT_FINITE,
+        lambda r, s, a, b, h: b.CreateGeomBindTransformAttr(matrix(3, 0, INF)), "static", NOT_FINITE,
     ),
     "transform of the skeleton": (lambda r, s, a, b, h: transform(s.GetPrim(), "orient", 2), 2, NOT_FINITE),
-    "transform of the root": (lambda r, s, a, b, h: transform(r.GetPrim(), "translate", "static"), 0, NOT_FINITE),
+    "transform of the root": (
+        lambda r, s, a, b, h: transform(r.GetPrim(), "translate", "static"), "static", NOT_FINITE,
+    ),
 }  # fmt: skip
 
 

@@ -246,17 +246,21 @@ def test_nothing_readable_is_an_error(tmp_path, capsys):
     assert main(["replay", save(stage), "--device", "cpu"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f"no visible mesh in the scene, or none is selected; {EMPTY}")
+
+
+def test_obstacles_are_checked_at_rest_if_all_that_moves_is_left_out(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
     add_floor(stage)
-    odd = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Odd"))
-    for time in (0, 1):
-        odd.CreatePointsAttr().Set([(0, 0, time)], time)
-    odd.CreateFaceVertexCountsAttr([3])
-    assert main(["replay", save(stage), "--device", "cpu"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "/World/Odd: faceVertexCounts add up to 3" in line
+    add_mesh(stage, "/World/Post", moved(FALLING, (0, 0, -0.25)))
+    add_mesh(stage, "/World/Odd", {time: [(0, 0, time)] for time in (0, 1)}, [3])
+    found = find(stage, status=4)
+    (sentence,) = found["left_out"]
+    assert sentence.startswith("/World/Odd: faceVertexCounts add up to 3")
+    (span,) = found["intersections"]
+    assert (span["meshes"], span["since"], span["until"]) == (["/World/Floor", "/World/Post"], 0, 1)
 
 
-# --- What breaks later ---
+# --- What breaks for some time ---
 
 
 def add_long_fall(stage):
@@ -274,46 +278,64 @@ def add_breaking(stage, points=None):
 
 def break_points(stage):
     add_breaking(stage, {3: [(0, 0, 0), (1, 0, 0), (0, np.nan, 0)]})
-    return 2, "vertex 2 is not finite at time 3"
+    return "from time 2 to 4", "vertex 2 is not finite at time 3"
+
+
+def block_points(stage):
+    add_breaking(stage, {3: Sdf.ValueBlock()})
+    return "from time 2 to 4", "the mesh has no points at time 3"
+
+
+def block_topology(stage):
+    counts = add_breaking(stage).GetFaceVertexCountsAttr()
+    for time, value in ((0, [3]), (3, Sdf.ValueBlock()), (4, [3])):
+        counts.Set(value, time)
+    return "from time 3 to 4", "the mesh has no faces"
 
 
 def break_number_of_points(stage):
     add_breaking(stage, {3: FALLING[:2]})
-    return 2, "2 points at time 3, but 3 at first"
+    return "from time 2 to 4", "2 points at time 3, but 3 at first"
 
 
 def break_topology(stage):
     indices = add_breaking(stage).GetFaceVertexIndicesAttr()
     for time, corners in ((0, [0, 1, 2]), (3, [0, 1, 9])):
         indices.Set(corners, time)
-    return 3, "face 0 refers to vertex 9"
+    return "from time 3 on", "face 0 refers to vertex 9"
 
 
 def break_a_welded_mesh(stage):
     add_breaking(stage, {3: [(0, 0, 0), (1, 0, 0), (0, np.nan, 0)]})
     shared = stage.GetPrimAtPath("/World/Breaking").GetAttribute("points").Get(0)[1]
     add_mesh(stage, "/World/Seam", [tuple(shared), (-5, 5, 5), (-5, 6, 5)])
-    return 2, "vertex 2 is not finite at time 3"
+    return "from time 2 to 4", "vertex 2 is not finite at time 3"
 
 
-@pytest.mark.parametrize("breaks", [break_points, break_number_of_points, break_topology, break_a_welded_mesh])
-def test_what_breaks_later_is_left_out_from_then_on(tmp_path, capsys, breaks):
+BREAKS = [
+    break_points, block_points, block_topology, break_number_of_points, break_topology, break_a_welded_mesh,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("breaks", BREAKS)
+def test_what_breaks_is_left_out_as_long_as_it_is_broken(tmp_path, capsys, breaks):
     stage = new_stage(tmp_path / "scene.usda")
     add_floor(stage)
     add_long_fall(stage)
-    since, reason = breaks(stage)
+    when, reason = breaks(stage)
     found = find(stage, status=4)
     assert [interval["start"] for interval in found["intervals"]] == [0, 1, 2, 3, 4]
     assert {"/World/Falling", "/World/Breaking"} <= {hit[0] for hit in hits(found, 0)}
-    assert hits(found, 4) == [(*HIT[:4], 4.5, HIT[5])]
+    assert hits(found, 4)[0] == (*HIT[:4], 4.5, HIT[5])
     (sentence,) = found["left_out"]
-    assert sentence.startswith(f"from time {since} on: /World/Breaking: ") and reason in sentence
+    assert sentence.startswith(f"{when}: /World/Breaking: ") and reason in sentence
+    assert not any("changes its topology" in warning for warning in found["warnings"]) or breaks is break_topology
     capsys.readouterr()
     assert main(["replay", save(stage), "--device", "cpu", "--strict"]) == 2
     assert reason in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_what_breaks_later_is_checked_until_then(tmp_path):
+def test_what_breaks_for_some_time_is_checked_before_and_after(tmp_path):
     stage = new_stage(tmp_path / "scene.usda")
     add_floor(stage)
     add_long_fall(stage)
@@ -322,20 +344,53 @@ def test_what_breaks_later_is_checked_until_then(tmp_path):
     scene = Scene(save(stage))
     intervals = [scene.interval(index) for index in range(5)]
     names = [[mesh.name for mesh in interval.segment.meshes] for interval in intervals]
-    assert ["/World/Breaking" in present for present in names] == [True, True, False, False, False]
+    assert ["/World/Breaking" in present for present in names] == [True, True, False, False, True]
     assert all({"/World/Floor", "/World/Falling", "/World/Sheet"} <= set(present) for present in names)
     (warning,) = intervals[2].warnings
-    assert warning.startswith("left out: from time 2 on: /World/Breaking: ")
+    assert warning.startswith("left out: from time 2 to 4: /World/Breaking: ")
     assert all(not interval.warnings for interval in intervals if interval.index != 2)
 
 
-def test_a_replay_ends_where_nothing_that_moves_is_left(tmp_path, capsys):
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("blocked", [{3: Sdf.ValueBlock()}, {3: Sdf.ValueBlock(), 4: Sdf.ValueBlock()}])
+def test_a_mesh_is_there_again_when_it_has_points_again(tmp_path, beside, blocked):
     stage = new_stage(tmp_path / "scene.usda")
     add_floor(stage)
-    add_breaking(stage, {3: [(0, 0, 0), (1, 0, 0), (0, np.nan, 0)]})
-    found = find(stage, status=2)
-    assert len(found["intervals"]) == 2 and not found["complete"]
-    assert "vertex 2 is not finite at time 3" in capsys.readouterr().err
+    heights = [3, 2, 2, 2, 0.5, 0.25, -0.25]
+    add_mesh(stage, "/World/Falling", {t: moved(FALLING, (0, 0, z)) for t, z in enumerate(heights)} | blocked)
+    if beside:
+        add_mesh(stage, "/World/Beside", {0: moved(FALLING, (9, 0, 0)), 6: moved(FALLING, (9, 0, 1))})
+    found = find(stage, status=4)
+    assert [interval["start"] for interval in found["intervals"]] == list(range(6)) and found["complete"]
+    assert hits(found) == [(*HIT[:4], 5.5, HIT[5])]
+    end = max(blocked) + 1
+    assert found["left_out"] == [f"from time 2 to {end}: /World/Falling: the mesh has no points at time 3"]
+
+
+def test_a_mesh_that_breaks_again_is_left_out_again(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    blocked = {time: Sdf.ValueBlock() for time in (0, 3, 5)}
+    heights = [0.25, -0.25, -0.5, -0.75, -1, -1.25, -1.5]
+    add_mesh(stage, "/World/Falling", {t: moved(FALLING, (0, 0, z)) for t, z in enumerate(heights, 1)} | blocked)
+    found = find(stage, status=4)
+    assert hits(found)[0] == (*HIT[:4], 1.5, HIT[5])
+    sentences = [("0 to 1", 0), ("2 to 4", 3), ("4 to 6", 5)]
+    assert found["left_out"] == [
+        f"from time {when}: /World/Falling: the mesh has no points at time {time}" for when, time in sentences
+    ]
+
+
+@pytest.mark.slow
+def test_workers_leave_out_the_same(tmp_path):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    add_long_fall(stage)
+    add_breaking(stage, {1: Sdf.ValueBlock(), 3: Sdf.ValueBlock()})
+    alone = find(stage, status=4)
+    assert len(alone["left_out"]) == 2
+    together = find(stage, "--workers", "2", status=4)
+    assert [together[key] for key in ("intervals", "left_out")] == [alone[key] for key in ("intervals", "left_out")]
 
 
 # --- Where files are ---
@@ -500,7 +555,7 @@ def test_damaged_scenes_are_read_or_refused_in_one_line(tmp_path, part):
         try:
             scene = Scene(path)
             for interval in islice(scene, 19):
-                assert interval.start < interval.end
+                assert interval.start < interval.end or interval.end == scene.times[-1]
                 positions = interval.x0, interval.x1
                 assert all(np.isfinite(x).all() and len(x) == interval.segment.vertex_count for x in positions), done
             counts["left out" if scene.left_out else "read"] += 1

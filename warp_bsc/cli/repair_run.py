@@ -125,7 +125,7 @@ class RepairRun:
         done = 0
         for stretch in journal.stretches(scene):
             self._add(stretch)
-            done = scene.times.index(stretch.end)
+            done = _interval_after(scene, stretch)
             yield done
         self.earlier = len(self.stretches)
         started = time.perf_counter()
@@ -146,7 +146,7 @@ class RepairRun:
                     self._keep(functools.partial(journal.add, stretch))
                 self._add(stretch)
                 self.seconds["repairing"] = time.perf_counter() - started
-                yield scene.times.index(stretch.end)
+                yield _interval_after(scene, stretch)
 
     def _keep(self, write: Callable[[], None]) -> None:
         """Writes to the journal; without space for it, the run goes on without one."""
@@ -245,6 +245,11 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
     if min_distance:
         counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
     return counts
+
+
+def _interval_after(scene: Scene, stretch: RepairedStretch) -> int:
+    """Returns the number of the interval after a stretch; one that ends where it starts is the last, without motion."""
+    return len(scene) if stretch.start == stretch.end else scene.times.index(stretch.end)
 
 
 def _tracked(scene: Scene, activity: str, device: str) -> Iterator[IntervalResult]:

@@ -222,7 +222,8 @@ def add_scene_selection(which: argparse._ArgumentGroup) -> None:
         "--frames",
         type=_frames,
         metavar="START:END:STEP",
-        help="time codes to check, each of the three optional; without STEP, all samples from START to END",
+        help="time codes to check, each of the three optional; without STEP, all samples from START to END; 5:5 "
+        "checks time 5 alone, at rest",
     )
     which.add_argument(
         "--strict",
@@ -306,8 +307,8 @@ def _frames(text: str) -> FrameRange:
         raise argparse.ArgumentTypeError(f"must be finite numbers, not {text!r}")
     if step is not None and step <= 0:
         raise argparse.ArgumentTypeError(f"STEP must be more than 0, not {step:g}")
-    if len(parts) < 2 or (start is not None and end is not None and end <= start):
-        raise argparse.ArgumentTypeError(f"must be START:END:STEP with END after START, not {text!r}")
+    if len(parts) < 2 or (start is not None and end is not None and end < start):
+        raise argparse.ArgumentTypeError(f"must be START:END:STEP with END not before START, not {text!r}")
     return FrameRange(start, end, step)
 
 

@@ -112,7 +112,7 @@ class IntervalChecker:
     def _at(self, interval: Interval) -> tuple["_SegmentDetector", "_SegmentNamer"]:
         if self._of_segment is None or interval.segment is not self._of_segment[1].segment:
             self._of_segment = None  # before the next is made, to free its memory
-            detector = _SegmentDetector(interval.segment, self.scene.is_still, self._checks)
+            detector = _SegmentDetector(interval.segment, self._checks)
             self._of_segment = detector, _SegmentNamer(interval.segment, detector, self._checks)
         return self._of_segment
 
@@ -161,8 +161,7 @@ class _SegmentDetector:
         strands: Detects the collisions of its curves and points; None without any.
     """
 
-    def __init__(self, segment: Segment, is_still: bool, checks: Checks):
-        self._is_still = is_still
+    def __init__(self, segment: Segment, checks: Checks):
         self._is_validated = checks.validate != 0
         self.mesh = CollisionMesh(segment.faces, segment.vertex_count, device=checks.device)
         self._detector = CollisionDetector(self.mesh, method=checks.method)
@@ -182,16 +181,16 @@ class _SegmentDetector:
         """Returns the detected collisions, intersections and proximities of an interval."""
         detector, arcs = self._detector, arcs_of(interval)
         start = self.find_intersections(interval.x0, interval.start) if self._finder else None
-        if self._is_still:  # at rest, coplanar faces would be many collisions between obstacles
+        if interval.is_at_rest:  # at rest, coplanar faces would be many collisions between obstacles
             nothing = CollisionMesh(np.empty((0, 3), int), 0, device=self.mesh.device)
             detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
             collisions = detector.detect(interval.x0, interval.x1, arcs=arcs)
-        of_strands = self.strands.detect(interval, arcs) if self.strands and not self._is_still else None
+        of_strands = self.strands.detect(interval, arcs) if self.strands and not interval.is_at_rest else None
         intersections = None
         if start:
-            motion = None if self._is_still or arcs else collisions
+            motion = None if interval.is_at_rest or arcs else collisions
             intersections = start, self.find_intersections(interval.x1, interval.end, motion)
         proximities = None
         if self._proximity_finder:

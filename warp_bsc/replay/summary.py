@@ -296,7 +296,7 @@ class Summary:
     def motion(self) -> str:
         """The motion that is assumed between samples, in words."""
         if self.scene.is_still:
-            return "Nothing moves: there are no collisions, only intersections at rest."
+            return "At one time there are no collisions, only intersections at rest."
         text = "Motion between time samples is taken to be linear."
         if turning := self.scene.turning:
             which = "1 mesh is" if turning == 1 else f"{turning} meshes are"

@@ -13,16 +13,18 @@ __all__ = ["Interval", "LeftOutMesh", "ReadingNotes", "jump_warning", "left_out_
 
 @dataclass(frozen=True)
 class LeftOutMesh:
-    """A mesh that is left out from some interval on, because it cannot be read.
+    """A mesh that is left out of some intervals, because it cannot be read.
 
     Attributes:
         name: Its name.
         since: Number of the first interval without it.
-        reason: Why and since when, a sentence.
+        until: Number of the interval after the last one without it.
+        reason: Why and when, a sentence.
     """
 
     name: str
     since: int
+    until: int
     reason: str
 
 
@@ -31,7 +33,7 @@ class ReadingNotes:
     """The left-out meshes, messages and jumps that reading an interval revealed.
 
     Attributes:
-        left_out: The meshes left out from this interval or a later one on.
+        left_out: The meshes left out of this interval or later ones.
         messages: Messages of OpenUSD that are new.
         jumps: Names of the meshes that do not start where the previous interval ended.
     """
@@ -44,6 +46,9 @@ class ReadingNotes:
 @dataclass(frozen=True)
 class Interval:
     """The motion of a scene from one of its times to the next: straight, but for the meshes that turn.
+
+    An interval that starts and ends at one time is without motion: at the only time that is checked, or at the last one
+    if meshes jump, appear, vanish or change their topology there.
 
     Attributes:
         index: Number of the interval, from 0.
@@ -68,6 +73,11 @@ class Interval:
     is_joined: bool
     notes: ReadingNotes
     turns: dict[int, Turn] = field(default_factory=dict)
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Whether it is without motion."""
+        return self.start == self.end
 
     @property
     def jumps(self) -> tuple[str, ...]:

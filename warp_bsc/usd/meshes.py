@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import bisect
 import copy
 import math
 import os
@@ -27,7 +28,7 @@ from .samples import as_time_code, may_jump, sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
-from .topology import Topology, is_empty, read_topology
+from .topology import BROKEN, Topology, as_topology, is_empty
 from .unreadable import UnreadableError, reading
 
 __all__ = ["UsdMesh"]
@@ -50,7 +51,7 @@ class UsdMesh:
         is_strands: Whether it is curves or points, see :class:`~warp_bsc.usd.strands.Strands`.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
         states: Its states by the time from which on they hold, the first by minus infinity: None where it is invisible,
-            absent or empty, else a digest of its topology.
+            absent or empty, else digests of its topology.
         turns: Whether a transform or a skeleton moves it, so that it may move nonlinearly between the samples.
         deforms: Whether anything except its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
@@ -98,13 +99,16 @@ class UsdMesh:
         self._break_codes = tuple(
             Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
         )
-        has_elements = [not is_empty(self._polygons.read_topology(code)[0]) for code in self._break_codes]
-        self.is_empty = not any(has_elements)
-        # A mesh may be empty for some time, such as a fluid before it flows.
+        self._topologies = self._read_topologies()
+        self.is_empty = not any(self._topologies)
         self._states = [
-            self._read_topology(code).digest() if has and is_shown(prim, self._root, code) else None
-            for code, has in zip(self._break_codes, has_elements, strict=True)
+            topology if topology and is_shown(prim, self._root, code) else None
+            for code, topology in zip(self._break_codes, self._topologies, strict=True)
         ]
+        # Points that are renumbered do not move to those of their number.
+        are_renumbered = len({polygons for polygons, _ in filter(None, self._topologies)}) > 1
+        has_numbers = not self._strands or self._strands.has_edges  # points without edges have ids
+        self._numbered_times = sorted(sample_times(*self._polygons.point_attributes)) * (are_renumbered and has_numbers)
         self._deformed_times = frozenset(
             sample_times(*self._polygons.point_attributes) | (skin.times if skin else set())
         )
@@ -155,8 +159,8 @@ class UsdMesh:
         if instance:
             present = instance.are_present(self._break_codes)
             states = [state if here else None for state, here in zip(states, present.tolist(), strict=True)]
-        self.states: dict[float, bytes | None] = {}
-        last = b""
+        self.states: dict[float, tuple[bytes, bytes] | None] = {}
+        last = b"", b""
         for time, state in zip(self._breaks, states, strict=True):
             if state != last:
                 self.states[time] = last = state
@@ -215,17 +219,35 @@ class UsdMesh:
         self.states = {scene_times.get(time, time): state for time, state in self.states.items()}
         self.may_jump |= any(first != last for first, last in self._own_times.values())
 
-    def state_at(self, time: float) -> bytes | None:
+    def state_at(self, time: float) -> tuple[bytes, bytes] | None:
         """Returns its state at a time, see :attr:`states`."""
         return next(state for since, state in reversed(self.states.items()) if since <= time)
 
-    def is_there_from(self, time: float) -> bool:
-        """Returns whether it is there at a time or later."""
-        return self.state_at(time) is not None or any(state for since, state in self.states.items() if since > time)
+    def changes(self) -> Iterator[tuple[float, str]]:
+        """Yields the times at which it changes and, in words, what it does then; without those at which it breaks."""
+        for (_, old), (time, new) in pairwise(self.states.items()):
+            if BROKEN not in (old, new):
+                yield time, "appears" if old is None else "vanishes" if new is None else "changes its topology"
 
-    def leave_out(self, since: float) -> None:
-        """Removes the mesh from a time on; minus infinity removes it at all times."""
-        self.states = {time: state for time, state in self.states.items() if time < since} | {since: None}
+    def can_be_read(self, time: float) -> bool:
+        """Returns whether all of it can be read at a time, or it is not there then."""
+        if self.state_at(time) is None:
+            return True
+        try:
+            points = self.read_points(time)
+            triangles, _, _ = self.read_triangles(time, points)
+            self.read_strands([time], len(points))
+            used = np.arange(len(points)) if self.is_strands else np.unique(triangles)
+            self.read_positions(time, used=used, point_count=len(points), dtype=points.dtype)
+        except UnreadableError:
+            return False
+        return True
+
+    def leave_out(self, since: float, until: float) -> None:
+        """Removes the mesh from a time, minus infinity for the first, up to before another, infinity for the last."""
+        last = {} if until == math.inf else {until: self.state_at(until)}
+        kept = {time: state for time, state in self.states.items() if not since <= time <= until}
+        self.states = dict(sorted((kept | {since: None} | last).items()))
 
     @property
     def why_not_written(self) -> str | None:
@@ -290,7 +312,7 @@ class UsdMesh:
                 return self._last_points[key]
             # A number of points that changes without the topology is an error, which the moment before would hide.
             at_time = before and time not in self.states
-            points = self._polygons.read_points(Usd.TimeCode(code.GetValue()) if at_time else code)
+            points = self._polygons.read_points(self._held(Usd.TimeCode(code.GetValue()) if at_time else code))
             if is_empty(points):
                 raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
             if self._skin:
@@ -520,4 +542,43 @@ class UsdMesh:
         return transform
 
     def _read_topology(self, time) -> Topology:
-        return read_topology(self._polygons, time, self._where)
+        return as_topology(self._polygons.read_topology(time), self._where)
+
+    def _read_topologies(self) -> list[tuple[bytes, bytes] | None]:
+        """Returns digests of the topology at each time at which it may change; None where it is empty.
+
+        A mesh may be empty for some time, such as a fluid before it flows. Where a sample is blocked it is not empty,
+        but broken.
+        """
+        topologies, is_empty, last = [], True, []
+        for code in self._break_codes:
+            values = self._polygons.read_topology(code)
+            if not last or any(old is not new and old != new for old, new in zip(last, values, strict=True)):
+                topology = as_topology(values, self._where)
+                has_elements = len(topology.counts) > 0
+                without = BROKEN if values[0] is None else None
+                topologies.append(topology.digests() if has_elements else without)
+                is_empty &= not has_elements
+            else:
+                topologies.append(topologies[-1])  # reading the digests of equal values would take longer
+            last = values
+        return [None] * len(topologies) if is_empty else topologies
+
+    def _held(self, code: Usd.TimeCode) -> Usd.TimeCode:
+        """Returns the time code of the last sample of the points where the next one is of other polygons, else a code.
+
+        USD holds points until the next sample if that has another number of points, and interpolates them if it has as
+        many. Neither value is a motion if the points have other numbers.
+        """
+        times, time = self._numbered_times, code.GetValue()
+        search = bisect.bisect_left if code.IsPreTime() else bisect.bisect_right
+        following = search(times, time)
+        if 0 < following < len(times):
+            topologies = (
+                self._topologies[max(0, search(self._breaks, time) - 1)],
+                self._topologies[bisect.bisect_right(self._breaks, times[following]) - 1],
+            )
+            now, then = (topology and topology[0] for topology in topologies)
+            if now and then and now != then:
+                return Usd.TimeCode(times[following - 1])
+        return code

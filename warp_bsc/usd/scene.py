@@ -115,8 +115,9 @@ class Scene:
         selection: The meshes that are checked, and the pairs of them.
         stage: The open ``Usd.Stage``.
         files: The files that the stage is read from.
-        times: Time codes between which motion is straight, ascending, at least two. If nothing moves, appears or
-            vanishes, it is one time code, twice: one interval without motion.
+        times: Time codes between which motion is straight, ascending, at least two. The last one is there twice, as an
+            interval without motion, if meshes jump, appear, vanish or change their topology then, or if it is the only
+            one: nothing moves, appears or vanishes, or the frames are one time alone.
         time_codes_per_second: Number of time codes in a second.
         meters_per_unit: The scene's unit of length [m].
         up_axis: "Y" or "Z".
@@ -240,6 +241,9 @@ class Scene:
             self._warnings += found.warnings + transform_warnings(self._usd_meshes, self.times)
             inner = [index for index, time in enumerate(self.times[:-1]) if index and time in found.changes]
             self._spans = list(pairwise([0, *inner, len(self.times) - 1]))
+            if self.times[-2] < self.times[-1] and self._jumps_at_end():
+                self.times.append(self.times[-1])
+                self._spans[-1] = self._spans[-1][0], len(self.times) - 1
             self._segment: Segment | None = None
             self._span: tuple[int, int] | None = None
             self._jumps = JumpFinder()
@@ -289,7 +293,7 @@ class Scene:
 
     @property
     def is_still(self) -> bool:
-        """Whether nothing moves, appears or vanishes."""
+        """Whether one time alone is checked, as nothing moves, appears or vanishes, or as the frames say."""
         return self.times[0] == self.times[-1]
 
     def __len__(self) -> int:
@@ -412,7 +416,7 @@ class Scene:
         segment, x0, x1, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
         with self._collecting(self._messages, self.path):
-            turns = segment.turns(start, end) if self.turning else {}
+            turns = segment.turns(start, end) if self.turning and end > start else {}
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
         return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), turns)
 
@@ -425,7 +429,7 @@ class Scene:
                 segment = self.segment(index)
                 try:
                     x0 = segment.positions(start, last=self._jumps.end_of(index - 1, segment))
-                    x1 = segment.positions(end, before=True)
+                    x1 = segment.positions(end, before=True) if end > start else x0
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
@@ -455,26 +459,44 @@ class Scene:
             reason = reason or "".join(f"; {warning}" for warning in self._warnings[:1])
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
+    def _jumps_at_end(self) -> bool:
+        """Returns whether a mesh jumps at the last time, or cannot be read at it."""
+        times = self.times[-2:]
+        jumping = [mesh for mesh in self._usd_meshes if mesh.may_jump and mesh.state_at(times[0]) is not None]
+        if not jumping:
+            return False
+        nothing = np.zeros(0, dtype=np.int64)
+        try:
+            segment = Segment(jumping, times, self.dtype, welds=(nothing, nothing))
+            finder, end = JumpFinder(), segment.positions(times[1])
+            finder.find(0, segment, segment.start_positions, segment.positions(times[1], before=True))
+            return bool(finder.find(1, segment, end, end))
+        except self._unreadable:
+            return True
+
     def _leave_out(self, error, index):
-        """Leaves out the mesh of an error from the interval in which it breaks, or from ``index`` if that is later."""
+        """Leaves out the mesh of an error from the interval in which it breaks, or from ``index`` if that is later.
+
+        It is there again from the first later interval at whose start it can be read.
+        """
         since = max(index, self.times.index(error.time) - 1)
-        self._left_out.add(error, f"from time {self.times[since]:g} on: " if since else "")
-        self._apply(LeftOutMesh(error.mesh, since, self.left_out[-1]))
-        moving = [mesh for mesh in self._usd_meshes if mesh.times or self.is_still]
-        if not any(mesh.is_there_from(self.times[since]) for mesh in moving):
-            raise error
+        mesh = self.prim_of(error.mesh)
+        later = range(since + 1, len(self))
+        until = next((number for number in later if mesh.can_be_read(self.times[number])), len(self))
+        start = f"from time {self.times[since]:g} " if since or until < len(self) else ""
+        end = f"to {self.times[until]:g}: " if until < len(self) else "on: " * bool(since)
+        self._left_out.add(error, start + end)
+        self._apply(LeftOutMesh(mesh.name, since, until, self.left_out[-1]))
 
     def _apply(self, part: LeftOutMesh) -> None:
-        """Leaves out a mesh from an interval on."""
+        """Leaves a mesh out of intervals."""
         self._parts.append(part)
-        since = part.since
-        mesh = next(mesh for mesh in self._usd_meshes if mesh.name == part.name)
-        mesh.leave_out(self.times[since] if since else -math.inf)
-        first, last = next(span for span in self._spans if span[0] <= since < span[1])
-        self._welds.pop((first, last), None)
-        if first < since:
-            number = self._spans.index((first, last))
-            self._spans[number : number + 1] = [(first, since), (since, last)]
+        since, until = part.since, part.until
+        times = self.times[since] if since else -math.inf, self.times[until] if until < len(self) else math.inf
+        self.prim_of(part.name).leave_out(*times)
+        self._welds = {span: welds for span, welds in self._welds.items() if span[1] <= since or span[0] >= until}
+        cuts = {since, until} | {number for span in self._spans for number in span}
+        self._spans = list(pairwise(sorted(cuts)))
         self._span = None
         self._jumps.forget()
 

@@ -19,8 +19,8 @@ class SceneTimes(NamedTuple):
     """The times of a scene.
 
     Attributes:
-        times: Time codes between which motion is straight, ascending, at least two; one time code twice if nothing
-            moves, appears or vanishes.
+        times: Time codes between which motion is straight, ascending, at least two. The last one is there twice if it
+            is the only one, or if meshes change at it: that interval is without motion.
         changes: Those at which meshes change their topology, appear or vanish.
         warnings: Sentences on the changes to the motion.
     """
@@ -43,7 +43,7 @@ def find_times(
         start: Start of the stage, the time at which a stage is checked in which nothing moves.
 
     Raises:
-        ValueError: If ``frames`` contains fewer than two times, or a turn takes too many.
+        ValueError: If ``frames`` contains no time, or a turn takes too many.
     """
     own = set().union(*(mesh.times | mesh.states.keys() for mesh in meshes)) - {-math.inf}
     if not any(mesh.times for mesh in meshes):
@@ -61,6 +61,8 @@ def find_times(
     changes = {time for mesh in meshes for time in mesh.states if time != -math.inf}
     samples = sorted(set(scene_times.values()))
     times = frames.times(samples, changes)
+    if len(times) == 1:
+        return SceneTimes(times * 2, set(), [f"frames: one time alone: checked at rest, at time {times[0]:g}"])
     warnings = []
     if skipped := sum(times[0] < time < times[-1] for time in set(samples) - set(times)):
         warnings.append(f"frames: the step passes over {skipped} time samples: motion is straight from step to step")
@@ -68,21 +70,30 @@ def find_times(
         times = [
             start + (end - start) * part / subdivide for start, end in pairwise(times) for part in range(subdivide)
         ] + times[-1:]
-    return SceneTimes(times, changes, warnings + _change_warnings(meshes, times[0], times[-1]))
+    warnings += _change_warnings(meshes, times[0], times[-1])
+    if times[-1] in changes:
+        times.append(times[-1])
+    return SceneTimes(times, changes, warnings)
 
 
 def _change_warnings(meshes: "list[UsdMesh]", first: float, last: float) -> list[str]:
-    """Returns a sentence for each way in which a mesh appears, vanishes or changes its topology between two times."""
-    warnings = []
+    """Returns sentences on the meshes that appear, vanish or change their topology between two times.
+
+    There is one for each way in which a mesh changes, and in which the instances of a point instancer do.
+    """
+    found: dict[tuple[str, str], tuple[set[str], set[float]]] = {}  # names and times by instancer or mesh, and change
     for mesh in meshes:
-        times_of = {}
-        for (_, old), (time, new) in pairwise(mesh.states.items()):
+        owner = mesh.instance.instancer.name if mesh.instance else mesh.name
+        for time, change in mesh.changes():
             if first < time <= last:
-                change = "appears" if old is None else "vanishes" if new is None else "changes its topology"
-                times_of.setdefault(change, []).append(time)
-        for change, times in times_of.items():
-            when = times_in_words(times)
-            warnings.append(f"{mesh.name} {change} {when}: its motion is split there, a jump is not checked")
+                names, times = found.setdefault((owner, change), (set(), set()))
+                names.add(mesh.name)
+                times.add(time)
+    warnings = []
+    for (owner, change), (names, times) in found.items():
+        who = names.pop() if len(names) == 1 else f"each of {len(names):,} meshes of {owner}"
+        when = times_in_words(sorted(times))
+        warnings.append(f"{who} {change} {when}: its motion is split there, a jump is not checked")
     return warnings
 
 

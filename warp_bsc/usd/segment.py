@@ -426,7 +426,8 @@ class Segment:
             return welded_to
         jumping = any(self._usd_meshes[number].may_jump for number in moving)
         moments = [(time, before) for time in times[1:-1] for before in ([True] if jumping else []) + [False]]
-        moments.append((times[-1], True))
+        if times[-1] > times[-2]:
+            moments.append((times[-1], True))
         reader = self._reader(crowded, moving)
         positions = self._start[crowded]
         groups = np.searchsorted(crowded, welded_to[crowded])

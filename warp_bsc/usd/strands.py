@@ -61,6 +61,8 @@ class Strands:
         first, last = self._id_times[following - 1 : following + 1]
         ids, next_ids = (np.array(self._ids.Get(sample) or ()) for sample in (first, last))
         points, next_points = (np.array(self.point_attributes[0].Get(sample) or ()) for sample in (first, last))
+        if not (len(points) and len(next_points)):
+            return held
         if np.array_equal(ids, next_ids) or len(ids) != len(points) or len(next_ids) != len(next_points):
             return held
         _, stays, comes = np.intersect1d(ids, next_ids, return_indices=True)

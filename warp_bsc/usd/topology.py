@@ -4,16 +4,19 @@
 # (OpenUSD's stubs leave out the classes of its modules.)
 
 import hashlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from pxr import Usd, Vt
+from pxr import Vt
 
-from .shapes import Polygons
 from .triangulation import triangulate
 from .unreadable import UnreadableError
 
-__all__ = ["Topology", "is_empty", "read_topology"]
+__all__ = ["BROKEN", "Topology", "as_topology", "is_empty"]
+
+BROKEN = b"", b""
+"""The digests of polygons of which a sample is blocked."""
 
 
 class Topology(NamedTuple):
@@ -29,12 +32,11 @@ class Topology(NamedTuple):
     indices: np.ndarray
     holes: np.ndarray
 
-    def digest(self) -> bytes:
-        """Returns a digest, which differs where the polygons differ."""
-        digest = hashlib.blake2b()
-        for values in self:
-            digest.update(len(values).to_bytes(8, "little") + values.tobytes())
-        return digest.digest()
+    def digests(self) -> tuple[bytes, bytes]:
+        """Returns a digest of the polygons, which differs where their points differ, and one of the holes."""
+        polygons = hashlib.blake2b(len(self.counts).to_bytes(8, "little") + self.counts.tobytes())
+        polygons.update(self.indices.tobytes())
+        return polygons.digest(), hashlib.blake2b(self.holes.tobytes()).digest()
 
     def triangles(self, points: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns the polygons without the holes as triangles of the same orientation.
@@ -51,6 +53,8 @@ class Topology(NamedTuple):
             UnreadableError: If the polygons are broken, or all of them are holes.
         """
         counts, indices, holes = self
+        if not len(counts):
+            raise UnreadableError(f"{where}: the mesh has no faces")
         if counts.min() < 3:
             face = int(np.argmin(counts))
             raise UnreadableError(f"{where}: face {face} has {counts[face]} vertices; 3 are the fewest")
@@ -72,12 +76,11 @@ class Topology(NamedTuple):
         return triangles[solid], polygons[solid]
 
 
-def read_topology(polygons: Polygons, time: Usd.TimeCode, where: str) -> Topology:
-    """Reads the polygons of a mesh at a time; missing attributes are read as empty ones.
+def as_topology(values: Sequence[Any], where: str) -> Topology:
+    """Returns the polygons of a mesh; missing attributes are read as empty ones.
 
     Args:
-        polygons: The polygons.
-        time: Time code.
+        values: What :class:`~warp_bsc.usd.shapes.Polygons` read at a time.
         where: File and prim, for messages.
 
     Raises:
@@ -91,7 +94,7 @@ def read_topology(polygons: Polygons, time: Usd.TimeCode, where: str) -> Topolog
         return array.astype(np.int64)
 
     names = "faceVertexCounts", "faceVertexIndices", "holeIndices"
-    return Topology(*map(as_integers, names, polygons.read_topology(time)))
+    return Topology(*map(as_integers, names, values))
 
 
 def is_empty(value: Any) -> bool:

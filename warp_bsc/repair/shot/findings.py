@@ -32,7 +32,7 @@ class Finding:
             are so initially.
         initially_near: Number of pairs that are nearer at the start of an interval that no other one precedes; 0 in
             other intervals.
-        crossings: Numbers of edges that meet faces at the start and at the end.
+        crossings: Numbers of edges that meet faces at the start and at the end, which is 0 if it is the same time.
         crossing_meshes: Names of the pairs of meshes that intersect at the start.
         is_joined: Whether the interval starts where the one before ends, with the same meshes.
     """
@@ -79,7 +79,7 @@ def _find_collisions(results: Iterable[IntervalResult], near_pairs: "_NearPairs 
     for result in results:
         interval, summary = result.contacts.interval, result.summary
         assert summary.intersections is not None
-        crossings = tuple(at.crossings + at.touches for at in summary.intersections)
+        start, end = (at.crossings + at.touches for at in summary.intersections)
         is_joined = interval.segment is last and not interval.jumps
         last = interval.segment
         near = near_pairs.find(interval, is_joined) if near_pairs else (0, 0)
@@ -87,7 +87,7 @@ def _find_collisions(results: Iterable[IntervalResult], near_pairs: "_NearPairs 
             hits=sum(summary.mesh_pairs.values()),
             near=near[0],
             initially_near=near[1],
-            crossings=(crossings[0], crossings[1]),
+            crossings=(start, 0 if interval.is_at_rest else end),
             crossing_meshes=tuple(summary.intersections[0].mesh_pairs),
             is_joined=is_joined,
         )
