@@ -232,7 +232,7 @@ def test_sentence_says_what_was_not_checked(tmp_path):
     assert said.startswith("Nothing collides, nothing intersects, nothing is within 0.1 of another: ")
     add_mesh(stage, "/World/Broken", {0: FALLING, 1: FALLING[:2]})
     said = sentence_of(stage, "--exclude", "/World/Floor", status=4)
-    assert said.endswith(" Not checked: 1 part that cannot be read; see the notes.")
+    assert said.endswith(" Not checked: 1 part that cannot be read, named as left out.")
 
 
 def test_charts_without_bars_are_left_out(tmp_path, browser):

@@ -1,12 +1,27 @@
 """Scenes of which parts cannot be read: these are named and left out, and the rest is checked."""
 
+import json
 import random
 from itertools import islice
 
 import numpy as np
 import pytest
 from pxr import Ar, Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
-from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
+from replay_files import Page
+from stages import (
+    FALLING,
+    HIT,
+    add_falling,
+    add_floor,
+    add_instancer,
+    add_mesh,
+    falling,
+    find,
+    hits,
+    moved,
+    new_stage,
+    save,
+)
 
 from warp_bsc.cli.main import main
 from warp_bsc.usd.scene import Scene
@@ -136,7 +151,7 @@ def test_what_is_broken_is_left_out(stage, capfd, add, reason):
     output = capfd.readouterr()
     text = " ".join(output.out.split())
     assert f"note: left out: {found['left_out'][0]}" in text
-    assert "Left out, as named above: 1 part of the scene that could not be read." in text
+    assert "Not checked: 1 part that cannot be read, named as left out." in text
 
 
 @pytest.mark.parametrize(("add", "reason"), BROKEN.items(), ids=lambda value: getattr(value, "__name__", ""))
@@ -391,6 +406,77 @@ def test_workers_leave_out_the_same(tmp_path):
     assert len(alone["left_out"]) == 2
     together = find(stage, "--workers", "2", status=4)
     assert [together[key] for key in ("intervals", "left_out")] == [alone[key] for key in ("intervals", "left_out")]
+
+
+def all_files(folder):
+    names = {"csv": "csv", "npz": "npz", "report": "html", "overlay": "usda"}
+    return [word for option, end in names.items() for word in (f"--{option}", str(folder / f"hits.{end}"))]
+
+
+def test_all_files_tell_the_same_of_what_is_left_out(stage, tmp_path, capfd):
+    add_mesh(stage, "/World/Odd", {0: FALLING, 1: Sdf.ValueBlock()})
+    found = find(stage, *all_files(tmp_path), status=4)
+    (reason,) = found["left_out"]
+    said = "Not checked: 1 part that cannot be read, named as left out."
+    assert said in capfd.readouterr().out and reason == "/World/Odd: the mesh has no points at time 1"
+    assert (tmp_path / "hits.csv").read_text().splitlines()[-1] == f"# left out: {reason}"
+    assert json.loads(str(np.load(tmp_path / "hits.npz")["facts"]))["left_out"] == [reason]
+    data = Page((tmp_path / "hits.html").read_text()).data
+    assert data["partial"] == said and f"left out: {reason}" in data["notes"] and not data["is_whole"]
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "hits.usda"))
+    assert list(layer.customLayerData["collisions"]["leftOut"]) == [reason] and said in layer.documentation
+
+
+def test_a_scene_without_anything_that_can_be_read(tmp_path, capfd):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_mesh(stage, "/World/Odd", {0: FALLING, 1: Sdf.ValueBlock(), 2: FALLING, 3: moved(FALLING, (0, 0, 1))})
+    found = find(stage, *all_files(tmp_path), "--clearance", "0.1", status=4)
+    assert [interval["start"] for interval in found["intervals"]] == [0, 1, 2] and found["hits"] == 0
+    add_mesh_with_a_broken_face(stage)
+    stage.GetPrimAtPath("/World/Odd").GetAttribute("points").Clear()
+    found = find(stage, *all_files(tmp_path), status=4)
+    assert len(found["intervals"]) == 1 and found["meshes"] == []
+    assert "No edge meets a face at rest" in capfd.readouterr().out
+
+
+def add_tetrahedron(stage, path="/World/Odd"):
+    mesh = UsdGeom.TetMesh.Define(stage, path)
+    mesh.CreatePointsAttr([(0, 0, 5), (1, 0, 5), (0, 1, 5), (0, 0, 6)])
+    mesh.CreateTetVertexIndicesAttr([(0, 1, 2, 3)])
+    mesh.CreateSurfaceFaceVertexIndicesAttr([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)])
+    return mesh
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_tetrahedra_are_not_checked(tmp_path, beside):
+    """They are left out until they are read."""
+    stage = new_stage(tmp_path / "scene.usda")
+    add_tetrahedron(stage)
+    if beside:
+        add_mesh(stage, "/World/Falling", falling(3, 2))
+    page = tmp_path / "page.html"
+    found = find(stage, "--report", str(page), status=4)
+    assert found["left_out"] == ["/World/Odd: prims of type TetMesh cannot be read"]
+    data = Page(page.read_text()).data
+    assert data["nothing"].endswith(" Not checked: 1 part that cannot be read, named as left out.")
+    assert not data["is_whole"]  # it has another colour
+
+
+def test_tetrahedra_that_need_not_be_checked(stage):
+    add_tetrahedron(stage)
+    assert find(stage, "--exclude", "/World/Odd", "--strict")["left_out"] == []
+    visibility = UsdGeom.Imageable(add_tetrahedron(stage)).CreateVisibilityAttr()
+    visibility.Set("invisible")
+    assert find(stage, "--strict")["left_out"] == []
+    visibility.Set("invisible", 0)
+    visibility.Set("inherited", 1)
+    assert len(find(stage, status=4)["left_out"]) == 1
+
+
+def test_tetrahedra_of_instances_are_named_once(stage):
+    add_instancer(stage, "/World/Many", {0: [(0, 0, 5), (1, 0, 5)]}, ["/World/Many/Odd"])
+    add_tetrahedron(stage, "/World/Many/Odd")
+    assert find(stage, status=4)["left_out"] == ["/World/Many/Odd: prims of type TetMesh cannot be read"]
 
 
 # --- Where files are ---

@@ -71,11 +71,8 @@ def print_replay(console: Console, summary: Summary) -> None:
 
     if not scene.is_still:
         _print_certificate(console, summary)
-    if scene.left_out:
-        say(
-            console,
-            f"Left out, as named above: {count(len(scene.left_out), 'part')} of the scene that could not be read.",
-        )
+    if summary.not_checked:
+        say(console, summary.not_checked)
     if summary.validation:
         _print_validation(console, summary.validation, scene.has_strands)
 

@@ -111,6 +111,7 @@ class HitsNpz:
         facts = self._facts | {"complete": part.is_complete, "stopped": part.stopped, "hits": part.hits}
         missing = not_listed(part, with_end=part.is_complete)
         facts["not_listed"] = asdict(missing) if missing else None
+        facts["left_out"] = summary.scene.left_out
         names, prims = ([names[side] for names in self._meshes] for side in range(2))
         words = {"meshes": names, "prims": prims, "kinds": _KINDS, "phases": _PHASES, "elements": ELEMENT_WORDS}
         starts, ends = np.array(self._times[:count], dtype=float).reshape(-1, 2).T

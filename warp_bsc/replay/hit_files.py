@@ -153,7 +153,7 @@ class HitsJson(RecordFile):
 
 
 class HitsCsv(RecordFile):
-    """A CSV file: a row for each contact, intersection and proximity, and last lines with # if some are missing.
+    """A CSV file: a row for each contact, intersection and proximity, and last lines with # on what is missing.
 
     Rows of intersections have the kind "edge-face", no time of impact and no normal. Their time is the interval's
     start, in the last interval its end too. A part of a mesh that is inside another mesh has the phase "inside" and the
@@ -193,11 +193,12 @@ class HitsCsv(RecordFile):
             yield from _csv_rows(where, proximities, _proximity_columns)
 
     def tail(self, summary: Summary) -> str:
-        """Returns lines on rows that a limit leaves out, and on missing intervals; empty if there are none."""
+        """Returns lines on rows that a limit leaves out, missing intervals and parts that are left out, if any are."""
         limited = str(not_listed(summary, with_end=summary.is_complete) or "")
         lines = f"# limit: {limited}\n" * bool(limited)
         if not summary.is_complete:
             lines += f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
+        lines += "".join(f"# left out: {reason}\n" for reason in summary.scene.left_out)
         return lines
 
 

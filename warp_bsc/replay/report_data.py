@@ -62,6 +62,7 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         f"{summary.device}",
         "partial": "",
         "nothing": _nothing_found(summary),
+        "is_whole": not summary.not_checked,
         "tiles": tiles,
         "intervals": [
             (
@@ -97,6 +98,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         data["partial"] = (
             f"Partial: {len(summary.intervals)} of {summary.interval_count} intervals were checked; {summary.stopped}."
         )
+    if not data["nothing"]:
+        data["partial"] = " ".join(filter(None, (data["partial"], summary.not_checked)))
     if found := summary.validation:
         wrong = len(found.disagreements)
         text = (
@@ -133,8 +136,7 @@ def _nothing_found(summary: Summary) -> str:
         text += " Intersections at rest were not checked."
     if hits := sum(hits for _, hits in summary.ignored):
         text += f" Left out: {hits:,} {_plural('collision', hits)} of ignored pairs."
-    if parts := len(scene.left_out):
-        text += f" Not checked: {parts:,} {_plural('part', parts)} that cannot be read; see the notes."
+    text += f" {summary.not_checked}" if summary.not_checked else ""
     selection = scene.selection
     if selection.between or selection.ignore or selection.ignored_names or not selection.self_collisions:
         text += " Only some pairs of meshes were checked, as options say."

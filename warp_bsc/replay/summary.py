@@ -307,6 +307,13 @@ class Summary:
             )
         return text
 
+    @property
+    def not_checked(self) -> str:
+        """A sentence on the parts of the scene that are left out; empty if there are none."""
+        parts = len(self.scene.left_out)
+        noun = "part" if parts == 1 else "parts"
+        return f"Not checked: {parts:,} {noun} that cannot be read, named as left out." if parts else ""
+
     def first(self, count: int) -> "Summary":
         """Returns the summary of the first intervals alone."""
         if count == len(self.intervals):

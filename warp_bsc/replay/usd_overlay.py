@@ -333,7 +333,10 @@ class Overlay:
         return LayerContent(
             metadata=self._metadata,
             documentation=" ".join(
-                text for text in ("Collisions found by warp-bsc replay.", SHOWN_BY, missing, summary.motion) if text
+                filter(
+                    None,
+                    ("Collisions found by warp-bsc replay.", SHOWN_BY, missing, summary.motion, summary.not_checked),
+                )
             ),
             custom={"collisions": self._facts(summary)},
             asset={"name": f"Collisions in {Path(self._scene.path).name}", "version": f"warp-bsc {__version__}"},
@@ -362,6 +365,10 @@ class Overlay:
             facts["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
         if summary.stopped:
             facts["stopped"] = summary.stopped
+        if self._scene.left_out:
+            from pxr import Vt  # noqa: PLC0415 (slow)
+
+            facts["leftOut"] = Vt.StringArray(self._scene.left_out)
         return facts
 
     def _groups(self, used: set[str]) -> list[LayerGroup]:

@@ -18,6 +18,7 @@ __all__ = [
     "Instancer",
     "are_finite",
     "find_instances",
+    "is_ever_shown",
     "is_shown",
     "masking_attributes",
     "transform_attributes",
@@ -312,6 +313,12 @@ def is_shown(prim: Usd.Prim, root: Usd.Prim | None, time: Usd.TimeCode) -> bool:
     return all(
         imageable.GetVisibilityAttr().Get(time) != UsdGeom.Tokens.invisible for imageable in _imageables(prim, root)
     )
+
+
+def is_ever_shown(prim: Usd.Prim, root: Usd.Prim | None) -> bool:
+    """Returns whether they are at some time."""
+    times = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted(visibility_times(prim, root)))]
+    return any(is_shown(prim, root, time) for time in times)
 
 
 def _imageables(prim, root):

@@ -11,7 +11,7 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
-from .instancers import Instance, find_instances, is_shown
+from .instancers import Instance, find_instances, is_ever_shown
 from .shapes import is_shape
 from .skinning import find_bindings
 from .strands import is_strands
@@ -56,6 +56,7 @@ class MeshPrimFinder:
 
     Attributes:
         found: The prims that are read as meshes, in the order of the walk.
+        unread: The prims that would be, but that no code reads yet, likewise.
         other: Number of the other visible prims with a shape, by their type.
     """
 
@@ -70,6 +71,7 @@ class MeshPrimFinder:
         self._left_out = left_out
         self._bindings: dict[Sdf.Path, Any] = {}  # by path; of a root, the error or None
         self.found: list[MeshPrim] = []
+        self.unread: list[MeshPrim] = []
         self.other: Counter[str] = Counter()
 
     def walk(self, prims: Iterator[Usd.Prim], instance: Instance | None = None) -> None:
@@ -93,7 +95,9 @@ class MeshPrimFinder:
                     prims.PruneChildren()
             elif prim.IsA(UsdGeom.Mesh) or is_shape(prim) or is_strands(prim):
                 self.found.append(MeshPrim(prim, instance, self._bindings.get(prim.GetPath())))
-            elif prim.IsA(UsdGeom.Gprim) and is_shown(prim, None, Usd.TimeCode.EarliestTime()):
+            elif prim.IsA(UsdGeom.TetMesh):
+                self.unread.append(MeshPrim(prim, instance, None))
+            elif prim.IsA(UsdGeom.Gprim) and is_ever_shown(prim, instance.root if instance else None):
                 self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
 
     def _find_bindings(self, root) -> bool:

@@ -452,11 +452,10 @@ class Scene:
         return self.times, [mesh.name for mesh in self._usd_meshes], len(self.left_out)
 
     def _check_meshes(self, is_selection):
-        """Raises a ValueError if there are no meshes."""
-        reason = f"; left out: {self.left_out[0]}" if self.left_out else ""
-        if not self._usd_meshes:
+        """Raises a ValueError if there are no meshes, and none is left out."""
+        if not self._usd_meshes and not self.left_out:
             none_selected = ", or none is selected" * is_selection
-            reason = reason or "".join(f"; {warning}" for warning in self._warnings[:1])
+            reason = "".join(f"; {warning}" for warning in self._warnings[:1])
             raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _jumps_at_end(self) -> bool:

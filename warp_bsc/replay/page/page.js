@@ -78,6 +78,7 @@ function fillText() {
   fillHead();
   byId("nothing").textContent = data.nothing;
   byId("nothing").hidden = !data.nothing;
+  byId("nothing").classList.toggle("banner", !data.is_whole);
   byId("only-new-label").hidden = !data.has_baseline;
   for (const id of ["tiles", "timeline", "findings", "pairs-panel", "impacts-panel", "steps"]) byId(id).hidden = Boolean(data.nothing);
   if (data.validation) {
