@@ -1,6 +1,5 @@
 """What a release names more than once: versions, dependencies and addresses."""
 
-import importlib.util
 import re
 import tomllib
 from pathlib import Path
@@ -60,20 +59,26 @@ def test_python_versions_are_those_that_continuous_integration_tests(project):
     assert named == tested
 
 
-def test_the_page_on_pypi_has_no_relative_link():
-    script = ROOT / ".ci" / "pypi_readme.py"
-    if not script.exists():
-        pytest.skip("not a checkout")
-    spec = importlib.util.spec_from_file_location("pypi_readme", script)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    text = "[page](docs/x.md#y) ![picture](assets/p.png) [there](#limits) [doi](https://doi.org/1)"
-    changed = module.with_absolute_links(text, "v1.2.3")
-    assert changed == (
-        f"[page]({URL}/blob/v1.2.3/docs/x.md#y) "
-        "![picture](https://raw.githubusercontent.com/warp-bsc/warp-bsc/v1.2.3/assets/p.png) "
-        "[there](#limits) [doi](https://doi.org/1)"
-    )
-    readme = module.with_absolute_links((ROOT / "README.md").read_text(), "v1.2.3")
-    links = re.findall(r"\]\(([^)\s]+)\)", readme)
-    assert len(links) > 5 and all(link.startswith(("https://", "#")) for link in links)
+def test_the_wheel_has_the_data_that_it_names():
+    """And no other: setuptools takes what MANIFEST.in names for packages that are not listed, with long warnings."""
+    options = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert options["include-package-data"] is False
+    found = set()
+    for package, patterns in options["package-data"].items():
+        assert package in options["packages"]
+        folder = ROOT / options["package-dir"].get(package, package.replace(".", "/"))
+        for pattern in patterns:
+            files = [path for path in folder.glob(pattern) if path.is_file()]
+            assert files or any(folder.glob(pattern + "/*")), (package, pattern)
+            found.update(files)
+    package = {path for path in (ROOT / "warp_bsc").rglob("*.*") if path.suffix not in (".py", ".pyc")}
+    measurements = {path for path in package if path.parent.name == "measurements"}  # for the tables of the guides
+    demo = ROOT / "assets" / "cloth_twist.usd"
+    assert found - {demo} == {path for path in package - measurements if path.is_file()} and demo in found
+    assert max(path.stat().st_size for path in found) < 2**21
+
+
+def test_the_sdist_has_what_tests_and_the_site_need():
+    lines = (ROOT / "MANIFEST.in").read_text().split("\n")
+    assert {f"graft {name}" for name in ("assets", "conda", "docs", "examples", "tests")} <= set(lines)
+    assert "include AGENTS.md CHANGELOG.md CITATION.cff" in lines

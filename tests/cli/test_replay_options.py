@@ -2,9 +2,11 @@
 
 import argparse
 import shlex
+from pathlib import Path
 
 import pytest
 
+from warp_bsc.cli.options import scene_path
 from warp_bsc.cli.replay_options import add_replay_options, command_of
 
 WITHOUT_EFFECT = {
@@ -70,3 +72,10 @@ def test_frames_without_a_start_or_an_end(parser, frames, written):
 def test_options_on_files_and_processes_are_left_out(parser):
     words = ["--json", "hits.json", "--workers", "8", "--resume", "--fail-on", "collisions", "--device", "cpu"]
     assert command_of(parser.parse_args(["scene.usd", *words])) == "warp-bsc replay scene.usd"
+
+
+def test_demo_is_the_scene_of_the_package_unless_there_is_a_file_of_this_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert Path(scene_path("demo")).is_file() and scene_path("demo.usd") == "demo.usd"
+    (tmp_path / "demo").touch()
+    assert scene_path("demo") == "demo"

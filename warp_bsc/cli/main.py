@@ -13,7 +13,7 @@ __all__ = ["main", "run"]
 
 _EPILOG = f"""\
 examples:
-  warp-bsc replay cloth.usd
+  warp-bsc replay demo
   warp-bsc repair cloth.usd --output fixed.usdc
   warp-bsc query 227vf.csv 227ee.csv
   warp-bsc bench detector

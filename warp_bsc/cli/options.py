@@ -2,7 +2,9 @@
 
 import argparse
 import math
+import os
 from collections.abc import Callable
+from pathlib import Path
 
 from .._arguments import SMALLEST_DISTANCE
 from ..detection.settings import METHODS
@@ -15,14 +17,19 @@ __all__ = [
     "add_fail_on",
     "add_json",
     "add_repeat",
+    "add_scene",
     "add_threads",
     "distance",
     "natural",
     "positive",
+    "scene_path",
 ]
 
 Commands = argparse._SubParsersAction
 """What ``ArgumentParser.add_subparsers`` returns: the commands, to which each module adds its own."""
+
+_DEMO = "assets/cloth_twist.usd"
+"""The scene called demo. In a checkout it stands beside the package, as the device code does, else in it."""
 
 
 def add_command(
@@ -53,6 +60,20 @@ def add_command(
     )
     command.set_defaults(run=run)
     return command
+
+
+def add_scene(command: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Adds the scene, whose value is for :func:`scene_path`."""
+    text = "a .usd, .usda, .usdc or .usdz file; demo for a recorded cloth that comes with warp-bsc"
+    command.add_argument("scene", metavar="SCENE", nargs="?" if optional else None, help=text)
+
+
+def scene_path(name: str) -> str:
+    """Returns the path of a scene: for demo that of the package's own, unless there is a file of this name."""
+    if name != "demo" or os.path.exists(name):
+        return name
+    package = Path(__file__).parents[1]
+    return next(str(folder / _DEMO) for folder in (package, package.parent) if (folder / _DEMO).exists())
 
 
 def add_detection_options(command: argparse.ArgumentParser, *, method: str) -> None:

@@ -17,7 +17,7 @@ from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
 from .exit_status import ExitStatus, explain_statuses
 from .interrupts import INTERRUPTS
-from .options import Commands, add_command, add_device, add_fail_on, add_json, distance
+from .options import Commands, add_command, add_device, add_fail_on, add_json, add_scene, distance, scene_path
 from .progress import RunProgress
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
@@ -63,7 +63,7 @@ def add_to(commands: Commands, summary: str) -> None:
         description=_DESCRIPTION,
         epilog=_EPILOG,
     )
-    command.add_argument("scene", metavar="SCENE", help="a .usd, .usda, .usdc or .usdz file")
+    add_scene(command)
     which = command.add_argument_group("selection")
     which.add_argument(
         "--keep",
@@ -115,6 +115,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ValueError("--report must be a file, not standard output")
     written = [file for file in (arguments.output, arguments.report) if file]
     written.append(str(unfinished_path(arguments.output)))
+    arguments.scene = scene_path(arguments.scene)
     paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
     for path in paths:
         if paths.count(path) > 1:

@@ -30,7 +30,7 @@ from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
 from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
-from .options import Commands, add_command
+from .options import Commands, add_command, scene_path
 from .progress import RunProgress
 from .replay_options import (
     DESCRIPTION,
@@ -102,6 +102,7 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
             setattr(arguments, option, STDOUT)
     if arguments.scene is None:
         raise ValueError("the following arguments are required: SCENE; see warp-bsc replay --help")
+    arguments.scene = scene_path(arguments.scene)
     is_saved = arguments.json not in (None, STDOUT)
     named = (arguments.overlay, arguments.report, arguments.json, arguments.csv, arguments.npz)
     outputs = [file for file in named if file]

@@ -14,7 +14,7 @@ from ..usd.frames import FrameRange
 from ..usd.scene import Scene
 from ..usd.selection import PURPOSES
 from .exit_status import ExitStatus, explain_statuses
-from .options import add_detection_options, add_fail_on, distance, positive
+from .options import add_detection_options, add_fail_on, add_scene, distance, positive
 
 __all__ = [
     "DESCRIPTION",
@@ -44,7 +44,7 @@ from which --resume continues."""
 
 EPILOG = f"""\
 examples:
-  warp-bsc replay cloth.usd
+  warp-bsc replay demo
   warp-bsc replay shot.usd --overlay hits.usda --report hits.html
   warp-bsc replay shot.usd --between '/World/Coat' '/World/Body*' --no-self
   warp-bsc replay shot.usd --frames 101:150 --subdivide 4 --validate 1000
@@ -68,7 +68,7 @@ examples:
 
 def add_replay_options(command: argparse.ArgumentParser) -> None:
     """Adds the options of the command."""
-    command.add_argument("scene", metavar="SCENE", nargs="?", help="a .usd, .usda, .usdc or .usdz file")
+    add_scene(command, optional=True)
 
     which = command.add_argument_group("selection")
     add_scene_selection(which)
