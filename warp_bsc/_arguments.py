@@ -163,18 +163,24 @@ def checked_shape(array: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Returns an array of coordinates, as NumPy, finite or not.
 
     Args:
-        array: Coordinates, float32 or float64, first dimension n, then ``shape``.
+        array: Coordinates, float32 or float64, first dimension n, then ``shape``; integers of at most 2^53, if it is a
+            list or of NumPy.
         shape: All dimensions except the first.
         name: Name of the array in errors.
 
     Returns:
-        NumPy array.
+        NumPy array, float64 for integers.
 
     Raises:
         TypeError: If its entries are no numbers.
-        ValueError: If the shape or the type is wrong, or entries are masked.
+        ValueError: If the shape or the type is wrong, entries are masked, or an integer is larger.
     """
+    of_device = hasattr(array, "numpy")
     array = as_numpy(array, name)
+    if array.dtype.kind in "iu" and not of_device:
+        if array.size and max(int(array.max()), -int(array.min())) > 2**53:
+            raise ValueError(f"{name} must have integers of at most 2^53, which are exact in float64")
+        array = array.astype(np.float64)
     if array.dtype not in (np.float32, np.float64):
         raise ValueError(f"{name} must be float32 or float64, got {array.dtype}")
     if array.ndim == 0 or array.shape[1:] != shape:

@@ -402,6 +402,21 @@ def test_poses_give_the_turn_between_them():
     np.testing.assert_array_equal(motion.centre, pose_0[:, :3])
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_half_a_turn_has_no_shorter_way(dtype):
+    start = np.array([[0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0.5, 0.5, 0.5, 0.5]], dtype)
+    for share, is_half in ((1.0, True), (1.0 - 1e-7, dtype == np.float32), (1.0 + 1e-4, False)):
+        sine, cosine = np.sin(0.5 * np.pi * share), np.cos(0.5 * np.pi * share)
+        end = np.stack([start[0], [1, 0, 0, *(0.5 * (cosine + sine * np.array([-1, 1, 1]))), 0.5 * (cosine - sine)]])
+        if is_half:
+            with pytest.raises(ValueError, match=r"pose_1\[1\] is half a turn from pose_0\[1\]"):
+                bsc.RigidMotion.between([0, 1], start, end.astype(dtype))
+        else:
+            turn = bsc.RigidMotion.between([0, 1], start, end.astype(dtype)).turn
+            expected = np.pi * (share if share < 1.0 else share - 2.0) * Z
+            np.testing.assert_allclose(turn, [0.0 * Z, expected], atol=1e-6)
+
+
 def test_what_does_not_fit_is_an_error(device):
     x0 = np.array([[1, 0, 0], [2, 0, 0], [1, 1, 0], [5, 0, 0], [6, 0, 0], [5, 1, 0]], float)
     x1 = x0.copy()

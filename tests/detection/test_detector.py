@@ -187,6 +187,22 @@ def test_meshes_of_any_integers_are_taken():
         assert bsc.CollisionMesh(faces, np.uint8(3)).faces.tolist() == [[0, 1, 2]]
 
 
+def test_positions_in_place_of_a_number_are_told_where_they_belong():
+    for arguments in ((np.zeros((3, 3)), [[0, 1, 2]]), ([[0, 1, 2]], np.zeros((3, 3)))):
+        with pytest.raises(TypeError, match=r"number of positions: CollisionMesh\(faces, len\(x\)\).*detect\(x0, x1\)"):
+            bsc.CollisionMesh(*arguments)
+
+
+def test_lists_of_whole_numbers_are_positions(device):
+    mesh = bsc.CollisionMesh([[0, 1, 2]], 4, points=[3], device=device)
+    x0 = [[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, 1]]
+    x1 = [[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -3]]
+    detector = bsc.CollisionDetector(mesh, min_distance=0.5)
+    found = detector.detect(x0, np.array(x1, np.int16))
+    assert found.vertex_face.tolist() == [[3, 0]]
+    assert found.vertex_face_toi[0] == detector.detect(np.array(x0, float), np.array(x1, float)).vertex_face_toi[0]
+
+
 def test_bad_positions_are_refused():
     detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2]], 4))
     x = np.zeros((4, 3))
@@ -195,8 +211,12 @@ def test_bad_positions_are_refused():
     with pytest.raises(ValueError, match="x0 must have shape"):
         detector.detect(np.zeros((4, 2)), x)
     with pytest.raises(ValueError, match="float32 or float64"):
-        detector.detect(x.astype(int), x)
-    with pytest.raises(ValueError, match="x1 must have the type of x0"):
+        detector.detect(x.astype(np.float16), x)
+    with pytest.raises(ValueError, match="float32 or float64"):
+        detector.detect(wp.zeros(4, dtype=wp.vec3i, device="cpu"), x)
+    with pytest.raises(ValueError, match="x0 must have integers of at most 2"):
+        detector.detect(x.astype(int) - 2**53 - 1, x)
+    with pytest.raises(ValueError, match=r"x1 must be .* as x0"):
         detector.detect(x, x.astype(np.float32))
     bad = x.copy()
     bad[2, 1] = np.nan

@@ -88,7 +88,7 @@ def test_bad_input_is_an_error(device):
         detector.inversions(x, bad)
     with pytest.raises(ValueError, match="x must have 6 rows"):
         detector.find_inversions(X)
-    with pytest.raises(ValueError, match="x1 must have the type of x0"):
+    with pytest.raises(ValueError, match="x1 must be float32 as x0, not float64"):
         detector.inversions(x.astype(np.float32), x)
 
 

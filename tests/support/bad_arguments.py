@@ -84,7 +84,7 @@ def bad_arrays(good: np.ndarray, *, index: bool = False) -> dict[str, Any]:
     if index:
         values |= {"floats": good.astype(float), "negative": np.full_like(good, -1), "huge": np.full_like(good, 2**40)}
     else:
-        values |= {"integers": good.astype(int), "half precision": good.astype(np.float16)}
+        values |= {"huge integers": good.astype(int) - 2**53 - 1, "half precision": good.astype(np.float16)}
     return values
 
 
@@ -345,7 +345,8 @@ def calls() -> dict[str, Call]:
         bsc.query_points,
         {"elements": FACES, "pairs": pairs, "x0": X, "x1": X},
         {
-            "elements": bad_arrays(FACES, index=True) | {"columns": np.zeros((2, 4), int)},
+            "elements": without(bad_arrays(FACES, index=True), "None") | {"columns": np.zeros((2, 4), int)},
+            "kind": without(CHOICES, "None") | {"of edges": "edge_edge", "of points": "vertex_vertex"},
             "pairs": bad_arrays(pairs, index=True),
             "x0": without(bad_arrays(X)) | {"rows": np.zeros((5, 3))},
             "x1": bad_arrays(X) | {"rows": np.zeros((5, 3)), "single": X.astype(np.float32)},
@@ -458,7 +459,7 @@ def calls_of_solvers() -> dict[str, Call]:
         "too few": bsc.FrictionTable([[0.1]], particle_material=np.zeros(count - 1, dtype=int)),
         "shapes": bsc.FrictionTable([[0.1]], shape_material=[0]),
     }
-    coefficients = without(bad_arrays(np.zeros((2, 2))), "integers", "half precision") | {
+    coefficients = without(bad_arrays(np.zeros((2, 2))), "huge integers", "half precision") | {
         "not square": np.zeros((2, 1)),
         "empty": np.zeros((0, 0)),
         "not symmetric": [[0.1, 0.2], [0.3, 0.1]],

@@ -254,7 +254,7 @@ class Queries:
 
     def points(self, which: slice | np.ndarray | list[int] = slice(None)) -> np.ndarray:
         """Returns the points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
-        return query_points(self.elements, self.pairs[which], self.x0, self.x1)
+        return query_points(self.elements, self.pairs[which], self.x0, self.x1, kind=self.kind.label)
 
     def __len__(self) -> int:
         """Returns the number of queries."""

@@ -2,6 +2,7 @@
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .._arguments import as_numpy, check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
@@ -101,10 +102,10 @@ class CollisionDetector:
     @one_at_a_time
     def detect(
         self,
-        x0: np.ndarray | wp.array,
-        x1: np.ndarray | wp.array,
+        x0: ArrayLike | wp.array,
+        x1: ArrayLike | wp.array,
         *,
-        only: np.ndarray | None = None,
+        only: ArrayLike | None = None,
         arcs: RigidMotion | None = None,
     ) -> Collisions:
         """Returns all collisions of a motion.
@@ -216,7 +217,7 @@ class CollisionDetector:
         at_once.bound(x0, x1)
         return self._capture_on_cuda(at_once.pipeline, x0, x1, at_once)
 
-    def find_intersections(self, x: np.ndarray | wp.array) -> np.ndarray:
+    def find_intersections(self, x: ArrayLike | wp.array) -> np.ndarray:
         """Returns the edges that meet faces in one configuration, exactly.
 
         Args:
@@ -233,7 +234,7 @@ class CollisionDetector:
         """
         return find_intersections(self.mesh, x)
 
-    def inversions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> Inversions:
+    def inversions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> Inversions:
         """Returns the tetrahedra of the mesh whose volume is 0 or negative at some time of a motion.
 
         Decided as by the method of the detector: "conservative" counts those that floating point cannot certify.
@@ -253,7 +254,7 @@ class CollisionDetector:
         x0, x1 = self._checked_positions(x0, x1)
         return inversions_of_motion(self.mesh, x0, x1, method=self.method, tolerance=self.tolerance)
 
-    def find_inversions(self, x: np.ndarray | wp.array) -> np.ndarray:
+    def find_inversions(self, x: ArrayLike | wp.array) -> np.ndarray:
         """Returns the tetrahedra of the mesh whose volume is 0 or negative in one configuration, exactly.
 
         Args:
@@ -272,7 +273,7 @@ class CollisionDetector:
         x = self.mesh.device_positions(x, "x")
         return inversions_of_motion(self.mesh, x, x, method="exact", tolerance=self.tolerance).tets
 
-    def find_proximities(self, x: np.ndarray | wp.array, distance: float, *, rings: int = 1) -> Proximities:
+    def find_proximities(self, x: ArrayLike | wp.array, distance: float, *, rings: int = 1) -> Proximities:
         """Returns the pairs of elements that are near each other in one configuration, exactly.
 
         Pairs are those of :meth:`detect`, points included, whether or not the detector has a minimum distance. Radii of
@@ -311,7 +312,7 @@ class CollisionDetector:
         return ArcBounds(arcs, self.mesh.device_vertices, x0, x1)
 
     def _detect_arcs(
-        self, x0: wp.array, x1: wp.array, only: np.ndarray | None, changed: wp.array | None, bounds: ArcBounds
+        self, x0: wp.array, x1: wp.array, only: ArrayLike | None, changed: wp.array | None, bounds: ArcBounds
     ) -> Collisions:
         """Returns the collisions of a motion in which bodies turn."""
         body, options = bounds.motion.body, {"method": self.method, "tolerance": self.tolerance}
@@ -343,19 +344,22 @@ class CollisionDetector:
         found = {kind: ContactRows(buffer, len(buffer.pairs)) for kind, buffer in buffers.items()}
         return Collisions(self.method != "float", (), None, self.method, counts, found, timer)
 
-    def _checked_vertices(self, only: np.ndarray) -> wp.array:
+    def _checked_vertices(self, only: ArrayLike) -> wp.array:
         """Returns which vertices are given, on the device, array of int."""
         mask = as_numpy(only, "only", "an array of bool")
         if mask.dtype != bool or mask.shape != (self.mesh.vertex_count,):
             raise ValueError(f"only must be bool of shape ({self.mesh.vertex_count},), not {mask.dtype} {mask.shape}")
         return wp.array(mask, dtype=int, device=self.mesh.device)
 
-    def _checked_positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array) -> tuple[wp.array, wp.array]:
+    def _checked_positions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> tuple[wp.array, wp.array]:
         """Returns the positions of a motion on the device, of one type."""
         x0 = self.mesh.device_positions(x0, "x0")
         x1 = self.mesh.device_positions(x1, "x1")
         if x0.dtype != x1.dtype:
-            raise ValueError(f"x1 must have the type of x0, {x0.dtype.__name__}, not {x1.dtype.__name__}")
+            x0_type, x1_type = ("float32" if x.dtype == wp.vec3 else "float64" for x in (x0, x1))
+            raise ValueError(
+                f"x1 must be {x0_type} as x0, not {x1_type}: convert one of them, exactly if it becomes float64"
+            )
         return x0, x1
 
     def _ordered_contacts(

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .. import checker
 from .._arguments import check_finite, check_instance
@@ -255,7 +256,7 @@ class IntersectionFinder:
         self._lock = self._candidates.lock
         self._allocate(len(mesh.faces))
 
-    def find(self, x: np.ndarray | wp.array, *, is_end: bool = False) -> Intersections:
+    def find(self, x: ArrayLike | wp.array, *, is_end: bool = False) -> Intersections:
         """Returns the intersections of one configuration.
 
         Args:
@@ -270,7 +271,7 @@ class IntersectionFinder:
         """
         return self._find(x, lambda positions: self._candidates.find(positions, is_end=is_end))
 
-    def find_at_end(self, x: np.ndarray | wp.array, start: Intersections, collisions: Collisions) -> Intersections:
+    def find_at_end(self, x: ArrayLike | wp.array, start: Intersections, collisions: Collisions) -> Intersections:
         """Returns the intersections at the end of a motion: those of :meth:`find`, on a CPU in less time.
 
         An edge and a face that are apart at the start and meet at the end have a first contact in between. There, an
@@ -295,7 +296,7 @@ class IntersectionFinder:
         return self._find(x, lambda _: self._candidates.enqueue(pairs))
 
     @one_at_a_time
-    def _find(self, x: np.ndarray | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
+    def _find(self, x: ArrayLike | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
         """Returns which of the pairs that a function enqueues for positions on the device meet."""
         mesh, given = self._mesh, x
         x = mesh.device_positions(x, "x")
@@ -402,7 +403,7 @@ class _Incidence:
         return rows, self._elements[places]
 
 
-def find_intersections(mesh: CollisionMesh, x: np.ndarray | wp.array) -> np.ndarray:
+def find_intersections(mesh: CollisionMesh, x: ArrayLike | wp.array) -> np.ndarray:
     """Returns the edges that meet faces in one configuration, exactly: :attr:`Intersections.pairs`.
 
     Arguments and errors are those of :meth:`IntersectionFinder.find`.

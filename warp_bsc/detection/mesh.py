@@ -1,11 +1,11 @@
 """The collision mesh: the faces, edges and vertices for collision detection."""
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .._arguments import as_numpy, checked_bits, checked_distances, checked_flag, checked_integer, checked_shape
 from ..kernels.pipeline.pairs import PairFilter
@@ -64,16 +64,16 @@ class CollisionMesh:
 
     def __init__(
         self,
-        faces: np.ndarray | wp.array,
+        faces: ArrayLike | wp.array,
         vertex_count: int,
         *,
-        edges: np.ndarray | wp.array | None = None,
-        points: np.ndarray | wp.array | None = None,
-        tets: np.ndarray | wp.array | None = None,
-        radius: float | np.ndarray | wp.array | None = None,
-        world: np.ndarray | wp.array | None = None,
-        group: int | np.ndarray | wp.array | None = None,
-        mask: int | np.ndarray | wp.array | None = None,
+        edges: ArrayLike | wp.array | None = None,
+        points: ArrayLike | wp.array | None = None,
+        tets: ArrayLike | wp.array | None = None,
+        radius: ArrayLike | wp.array | None = None,
+        world: ArrayLike | wp.array | None = None,
+        group: ArrayLike | wp.array | None = None,
+        mask: ArrayLike | wp.array | None = None,
         only_free: bool = False,
         device: wp.DeviceLike = None,
     ):
@@ -110,6 +110,11 @@ class CollisionMesh:
                 one vertex twice, entries are masked, the worlds differ within a face or an edge, or the device does not
                 exist.
         """
+        if isinstance(vertex_count, list | tuple | np.ndarray | wp.array):  # CollisionMesh(x, faces), as elsewhere
+            raise TypeError(
+                "vertex_count must be an integer, the number of positions: CollisionMesh(faces, len(x)); a mesh has no "
+                "positions, which detect(x0, x1) takes"
+            )
         self.vertex_count = checked_integer(vertex_count, "vertex_count")
         self.only_free = checked_flag(only_free, "only_free")
         self.device = checked_device(device)
@@ -260,7 +265,7 @@ class CollisionMesh:
         """
         return self.device_faces if kind == PairKind.VERTEX_FACE else self.device_edges
 
-    def device_positions(self, x: np.ndarray | wp.array, name: str) -> wp.array:
+    def device_positions(self, x: ArrayLike | wp.array, name: str) -> wp.array:
         """Returns positions on the device as an array of vec3 or vec3d, unchanged or a copy; finite or not.
 
         Args:
@@ -286,7 +291,7 @@ class CollisionMesh:
         dtype = wp.vec3 if values.dtype == np.float32 else wp.vec3d
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
 
-    def _checked_indices(self, given: np.ndarray | wp.array | Sequence, corners: int, name: str) -> np.ndarray:
+    def _checked_indices(self, given: ArrayLike | wp.array, corners: int, name: str) -> np.ndarray:
         """Returns the vertex indices of elements, int32, shape [n, corners], or [n] for points."""
         shape = (0,) if corners == 1 else (0, corners)
         elements = as_numpy(given, f"{name}s")
@@ -310,16 +315,16 @@ class CollisionMesh:
             )
         return np.ascontiguousarray(elements, dtype=np.int32)
 
-    def _checked_radius(self, radius: float | np.ndarray | wp.array) -> np.ndarray | None:
+    def _checked_radius(self, radius: ArrayLike | wp.array) -> np.ndarray | None:
         """Returns the radius of each vertex, float64, shape [vertex_count], or None if all are 0."""
         values = checked_distances(radius, "radius", self.vertex_count)
         return np.broadcast_to(values, self.vertex_count).copy() if values.any() else None
 
-    def _checked_bits(self, bits: int | np.ndarray | wp.array, name: str) -> np.ndarray:
+    def _checked_bits(self, bits: ArrayLike | wp.array, name: str) -> np.ndarray:
         """Returns groups or masks of the vertices, uint32, shape [vertex_count]."""
         return checked_bits(bits, name, self.vertex_count)
 
-    def _checked_world(self, world: np.ndarray | wp.array) -> np.ndarray:
+    def _checked_world(self, world: ArrayLike | wp.array) -> np.ndarray:
         """Returns the world of each vertex, int32, shape [vertex_count], one for the vertices of a face or an edge."""
         worlds = as_numpy(world, "world")
         if worlds.shape != (self.vertex_count,) or not np.issubdtype(worlds.dtype, np.integer):

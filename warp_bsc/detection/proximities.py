@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .. import checker
 from .._arguments import check_finite, check_instance, checked_distance
@@ -185,7 +186,7 @@ class ProximityFinder:
         self._rings = make_rings(mesh, rings)
 
     @one_at_a_time
-    def find(self, x: np.ndarray | wp.array) -> Proximities:
+    def find(self, x: ArrayLike | wp.array) -> Proximities:
         """Returns the proximities of one configuration.
 
         The pairs are exactly those whose distance is at most the given one: exact arithmetic decides where the computed

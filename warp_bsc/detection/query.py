@@ -5,6 +5,7 @@ from typing import overload
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .._arguments import check_finite, check_instance, checked_choice, checked_distances, checked_flag, checked_shape
 from ..kernels.signs import FREE, HIT, UNSURE
@@ -47,9 +48,9 @@ class QueryResult:
 
 @overload
 def query_vertex_face(
-    points: np.ndarray | wp.array,
+    points: ArrayLike | wp.array,
     *,
-    min_distance: float | np.ndarray = 0.0,
+    min_distance: ArrayLike = 0.0,
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -66,9 +67,9 @@ def query_vertex_face(
     out: QueryArrays,
 ) -> QueryArrays: ...
 def query_vertex_face(
-    points: np.ndarray | wp.array,
+    points: ArrayLike | wp.array,
     *,
-    min_distance: float | np.ndarray = 0.0,
+    min_distance: ArrayLike = 0.0,
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -107,9 +108,9 @@ def query_vertex_face(
 
 @overload
 def query_edge_edge(
-    points: np.ndarray | wp.array,
+    points: ArrayLike | wp.array,
     *,
-    min_distance: float | np.ndarray = 0.0,
+    min_distance: ArrayLike = 0.0,
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -126,9 +127,9 @@ def query_edge_edge(
     out: QueryArrays,
 ) -> QueryArrays: ...
 def query_edge_edge(
-    points: np.ndarray | wp.array,
+    points: ArrayLike | wp.array,
     *,
-    min_distance: float | np.ndarray = 0.0,
+    min_distance: ArrayLike = 0.0,
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -166,9 +167,9 @@ def query_edge_edge(
 
 
 def query_vertex_edge(
-    points: np.ndarray | wp.array,
+    points: ArrayLike | wp.array,
     *,
-    min_distance: float | np.ndarray = 0.0,
+    min_distance: ArrayLike = 0.0,
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -196,9 +197,9 @@ def query_vertex_edge(
 
 
 def query_vertex_vertex(
-    points: np.ndarray | wp.array,
+    points: ArrayLike | wp.array,
     *,
-    min_distance: float | np.ndarray = 0.0,
+    min_distance: ArrayLike = 0.0,
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
@@ -228,8 +229,8 @@ def query_vertex_vertex(
 def _query_into(
     out: QueryArrays,
     kind: PairKind,
-    points: np.ndarray | wp.array,
-    min_distance: float | np.ndarray,
+    points: ArrayLike | wp.array,
+    min_distance: ArrayLike,
     method: Method,
     timed: bool,
     tolerance: float,
@@ -252,8 +253,8 @@ def _query_into(
 
 def _query(
     kind: DistanceKind,
-    points: np.ndarray | wp.array,
-    min_distance: float | np.ndarray,
+    points: ArrayLike | wp.array,
+    min_distance: ArrayLike,
     method: Method,
     timed: bool,
     tolerance: float,

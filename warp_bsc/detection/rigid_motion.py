@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import warp as wp
+from numpy.typing import ArrayLike
 
 from .._arguments import as_numpy, check_finite, checked_coordinates, checked_distance, checked_number
 from ..kernels.arcs import arc_bounds, on_arc
@@ -90,9 +91,9 @@ class RigidMotion:
 
     def __init__(
         self,
-        body: np.ndarray | wp.array,
-        centre: np.ndarray | wp.array,
-        turn: np.ndarray | wp.array,
+        body: ArrayLike | wp.array,
+        centre: ArrayLike | wp.array,
+        turn: ArrayLike | wp.array,
         *,
         tolerance: float | None = None,
     ):
@@ -144,9 +145,9 @@ class RigidMotion:
     @classmethod
     def between(
         cls,
-        body: np.ndarray | wp.array,
-        pose_0: np.ndarray | wp.array,
-        pose_1: np.ndarray | wp.array,
+        body: ArrayLike | wp.array,
+        pose_0: ArrayLike | wp.array,
+        pose_1: ArrayLike | wp.array,
         *,
         tolerance: float | None = None,
     ) -> "RigidMotion":
@@ -163,11 +164,13 @@ class RigidMotion:
 
         Raises:
             TypeError: If an argument has another type.
-            ValueError: As of :class:`RigidMotion`, or if a quaternion is not of length 1, to a thousandth.
+            ValueError: As of :class:`RigidMotion`, or if a quaternion is not of length 1, to a thousandth, or the turn
+                is half a turn, up to the rounding of the poses' type.
         """
-        poses = []
+        poses, rounding = [], 0.0
         for name, pose in (("pose_0", pose_0), ("pose_1", pose_1)):
-            values = checked_coordinates(pose, (7,), name).astype(np.float64)
+            given = checked_coordinates(pose, (7,), name)
+            values, rounding = given.astype(np.float64), max(rounding, float(np.finfo(given.dtype).eps))
             with np.errstate(over="ignore"):
                 length = np.linalg.norm(values[:, 3:], axis=1)
             bad = ~(np.abs(length - 1.0) < 1e-3)
@@ -180,6 +183,9 @@ class RigidMotion:
         v0, w0, v1, w1 = poses[0][:, 3:6], poses[0][:, 6:], poses[1][:, 3:6], poses[1][:, 6:]
         # q1 times the conjugate of q0, of the sign that turns the shorter way
         vector, scalar = w0 * v1 - w1 * v0 - np.cross(v1, v0), w1 * w0 + (v1 * v0).sum(axis=1, keepdims=True)
+        if (half := np.abs(scalar[:, 0]) < 4.0 * rounding).any():
+            which = int(np.argmax(half))
+            raise ValueError(f"pose_1[{which}] is half a turn from pose_0[{which}], which tells no way: give the turn")
         vector = np.where(scalar < 0.0, -vector, vector)
         sine = np.linalg.norm(vector, axis=1, keepdims=True)
         still = sine < _SMALLEST_TURN
@@ -187,7 +193,7 @@ class RigidMotion:
         turn = np.where(still, 0.0, vector / np.where(still, 1.0, sine) * angle)
         return cls(body, poses[0][:, :3], turn, tolerance=tolerance)
 
-    def positions(self, x0: np.ndarray | wp.array, x1: np.ndarray | wp.array, time: float) -> np.ndarray:
+    def positions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array, time: float) -> np.ndarray:
         """Returns the positions of all vertices at a time, rounded, float64, shape [vertex_count, 3].
 
         Args:

@@ -84,7 +84,7 @@ def validate(
         if most is not None and len(rows) > most:
             rows = np.sort(random.choice(rows, most, replace=False))
         decided_hits += len(rows)
-        bounds = getattr(checker, f"{kind}_toi")(query_points(second, found[rows], x0, x1))
+        bounds = getattr(checker, f"{kind}_toi")(query_points(second, found[rows], x0, x1, kind=kind))
         for row, (earliest, latest) in zip(rows, bounds, strict=True):
             pair = f"{kind.replace('_', '-')} {found[row].tolist()}"
             if np.isnan(earliest) and detector.method == "conservative":
@@ -99,7 +99,7 @@ def validate(
         others = (p[are_straight(p)] for p in _unreported(mesh, kind, first, second, found, x0, x1))
         for pairs in _merged(others) if most is None else [_choose(others, most, random)]:
             decided_others += len(pairs)
-            collides = getattr(checker, kind)(query_points(second, pairs, x0, x1))
+            collides = getattr(checker, kind)(query_points(second, pairs, x0, x1, kind=kind))
             name = kind.replace("_", "-")
             disagreements += [f"{name} {pair} collides and was not reported" for pair in pairs[collides].tolist()]
 
