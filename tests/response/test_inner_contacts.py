@@ -190,7 +190,8 @@ def test_triangles_of_round_shapes_are_no_deeper_than_said(device):
     builder.add_shape_box(-1, hx=0.1, hy=0.2, hz=0.3)
     builder.add_particle(wp.vec3(), wp.vec3(), 1.0)
     model = builder.finalize(device=device)
-    mesh, depths = ModelMesh(model), inner_contacts._depths(model)
+    mesh = ModelMesh(model)
+    depths = inner_contacts.InnerContacts(mesh, moves_bodies=False)._stage.depth.numpy()
     scale = model.shape_scale.numpy().astype(float)
     x = np.concatenate([np.zeros((1, 3)), mesh.shape_vertices.position]).astype(float)
     for shape, kind in enumerate(map(GeoType, model.shape_type.numpy())):

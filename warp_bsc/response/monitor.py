@@ -62,7 +62,8 @@ class CollisionMonitor(CollisionStage):
         report_worlds = checked_flag(report_worlds, "report_worlds")
         distances = KeptDistances.of(self.model, min_distance, particle_radius)
         collision_filter = checked_filter(collision_filter, self.model)
-        mesh = ModelMesh(self.model, strands=distances.any, collision_filter=collision_filter)
+        of_mesh = {"collision_filter": collision_filter, "uses_margins": isinstance(min_distance, str)}
+        mesh = ModelMesh(self.model, strands=distances.any, **of_mesh)
         self._warn_of_unseen(mesh, distances)
         if distances.any:
             mesh.distances = mesh.min_distances(distances, reach=0.0)

@@ -9,6 +9,7 @@ from .._warnings import warn_caller
 from ..detection.intersections import find_intersections
 from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
+from .report_text import shape_name
 from .report_totals import GradientTotals, StepTotals, Totals
 from .report_views import ReportViews
 from .schedule import Result, views_of
@@ -24,6 +25,10 @@ _CROSSINGS_WARNING = (
 _INVERSIONS_WARNING = (
     "a step inverted tetrahedra, report.inversions counts those of the last one: take shorter steps, or pass "
     "inversions='prevented'"
+)
+_NOT_FOLLOWED = (
+    "has changed in what the stage does not follow at run time, such as type, source, body, margin or flags of "
+    "collision: it collides as it was, at its new pose; put a new stage behind the solver"
 )
 _NOT_WATCHED = "a stage counts inversions only if it is asked to: pass inversions='reported' or 'prevented'"
 _LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it; shorten steps"
@@ -86,6 +91,9 @@ class SolverReport(ReportViews, WorldsOfReport):
             self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
             self._warn_once("layer", lambda: _LAYER_WARNING)
+        if known["shape_not_followed"]:
+            shape = shape_name(self._mesh.model, known["shape_not_followed"] - 1)
+            self._warn_once("shapes", lambda: f"{shape} {_NOT_FOLLOWED}")
         if known["ambiguous_moves"]:
             self._warn_once("moves", lambda: f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)")
 
@@ -338,7 +346,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        return Totals(*self._read_totals()[:-4])
+        return Totals(*self._read_totals()[:-5])
 
     @property
     def gradients(self) -> GradientTotals:

@@ -21,6 +21,7 @@ class StepTotals:
     strained_steps: wp.array[wp.int64]
     crossing_steps: wp.array[wp.int64]
     inverting_steps: wp.array[wp.int64]
+    shape_not_followed: wp.array[wp.int64]  # the last shape with a change that the stage does not follow, from 1
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
     outrun_steps: wp.array[wp.int64]

@@ -221,8 +221,8 @@ class SolverCCD(CollisionStage):
         self.friction, self.restitution = options.friction, options.restitution
         self.substeps, self.max_iterations = options.substeps, options.max_iterations
         separates, keeps_distances = options.bodies == "separated", options.distances.any
-        filters = {"collision_filter": collision_filter, "separates_bodies": separates}
-        mesh = ModelMesh(self.model, strands=keeps_distances, **filters)
+        of_mesh = {"separates_bodies": separates, "uses_margins": isinstance(min_distance, str)}
+        mesh = ModelMesh(self.model, strands=keeps_distances, collision_filter=collision_filter, **of_mesh)
         self._warn_of_unseen(mesh, options.distances)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
         if keeps_distances:
@@ -470,10 +470,16 @@ class SolverCCD(CollisionStage):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies the inner solver, and reads masses and flags of particles and gravity again."""
+        """Notifies the inner solver, and reads masses, gravity and shapes again, see :class:`.stage.CollisionStage`."""
         super().notify_model_changed(flags)
         if self._substepping is not None and flags & newton.ModelFlags.MODEL_PROPERTIES:
             self._substepping[1].read_gravity()
+
+    def _follow_shapes(self):
+        self._motion.friction.read_shapes(self.model)
+        super()._follow_shapes()
+        if self._substepping is not None:
+            self._substepping[1].read_shapes()
 
     def update_contacts(self, contacts, state=None):
         """Delegates to the inner solver, for the contacts that it got."""

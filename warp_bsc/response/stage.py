@@ -218,12 +218,25 @@ class CollisionStage(CouplingHooks):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
+        """Notifies the inner solver, and reads masses and flags of particles again, and of shapes if they changed.
+
+        With ``SHAPE_PROPERTIES`` the stage follows poses, scales and friction of shapes, in each world. A shape that
+        changes jumps, as in a reset: the next step begins with the new surface, and what is then inside it, or crosses
+        it, counts as that. What is not followed is warned of once, see :meth:`.state.mesh.ModelMesh.follow_shapes`.
+        """
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
+        if flags & (newton.ModelFlags.SHAPE_PROPERTIES | newton.ModelFlags.SHAPE_TYPE_AND_SOURCE):
+            self._follow_shapes()
         if self._between_steps is not None:
             self._between_steps.refresh()
         self._recount_crossings()
+
+    def _follow_shapes(self):
+        self._motion.follow_shapes(self._work.vertices, self.report.device_totals.shape_not_followed)
+        if not self.mesh.device.is_capturing:
+            self.report.copy_totals()
+            self.report.warn()
 
     @one_at_a_time
     def reset(self, state, world_mask=None, flags=None):

@@ -160,7 +160,7 @@ class ContactLayer(WrappedSolver):
             add_zeros(layer, ["changes"], body_count, device)
             self._poses = wp.zeros(body_count, dtype=wp.transform, device=device)
         self._layer, self._body_count = layer, body_count
-        self.skipped = wp.zeros(1, dtype=wp.int64, device=device)
+        self.skipped, self._not_followed = (wp.zeros(1, dtype=wp.int64, device=device) for _ in range(2))
         self._motion.set_start(arrays_of(self.model))
         self._motion.set_end(arrays_of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
@@ -294,9 +294,12 @@ class ContactLayer(WrappedSolver):
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:
-        """Notifies the inner solver, and reads masses and flags of particles again; shapes stay as they were."""
+        """Notifies the inner solver, and reads masses and shapes again, see :class:`..stage.CollisionStage`."""
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
+        if flags & (newton.ModelFlags.SHAPE_PROPERTIES | newton.ModelFlags.SHAPE_TYPE_AND_SOURCE):
+            self.mesh.follow_shapes(self._not_followed)  # the stage around the layer warns
+            self._motion.friction.read_shapes(self.model)
 
 
 def default_thicknesses(mesh: ModelMesh, of_pairs: float) -> tuple[float, float]:

@@ -1,5 +1,6 @@
 """Coefficients of friction of the vertices and planes of a mesh, from those of particles and shapes, and by pair."""
 
+import newton
 import numpy as np
 import warp as wp
 
@@ -53,7 +54,7 @@ class Friction:
         """Reads the coefficients of the vertices and planes of a mesh for the first time."""
         self.of_particles, self.of_shapes = of_particles, of_shapes
         shapes = mesh.device_shape_vertices.shape, mesh.device_planes.shape
-        self._inputs = [of_particles, of_shapes, mesh.model.particle_count, *shapes]
+        self._places = [mesh.model.particle_count, *shapes]
         self.vertices = wp.zeros(mesh.vertex_count, dtype=float, device=mesh.device)
         self.planes = wp.zeros(len(shapes[1]), dtype=float, device=mesh.device)
         self.materials = Materials()
@@ -75,6 +76,12 @@ class Friction:
         """Reads the coefficients again. Can be captured in a CUDA graph."""
         self._launch([self.vertices, self.planes])
 
+    def read_shapes(self, model: newton.Model) -> None:
+        """Reads the coefficients again, those of shapes from the array that a model has now."""
+        if model.shape_material_mu is not None:
+            self.of_shapes = model.shape_material_mu
+        self.read()
+
     def backward(self, of_vertices: wp.array[float], of_planes: wp.array[float]) -> None:
         """Adds to the gradients of :attr:`of_particles` and :attr:`of_shapes`, given those of vertices and planes."""
         outputs = [of_vertices, of_planes]  # stand in for the outputs, which the adjoint does not read or write
@@ -82,4 +89,5 @@ class Friction:
 
     def _launch(self, outputs, **options):
         size, device = max(map(len, outputs)), self.vertices.device
-        wp.launch(_write_friction, size, inputs=self._inputs, outputs=outputs, device=device, **options)
+        inputs = [self.of_particles, self.of_shapes, *self._places]
+        wp.launch(_write_friction, size, inputs=inputs, outputs=outputs, device=device, **options)

@@ -13,6 +13,7 @@ from ...kernels.pipeline.pairs import PairFilter
 from ..tuning import SEGMENTS
 from .collision_filter import CollisionFilter, bits_of_model
 from .kept_distances import KeptDistances
+from .shapes import PlacedShapes, place_shapes, shapes_of, take_shapes
 from .structs import Connectivity, Incidence
 
 MAX_SEGMENTS = 1024
@@ -65,19 +66,20 @@ class ModelMesh(CollisionMesh):
     vertices on the surface, so that the mesh of a convex shape lies within it. A shape that is in all worlds has
     vertices in each. Infinite planes have no triangles and are listed separately.
 
-    Later changes of the model do not change the mesh, except for positions and inverse masses. Shapes that do not
-    collide with particles by their flags (``newton.ShapeFlags``) are not part of it. Particles that are not active are,
-    and are held where the program puts them.
+    Later changes of the model do not change the mesh, except for positions and inverse masses, and poses and scales of
+    shapes, see :meth:`follow_shapes`. Shapes that do not collide with particles by their flags (``newton.ShapeFlags``)
+    are not part of it. Particles that are not active are, and are held where the program puts them.
 
     Attributes:
         model: The model.
         segments: Triangles around a round shape.
-        shape_vertices: The vertices from ``model.particle_count`` on, NumPy arrays.
-        planes: The infinite planes, NumPy arrays.
+        shape_vertices: The vertices from ``model.particle_count`` on, NumPy arrays, positions those of construction.
+        planes: The infinite planes, NumPy arrays, those of construction.
         inverse_masses: Inverse masses [1/kg] of all vertices, Warp array of float, shape [vertex_count].
         device_world: World of each vertex, Warp array of int, shape [vertex_count].
         device_shape_vertices: ``shape_vertices`` as Warp arrays.
         device_planes: ``planes`` as Warp arrays.
+        placed_shapes: Both for kernels, :class:`.state.shapes.PlacedShapes`.
         connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
         shape_filter: Groups and masks of the shapes on the device, for infinite planes; empty without a filter.
@@ -91,6 +93,7 @@ class ModelMesh(CollisionMesh):
         segments: int = SEGMENTS,
         collision_filter: CollisionFilter | None = None,
         separates_bodies: bool = False,
+        uses_margins: bool = False,
     ):
         """Tessellates the shapes and puts the mesh on the model's device.
 
@@ -104,6 +107,7 @@ class ModelMesh(CollisionMesh):
             collision_filter: Groups and masks of particles and shapes; None to leave out no pairs.
             separates_bodies: Whether shapes of a model with bodies take part that collide with shapes, but not with
                 particles; a filter leaves out their pairs with particles.
+            uses_margins: Whether distances that pairs keep follow from margins of shapes, see :meth:`follow_shapes`.
 
         Raises:
             TypeError: If ``segments`` is no integer.
@@ -122,11 +126,11 @@ class ModelMesh(CollisionMesh):
                 f"particle {np.argmax(particle_world < 0)} is in all of {model.world_count} worlds; add it to one world"
             )
         shape_body, shape_world = host_array(model.shape_body), host_array(model.shape_world)
-        transform = host_array(model.shape_transform).astype(np.float64)
         flags = host_array(model.shape_flags)
-        apart = np.zeros(len(flags), dtype=bool)
+        apart, self._colliding = np.zeros(len(flags), dtype=bool), int(ShapeFlags.COLLIDE_PARTICLES)
         if separates_bodies and model.body_count:
             apart = (flags & (ShapeFlags.COLLIDE_SHAPES | ShapeFlags.COLLIDE_PARTICLES)) == ShapeFlags.COLLIDE_SHAPES
+            self._colliding |= int(ShapeFlags.COLLIDE_SHAPES)
         collides = apart | ((flags & ShapeFlags.COLLIDE_PARTICLES) != 0)
         shape_type, shape_scale = host_array(model.shape_type), host_array(model.shape_scale)
         infinite = are_infinite_planes(model)
@@ -134,19 +138,21 @@ class ModelMesh(CollisionMesh):
         triangles, vertex_count = elements_of(model.tri_indices, 3), model.particle_count
         tetrahedra = elements_of(model.tet_indices, 4)
         faces = [triangles, outer_sides(tetrahedra, triangles)]
-        shapes, worlds, positions = [], [], [np.empty((0, 3))]
+        shapes, worlds, units, unit_of_vertex, unit_count = [], [], [np.empty((0, 4))], [np.empty(0, dtype=int)], 0
         for shape in np.flatnonzero(collides & ~infinite):
-            key = shape_type[shape], *shape_scale[shape], id(model.shape_source[shape])
+            key = _tessellation_key(model, shape, GeoType(shape_type[shape]), shape_scale[shape])
             if key not in tessellations:
-                tessellations[key] = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments)
-            shape_positions, shape_faces = tessellations[key]
-            shape_positions = transform[shape, :3] + _rotate(transform[shape, 3:], shape_positions)
+                unit, shape_faces = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments)
+                tessellations[key] = unit_count + np.arange(len(unit)), shape_faces
+                units.append(unit)
+                unit_count += len(unit)
+            of_unit, shape_faces = tessellations[key]
             for world in range(model.world_count) if shape_world[shape] < 0 else [shape_world[shape]]:
-                shapes += [shape] * len(shape_positions)
-                worlds += [world] * len(shape_positions)
-                positions.append(shape_positions)
+                shapes += [shape] * len(of_unit)
+                worlds += [world] * len(of_unit)
+                unit_of_vertex.append(of_unit)
                 faces.append(vertex_count + shape_faces)
-                vertex_count += len(shape_positions)
+                vertex_count += len(of_unit)
         world, faces = np.concatenate([particle_world, np.array(worlds, dtype=np.int32)]), np.concatenate(faces)
         edges, points = _strands(model, faces) if strands else (None, None)
         worlds = world if model.world_count > 1 else None
@@ -161,13 +167,21 @@ class ModelMesh(CollisionMesh):
         super().__init__(faces, vertex_count, **options, tets=tetrahedra, device=model.device)
         self.model = model
         planes = np.flatnonzero(collides & infinite).astype(np.int32)
-        normals = _rotate(transform[planes, 3:], np.array([0.0, 0.0, 1.0]))
-        self.shape_vertices = ShapeVertices(np.concatenate(positions).astype(np.float32), shape_body[shapes], shapes)
-        of_planes = shape_body[planes], planes, shape_world[planes]
-        self.planes = Planes(transform[planes, :3].astype(np.float32), normals.astype(np.float32), *of_planes)
+        of_vertices, of_planes = (shape_body[shapes], shapes), (shape_body[planes], planes, shape_world[planes])
+        unplaced = np.zeros((len(shapes), 3)), np.zeros((len(planes), 3))
+        self.device_shape_vertices = vertices = ShapeVertices(*map(self._on_device, (unplaced[0], *of_vertices)))
+        self.device_planes = on_device = Planes(*map(self._on_device, (unplaced[1], unplaced[1], *of_planes)))
+        self.placed_shapes = placed = PlacedShapes()
+        placed.jumped = wp.ones(len(flags), dtype=int, device=self.device)
+        placed.unit = wp.array(np.concatenate(units), dtype=wp.vec4d, device=self.device)
+        placed.unit_of_vertex = self._on_device(np.concatenate(unit_of_vertex))
+        placed.position, placed.body, placed.shape = vertices
+        placed.plane_point, placed.plane_normal, placed.plane_body, placed.plane_shape = on_device[:4]
+        self._taken_shapes = shapes_of(model, with_margins=uses_margins, copies=True)
+        self._place_shapes()
+        self.shape_vertices = ShapeVertices(vertices.position.numpy().copy(), *of_vertices)
+        self.planes = Planes(on_device.point.numpy().copy(), on_device.normal.numpy().copy(), *of_planes)
         self.device_world = self._on_device(world)
-        self.device_shape_vertices = ShapeVertices(*map(self._on_device, self.shape_vertices))
-        self.device_planes = Planes(*map(self._on_device, self.planes))
         self.connectivity = connectivity = Connectivity()
         connectivity.faces, connectivity.edges = self.device_faces, self.device_edges
         connectivity.vertex_edges = _incidence(self.edges, vertex_count, self.device)
@@ -237,6 +251,33 @@ class ModelMesh(CollisionMesh):
         model = self.model
         inputs, outputs = [model.particle_inv_mass, model.particle_flags], [self.inverse_masses]
         wp.launch(_write_inverse_masses, model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
+
+    def follow_shapes(self, not_followed: wp.array[wp.int64]) -> None:
+        """Moves vertices and planes to where poses and scales of shapes have them now. Can be captured in a CUDA graph.
+
+        Not followed are other changes of shapes that collide, or did: of type, source, body, flags of collision, and
+        margin if margins are used; the third scale of a barrel, a capsule that becomes a sphere or was one, and a plane
+        that becomes infinite or was so. What such a shape collides with is as it was, but for its pose.
+
+        Args:
+            not_followed: Written where something is not followed: the last such shape, counted from 1, shape [1].
+
+        Raises:
+            ValueError: If the number of shapes has changed.
+        """
+        if not self.model.shape_count:
+            return
+        now = shapes_of(self.model, with_margins=bool(self._taken_shapes.margin))
+        if len(now.type) != len(self._taken_shapes.type):
+            raise ValueError(f"the model had {len(self._taken_shapes.type)} shapes, now it has {len(now.type)}")
+        outputs = [self._taken_shapes, self.placed_shapes.jumped, not_followed]
+        wp.launch(take_shapes, len(now.type), inputs=[now, self._colliding], outputs=outputs, device=self.device)
+        self._place_shapes()
+
+    def _place_shapes(self):
+        placed = self.placed_shapes
+        size = max(len(placed.shape), len(placed.plane_shape))
+        wp.launch(place_shapes, size, inputs=[self._taken_shapes, placed], device=self.device)
 
 
 @wp.func
@@ -366,36 +407,41 @@ def unseen_strands(mesh: ModelMesh) -> str | None:
     return " and ".join(f"{n} {name}" for n, name in zip(numbers, names, strict=True) if n) or None
 
 
-def _tessellate(model, shape, shape_type, scale, segments):
-    """Returns the surface of a shape: positions in its frame [m], float64, shape [n, 3], and faces, shape [m, 3].
+def _tessellation_key(model, shape, shape_type, scale):
+    """Returns what the triangles of a shape, for a scale of 1, depend on."""
+    is_barrel = shape_type == GeoType.CYLINDER and scale[2] > 0.0
+    is_sphere = shape_type == GeoType.CAPSULE and not scale[1] > 0.0
+    return shape_type, id(model.shape_source[shape]), is_sphere, tuple(scale) if is_barrel else None
 
-    No two vertices are in one place. Raises NotImplementedError if there are no triangles for the type.
+
+def _tessellate(model, shape, shape_type, scale, segments):
+    """Returns the surface of a shape for a scale of 1, see :mod:`.shapes`.
+
+    That is its vertices, float64, shape [n, 4], and faces, shape [m, 3]; no two vertices are in one place. Raises
+    NotImplementedError if there are no triangles for the type.
     """
-    x, y, z = scale.astype(np.float64)
     match shape_type:
         case GeoType.MESH | GeoType.CONVEX_MESH:
-            positions, faces = _weld(model.shape_source[shape])
-            return positions * (x, y, z), faces
+            return _weld(model.shape_source[shape])
         case GeoType.PLANE:
-            return _weld(Mesh.create_plane(x, y, **_BARE))
+            return _weld(Mesh.create_plane(1.0, 1.0, **_BARE))
         case GeoType.BOX:
-            return _weld(Mesh.create_box(x, y, z, **_BARE))
-        case GeoType.SPHERE:
-            return _revolve(_capsule_profile(x, 0.0, segments), segments)
-        case GeoType.ELLIPSOID:
-            positions, faces = _revolve(_capsule_profile(1.0, 0.0, segments), segments)
-            return positions * (x, y, z), faces
+            return _weld(Mesh.create_box(1.0, 1.0, 1.0, **_BARE))
+        case GeoType.SPHERE | GeoType.ELLIPSOID:
+            return _revolve(_capsule_profile(segments, is_sphere=True), segments)
         case GeoType.CAPSULE:
-            return _revolve(_capsule_profile(x, y, segments), segments)
+            return _revolve(_capsule_profile(segments, is_sphere=not scale[1] > 0.0), segments)
         case GeoType.CYLINDER:
-            side = np.array([[x, -y], [x, y]])
-            if z > 0.0:  # a barrel, whose side is an arc of radius z
-                angle = np.linspace(-1.0, 1.0, segments // 2 + 1)[1:-1] * np.arcsin(y / z)
-                arc = np.column_stack([x - np.sqrt(z * z - y * y) + z * np.cos(angle), z * np.sin(angle)])
-                side = np.concatenate([side[:1], arc, side[1:]])
-            return _revolve(np.concatenate([[[0.0, -y]], side, [[0.0, y]]]), segments)
+            x, y, z = scale.astype(np.float64)
+            if not z > 0.0:
+                return _revolve([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, 1.0], [0.0, 0.0, 1.0]], segments)
+            # a barrel, whose side is an arc of radius z
+            angle = np.linspace(-1.0, 1.0, segments // 2 + 1)[1:-1] * np.arcsin(y / z)
+            arc = np.column_stack([x - np.sqrt(z * z - y * y) + z * np.cos(angle), z * np.sin(angle)])
+            profile = np.concatenate([[[0.0, -y], [x, -y]], arc, [[x, y], [0.0, y]]])
+            return _revolve(np.column_stack([profile, np.zeros(len(profile))]), segments)
         case GeoType.CONE:
-            return _revolve(np.array([[0.0, -y], [x, -y], [0.0, y]]), segments)
+            return _revolve([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 0.0, 1.0]], segments)
     raise NotImplementedError(
         f"shape {shape} ({model.shape_label[shape]!r}) of type {shape_type.name} collides with particles, but has no "
         "triangles to collide with: use a mesh, or clear its flag COLLIDE_PARTICLES"
@@ -408,21 +454,22 @@ def _weld(mesh):
     Seams of texture or normals have several, and the triangles on both sides would always collide with each other.
     """
     positions, vertex = np.unique(mesh.vertices.astype(np.float64), axis=0, return_inverse=True)
-    return positions, vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
+    return np.column_stack([positions, np.zeros(len(positions))]), vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
 
 
-def _capsule_profile(radius, half_height, segments):
-    """Returns radius and height [m] of a capsule from pole to pole, shape [n, 2]."""
+def _capsule_profile(segments, *, is_sphere):
+    """Returns the profile of a capsule from pole to pole, as of :func:`_revolve`; that of a sphere has one equator."""
     angle = np.linspace(0.0, np.pi / 2.0, segments // 4 + 1)
-    lower = np.column_stack([radius * np.sin(angle), -half_height - radius * np.cos(angle)])
-    upper = lower[::-1] * (1.0, -1.0)
-    return np.concatenate([lower, upper if half_height > 0.0 else upper[1:]])
+    lower = np.column_stack([np.sin(angle), -np.cos(angle), np.full(len(angle), -1.0)])
+    upper = lower[::-1] * (1.0, -1.0, -1.0)
+    return np.concatenate([lower, upper[1:] if is_sphere else upper])
 
 
 def _revolve(profile, segments):
     """Returns the surface that a profile makes when it turns around the z axis, as :func:`_tessellate` does.
 
-    The profile has radius and height [m] from the lower pole to the upper, both on the axis, shape [n, 2].
+    The profile has radius and height, and the share of the half height that is added to it, from the lower pole to the
+    upper, both on the axis, shape [n, 3].
     """
     from trimesh import creation  # noqa: PLC0415 (slow)
 
@@ -430,12 +477,5 @@ def _revolve(profile, segments):
     unit = np.column_stack([np.ones(len(profile)), np.arange(len(profile))])
     unit[[0, -1], 0] = 0.0
     surface = creation.revolve(unit, sections=segments)
-    radius, height = profile[surface.vertices[:, 2].astype(int)].T
-    return np.column_stack([surface.vertices[:, :2] * radius[:, None], height]), np.array(surface.faces)
-
-
-def _rotate(quaternion, vectors):
-    """Returns vectors rotated by unit quaternions (x, y, z, w), shape [..., 3]."""
-    axis = quaternion[..., :3]
-    twist = 2.0 * np.cross(axis, vectors)
-    return vectors + quaternion[..., 3:] * twist + np.cross(axis, twist)
+    rings = np.asarray(profile)[surface.vertices[:, 2].astype(int)]
+    return np.column_stack([surface.vertices[:, :2] * rings[:, :1], rings[:, 1:]]), np.array(surface.faces)

@@ -9,7 +9,8 @@ from .friction import Friction
 from .mesh import ModelMesh, Placement, members_of_worlds, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
-from .structs import Bodies, Motion, add_zeros, body_of, can_move
+from .shapes import PlacedShapes
+from .structs import Bodies, Motion, MovedBodies, Vertices, add_zeros, body_of, can_move
 from .turns import BodyTurns
 from .vectors import to_double
 
@@ -168,6 +169,39 @@ def _write_end(
     motion.is_not_finite[i] = wp.where(finite, 0, 1)
 
 
+@wp.kernel(enable_backward=False)
+def _jump(
+    # in
+    placed: PlacedShapes,
+    motion: Motion,
+    moved: MovedBodies,
+    poses: wp.array[wp.transform],
+    particle_count: int,
+    # out
+    x1: wp.array[wp.vec3],
+    planes: wp.array[wp.vec4d],
+):
+    """Writes vertices and planes of shapes that jumped to where the last step left their bodies.
+
+    That is ``poses`` for those that the response cannot move, which has them if a body has vertices.
+    """
+    i = wp.tid()
+    if i < planes.shape[0] and placed.jumped[placed.plane_shape[i]] == 1:
+        on = placed.plane_body[i]
+        if on < 0 or poses:
+            planes[i] = transformed_plane(placed.plane_point[i], placed.plane_normal[i], on, poses)
+        else:  # the next step starts it where its body is
+            planes[i] = wp.vec4d(wp.float64(wp.nan))
+    if i < placed.position.shape[0] and placed.jumped[placed.shape[i]] == 1:
+        x = placed.position[i]
+        body = placed.body[i]
+        if can_move(motion, body):
+            x = wp.transform_point(moved.pose[body], x)
+        elif body >= 0:
+            x = wp.transform_point(poses[body], x)
+        x1[particle_count + i] = x
+
+
 def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
     """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
     if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
@@ -300,6 +334,20 @@ class ModelMotion:
             interrupted.fill_(1)
         else:
             wp.launch(_interrupt, len(interrupted), inputs=[world_mask, interrupted], device=self.mesh.device)
+
+    def follow_shapes(self, vertices: Vertices, not_followed: wp.array[wp.int64]) -> None:
+        """Moves shapes to where the model has them now, as :meth:`.state.mesh.ModelMesh.follow_shapes`.
+
+        The last step is made to have ended there, so that nothing sweeps the way.
+
+        Args:
+            vertices: As the response left them in the last step.
+            not_followed: As there.
+        """
+        self.mesh.follow_shapes(not_followed)
+        poses = None if self.turns is None else self.turns.turns.end
+        inputs = [self.mesh.placed_shapes, self.vertices, vertices.bodies, poses, self.mesh.model.particle_count]
+        wp.launch(_jump, self._size, inputs=inputs, outputs=[vertices.x1, self.planes.end], device=self.mesh.device)
 
     def starts(self) -> list[wp.array]:
         """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""

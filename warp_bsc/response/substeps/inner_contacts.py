@@ -125,6 +125,29 @@ def _pack(
 
 
 @wp.kernel
+def _write_depths(shape_type: wp.array[int], shape_scale: wp.array[wp.vec3], sagitta: float, depth: wp.array[float]):
+    """Writes how deep below the surface of each shape a particle may rest on its triangles [m].
+
+    The triangles of a round shape lie below its surface, so that a particle that rests on them has not entered it.
+    """
+    i = wp.tid()
+    kind = shape_type[i]
+    scale = shape_scale[i]
+    radius = wp.float64(0.0)
+    if kind == GeoType.SPHERE or kind == GeoType.CAPSULE or kind == GeoType.CONE:
+        radius = wp.float64(scale[0])
+    elif kind == GeoType.ELLIPSOID:
+        radius = wp.float64(wp.max(scale))
+    elif kind == GeoType.CYLINDER:
+        y, z = wp.float64(scale[1]), wp.float64(scale[2])  # z is the radius of the side of a barrel, an arc
+        bulge = wp.where(z > wp.float64(0.0), wp.min(y, z), wp.float64(0.0))
+        if z > y:
+            bulge = z - wp.sqrt(z * z - y * y)
+        radius = wp.float64(scale[0]) + bulge
+    depth[i] = sagitta * float(radius)
+
+
+@wp.kernel
 def _unpack(
     packed: wp.array[wp.spatial_vector],
     count: wp.array[int],
@@ -151,7 +174,9 @@ class InnerContacts:
         model, self._device = mesh.model, mesh.device
         self._model = model
         self._stage = stage = _Stage()
-        stage.depth = wp.array(_depths(model, mesh.segments), dtype=float, device=mesh.device)
+        stage.depth = wp.zeros(model.shape_count, dtype=float, device=mesh.device)
+        self._sagitta = SHAPE_SAGITTA * (SEGMENTS / mesh.segments) ** 2
+        self.read_shapes()
         stage.is_plane = wp.array(are_infinite_planes(model), dtype=bool, device=mesh.device)
         stage.takes_part = wp.array(_takes_part(mesh), dtype=bool, device=mesh.device)
         stage.of_particles, stage.of_shapes = mesh.pair_filter, mesh.shape_filter
@@ -170,6 +195,12 @@ class InnerContacts:
         gravity = self._model.gravity
         assert gravity is not None  # a finalized model has one of each world
         self._gravity = float(np.linalg.norm(gravity.numpy().reshape(-1, 3).astype(np.float64), axis=1).max())
+
+    def read_shapes(self) -> None:
+        """Reads the scales of the model's shapes. Can be captured in a CUDA graph."""
+        inputs = [self._model.shape_type, self._model.shape_scale, self._sagitta]
+        depth = self._stage.depth
+        wp.launch(_write_depths, len(depth), inputs=inputs, outputs=[depth], device=self._device)
 
     def is_short(self, dt: float) -> bool:
         """Returns whether a step of this length [s] is so short that springs hold what weight presses on them.
@@ -259,20 +290,6 @@ def _as_struct(arrays):
     for name, array in arrays.items():
         setattr(soft, name, array)
     return soft
-
-
-def _depths(model, segments=SEGMENTS):
-    """Returns how deep below the surface of each shape a particle may rest on its triangles [m].
-
-    The triangles of a round shape lie below its surface, so that a particle that rests on them has not entered it.
-    """
-    kind, scale = model.shape_type.numpy(), model.shape_scale.numpy().astype(np.float64)
-    x, y, z = scale.T
-    bulge = np.where(z > y, z - np.sqrt(np.maximum(z * z - y * y, 0.0)), np.where(z > 0.0, y, 0.0))  # of a barrel
-    radius = np.where(np.isin(kind, (GeoType.SPHERE, GeoType.CAPSULE, GeoType.CONE)), x, 0.0)
-    radius = np.where(kind == GeoType.CYLINDER, x + bulge, radius)
-    radius = np.where(kind == GeoType.ELLIPSOID, scale.max(axis=1), radius)
-    return SHAPE_SAGITTA * (SEGMENTS / segments) ** 2 * radius
 
 
 def _takes_part(mesh):
