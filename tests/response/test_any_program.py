@@ -93,7 +93,7 @@ def write_rows(array, rows, value):
 @pytest.mark.parametrize("what", ["particle_q", "particle_qd"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_wanted_position_that_is_not_finite(value, what, device):
-    """Its particle stands, and the others are stopped and certified as ever."""
+    """Its particle stands, and lacks a certificate; the others are stopped as ever."""
     model = bullet(40.0, device=device)
     lost = model.particle_count - 41  # in the middle of the patch that flies
     rollout = Rollout(model, bsc.SolverCCD(Changed(model, lambda state: write_rows(getattr(state, what), lost, value))))
@@ -101,8 +101,9 @@ def test_a_wanted_position_that_is_not_finite(value, what, device):
     for _ in range(3):
         start = rollout.positions
         rollout.step()
-        assert rollout.solver.report.certified and not rollout.solver.report.undetected
-        assert rollout.solver.report.not_finite == 1
+        assert not rollout.solver.report.certified and not rollout.solver.report.undetected
+        assert rollout.solver.report.not_finite == 1 and rollout.solver.report.remaining == 0
+        assert rollout.solver.report.uncertified_vertices.tolist() == [lost]
         hits += rollout.solver.report.hits
         assert rollout.positions[lost].tobytes() == start[lost].tobytes()
         assert (rollout.velocities[lost] == 0.0).all()
@@ -171,7 +172,7 @@ def test_any_positions_that_are_not_finite(shot, share, seed):
     for _ in range(3):
         start = shot.positions
         shot.step()
-        assert shot.solver.report.certified
+        assert shot.solver.report.certified == (not len(lost)) and shot.solver.report.remaining == 0
         assert shot.solver.report.not_finite == len(lost)
         assert np.isfinite(shot.positions).all() and np.isfinite(shot.velocities).all()
         still = (shot.positions[lost] == start[lost]).all(axis=1)

@@ -1,5 +1,7 @@
 """Worlds: each is stepped as if it were alone, may take no part in steps, and has results of its own."""
 
+import warnings
+
 import newton
 import numpy as np
 import pytest
@@ -226,6 +228,81 @@ def test_a_world_with_a_position_that_is_not_finite_is_not_certified(device):
     solver.step(state, model.state(), model.control(), None, DT)
     assert not solver.report.certified
     assert solver.report.worlds.certified.numpy().tolist() == [True, False]
+
+
+@pytest.mark.parametrize("options", [{"substeps": None}, {"substeps": 4}, {}])
+def test_a_velocity_that_is_not_finite_leaves_its_world_alone_uncertified(options, device):
+    """In whole steps and in substeps; one warning names the particle."""
+    worlds, lost = 4, 2
+    model = bullet(20.0, device=device, worlds=worlds)
+    particle = lost * model.particle_count // worlds + 5
+
+    def lose(state):
+        velocity = state.particle_qd.numpy().copy()
+        velocity[particle] = np.nan
+        state.particle_qd.assign(velocity)
+
+    solver = bsc.SolverCCD(Changed(model, lose), report_worlds=True, **options)
+    state, end = model.state(), model.state()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for _ in range(3):
+            solver.step(state, end, model.control(), None, DT)
+            results, report = solver.report.worlds.numpy(), solver.report
+            assert not report.certified and report.not_finite == 1 and report.remaining == 0
+            assert results["certified"].tolist() == [world != lost for world in range(worlds)]
+            assert results["not_finite"].tolist() == [int(world == lost) for world in range(worlds)]
+            assert report.uncertified_vertices.tolist() == [particle]
+            state, end = end, state
+    said = [str(warning.message) for warning in said if "not finite" in str(warning.message)]
+    assert len(said) == 1 and f"particle {particle} of world {lost}" in said[0]
+    assert report.totals.not_finite_steps == report.totals.uncertified_steps == 3
+
+
+def test_a_velocity_that_is_not_finite_in_one_substep_is_seen(device):
+    """Other substeps are finite, and so is the end of the step: it is where the particle was at the start."""
+    model = bullet(20.0, device=device)
+    calls = []
+
+    def lose(state):
+        calls.append(0)
+        if len(calls) == 4:  # after the whole step, the third substep
+            velocity = state.particle_qd.numpy().copy()
+            velocity[-1] = np.inf
+            state.particle_qd.assign(velocity)
+
+    solver = bsc.SolverCCD(Changed(model, lose), substeps=8, report_worlds=True)
+    state, end = model.state(), model.state()
+    while not solver.report.substeps:
+        calls.clear()
+        solver.step(state, end, model.control(), None, DT)
+        state, end = end, state
+    assert len(calls) == 9 and not solver.report.certified and solver.report.not_finite == 1
+    np.testing.assert_array_equal(state.particle_q.numpy()[-1], end.particle_q.numpy()[-1])
+    assert solver.report.uncertified_vertices.tolist() == [model.particle_count - 1]
+
+
+def test_strain_and_what_is_inside_by_world(device):
+    """Of a patch whose middle falls on a box in one world, and starts in it in another."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    world.add_shape_box(-1, hx=0.03, hy=0.03, hz=0.1)
+    add_patch(world, 2, 0.05, (0.0, 0.0, 0.11))
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.replicate(world, 3)
+    count = world.particle_count
+    for i in range(count):
+        builder.particle_qd[i] = wp.vec3(0.0, 0.0, -10.0)
+    for i in range(count, 2 * count):
+        builder.particle_q[i] = wp.vec3(*builder.particle_q[i]) - wp.vec3(0.0, 0.0, 0.1)
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(Changed(model), substeps=None, report_worlds=True)
+    with pytest.warns(UserWarning, match="edges pass through faces at the start"):
+        solver.step(model.state(), model.state(), model.control(), None, DT)
+    strain = solver.report.worlds.strain.numpy()
+    assert strain[0] > 0.05 and strain[0] == pytest.approx(solver.report.strain)
+    assert strain[1:].tolist() == [0.0, 0.0]
+    assert solver.report.worlds.inside.tolist() == [0, 1, 0]
+    assert solver.report.inside.particles.tolist() == [count + 4]
 
 
 def test_frozen_and_truncated_vertices_are_counted_by_world(device):

@@ -96,6 +96,11 @@ class InsideFinder:
         rows = rows[np.lexsort(rows.T[::-1])].astype(np.int32)
         return Inside(*np.ascontiguousarray(rows.T))
 
+    def count_by_world(self, x: np.ndarray | wp.array, planes: np.ndarray | wp.array) -> np.ndarray:
+        """Returns how many particles of each world are inside solids, int32, with arguments as of :meth:`find`."""
+        world = self._world[np.unique(self.find(x, planes).particles)]
+        return np.bincount(world, minlength=max(1, self._mesh.model.world_count)).astype(np.int32)
+
     def _find_in_bodies(self, x, particles, finite, movable, moves):
         """Returns rows of a particle, a shape and a soft body."""
         solids, world = self._solids, self._world

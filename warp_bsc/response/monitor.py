@@ -72,7 +72,7 @@ class CollisionMonitor(CollisionStage):
         motion = ModelMotion(mesh, friction, watches_turns=True)
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
         if report_worlds:
-            self._count_worlds(responds=False)
+            self._count_worlds()
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         end = arrays_of(state_out)

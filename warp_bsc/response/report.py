@@ -1,6 +1,7 @@
 """The report of the collision stage: what it found and did, read from the device on access."""
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -37,7 +38,7 @@ _LAYER_WARNING = "contacts passed the contact layer in one step: results jump th
 class SolverReport(ReportViews, WorldsOfReport):
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
-    Of steps that are not certified, strain, cross or invert something it warns once each.
+    Of steps that are not certified, are not finite, strain, cross or invert something it warns once each.
 
     :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
 
@@ -56,7 +57,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         self.speed_limit_lifted = False
         self.substeps_omitted: str | None = None
         self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
-        self.last_strain = wp.zeros(1, dtype=float, device=work.device)
+        self.last_strain = wp.zeros(work.worlds, dtype=float, device=work.device)  # by world
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
         self.device_totals = views_of(StepTotals, self.total_values)
         self._host_totals = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)
@@ -75,13 +76,17 @@ class SolverReport(ReportViews, WorldsOfReport):
         return totals["undetected_steps"] + totals["lost_gradients"]
 
     def warn(self) -> None:
-        """Warns once each of steps not certified, strain above 0.2, crossings, inversions, and wrong gradients.
+        """Warns once each of steps with predictions that are not finite, and of others that are not certified.
+
+        So it does of strain above 0.2, crossings, inversions, and wrong gradients.
 
         Known is what the host knows already; the device is only waited for to warn. A step on a GPU may end before the
         host knows of it: then the next one warns, or the first number that is read, which waits for the device.
         """
         known = dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True))
-        if known["uncertified_steps"] and self._responds:
+        if known["not_finite_steps"] and self._responds:
+            self._warn_once("not_finite", self._not_finite_warning)
+        if (known["uncertified_steps"] > known["not_finite_steps"] or known["remaining"]) and self._responds:
             self._warn_once("uncertified", self._uncertified_warning)
         if known["strained_steps"]:
             self._warn_once("strain", self._strain_warning)
@@ -103,8 +108,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             warn_caller(message())
 
     def _read(self, values):
-        """Returns the only number of an array, and warns: the totals were copied before, on the same stream."""
-        value = values.numpy()[0].item()
+        """Returns the largest number of an array, and warns: the totals were copied before, on the same stream."""
+        value = values.numpy().max().item()
         self.warn()
         return value
 
@@ -124,9 +129,9 @@ class SolverReport(ReportViews, WorldsOfReport):
         With minimum distances, a collision is a pair that comes nearer than it may, here and in what follows.
 
         Contacts that :attr:`excluded` counts, pairs that filters leave out (:attr:`filtered`), and contacts of which no
-        vertex can be moved, are not part of this. A step with a start position that is not finite is not certified;
-        without a response, neither is one with such an end. With ``inversions="prevented"``, :attr:`inversions` is 0 in
-        a certified step. :attr:`uncertified_vertices` lists the particles concerned.
+        vertex can be moved, are not part of this. A step with a position or velocity that is not finite, at the start
+        or as it is predicted, is not certified. With ``inversions="prevented"``, :attr:`inversions` is 0 in a certified
+        step. :attr:`uncertified_vertices` lists the particles concerned.
         """
         return bool(self._read(self._work.results[Result.CERTIFIED]))
 
@@ -213,9 +218,10 @@ class SolverReport(ReportViews, WorldsOfReport):
 
     @property
     def not_finite(self) -> int:
-        """Particles whose position or velocity was not finite after the inner solver in the last step.
+        """Particles whose position or velocity was not finite after the inner solver in the last step, or a substep.
 
-        They stood where they were at the start. Without a response they are left as the inner solver made them.
+        They stood where they were at the start, and the step is not certified. Without a response they are left as the
+        inner solver made them.
         """
         return self._read(self._work.results[Result.NOT_FINITE])
 
@@ -223,10 +229,9 @@ class SolverReport(ReportViews, WorldsOfReport):
     def uncertified_vertices(self) -> np.ndarray:
         """Particles that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
 
-        They are the particles of contacts that remain, of tetrahedra that invert where that is prevented, and of
-        elements with a start position that is not finite.
-        Without a response, a position or velocity that is not finite at the end counts as well. If :attr:`undetected`
-        is true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
+        They are the particles of contacts that remain, of tetrahedra that invert where that is prevented, of elements
+        with a start position that is not finite, and those that :attr:`not_finite` counts. If :attr:`undetected` is
+        true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
         nothing but the position of a body is not finite. Gathered on the host, on each access.
         """
         listed = self._find_uncertified()[: self._mesh.model.particle_count]
@@ -257,11 +262,12 @@ class SolverReport(ReportViews, WorldsOfReport):
         listed = vertices.changed.numpy() != 0  # those in a contact of the last detection
         x0, x1 = (x.numpy() for x in (self._motion.vertices.x0, vertices.x1))
         invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
+        replaced = self._motion.vertices.is_not_finite.numpy() != 0
         first = self._mesh.model.particle_count if self._responds else 0  # a response leaves particles where they were
-        invalid[first:] |= self._motion.vertices.is_not_finite.numpy()[first:] != 0
+        invalid[first:] |= replaced[first:]
         for elements in (self._mesh.faces, self._mesh.edges):
             listed[elements[invalid[elements].any(axis=1)]] = True
-        return listed | invalid
+        return listed | invalid | replaced
 
     @property
     def undetected(self) -> bool:
@@ -311,11 +317,19 @@ class SolverReport(ReportViews, WorldsOfReport):
         nothing any more: later steps are certified, and leave it where it is. See :class:`.inside.InsideFinder` for
         what counts. Computed on each access, on the host.
         """
-        return self._inside_finder.find(self._work.vertices.x1, self._motion.planes.end)
+        return self._inside_finder.find(*self._placed)
 
     @functools.cached_property
     def _inside_finder(self):
         return InsideFinder(self._mesh)
+
+    @property
+    def _placed(self):
+        return self._work.vertices.x1, self._motion.planes.end
+
+    def find_inside_by_world(self) -> Callable[[], np.ndarray]:
+        """Returns a function that counts the particles inside solids at the end of the last step in each world."""
+        return functools.partial(self._inside_finder.count_by_world, *self._placed)
 
     @property
     def milliseconds(self) -> float | None:

@@ -52,6 +52,24 @@ def table_by_shape(model: newton.Model, contacts: dict[str, np.ndarray], dt: flo
     return "\n".join(lines)
 
 
+def _name_particles(model, particles):
+    """Returns number and world of the first of some particles, and how many more there are."""
+    world = None if model.particle_world is None or model.world_count <= 1 else model.particle_world.numpy()
+    named = [f"particle {i}" + ("" if world is None else f" of world {world[i]}") for i in particles[:_NAMED]]
+    if len(particles) > _NAMED:
+        named.append(f"{len(particles) - _NAMED} more particles")
+    return named
+
+
+def not_finite_warning(model: newton.Model, particles: np.ndarray) -> str:
+    """Returns what to say of a step in which particles had no finite prediction, empty if that was an earlier step."""
+    named = f" ({', '.join(_name_particles(model, particles))})" if len(particles) else ""
+    return (
+        f"positions or velocities of particles{named} were not finite after the inner solver in a step: the particles "
+        "stayed where they were, and the step is not certified (see report.not_finite)"
+    )
+
+
 def uncertified_warning(
     model: newton.Model, particles: np.ndarray, shapes: np.ndarray, *, may_invert: bool = False
 ) -> str:
@@ -64,11 +82,7 @@ def uncertified_warning(
             "a step was not certified, and a later one is: read report.certified after each step, "
             "or report.totals.uncertified_steps"
         )
-    world = None if model.particle_world is None or model.world_count <= 1 else model.particle_world.numpy()
-    of_world = "" if world is None else " of world {}"
-    named = [f"particle {i}" + of_world.format(-1 if world is None else world[i]) for i in particles[:_NAMED]]
-    if len(particles) > _NAMED:
-        named.append(f"{len(particles) - _NAMED} more particles")
+    named = _name_particles(model, particles)
     named += [shape_name(model, shape) for shape in shapes[:_NAMED]]
     if len(shapes) > _NAMED:
         named.append(f"{len(shapes) - _NAMED} more shapes")

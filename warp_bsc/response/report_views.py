@@ -8,9 +8,9 @@ from newton.viewer import ViewerBase
 from .._arguments import check_instance, checked_number
 from .drawing import Drawing
 from .forces.contact_report import ContactReport
-from .report_text import table_by_shape, uncertified_warning
+from .report_text import not_finite_warning, table_by_shape, uncertified_warning
 from .state.mesh import ModelMesh
-from .state.structs import FROZEN, TRUNCATED
+from .state.structs import FROZEN, NOT_FINITE, TRUNCATED
 
 _NOT_DRAWN = "report.draw draws contacts only if a stage keeps them: SolverCCD(solver, report_contacts=True)"
 _INCOMPLETE = "report.draw lacks contacts: raise the number that report_contacts= allows"
@@ -78,6 +78,10 @@ class ReportViews(ContactReport):
         first = mesh.model.particle_count
         particles, shapes = np.flatnonzero(listed[:first]), np.unique(mesh.shape_vertices.shape[listed[first:]])
         return uncertified_warning(mesh.model, particles, shapes, may_invert=self._prevents_inversions)
+
+    def _not_finite_warning(self):
+        model = self._mesh.model
+        return not_finite_warning(model, np.flatnonzero(self._find_vertices(NOT_FINITE)[: model.particle_count]))
 
     @property
     def _mesh(self) -> ModelMesh:

@@ -77,9 +77,11 @@ class CollisionStage(CouplingHooks):
         if self.model.requires_grad:
             self._between_steps = BetweenSteps(self.model, self.report.device_totals.ambiguous_moves, bodies=bodies)
 
-    def _count_worlds(self, max_impulse: wp.array | None = None, *, responds: bool = True):
+    def _count_worlds(self, max_impulse: wp.array | None = None):
         """Makes the report have results by world."""
-        self._counter = WorldCounter(self._work, responds=responds, max_impulse=max_impulse)
+        find_inside = self.report.find_inside_by_world()
+        published = {"strain": self.report.last_strain, "find_inside": find_inside, "max_impulse": max_impulse}
+        self._counter = WorldCounter(self._work, **published)
         self.report.keep_worlds(self._counter.worlds)
 
     @one_at_a_time

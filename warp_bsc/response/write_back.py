@@ -21,6 +21,18 @@ def _write_cuts(outcome: int, status: SolveStatus):
         status.results[Result.FROZEN] = 1
 
 
+@wp.func
+def _count_if_not_finite(outcome: int, is_particle: bool, status: SolveStatus):
+    """Counts a particle without a finite prediction. A step with one, or with such a vertex of a shape, is uncertified.
+
+    What stands in its place is no result of the inner solver.
+    """
+    if outcome & NOT_FINITE != 0:
+        status.results[Result.CERTIFIED] = 0
+        if is_particle:
+            wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
+
+
 @wp.kernel
 def write_back(vertices: Vertices, end: StateArrays, body_q_prev: wp.array[wp.transform], status: SolveStatus):
     """Writes the particles and bodies that the response changed; the others keep every bit of what they are.
@@ -38,15 +50,12 @@ def write_back(vertices: Vertices, end: StateArrays, body_q_prev: wp.array[wp.tr
     if i >= vertices.outcome.shape[0]:
         return
     outcome = vertices.outcome[i]
+    _count_if_not_finite(outcome, i < end.particle_q.shape[0], status)
     if i >= end.particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
-        if outcome & NOT_FINITE != 0:
-            status.results[Result.CERTIFIED] = 0
         return
     if outcome != 0:
         end.particle_q[i] = vertices.x1[i]
         end.particle_qd[i] = vertices.velocity[i]
-    if outcome & NOT_FINITE != 0:
-        wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
     _write_cuts(outcome, status)
 
 
@@ -60,10 +69,7 @@ def finish_inspection(outcome: wp.array[int], particle_count: int, status: Solve
     if vertex == 0:
         status.results[Result.FIRST_HITS] = status.results[Result.REMAINING]
         status.results[Result.ITERATIONS] = 0
-    if outcome[vertex] & NOT_FINITE != 0:
-        status.results[Result.CERTIFIED] = 0
-        if vertex < particle_count:
-            wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
+    _count_if_not_finite(outcome[vertex], vertex < particle_count, status)
 
 
 @wp.kernel
@@ -82,8 +88,10 @@ def count_step(status: SolveStatus, substeps: wp.array[int], strain: wp.array[fl
     totals.not_finite_steps[0] += wp.int64(wp.min(results[Result.NOT_FINITE], 1))
     totals.remaining[0] += wp.int64(results[Result.REMAINING])
     totals.excluded[0] += wp.int64(results[Result.EXCLUDED])
-    if strain[0] > MAX_STRAIN:
-        totals.strained_steps[0] += wp.int64(1)
+    for world in range(strain.shape[0]):
+        if strain[world] > MAX_STRAIN:
+            totals.strained_steps[0] += wp.int64(1)
+            break
     if results[Result.INVERTING] > 0:
         totals.inverting_steps[0] += wp.int64(1)
     if results[Result.CROSSINGS] > 0:

@@ -219,19 +219,20 @@ def begin_substeps(
     world = wp.tid()
     takes_substeps[world] = wp.where(number[world] == substeps, is_pending[world], 0)
     if takes_substeps[world] == 1:
-        strain[wp.min(world, strain.shape[0] - 1)] = 0.0
+        strain[world] = 0.0
     status.contact_iteration[world] = wp.where(takes_substeps[world] == 1, 0, _NOT_PROJECTED)
 
 
 @wp.kernel
 def start_substep(
-    # in
+    # in, and motion also out
     motion: Motion,
     planes: MovingPlanes,
     substeps: int,
     dt: float,
     remaining: wp.array[int],
     detected: wp.array[int],
+    takes_substeps: wp.array[int],
     end: StateArrays,
     arcs: Arcs,
     # in and out
@@ -243,7 +244,7 @@ def start_substep(
     """Writes the motion of a substep to that of ``step``, given the motion of the whole step.
 
     Particles, and bodies that the response can move, end where the inner solver predicts them; shapes go a share of
-    their path in the whole step, on arcs if they turn.
+    their path in the whole step, on arcs if they turn. A particle without a finite prediction is one of the whole step.
     """
     i = wp.tid()
     done = substeps - remaining[0]
@@ -268,6 +269,10 @@ def start_substep(
             x1 = x0
             velocity = wp.vec3()
             is_not_finite = 1
+            if takes_substeps[motion.world[i]] == 1:  # it stands in the whole step, also if other substeps are finite
+                motion.x1[i] = motion.x0[i]
+                motion.velocity[i] = velocity
+                motion.is_not_finite[i] = 1
     elif moves_with_body(substep, i):
         x1 = predicted_position(substep, i)
         velocity = predicted_velocity(substep, i, x1)

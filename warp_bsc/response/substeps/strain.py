@@ -38,7 +38,7 @@ def measure_strain(
     # out
     strain: wp.array[float],
 ):
-    """Finds the largest strain of an edge between predicted positions and ``x1``, in each world, or in all.
+    """Finds the largest strain of an edge between predicted positions and ``x1`` in each world.
 
     Cloth that is compressed buckles, and resists less than cloth that is stretched: a quarter of its compression
     counts, and of the strain of a solid a third.
@@ -52,7 +52,7 @@ def measure_strain(
     if is_solid[i]:
         change = SOLID * wp.abs(length - predicted)
     if change > 0.0:
-        wp.atomic_max(strain, wp.min(motion.world[a], strain.shape[0] - 1), change / lengths[i])
+        wp.atomic_max(strain, motion.world[a], change / lengths[i])
 
 
 @wp.func
@@ -99,7 +99,7 @@ def choose_substeps(
     substeps: wp.array[int],
     largest: wp.array[float],
 ):
-    """Chooses the substeps of each world that has none, 0 where contacts strain little; ``substeps`` is the largest."""
+    """Chooses the substeps of each world that has none, 0 where contacts strain little; ``substeps`` are the most."""
     world = wp.tid()
     status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
     if number[world] == 0 and has_constraints[world] == 1:
@@ -111,7 +111,7 @@ def choose_substeps(
             mark_choice(choices, n, is_chosen, substeps)
             _lose_calm(calm, patience, world)
         else:
-            wp.atomic_max(largest, 0, strain[world])
+            largest[world] = strain[world]
 
 
 @wp.func
@@ -162,7 +162,7 @@ def review_substeps(
         repeats[0] = 1
         mark_choice(choices, number[world], is_chosen, substeps)
     else:
-        wp.atomic_max(largest, 0, wp.max(strain[world], final_strain[world]))
+        largest[world] = wp.max(strain[world], final_strain[world])
 
 
 @wp.kernel
@@ -209,11 +209,11 @@ class StrainMeter:
         self._edges = [wp.array(values, dtype=dtype, device=work.device) for values, dtype in columns]
 
     def measure(self, motion: Motion, strain: wp.array[float]) -> None:
-        """Increases ``strain`` to that between predicted positions and positions as they are, of each world or of all.
+        """Increases ``strain`` to that between predicted positions and positions as they are, of each world.
 
         Args:
             motion: The motion, as the inner solver predicted it.
-            strain: Shape [worlds] or [1].
+            strain: Shape [worlds].
         """
         self._work.launch(measure_strain, len(self._edges[0]), [motion, self._work.vertices.x1, *self._edges], [strain])
 

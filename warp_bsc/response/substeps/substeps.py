@@ -82,7 +82,7 @@ class Substeps:
 
     Attributes:
         substeps: Substeps of the last step, the most of all worlds, on the device; 0 if it was not taken in substeps.
-        strain: Largest strain by contacts of the last step, or of one of its substeps, on the device.
+        strain: Largest strain by contacts of the last step, or of one of its substeps, in each world, on the device.
         forces: Keeps the impulses of contacts, if the report is to have them.
         taken: Substeps of the last step in each world, if the report is to have them, on the device.
     """
@@ -119,7 +119,7 @@ class Substeps:
         self._number = wp.zeros(worlds, dtype=int, device=device)  # of substeps, by world
         self._needs_whole_step = wp.zeros(1, dtype=int, device=device)
         self._has_constraints = wp.zeros(worlds, dtype=int, device=device)
-        self.strain = self._strain = wp.zeros(1, dtype=float, device=device)
+        self.strain = self._strain = wp.zeros(worlds, dtype=float, device=device)
         self._is_pending = wp.zeros(worlds, dtype=int, device=device)  # 1 while a world has substeps to take
         self._takes_substeps = wp.zeros(worlds, dtype=int, device=device)
         self._is_fast = wp.zeros(worlds, dtype=int, device=device)  # as in SolveStatus, of the predicted motion
@@ -343,6 +343,7 @@ class Substeps:
             step.dt,
             self._remaining,
             self._detected,
+            self._takes_substeps,
             arrays_of(end),
             work.arcs,
         ]

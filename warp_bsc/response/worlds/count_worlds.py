@@ -1,5 +1,8 @@
 """Writes the results of a step by world."""
 
+from collections.abc import Callable
+
+import numpy as np
 import warp as wp
 
 from ..schedule import Result, SolveStatus
@@ -17,6 +20,7 @@ class _Arrays:
     certified: wp.array[wp.bool]
     truncated: wp.array[int]
     frozen: wp.array[int]
+    not_finite: wp.array[int]
     substeps: wp.array[int]
 
 
@@ -30,6 +34,7 @@ def _begin(status: SolveStatus, prevents_inversions: bool, taken: wp.array[int],
         out.certified[world] = False
     out.truncated[world] = 0
     out.frozen[world] = 0
+    out.not_finite[world] = 0
     out.substeps[world] = 0
     if taken:
         out.substeps[world] = taken[world]
@@ -49,12 +54,11 @@ def _count_vertices(
     # in
     step: Step,
     particle_count: int,
-    responds: bool,
     not_finite: wp.array[wp.int64],
     # out
     out: _Arrays,
 ):
-    """Counts the vertices and bodies that were cut, and finds worlds that are not certified for a position.
+    """Counts vertices and bodies that were cut or have no prediction; finds worlds not certified for a position.
 
     ``not_finite`` is the number of elements with a position at the start or the end that is not finite.
     """
@@ -64,7 +68,9 @@ def _count_vertices(
         outcome = vertices.outcome[i]
         world = motion.world[i]
         _count(outcome, world, out)
-        lost = outcome & NOT_FINITE != 0 and (i >= particle_count or not responds)
+        lost = outcome & NOT_FINITE != 0
+        if lost and i < particle_count:
+            wp.atomic_add(out.not_finite, world, 1)
         invalid = not_finite[0] > wp.int64(0) and not (wp.isfinite(motion.x0[i]) and wp.isfinite(vertices.x1[i]))
         if lost or invalid:
             out.certified[world] = False
@@ -83,9 +89,16 @@ class WorldCounter:
         worlds: The results of the last step.
     """
 
-    def __init__(self, work: Workspace, *, responds: bool, max_impulse: wp.array[float] | None = None):
-        """Allocates the results, and makes detections count by world; ``max_impulse`` is published with them."""
-        self._work, self._responds = work, responds
+    def __init__(
+        self,
+        work: Workspace,
+        *,
+        strain: wp.array[float],
+        find_inside: Callable[[], np.ndarray],
+        max_impulse: wp.array[float] | None = None,
+    ):
+        """Allocates the results, and makes detections count by world; what is given is published with them."""
+        self._work = work
         found = work.count_worlds()
         self._out = allocate(_Arrays, work.worlds, work.device)
         arrays = {name: getattr(self._out, name) for name in _Arrays.vars}
@@ -93,11 +106,11 @@ class WorldCounter:
         counts["crossings"] = work.status.crossings
         if work.tetrahedra is not None:
             counts |= {"inversions": found.inverting, "inverted": found.inverted}
-        self.worlds = Worlds(**arrays, **counts, _max_impulse=max_impulse)
+        self.worlds = Worlds(**arrays, **counts, strain=strain, _find_inside=find_inside, _max_impulse=max_impulse)
 
     def count(self, taken: wp.array[int] | None = None) -> None:
         """Writes the results of a step, given the substeps that each world took, None for none."""
         work = self._work
         work.launch(_begin, work.worlds, [work.status, work.ends is not None, taken], [self._out])
-        inputs = [work.step, work.particle_count, self._responds, work.detector.counters.array]
+        inputs = [work.step, work.particle_count, work.detector.counters.array]
         work.launch(_count_vertices, max(work.mesh.vertex_count, work.body_count), inputs, [self._out])

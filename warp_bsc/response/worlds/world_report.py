@@ -1,5 +1,6 @@
 """The part of a report that says what a step did in each world, as arrays on the device."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,10 @@ class Worlds:
         filtered: Pairs that filters left out, int. Shapes that are in all worlds have their elements in each of them.
         truncated: Vertices and bodies whose paths were truncated, int.
         frozen: Vertices and bodies that were frozen, int.
+        not_finite: Particles whose predicted position or velocity was not finite, int.
         substeps: Substeps of the step, 0 if it was not taken in substeps, int.
         crossings: Edges that cross faces at the start, int.
+        strain: Largest strain by contacts, float.
         inversions: Tetrahedra that the motion inverts, int; None if the stage was not asked to count them.
         inverted: Tetrahedra that were inverted at the start, int; None if the stage was not asked to count them.
     """
@@ -35,8 +38,11 @@ class Worlds:
     filtered: wp.array[int]
     truncated: wp.array[int]
     frozen: wp.array[int]
+    not_finite: wp.array[int]
     substeps: wp.array[int]
     crossings: wp.array[int]
+    strain: wp.array[float]
+    _find_inside: Callable[[], np.ndarray]
     inversions: wp.array[int] | None = None
     inverted: wp.array[int] | None = None
     _max_impulse: wp.array[float] | None = None
@@ -52,10 +58,15 @@ class Worlds:
             raise RuntimeError(_NO_IMPULSES)
         return self._max_impulse
 
+    @property
+    def inside(self) -> np.ndarray:
+        """Particles inside solids at the end of the step, int32, NumPy: found on the host on each access."""
+        return self._find_inside()
+
     def numpy(self) -> dict[str, np.ndarray]:
-        """Returns all results on the host. Synchronizes with the device."""
-        arrays = {name.lstrip("_"): array for name, array in vars(self).items() if array is not None}
-        return {name: array.numpy() for name, array in arrays.items()}
+        """Returns all results but :attr:`inside` on the host. Synchronizes with the device."""
+        arrays = {name: array for name, array in vars(self).items() if isinstance(array, wp.array)}
+        return {name.lstrip("_"): array.numpy() for name, array in arrays.items()}
 
 
 class WorldsOfReport:
