@@ -106,6 +106,56 @@ def test_a_crowd_of_instances_is_the_same_crowd_without(tmp_path, own_animation)
         assert [interval[key] for interval in found[0]["intervals"]] == [i[key] for i in found[1]["intervals"]]
 
 
+# --- Blend shapes ---
+
+
+def add_face(stage, weights):
+    """FALLING, a quarter above the floor; a weight of a half lowers it by 1, one of 1 not at all."""
+    UsdSkel.Root.Define(stage, "/World/Model")
+    skeleton = UsdSkel.Skeleton.Define(stage, "/World/Model/Skeleton")
+    animation = UsdSkel.Animation.Define(stage, "/World/Model/Animation")
+    animation.CreateBlendShapesAttr(["other", "dip"])
+    for time, weight in weights.items():
+        animation.CreateBlendShapeWeightsAttr().Set([0.5 * (time > 0), weight], time)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    mesh = add_mesh(stage, "/World/Model/Falling", moved(FALLING, (0, 0, 0.25)))
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    targets = []
+    for name in ("dip", "other"):
+        shape = UsdSkel.BlendShape.Define(stage, f"/World/Model/Falling/{name}")
+        shape.CreateOffsetsAttr([(0, 0, 0)] * 3)
+        targets.append(shape.GetPath())
+    between = UsdSkel.BlendShape(stage.GetPrimAtPath(targets[0])).CreateInbetween("half")
+    between.SetWeight(0.5)
+    between.SetOffsets([(0, 0, -1)] * 3)
+    binding.CreateBlendShapesAttr(["dip", "other"])
+    binding.CreateBlendShapeTargetsRel().SetTargets(targets)
+
+
+@pytest.mark.parametrize(
+    ("weights", "bends"),
+    [
+        ({0: 0.0, 1: 1.0}, [0.5]),
+        ({0: 0.0, 4: 0.0, 5: 0.8, 6: 0.3}, [4.625, 5.6]),
+        ({0: 0.0, 1: 0.5, 2: 0.0}, []),
+        ({0: 0.6, 1: 0.9}, []),
+    ],
+)
+def test_weights_that_pass_an_in_between_are_sampled_there(stage, weights, bends):
+    add_floor(stage)
+    add_face(stage, weights)
+    found = find(stage)
+    times = [*starts(found), found["intervals"][-1]["end"]]
+    assert times == pytest.approx(sorted({*range(max(weights) + 1), *bends}))
+    touched = sorted({round(contact["time"], 5) for interval in found["intervals"] for contact in interval["contacts"]
+                      if contact["elements"] == ["vertex 0", "face 0"]})  # fmt: skip
+    weight = np.interp(np.linspace(0, times[-1], 100_001), list(weights), list(weights.values()))
+    height = 0.25 - np.interp(weight, [0, 0.5, 1], [0, 1, 0])
+    (passed,) = np.nonzero(np.diff(height > 0))
+    assert touched == pytest.approx((passed + 0.5) * times[-1] / 100_000, abs=2e-4)
+
+
 # --- Splines ---
 
 

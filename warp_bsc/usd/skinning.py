@@ -17,7 +17,7 @@ class Skin:
 
     Attributes:
         skeleton: The prim to whose space the joints transform the points, None if only blend shapes deform the mesh.
-        times: Time codes at which the animation has a sample.
+        times: Time codes at which the animation has a sample, or a weight is that of an in-between of a blend shape.
         may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
     """
 
@@ -42,11 +42,15 @@ class Skin:
         self._animation = skeleton_query.GetAnimQuery()
         prim = skinning.GetPrim()
         self._blend_shapes: UsdSkel.BlendShapeQuery | None = None
+        self._inbetweens: dict[int, set[float]] = {}  # weights at which its points bend, by shape with in-betweens
         if skinning.HasBlendShapes() and self._animation:
             self._blend_shapes = query = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
-            inbetweens = filter(None, map(query.GetInbetween, range(query.GetNumSubShapes())))
-            if not np.isfinite([shape.GetWeight() or 0.0 for shape in inbetweens]).all():  # OpenUSD skips these
-                raise UnreadableError(f"{where}: the weight of an in-between of its blend shapes is not finite")
+            for number in range(query.GetNumSubShapes()):
+                if inbetween := query.GetInbetween(number):
+                    weight = inbetween.GetWeight() or 0.0
+                    if not np.isfinite(weight):  # OpenUSD skips it
+                        raise UnreadableError(f"{where}: the weight of an in-between of its blend shapes is not finite")
+                    self._inbetweens.setdefault(query.GetBlendShapeIndex(number), {0.0, 1.0}).add(weight)
         # The prim of the query would be that of the prototype if the skeleton is in an instance.
         self.skeleton = skeleton.GetPrim() if skinning.HasJointInfluences() else None
         self._broken_joints = _find_broken_joints(skeleton_query) if self.skeleton else []
@@ -57,6 +61,7 @@ class Skin:
                 self._add_times(self._animation.GetJointTransformTimeSamples())
             if self._blend_shapes:
                 self._add_times(self._animation.GetBlendShapeWeightTimeSamples())
+                self.times |= self._find_bends()
         if self.skeleton:
             binding = UsdSkel.BindingAPI(prim)
             bound = binding.GetJointIndicesAttr(), binding.GetJointWeightsAttr(), binding.GetGeomBindTransformAttr()
@@ -88,12 +93,29 @@ class Skin:
                 if joint in used:
                     raise UnreadableError(f"{self._where}: the bind transform of joint {joint} has no inverse")
 
-    def _apply_blend_shapes(self, query, points, time):
+    def _find_bends(self) -> set[float]:
+        """Returns the times between samples of the weights at which points bend, as a weight passes an in-between."""
+        times = np.array(self._animation.GetBlendShapeWeightTimeSamples())
+        if not self._inbetweens or len(times) < 2:
+            return set()
+        weights = [np.array(self._read_weights(Usd.TimeCode(time)) or (), dtype=float) for time in times.tolist()]
+        bends = set()
+        for shape, bent in self._inbetweens.items():
+            values = np.array([some[shape] if shape < len(some) else np.nan for some in weights])
+            for weight in bent:
+                (passed,) = np.nonzero((values[:-1] - weight) * (values[1:] - weight) < 0.0)
+                shares = (weight - values[passed]) / (values[passed + 1] - values[passed])
+                bends.update((times[passed] + shares * (times[passed + 1] - times[passed])).tolist())
+        return bends
+
+    def _read_weights(self, time):
+        """Returns the weights of the blend shapes of the mesh."""
         weights = self._animation.ComputeBlendShapeWeights(time)
         mapper = self._skinning.GetBlendShapeMapper()
-        if mapper and not mapper.IsNull():
-            weights = mapper.Remap(weights)
-        shapes = query.ComputeSubShapeWeights(weights)
+        return mapper.Remap(weights) if mapper and not mapper.IsNull() else weights
+
+    def _apply_blend_shapes(self, query, points, time):
+        shapes = query.ComputeSubShapeWeights(self._read_weights(time))
         if not query.ComputeDeformedPoints(
             *shapes, query.ComputeBlendShapePointIndices(), query.ComputeSubShapePointOffsets(), points
         ):
