@@ -10,9 +10,9 @@ import time
 
 import pytest
 import warp as wp
-from pxr import Usd
+from pxr import Usd, UsdGeom
 from replay_files import Page
-from stages import add_mesh, new_stage, save
+from stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, animate, new_stage, save
 
 from warp_bsc.cli import device
 from warp_bsc.cli.main import main
@@ -170,6 +170,30 @@ def test_full_disk(tmp_path, capsys):
     assert 10 < stage.GetEndTimeCode() < 49
     assert "not all of it is written" in capsys.readouterr().err
     assert not [name for name in os.listdir(tmp_path) if name.startswith(".")]
+
+
+@pytest.mark.parametrize(
+    ("mover", "is_named"), [("mesh", True), ("transform", False), ("shape", False), ("instance", False)]
+)
+def test_replay_says_how_to_repair_only_what_a_repair_moves(tmp_path, capsys, mover, is_named):
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    heights = (0, 0, 0.25), (0, 0, -0.25)
+    if mover == "mesh":
+        add_falling(stage)
+    elif mover == "transform":
+        animate(add_mesh(stage, "/World/Falling", FALLING), *heights)
+    elif mover == "shape":
+        sphere = UsdGeom.Sphere.Define(stage, "/World/Ball")
+        sphere.CreateRadiusAttr(0.25)
+        animate(sphere, (0, 0, 1), (0, 0, -1))
+    else:
+        places = dict(enumerate([[height] for height in heights]))
+        add_instancer(stage, "/World/Leaves", places, ["/World/Leaves/Leaf"])
+        add_mesh(stage, "/World/Leaves/Leaf", FALLING)
+    assert main(["replay", save(stage), "--device", "cpu"]) == 0
+    said = capsys.readouterr().out
+    assert "Collisions in 1 of 1 interval" in said and ("To repair: " in said) == is_named
 
 
 def test_replay_says_how_to_repair(tmp_path, capsys):

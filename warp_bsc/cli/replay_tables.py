@@ -78,8 +78,9 @@ def print_replay(console: Console, summary: Summary) -> None:
 
 
 def print_repair(console: Console, summary: Summary, command: str) -> None:
-    """Prints the command that repairs what a replay found; nothing if it found nothing that moves."""
-    if summary.hits and not summary.scene.is_still:
+    """Prints the command that repairs what a replay found; nothing if it found nothing that a repair can move."""
+    names = {name for meshes, _ in summary.mesh_pairs for name in meshes}
+    if any(summary.scene.prim_of(name).why_not_repaired is None for name in names):
         say(console, f"To repair: {command}")
 
 

@@ -261,6 +261,13 @@ class UsdMesh:
         return None
 
     @property
+    def why_not_repaired(self) -> str | None:
+        """Why a repair does not move the mesh, in words; None if it may."""
+        if self.why_not_written or self.deforms:
+            return self.why_not_written
+        return "its points do not move, only its transform" if self.times else "it does not move"
+
+    @property
     def prim(self) -> Usd.Prim:
         """The prim."""
         return self._prim

@@ -233,6 +233,7 @@ class Scene:
             self.comments = [(title, text) for title, key in texts.items() if (text := self.stage.GetMetadata(key))]
             self._usd_meshes, self._warnings = find_meshes(self.stage, path, self.selection, self._left_out)
             self._check_meshes(bool(options.selection))
+            self._by_name = {mesh.name: mesh for mesh in self._usd_meshes}
             self.dtype = np.dtype(np.float32 if all(mesh.is_placed for mesh in self._usd_meshes) else np.float64)
             frames = options.frames or FrameRange()
             own_start = self.stage.GetStartTimeCode()
@@ -385,7 +386,7 @@ class Scene:
 
     def prim_of(self, name: str) -> "UsdMesh":
         """Returns the prim, or the instance of one, that is read as the mesh of a name."""
-        return next(mesh for mesh in self._usd_meshes if mesh.name == name)
+        return self._by_name[name]
 
     @one_at_a_time
     def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:

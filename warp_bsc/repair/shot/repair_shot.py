@@ -54,10 +54,8 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
     for prim in prims:
         if patterns and Selection(prims=patterns).includes(prim):
             kept[prim.name] = "it is to be kept"
-        elif prim.why_not_written:
-            kept[prim.name] = prim.why_not_written
-        elif not prim.deforms:
-            kept[prim.name] = "its points do not move, only its transform" if prim.times else "it does not move"
+        elif prim.why_not_repaired:
+            kept[prim.name] = prim.why_not_repaired
     return kept
 
 
