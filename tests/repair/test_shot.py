@@ -1,16 +1,21 @@
 """A repaired shot: free of collisions, as it was where it was free, and back where it was after each collision."""
 
+import itertools
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from dipping import FRAMES, HIT, SIZE, dipping_sheet, points_of, quads, repaired, sheet
 from pxr import Gf, Usd, UsdGeom, UsdSkel
+from replay_files import Page
 from stages import add_mesh, find, new_stage, save
 
 from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
+from warp_bsc.cli.main import main
 from warp_bsc.repair.shot.blend import BLEND, blend
 from warp_bsc.repair.shot.findings import find_collisions
+from warp_bsc.repair.shot.mesh_groups import groups_of
 from warp_bsc.repair.shot.repair_shot import repair_shot
 
 
@@ -76,13 +81,100 @@ def test_free_shot_is_not_written(tmp_path, capsys):
     assert not (tmp_path / "fixed.usdc").exists()
 
 
-def test_kept_mesh_does_not_move(tmp_path, capsys):
+def test_kept_meshes_do_not_move_and_are_not_left(tmp_path, capsys):
+    """What they do among themselves is counted in a note alone; an earlier layer stays, and a line says so."""
     stage = dipping_sheet(tmp_path)
-    output = repaired(stage, "--keep", "/World/Sheet", "--json", "--fail-on", "left", status=1)
+    (tmp_path / "fixed.usdc").write_text("earlier")
+    output = repaired(stage, "--keep", "/World/Sheet", "--json", "--fail-on", "left")
     found = json.loads(capsys.readouterr().out)
     assert found["kept"]["/World/Sheet"] == "it is to be kept"
-    assert found["left"] == found["before"] and found["output"] is None
-    assert not (tmp_path / output).exists()
+    assert found["left"] == found["before"] == {"collisions": 0, "intersections": 0} and found["output"] is None
+    repaired(stage, "--keep", "/World/Sheet")
+    printed = capsys.readouterr().out
+    hits = sum(len(result.contacts) for result in replay(Scene(save(stage)), device="cpu"))
+    assert hits
+    assert f"note: collisions of meshes that are not moved with each other: {hits}, not counted" in printed
+    assert f"Nothing was moved: no layer was written.\n{output} is that of an earlier run" in printed
+    assert (tmp_path / "fixed.usdc").read_text() == "earlier"
+
+
+def overlapping_sheets(folder):
+    """A sheet that dips through a plate, and a board that crosses the sheet at all times; both deform."""
+    stage = dipping_sheet(folder)
+    board = sheet(0.0)[:, [2, 0, 1]] * np.float32(0.6) + np.float32([0.31, 0.0, 0.35])
+    points = {time: (board * np.float32(1.0 + 1e-4 * (time % 2))).tolist() for time in range(FRAMES)}
+    add_mesh(stage, "/World/Board", points, [4] * SIZE**2, quads())
+    return stage
+
+
+def test_meshes_that_cross_at_first_are_left_and_named(tmp_path, capsys):
+    output = repaired(
+        overlapping_sheets(tmp_path), "--report", str(tmp_path / "moves.html"), "--fail-on", "left", status=1
+    )
+    printed = capsys.readouterr().out
+    assert "Left: /World/Board with /World/Sheet, which cross at 0 already." in printed
+    assert "Collisions: " in printed and ", 0 left." in printed
+    page = Page((tmp_path / "moves.html").read_text())
+    assert ["Left: /World/Board", "with /World/Sheet, which it crosses at first"] in page.data["facts"]
+    assert page.data["tiles"][2][1].startswith("collisions of meshes that cross at the first frame, of ")
+    assert np.array_equal(points_of(output, 0), sheet(0.1)), "what is left moves nothing"
+    command = ["replay", output, "--device", "cpu", "--fail-on", "collisions"]
+    assert main([*command, "--ignore", "/World/Board", "/World/Sheet"]) == 0
+    capsys.readouterr()
+    assert main(command) == 1
+    assert "It leaves 1 pair of meshes that cross at the first time" in capsys.readouterr().out
+
+
+def test_ignored_meshes_are_not_kept_apart(tmp_path, capsys):
+    """Only the dip is repaired: the board, which the sheet crosses at all times, keeps every bit."""
+    options = ["--ignore", "/World/Board", "/World/Sheet", "--fail-on", "left"]
+    output = repaired(overlapping_sheets(tmp_path), *options)
+    assert "Left: " not in capsys.readouterr().out
+    assert np.array_equal(points_of(output, 0), sheet(0.1))
+    assert not np.array_equal(points_of(output, HIT), sheet(0.1 + 0.001 * HIT, -0.12))
+    board = sheet(0.0)[:, [2, 0, 1]] * np.float32(0.6) + np.float32([0.31, 0.0, 0.35])
+    assert np.array_equal(points_of(output, HIT, "/World/Board"), board)
+
+
+def test_meshes_that_cross_at_first_are_repaired_if_asked(tmp_path, capsys):
+    output = repaired(overlapping_sheets(tmp_path), "--include-initial", "--fail-on", "left", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["left_pairs"] == [] and not any(found["left"].values())
+    assert main(["replay", output, "--device", "cpu", "--fail-on", "collisions,intersections"]) == 0
+
+
+def meshes_of(count):
+    """Stands in for a segment of meshes with one vertex each, and one that the first two share."""
+    meshes = [SimpleNamespace(name=f"/M{number}") for number in range(count)]
+    vertices = [[number] + [count] * (number < 2) for number in range(count)]
+    return SimpleNamespace(meshes=meshes, vertex_count=count + 1, vertices_of=lambda number: vertices[number])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_groups_leave_out_kept_and_left_pairs(seed):
+    random, count = np.random.default_rng(seed), 12
+    segment = meshes_of(count)
+    kept = {mesh.name for mesh in segment.meshes if random.random() < 0.3}
+    pairs = {(i, j) for i in range(count) for j in range(i, count) if random.random() < 0.3}
+    names = [mesh.name for mesh in segment.meshes]
+    group, mask = groups_of(segment, kept, [(names[i], names[j]) for i, j in pairs])
+
+    def meet(i, j):
+        return bool(group[i] & mask[j] and group[j] & mask[i])
+
+    for i, j in itertools.product(range(count), repeat=2):
+        is_left = (min(i, j), max(i, j)) in pairs or kept >= {names[i], names[j]}
+        assert meet(i, j) != is_left, (i, j)
+        assert meet(count, j) or not (meet(0, j) or meet(1, j)), "a shared vertex meets what either mesh meets"
+
+
+def test_groups_are_limited():
+    segment = meshes_of(33)
+    names = [mesh.name for mesh in segment.meshes]
+    assert groups_of(segment, set(), []) == (None, None)
+    groups_of(segment, set(), itertools.combinations(names[:31], 2))
+    with pytest.raises(ValueError, match="33 combinations"):
+        groups_of(segment, set(), itertools.combinations(names, 2))
 
 
 def test_larger_moves_are_not_made(tmp_path, capsys):

@@ -7,7 +7,7 @@ import json
 import os
 
 from .._atomic_file import STDOUT, unfinished_path
-from ..repair.shot.repair_shot import kept_meshes
+from ..repair.shot.findings import kept_meshes
 from ..repair.shot.report import RepairPage
 from ..replay.hit_files import replay_facts
 from ..usd.frames import FrameRange
@@ -33,8 +33,10 @@ Where the scene is free, it keeps every bit; a few frames before a collision the
 points leave their places, and return to them after it.
 Meshes that only transforms move, shapes, curves, points and instances keep
 their places, and so do meshes of --keep: the others are kept apart from them.
+Two meshes that cross at the first frame, such as the parts of a body, are
+mostly meant to: they are named and left as they are, at all frames.
 Curves and points are not seen. --ignore and --between choose what is looked
-for; where something is found, all pairs are kept apart.
+for; where something is found, all pairs except ignored ones are kept apart.
 Skeletons and blend shapes no longer deform a mesh that is moved; it has points
 of its own. The layer is then replayed, and what is left is named.
 If Ctrl-C, SIGTERM, SIGHUP, an error or a full disk stops the run, the layer
@@ -75,6 +77,11 @@ def add_to(commands: Commands, summary: str) -> None:
     )
     add_scene_selection(which)
     how = command.add_argument_group("repair")
+    how.add_argument(
+        "--include-initial",
+        action="store_true",
+        help="repair also pairs of two meshes that cross at the first frame; by default these are left",
+    )
     how.add_argument(
         "--max-move",
         type=distance,
@@ -140,7 +147,7 @@ def _run(arguments: argparse.Namespace) -> int:
     with loading_kernels(device):
         load_detector("exact", scene.dtype, device, intersections=True, strands=scene.has_strands)
     options = describe_selection(scene, arguments)
-    options |= {name: getattr(arguments, name) for name in ("keep", "max_move", "min_distance")}
+    options |= {name: getattr(arguments, name) for name in ("keep", "include_initial", "max_move", "min_distance")}
     facts = replay_facts(scene, method="exact", device=str(device), clearance=None, options=options)
     with contextlib.ExitStack() as stack:
         page = None
@@ -152,7 +159,8 @@ def _run(arguments: argparse.Namespace) -> int:
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and run.is_written:
             fixed = _open(arguments.output, arguments, selection, arguments.frames)
-            after = find(fixed, "Checking", arguments.min_distance, str(device))
+            assert run.journal.findings
+            after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].left_pairs)
         if page and run.journal.findings is not None:
             run.report(page, kept, after)
         if run.interrupt:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from .._atomic_file import naming, unfinished_path
-from ..repair.shot.findings import Finding, find_collisions
+from ..repair.shot.findings import Finding, MeshPair, find_collisions
 from ..repair.shot.journal import Journal
 from ..repair.shot.repair_shot import repair_shot
-from ..repair.shot.report import RepairPage
+from ..repair.shot.report import LEFT_HITS, RepairPage
 from ..repair.shot.stretch import RepairedStretch
 from ..replay.intervals import replay
 from ..replay.results import IntervalResult
@@ -35,6 +35,7 @@ class RepairRun:
         journal: The findings, and the stretches with their frames, also those of an earlier run.
         found: Numbers of what was found before, by its name.
         initially_near: Number of pairs that are nearer than the minimum distance from the start.
+        left_pairs: Pairs of meshes that are left as they are.
         stretches: The stretches, without their frames.
         frames: Times and numbers of moved vertices of the moved frames, by stretch.
         earlier: Number of stretches of an earlier run.
@@ -65,6 +66,7 @@ class RepairRun:
             raise
         self.found: dict[str, int] = {}
         self.initially_near = 0
+        self.left_pairs: tuple[MeshPair, ...] = ()
         self.stretches: list[RepairedStretch] = []
         self.frames: list[list[tuple[float, int]]] = []
         self.earlier = 0
@@ -111,16 +113,20 @@ class RepairRun:
         scene, arguments, journal = self.scene, self._arguments, self.journal
         started = time.perf_counter()
         if journal.findings is None:
-            findings = find(scene, "Finding", arguments.min_distance, self._device)
+            left_pairs = () if arguments.include_initial else None
+            findings = find(scene, "Finding", arguments, self._device, left_pairs)
             self._keep(lambda: journal.begin(findings))
         assert journal.findings is not None
         self.found = count_found(journal.findings, arguments.min_distance)
         self.initially_near = sum(finding.initially_near for finding in journal.findings)
+        self.left_pairs = journal.findings[0].left_pairs
         if self.initially_near:
             self.notes.append(
                 f"pairs that are nearer than {arguments.min_distance:g} from the start: {self.initially_near:,}, which "
                 "are not counted; where the scene is repaired, they come no nearer"
             )
+        if kept_hits := sum(finding.kept_hits for finding in journal.findings):
+            self.notes.append(f"collisions of meshes that are not moved with each other: {kept_hits:,}, not counted")
         self.seconds["finding"] = time.perf_counter() - started
         done = 0
         for stretch in journal.stretches(scene):
@@ -227,23 +233,33 @@ class RepairRun:
             "before": self.found,
             "left": left,
             "initially_near": self.initially_near,
+            "left_pairs": self.left_pairs,
             "kept": kept,
             "stretches": stretches,
             "seconds": self.seconds,
         }
 
 
-def find(scene: Scene, activity: str, min_distance: float, device: str) -> list[Finding]:
-    """Returns what an exact replay of a scene finds, and shows its progress."""
-    return list(find_collisions(scene, _tracked(scene, activity, device), min_distance=min_distance, device=device))
+def find(
+    scene: Scene,
+    activity: str,
+    arguments: argparse.Namespace,
+    device: str,
+    left_pairs: tuple[MeshPair, ...] | None,
+) -> list[Finding]:
+    """Returns what an exact replay of a scene finds, and shows its progress; pairs as of :func:`.find_collisions`."""
+    options = {"keep": arguments.keep, "left_pairs": left_pairs, "min_distance": arguments.min_distance}
+    return list(find_collisions(scene, _tracked(scene, activity, device), **options, device=device))
 
 
 def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
-    """Returns the numbers of collisions and intersections, and of pairs that are too near, by their names."""
+    """Returns the numbers of collisions and intersections, and of others that there may be, by their names."""
     crossings = sum(finding.crossings[0] for finding in findings) + findings[-1].crossings[1]
     counts = {"collisions": sum(finding.hits for finding in findings), "intersections": crossings}
     if min_distance:
         counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
+    if findings[0].left_pairs:
+        counts[LEFT_HITS] = sum(finding.left_hits for finding in findings)
     return counts
 
 

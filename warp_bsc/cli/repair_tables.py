@@ -1,5 +1,7 @@
 """Prints what warp-bsc repair did: a table of the repaired stretches, and what is left."""
 
+from pathlib import Path
+
 from .option_names import with_option
 from .repair_run import RepairRun
 from .tables import LONGEST, Console, count, make_table, say
@@ -23,6 +25,12 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
         say(console, f"note: {name} is not moved: {reason}")
     if len(kept) > LONGEST:
         say(console, f"note: {len(kept) - LONGEST} more are not moved")
+    for first, second in run.left_pairs[:LONGEST]:
+        say(console, f"Left: {first} with {second}, which cross at {scene.times[0]:g} already.")
+    if run.left_pairs:
+        more = len(run.left_pairs) - LONGEST
+        other = f"{count(more, 'more pair')} of meshes as well; " if more > 0 else ""
+        say(console, f"  {other}--include-initial repairs them too, --ignore does not count them.")
     if run.earlier:
         say(console, f"note: stretches that an earlier run has repaired: {run.earlier:,}")
     if run.stretches:
@@ -45,6 +53,8 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
         say(console, f"Wrote {run.output}.")
     else:
         say(console, "Nothing was moved: no layer was written.")
+        if Path(run.output).exists():
+            say(console, f"{run.output} is that of an earlier run, and stays as it is.")
     if run.page:
         say(console, f"Wrote {run.page}.")
 

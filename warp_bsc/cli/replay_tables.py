@@ -5,6 +5,7 @@ from collections import defaultdict
 from rich.console import Console
 from rich.text import Text
 
+from ..repair.shot.findings import kept_meshes
 from ..replay.baseline import NewFinding
 from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
 from ..replay.scene_contacts import PHASES
@@ -80,8 +81,14 @@ def print_replay(console: Console, summary: Summary) -> None:
 def print_repair(console: Console, summary: Summary, command: str) -> None:
     """Prints the command that repairs what a replay found; nothing if it found nothing that a repair can move."""
     names = {name for meshes, _ in summary.mesh_pairs for name in meshes}
-    if any(summary.scene.prim_of(name).why_not_repaired is None for name in names):
-        say(console, f"To repair: {command}")
+    if all(summary.scene.prim_of(name).why_not_repaired for name in names):
+        return
+    say(console, f"To repair: {command}")
+    start = summary.intersections[0].mesh_pairs if summary.intersections else {}
+    crossing = [pair for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1]]
+    if crossing and (left := [pair for pair in crossing if not kept_meshes(summary.scene).keys() >= {*pair}]):
+        pairs = count(len(left), "pair")
+        say(console, f"  It leaves {pairs} of meshes that cross at the first time; --include-initial repairs them too.")
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:

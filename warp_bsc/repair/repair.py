@@ -46,12 +46,13 @@ def repair(
             for contour in result.unresolved:
                 print(contour.kind, contour.reason, contour.elements)
 
-    Vertices of borders that have the same position, the same layer and the same world are one vertex: the two sides of
+    Vertices of borders that have the same position, layer, world, groups and mask are one vertex: the two sides of
     a seam do not part. Pairs of elements that share such a vertex are excluded, as all pairs that share a vertex: they
     touch, and do not count. Faces that lie on each other with all of their corners at borders are among them.
 
     Args:
-        mesh: The mesh, or its faces: vertex indices, integers, shape [face_count, 3]. Its radii are not counted.
+        mesh: The mesh, or its faces: vertex indices, integers, shape [face_count, 3]. Its radii are not counted; pairs
+            that its groups and masks leave out do not cross.
         x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
         fixed: Vertices that stay, such as the body under a garment: a mask, bool, shape [vertex_count], or indices,
             integers, shape [n].
@@ -136,8 +137,8 @@ def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: Co
 
 
 def _labels(mesh: CollisionMesh, layer: np.ndarray) -> np.ndarray:
-    """Returns what the vertices that are welded have in common beside their position, int, shape [n, 2]."""
-    return np.column_stack([layer, np.zeros_like(layer) if mesh.world is None else mesh.world])
+    """Returns what the vertices that are welded have in common beside their position, int, shape [n, k]."""
+    return np.column_stack([layer, *(bits for bits in (mesh.world, mesh.group, mesh.mask) if bits is not None)])
 
 
 def _repaired(

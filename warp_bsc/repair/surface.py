@@ -43,6 +43,8 @@ def welded(mesh: CollisionMesh, weld: np.ndarray) -> CollisionMesh:
         edges=edges[edges[:, 0] != edges[:, 1]],
         points=weld[mesh.points],
         world=mesh.world,
+        group=mesh.group,
+        mask=mesh.mask,
         device=mesh.device,
     )
 

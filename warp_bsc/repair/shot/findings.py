@@ -1,12 +1,12 @@
 """What a replay found in a shot, as far as a repair needs it: collisions, intersections, and what comes too near."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..._arguments import check_instance, checked_distance
+from ..._arguments import check_instance, checked_distance, checked_strings
 from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...replay.results import IntervalResult
@@ -16,7 +16,10 @@ from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.selection import Selection
 
-__all__ = ["Finding", "find_collisions"]
+__all__ = ["Finding", "MeshPair", "find_collisions", "kept_meshes"]
+
+MeshPair = tuple[str, str]
+"""Names of two meshes."""
 
 _KEY = np.array([2**31, 1])
 """Makes one number of the numbers of two elements."""
@@ -25,6 +28,8 @@ _KEY = np.array([2**31, 1])
 @dataclass(frozen=True)
 class Finding:
     """What a replay found in an interval, as far as a repair needs it.
+
+    Two meshes that are kept, and a kept mesh with itself, count in ``kept_hits`` alone: no repair can free them.
 
     Attributes:
         hits: Number of pairs that collide.
@@ -35,29 +40,72 @@ class Finding:
         crossings: Numbers of edges that meet faces at the start and at the end, which is 0 if it is the same time.
         crossing_meshes: Names of the pairs of meshes that intersect at the start.
         is_joined: Whether the interval starts where the one before ends, with the same meshes.
+        left_pairs: In the first interval the pairs of meshes that are left as they are, each sorted: they cross at its
+            start. The other attributes do not count them. Empty in other intervals.
+        left_hits: Number of pairs that collide of meshes that are left.
+        kept_hits: Number of those of meshes that are kept.
+        ignored_pairs: Pairs of meshes that collide and are ignored.
     """
 
     hits: int
     near: int
     initially_near: int
     crossings: tuple[int, int]
-    crossing_meshes: tuple[tuple[str, str], ...]
+    crossing_meshes: tuple[MeshPair, ...]
     is_joined: bool
+    left_pairs: tuple[MeshPair, ...] = ()
+    left_hits: int = 0
+    kept_hits: int = 0
+    ignored_pairs: tuple[MeshPair, ...] = ()
 
     @property
     def is_free(self) -> bool:
-        """Whether nothing collides, intersects or comes too near."""
+        """Whether nothing that is to be repaired collides, intersects or comes too near."""
         return not self.hits and not self.near and not any(self.crossings)
 
 
+def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
+    """Returns the meshes of a scene that a repair does not move, and why, by their names.
+
+    Args:
+        scene: The scene.
+        keep: Patterns of meshes, as those of a selection, that are obstacles.
+
+    Raises:
+        TypeError: If ``keep`` is not a sequence of strings.
+        ValueError: If a pattern matches no mesh.
+    """
+    patterns = checked_strings(keep, "keep")
+    prims = [scene.prim_of(name) for name in scene.names]
+    for pattern in patterns:
+        if not any(Selection(prims=(pattern,)).includes(prim) for prim in prims):
+            raise ValueError(f"keep: no mesh matches {pattern}")
+    kept = {}
+    for prim in prims:
+        if patterns and Selection(prims=patterns).includes(prim):
+            kept[prim.name] = "it is to be kept"
+        elif prim.why_not_repaired:
+            kept[prim.name] = prim.why_not_repaired
+    return kept
+
+
 def find_collisions(
-    scene: Scene, results: Iterable[IntervalResult], *, min_distance: float = 0.0, device: Any = None
+    scene: Scene,
+    results: Iterable[IntervalResult],
+    *,
+    keep: Iterable[str] = (),
+    left_pairs: Iterable[MeshPair] | None = None,
+    min_distance: float = 0.0,
+    device: Any = None,
 ) -> Iterator[Finding]:
     """Yields what a repair needs of each interval of a scene.
 
     Args:
         scene: The scene.
         results: Results of its replay with intersections, in order.
+        keep: Patterns of meshes that the repair does not move, as of :func:`~.repair_shot.repair_shot`.
+        left_pairs: Names of the pairs of meshes that the repair leaves as they are, each sorted; default: two different
+            meshes that cross at the first time, which are mostly meant to, such as the parts of a body.
         min_distance: Distance that pairs are to keep between the times too, in the scene's unit of length: 0 or at
             least 2^-1021. It is not looked for between elements that an edge of the mesh joins, nor at curves and
             points. Pairs that are nearer at the first time, or where a mesh jumps or changes its topology, are counted
@@ -66,38 +114,59 @@ def find_collisions(
 
     Raises:
         TypeError: If an argument has another type.
-        ValueError: If the distance is out of range, or the scene is broken at some time.
+        ValueError: If the distance is out of range, a pattern matches no mesh, or the scene is broken at some time.
     """
     check_instance(scene, "scene", Scene, "a Scene")
+    kept = kept_meshes(scene, keep).keys()
     distance = checked_distance(min_distance, "min_distance")
-    return _find_collisions(results, _NearPairs(scene.selection, distance, device) if distance else None)
+    left = None if left_pairs is None else frozenset(left_pairs)
+    return _find_collisions(results, scene.selection, kept, left, distance, device)
 
 
-def _find_collisions(results: Iterable[IntervalResult], near_pairs: "_NearPairs | None") -> Iterator[Finding]:
-    """Yields the findings of :func:`find_collisions`."""
+def _find_collisions(results, selection, kept, left, min_distance, device) -> Iterator[Finding]:
+    """Yields the findings of :func:`find_collisions`, whose arguments have been checked."""
     last: Segment | None = None
+    near_pairs = None
     for result in results:
         interval, summary = result.contacts.interval, result.summary
         assert summary.intersections is not None
-        start, end = (at.crossings + at.touches for at in summary.intersections)
+        start, end = ({p: n for p, n in at.mesh_pairs.items() if not kept >= {*p}} for at in summary.intersections)
+        hits = {pair: number for pair, number in summary.mesh_pairs.items() if not kept >= {*pair}}
+        if left is None:
+            left = frozenset(_sorted(pair) for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1])
+        if last is None and min_distance:
+            selection = replace(selection, ignored_names=selection.ignored_names | left)
+            near_pairs = _NearPairs(selection, kept, min_distance, device)
+        is_left = {pair: _sorted(pair) in left for pair in (*start, *end, *hits)}
         is_joined = interval.segment is last and not interval.jumps
-        last = interval.segment
         near = near_pairs.find(interval, is_joined) if near_pairs else (0, 0)
+        counted, left_hits = (sum(hits[p] for p in hits if is_left[p] == which) for which in (False, True))
+        low, high = (sum(sum(at[p]) for p in at if not is_left[p]) for at in (start, end))
         yield Finding(
-            hits=sum(summary.mesh_pairs.values()),
+            hits=counted,
             near=near[0],
             initially_near=near[1],
-            crossings=(start, 0 if interval.is_at_rest else end),
-            crossing_meshes=tuple(summary.intersections[0].mesh_pairs),
+            crossings=(low, 0 if interval.is_at_rest else high),
+            crossing_meshes=tuple(pair for pair in start if not is_left[pair]),
             is_joined=is_joined,
+            left_pairs=tuple(sorted(left)) if last is None else (),
+            left_hits=left_hits,
+            kept_hits=sum(summary.mesh_pairs.values()) - counted - left_hits,
+            ignored_pairs=tuple(summary.ignored),
         )
+        last = interval.segment
+
+
+def _sorted(pair: MeshPair) -> MeshPair:
+    return min(pair), max(pair)
 
 
 class _NearPairs:
     """Finds the pairs that come nearer than a distance, interval by interval, without those that are so initially."""
 
-    def __init__(self, selection: Selection, min_distance: float, device: Any):
-        self._selection, self._min_distance, self._device = selection, min_distance, device
+    def __init__(self, selection: Selection, kept: Set[str], min_distance: float, device: Any):
+        self._selection, self._kept = selection, kept
+        self._min_distance, self._device = min_distance, device
         self._segment: Segment | None = None
         self._initial = np.zeros(0, np.int64)
 
@@ -108,6 +177,7 @@ class _NearPairs:
             self._segment = segment
             self._mesh = CollisionMesh(segment.faces, segment.vertex_count, device=self._device)
             self._detector = CollisionDetector(self._mesh, method="exact", min_distance=self._min_distance)
+            self._is_kept = np.array([mesh.name in self._kept for mesh in segment.meshes])
         if not is_joined:
             self._initial = self._pairs(interval, interval.x0)
         pairs = self._pairs(interval, interval.x1)
@@ -117,6 +187,7 @@ class _NearPairs:
     def _pairs(self, interval: Interval, end: np.ndarray) -> np.ndarray:
         """Returns a number for each pair that is too near on the way to some positions, int64."""
         found = self._detector.detect(interval.x0, end)
-        counted = find_contacts(interval, self._mesh, found, self._selection).counted
+        contacts = find_contacts(interval, self._mesh, found, self._selection)
         vertex_face, edge_edge = (pairs.astype(np.int64) @ _KEY for pairs in (found.vertex_face, found.edge_edge))
-        return np.concatenate([vertex_face, -1 - edge_edge])[counted]
+        keys = np.concatenate([vertex_face, -1 - edge_edge])[contacts.counted]
+        return keys[~self._is_kept[contacts.meshes].all(axis=1)]

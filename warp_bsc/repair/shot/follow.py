@@ -72,43 +72,31 @@ class Follower:
     is left to :class:`warp_bsc.SolverCCD`.
 
     Attributes:
+        mesh: The mesh.
         edges: Vertices of the edges of the movable part, the smaller first, shape [n, 2].
         length: Median length of these at the start.
     """
 
-    def __init__(
-        self,
-        faces: np.ndarray,
-        x: np.ndarray,
-        is_movable: np.ndarray,
-        *,
-        min_distance: float = 0.0,
-        device: wp.DeviceLike = None,
-    ):
+    def __init__(self, mesh: CollisionMesh, x: np.ndarray, is_movable: np.ndarray, *, min_distance: float = 0.0):
         """Makes the stages.
 
         Args:
-            faces: Vertices of the faces, integers, shape [face_count, 3].
+            mesh: The mesh. Pairs that its groups and masks leave out are not kept apart.
             x: Positions at the start, float, shape [vertex_count, 3].
             is_movable: Whether each vertex may be displaced, bool, shape [vertex_count]. The others are obstacles and
                 move as given.
             min_distance: Distance that pairs keep, see :class:`warp_bsc.SolverCCD`.
-            device: Warp device.
         """
-        self._is_movable = is_movable
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        edges = np.unique(np.sort(edges[is_movable[edges].all(axis=1)], axis=1), axis=0).astype(np.int64)
+        self.mesh, self._is_movable, self._device = mesh, is_movable, mesh.device
+        edges = mesh.edges[is_movable[mesh.edges].all(axis=1)].astype(np.int64)
         lengths = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
         self.length = float(np.median(lengths)) if len(lengths) else 1.0
         self.edges = edges
         self._x, self._min_distance = np.asarray(x, np.float32), min_distance
-        mesh = CollisionMesh(faces, len(x), device=device)
-        self._device = mesh.device
         self._gaps = {CollisionDetector(mesh): _GAP * self.length}
         if min_distance:
             detector = CollisionDetector(mesh, min_distance=min_distance)
             self._gaps[detector] = min_distance + _GAP * self.length
-        self._mesh = mesh
         both = np.concatenate([edges, edges[:, ::-1]])
         order = np.argsort(both[:, 0], kind="stable")
         first = np.concatenate([[0], np.cumsum(np.bincount(both[:, 0], minlength=len(x)))])
@@ -145,7 +133,7 @@ class Follower:
             arcs: The obstacles that turn on their way and how; None if all move straight.
         """
         tolerance *= self.length
-        device_start = self._mesh.device_positions(start, "start")
+        device_start = self.mesh.device_positions(start, "start")
         best: tuple[float, FollowedFrame] | None = None
         sweeps = list(_SWEEPS)
         target = _displaced(given, displacement)
@@ -197,7 +185,7 @@ class Follower:
             x: The positions at its end, which are free, float32, shape [vertex_count, 3].
         """
         contacts = contacts.latest()
-        at = self._mesh.device_positions(x, "x")
+        at = self.mesh.device_positions(x, "x")
         contacts = self._directed(contacts, at, at)
         distance = np.einsum(
             "ik,ikj,ij->i", contacts.weights, x[contacts.vertices].astype(np.float64), contacts.normals
@@ -217,7 +205,7 @@ class Follower:
         Pairs that start too near are left to the stage, which lets them come no nearer. Those of which no vertex is
         movable do not count, nor do those of which none is changed.
         """
-        end = self._mesh.device_positions(target, "target")
+        end = self.mesh.device_positions(target, "target")
         found, touched = [], np.zeros(len(target), dtype=bool)
         for detector, gap in self._gaps.items():
             contacts = as_contacts(detector.mesh, detector.detect(start, end, only=changed, arcs=arcs), gap)
@@ -258,7 +246,7 @@ class Follower:
         """The stage behind a solver that moves particles to given positions."""
         from .playback import Playback  # noqa: PLC0415 (Newton takes seconds, and few shots need it)
 
-        return Playback(self._mesh.faces, self._x, self._is_movable, self._min_distance, self._device)
+        return Playback(self.mesh, self._x, self._is_movable, self._min_distance)
 
     def _spread_out(self, displacement, sweeps) -> np.ndarray:
         """Returns the displacements of some vertices, and of those around them."""

@@ -4,10 +4,11 @@ import warnings
 
 import newton
 import numpy as np
-import warp as wp
 from newton.solvers import SolverBase
 
+from ...detection.mesh import CollisionMesh
 from ...response.solver_ccd import SolverCCD
+from ...response.state.collision_filter import CollisionFilter
 
 __all__ = ["Playback"]
 
@@ -15,24 +16,23 @@ __all__ = ["Playback"]
 class Playback:
     """The stage behind a solver that moves the vertices of a mesh to given positions."""
 
-    def __init__(
-        self, faces: np.ndarray, x: np.ndarray, is_movable: np.ndarray, min_distance: float, device: wp.DeviceLike
-    ):
+    def __init__(self, mesh: CollisionMesh, x: np.ndarray, is_movable: np.ndarray, min_distance: float):
         """Makes the model.
 
         Args:
-            faces: Vertices of the faces, integers, shape [face_count, 3].
+            mesh: The mesh, with its groups and masks.
             x: Positions at the start, float32, shape [vertex_count, 3].
             is_movable: Whether the stage may move each vertex, bool, shape [vertex_count].
             min_distance: Distance that pairs keep.
-            device: Warp device.
         """
         builder = newton.ModelBuilder()
         builder.add_particles(x.tolist(), np.zeros_like(x).tolist(), is_movable.astype(float).tolist())
-        builder.add_triangles(*np.asarray(faces, np.int64).T.tolist())
-        model = builder.finalize(device=device)
+        builder.add_triangles(*mesh.faces.astype(np.int64).T.tolist())
+        model = builder.finalize(device=mesh.device)
         self._given = _Given(model)
         options = {"friction": 0.0, "restitution": 0.0, "substeps": None, "min_distance": min_distance}
+        if mesh.group is not None and mesh.mask is not None:
+            options["collision_filter"] = CollisionFilter(mesh.group, mesh.mask)
         self._stage = SolverCCD(self._given, **options)
         self._start, self._end = model.state(), model.state()
 

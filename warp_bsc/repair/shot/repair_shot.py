@@ -6,22 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from ..._arguments import check_instance, checked_distance, checked_integer, checked_strings
+from ..._arguments import check_instance, checked_distance, checked_integer
+from ...detection.mesh import CollisionMesh
 from ...detection.rigid_motion import RigidMotion
 from ...replay.scene_arcs import arcs_of
 from ...usd.interval import Interval
 from ...usd.points_layer import MovedFrame
 from ...usd.scene import Scene
 from ...usd.segment import Segment
-from ...usd.selection import Selection
 from ..contacts import Contacts
 from ..repair import repair
 from .blend import MARGIN, blend
-from .findings import Finding
+from .findings import Finding, kept_meshes
 from .follow import Follower
+from .mesh_groups import groups_of
 from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
 
-__all__ = ["kept_meshes", "repair_shot"]
+__all__ = ["repair_shot"]
 
 _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
@@ -32,31 +33,6 @@ _SOUGHT, _ACCEPTED = 0.02, 0.05
 afterwards."""
 _MORE_DISTANCE = 1.0 + 2.0**-8
 """Distance that is kept, as a multiple of the minimum distance: the points of a layer are rounded."""
-
-
-def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
-    """Returns the meshes of a scene that a repair does not move, and why, by their names.
-
-    Args:
-        scene: The scene.
-        keep: Patterns of meshes, as those of a selection, that are obstacles.
-
-    Raises:
-        TypeError: If ``keep`` is not a sequence of strings.
-        ValueError: If a pattern matches no mesh.
-    """
-    patterns = checked_strings(keep, "keep")
-    prims = [scene.prim_of(name) for name in scene.names]
-    for pattern in patterns:
-        if not any(Selection(prims=(pattern,)).includes(prim) for prim in prims):
-            raise ValueError(f"keep: no mesh matches {pattern}")
-    kept = {}
-    for prim in prims:
-        if patterns and Selection(prims=patterns).includes(prim):
-            kept[prim.name] = "it is to be kept"
-        elif prim.why_not_repaired:
-            kept[prim.name] = prim.why_not_repaired
-    return kept
 
 
 def repair_shot(
@@ -79,6 +55,9 @@ def repair_shot(
 
     The first frame of the scene, or after a jump, is repaired by itself, see :func:`warp_bsc.repair`.
 
+    Pairs of meshes that the findings leave or ignore, and kept meshes among themselves, are not kept apart: nothing
+    moves because of them, and no certificate covers them.
+
     Args:
         scene: The scene.
         findings: What a replay has found in each interval, in order, see :func:`~.findings.find_collisions`.
@@ -98,7 +77,8 @@ def repair_shot(
 
     Raises:
         TypeError: If an argument has another type.
-        ValueError: If a number is out of range, a pattern matches no mesh, or the scene is broken at some time.
+        ValueError: If a number is out of range, a pattern matches no mesh, the scene is broken at some time, or meshes
+            are left in more combinations than :func:`~.mesh_groups.groups_of` can tell apart.
     """
     check_instance(scene, "scene", Scene, "a Scene")
     kept = kept_meshes(scene, keep)
@@ -129,6 +109,7 @@ class _Shot:
         self._scene, self._findings, self._kept = scene, findings, kept
         self._min_distance, self._device = min_distance, device
         self._segment: Segment | None = None
+        self._passing = {pair for finding in findings for pair in (*finding.left_pairs, *finding.ignored_pairs)}
 
     def stretches(self) -> list[tuple[int, int]]:
         """Returns the first intervals of the stretches and those after their last, ascending; they may overlap."""
@@ -199,18 +180,14 @@ class _Shot:
                 for number, is_kept in enumerate(are_kept):
                     if is_kept != is_given:
                         is_movable[segment.vertices_of(number)] = is_given
+            group, mask = groups_of(segment, self._kept.keys(), self._passing)
             # The same for all stretches of the segment, wherever a run begins.
             x = segment.start_positions
             # The stage works in single precision: near the origin it is finer.
             self._is_single = x.dtype == np.float32
             self._origin = np.zeros(3) if self._is_single else x.mean(axis=0)
-            self._follower = Follower(
-                segment.faces,
-                self._single(x),
-                is_movable,
-                min_distance=self._min_distance,
-                device=self._device,
-            )
+            mesh = CollisionMesh(segment.faces, len(x), group=group, mask=mask, device=self._device)
+            self._follower = Follower(mesh, self._single(x), is_movable, min_distance=self._min_distance)
             self._mesh = FollowedMesh(is_movable, self._follower.edges, self._follower.length)
         return self._scene.interval(index)
 
@@ -230,13 +207,8 @@ class _Shot:
         given = self._single(interval.x0)
         if not self._findings[first].crossings[0]:
             return ShotFrame.of_shot(given)
-        result = repair(
-            interval.segment.faces,
-            given,
-            fixed=~self._mesh.is_movable,
-            min_distance=self._min_distance,
-            device=self._device,
-        )
+        fixed, distance = ~self._mesh.is_movable, self._min_distance
+        result = repair(self._follower.mesh, given, fixed=fixed, min_distance=distance)
         if result.unresolved:
             pairs = sorted({" and ".join(dict.fromkeys(names)) for names in self._findings[first].crossing_meshes})
             reasons = "; ".join(dict.fromkeys(contour.reason for contour in result.unresolved))

@@ -18,7 +18,10 @@ from ...usd.segment import Segment
 from .findings import Finding
 from .stretch import RepairedStretch
 
-__all__ = ["RepairPage"]
+__all__ = ["LEFT_HITS", "RepairPage"]
+
+LEFT_HITS = "collisions of meshes that cross at the first frame"
+"""What is left of pairs of meshes that are left as they are."""
 
 _ALL_FACES = (
     3_000_000  # about 25 MB, in the views of all frames together; divided by their number, the limit of a frame ...
@@ -138,6 +141,8 @@ class _Summary:
         ]
         if min_distance:
             tiles.append(_left(before, after, f"pairs nearer than {min_distance:g}", lambda found: found.near))
+        if before[0].left_pairs:
+            tiles.append(_left(before, after, LEFT_HITS, lambda found: found.left_hits))
         ratios = [stretch.edge_ratio for stretch in stretches]
         tiles += [
             (f"{len(moves.keys() & {frame['time'] for frame in self.frames}):,} of {len(moves):,}", "frames moved"),
@@ -181,6 +186,7 @@ class _Summary:
                 ("Vertices", f"{scene.vertex_count:,}"),
                 ("Triangles", f"{scene.face_count:,}"),
                 *((f"Kept: {name}", reason) for name, reason in list(kept.items())[:_MAX_ROWS]),
+                *((f"Left: {a}", f"with {b}, which it crosses at first") for a, b in before[0].left_pairs[:_MAX_ROWS]),
             ],
             "notes": [
                 "Moves are distances from the scene at the same time; edges are compared with the scene at the same "
