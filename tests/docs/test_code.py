@@ -71,7 +71,10 @@ def test_newton(tmp_path, capsys):
     names, output = run("newton.md", tmp_path, capsys)
     report = names["solver"].report
     assert (report.totals.steps, report.totals.uncertified_steps) == (10, 0) and report.totals.truncated_steps == 0
-    assert re.fullmatch(r"10 0\n\d+ \d+\n", output) and names["plain"].report.totals.steps == 1
+    assert (
+        re.fullmatch(r"10 0\nPenetrated\(passed=\d+, crossed=0, inside=\d+, steps=[01]\)\n", output)
+        and names["plain"].report.totals.steps == 1
+    )
 
 
 def test_contacts(tmp_path, capsys):

@@ -81,17 +81,48 @@ def test_the_count_is_that_of_exact_detection(device):
     tilted = np.float32([[0.2, 0.1, 0.97]]) * rollout.positions[25:, :1]
     apart = rollout.positions
     crossing = np.concatenate([apart[:25], apart[25:] + tilted - np.float32([0.013, 0.007, 0.19])])
-    counts = []
-    for moved in (None, None, crossing, None, None, apart, None, crossing, apart):
+    turned = np.concatenate([apart[:25], apart[25:] + tilted[:, [1, 0, 2]] - np.float32([0.0, 0.01, 0.19])])
+    counts, last, steps = [], None, 0
+    for moved in (None, None, crossing, None, None, apart, None, turned, crossing, apart):
         if moved is not None:
             rollout.states[0].particle_q.assign(moved)
-        expected = len(rollout.find_crossings(rollout.positions))
+        pairs = np.array(list(rollout.find_crossings(rollout.positions)), dtype=int).reshape(-1, 2)
+        of_edges = np.bincount(pairs[:, 0], minlength=len(rollout.mesh.edges))
+        new = 0 if last is None else int(np.maximum(of_edges - last, 0).sum())
+        last, steps = of_edges, steps + (new > 0)
         rollout.step()
-        assert rollout.solver.report.crossings == expected
-        assert rollout.solver.report.certified and rollout.collisions == 0
-        counts.append(expected)
-    assert [count > 0 for count in counts] == [bool(int(digit)) for digit in "001110010"]
+        report = rollout.solver.report
+        assert report.crossings == len(pairs) and report.certified and rollout.collisions == 0
+        penetrated = report.penetrated
+        assert (penetrated.passed, penetrated.crossed, penetrated.inside, penetrated.steps) == (0, new, 0, steps)
+        assert bool(penetrated) == (steps > 0) and report.totals.penetrated_steps == steps
+        counts.append((len(pairs) > 0, new > 0))
+    assert counts == [(c == "1", n == "1") for c, n in zip("0011100110", "0010000110", strict=True)]
     assert rollout.solver.report.totals.frozen_steps == rollout.solver.report.totals.truncated_steps == 0
+
+
+def test_what_crosses_in_a_first_step_or_after_a_reset_did_not_pass_through(device):
+    """Of two worlds, the one that was not reset has passed through."""
+    world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_crossing_sheets(world, 0.0, n=4)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.replicate(world, 2)
+    rollout = flying(builder, device)
+    report, crossing = rollout.solver.report, rollout.positions
+    apart = crossing + np.float32([[0.0, 0.0, 1.0]]) * (np.arange(len(crossing)) % 50 >= 25)[:, None]
+    worlds = wp.array([True, False, False], dtype=bool, device=device)
+    for x, mask in ((crossing, None), (apart, None), (crossing, worlds), (apart, None)):
+        rollout.states[0].particle_q.assign(x)
+        if mask is not None:
+            rollout.solver.reset(rollout.states[0], mask, flags=0)
+        rollout.step()
+        if x is crossing:
+            new = 0 if mask is None else report.crossings // 2
+            assert report.crossings > 10 and report.penetrated.crossed == new and bool(report.penetrated) == (new > 0)
+    rollout.states[0].particle_q.assign(crossing)
+    rollout.solver.reset(rollout.states[0], flags=0)
+    rollout.step()
+    assert report.penetrated.crossed == 0 and report.penetrated.steps == 1
 
 
 def test_crossings_elsewhere_do_not_let_a_bullet_pass(device):

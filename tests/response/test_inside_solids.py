@@ -250,6 +250,10 @@ def test_the_report_names_what_solids_have_swallowed(device):
         rollout.step(DT)
         certified.append(report.certified)
         inside.append(set(report.inside.particles.tolist()))
+        penetrated = report.penetrated
+        assert (penetrated.inside, penetrated.passed) == (len(inside[-1]), report.remaining)
+        assert bool(penetrated) == (len(certified) > 1) and penetrated.steps == min(len(certified) - 1, 1)
+        assert (f"{len(inside[-1])} particles inside solids" in str(report)) == (len(certified) > 1)
     everything = set(range(model.particle_count))
     assert certified == [True, False, True, True] and report.totals.uncertified_steps == 1
     assert inside == [set(), everything, everything, everything] and report.crossings == 0

@@ -227,6 +227,34 @@ def test_plates_bodies_and_coupled_steps(options, device):
     assert hits > 20 and rollout.approaches == 0
 
 
+@pytest.mark.parametrize(("gap", "lifts"), [(2.5, True), (1.5, False)])
+def test_kinematic_fingers_lift_cloth_by_the_gap_of_the_guide(gap, lifts, device):
+    """With a layer in between, a gap of 2.5 distances holds it; below 2 distances there is no space for it."""
+    distance, half, steps = 0.004, 0.01, 10
+    builder = newton.ModelBuilder()
+    for side in (-1.0, 1.0):
+        at = wp.transform(wp.vec3(0.0, 0.0, 0.03 * side), wp.quat_identity())
+        builder.add_shape_box(builder.add_body(xform=at, is_kinematic=True), hx=0.02, hy=0.02, hz=half)
+    add_patch(builder, 4, 0.02, (0.0, 0.0, 0.0))
+    builder.color()
+    model = builder.finalize(device=device)
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), min_distance=distance, friction=0.5)
+    states, height, fastest = [model.state(), model.state()], 0.0, 0.0
+    for step in range(2 * steps):
+        share = min(1.0, (step + 1) / steps)
+        height += 0.003 * (step >= steps)
+        apart = half + 0.5 * (0.04 + share * (gap * distance - 0.04))
+        poses = [[0.0, 0.0, height + side * apart, 0.0, 0.0, 0.0, 1.0] for side in (-1.0, 1.0)]
+        states[0].body_q.assign(np.float32(poses))
+        solver.step(*states, None, None, 1.0 / 60.0)
+        states.reverse()
+        fastest = max(fastest, np.linalg.norm(states[0].particle_qd.numpy(), axis=1).max())
+    middle = states[0].particle_q.numpy()[12]
+    assert bool(solver.report.penetrated) == (not lifts) and (solver.report.totals.uncertified_steps == 0) == lifts
+    if lifts:
+        assert abs(middle[2] - height) < 0.5 * distance and fastest < 2.5
+
+
 def test_what_touches_at_the_start_is_set_aside(device):
     """A rope through another one is left to the inner solver, and the steps are certified without this pair."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))

@@ -1,5 +1,7 @@
 """What a program moves between steps, as animations do, takes that way in the next step."""
 
+import warnings
+
 import newton
 import numpy as np
 import pytest
@@ -16,11 +18,12 @@ def pose(x):
     return np.float32([[*x, 0.0, 0.0, 0.0, 1.0]])
 
 
-def ball_over_sheet(device, *, worlds=1, **options):
-    """A sheet that floats, and a kinematic ball above it."""
+def ball_over_sheet(device, *, worlds=1, is_kinematic=True, speed=0.0, **options):
+    """A sheet that floats, and a ball above it, which is kinematic or falls with a speed."""
     world = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_patch(world, 8, 0.04, (0.0, 0.0, 0.0))
-    body = world.add_body(xform=wp.transform(wp.vec3(*POSES[0]), wp.quat_identity()), is_kinematic=True)
+    body = world.add_body(xform=wp.transform(wp.vec3(*POSES[0]), wp.quat_identity()), is_kinematic=is_kinematic)
+    world.body_qd[body] = (0.0, 0.0, -speed, 0.0, 0.0, 0.0)
     world.add_shape_sphere(body, radius=0.05)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.replicate(world, worlds)
@@ -55,6 +58,42 @@ def test_a_ball_set_between_steps_is_one_that_moves_in_them(substeps, device):
         assert ball_in_sheet(between) == between.solver.report.crossings == 0
         hits += between.solver.report.hits
     assert hits > 20 and between.positions[:, 2].min() < POSES[-1][2]
+
+
+def said_of_bodies(rollout, steps, move=None):
+    """Returns what some steps warn of bodies that a program moves, which happens between them."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for x in POSES[:steps]:
+            if move is not None:
+                move(rollout, x)
+            rollout.step()
+            assert rollout.solver.report.certified
+    return [str(warning.message) for warning in said if "pose of dynamic bodies" in str(warning.message)]
+
+
+def test_a_dynamic_body_that_a_program_sets_in_each_step_is_named_once(device):
+    """Not one that is kinematic, that contacts push, that is set now and then, or whose world starts anew."""
+    model, kinematic = ball_over_sheet(device, is_kinematic=False), ball_over_sheet(device)
+    rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
+    (said,) = said_of_bodies(rollout, 12, animate)
+    assert "body 0 ('body_0')" in said and "is_kinematic=True" in said
+    assert rollout.solver.report.totals.set_bodies == 1
+
+    def animate_at_times(rollout, x):
+        if POSES.index(x) % 3:
+            animate(rollout, x)
+
+    def start_anew(rollout, x):
+        animate(rollout, x)
+        rollout.states[0].particle_q.assign(rollout.positions + np.float32([0.0, 0.0, 1e-3 * POSES.index(x)]))
+
+    for bodies, move in ((model, animate_at_times), (model, start_anew), (kinematic, animate)):
+        rollout = Rollout(bodies, bsc.SolverCCD(Changed(bodies)))
+        assert not said_of_bodies(rollout, 9, move) and rollout.solver.report.totals.set_bodies == 0
+    pushed = ball_over_sheet(device, is_kinematic=False, speed=SPEED)
+    rollout = Rollout(pushed, bsc.SolverCCD(newton.solvers.SolverXPBD(pushed, iterations=1)))
+    assert not said_of_bodies(rollout, 9) and rollout.solver.report.totals.truncated_steps == 0
 
 
 @pytest.mark.parametrize("device_loop", [False, True])

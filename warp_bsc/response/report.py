@@ -10,10 +10,11 @@ from .._warnings import warn_caller
 from ..detection.intersections import find_intersections
 from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
-from .report_text import shape_name
-from .report_totals import GradientTotals, StepTotals, Totals
+from .report_text import set_bodies_warning, shape_name
+from .report_totals import GradientTotals, Penetrated, StepTotals, Totals
 from .report_views import ReportViews
 from .schedule import Result, views_of
+from .state.motion import SET_STEPS
 from .state.structs import FROZEN, TRUNCATED
 from .state.workspace import Workspace
 from .tuning import MAX_STRAIN
@@ -58,6 +59,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         self.substeps_omitted: str | None = None
         self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
         self.last_strain = wp.zeros(work.worlds, dtype=float, device=work.device)  # by world
+        self.set_steps = wp.zeros(work.body_count, dtype=int, device=work.device)  # of bodies, see find_set_bodies
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
         self.device_totals = views_of(StepTotals, self.total_values)
         self._host_totals = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)
@@ -78,7 +80,7 @@ class SolverReport(ReportViews, WorldsOfReport):
     def warn(self) -> None:
         """Warns once each of steps with predictions that are not finite, and of others that are not certified.
 
-        So it does of strain above 0.2, crossings, inversions, and wrong gradients.
+        So it does of strain above 0.2, crossings, inversions, dynamic bodies that a program moves, and wrong gradients.
 
         Known is what the host knows already; the device is only waited for to warn. A step on a GPU may end before the
         host knows of it: then the next one warns, or the first number that is read, which waits for the device.
@@ -99,6 +101,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         if known["shape_not_followed"]:
             shape = shape_name(self._mesh.model, known["shape_not_followed"] - 1)
             self._warn_once("shapes", lambda: f"{shape} {_NOT_FOLLOWED}")
+        if known["set_bodies"]:
+            self._warn_once("set_bodies", self._set_bodies_warning)
         if known["ambiguous_moves"]:
             self._warn_once("moves", lambda: f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)")
 
@@ -112,6 +116,10 @@ class SolverReport(ReportViews, WorldsOfReport):
         value = values.numpy().max().item()
         self.warn()
         return value
+
+    def _set_bodies_warning(self):
+        labels, bodies = self._mesh.model.body_label, np.flatnonzero(self.set_steps.numpy() == SET_STEPS)
+        return set_bodies_warning([f"body {body} ({labels[body]!r})" for body in bodies])
 
     def _strain_warning(self):
         advice = "take shorter steps"
@@ -319,6 +327,19 @@ class SolverReport(ReportViews, WorldsOfReport):
         """
         return self._inside_finder.find(*self._placed)
 
+    @property
+    def penetrated(self) -> Penetrated:
+        """What passed through something, in the last step and so far: false if nothing did.
+
+        It is about triangles, springs and particles that take part, and pairs that no filter leaves out. With minimum
+        distances, a pair that came nearer than it may counts as passed. What crosses in a first step is not counted,
+        :attr:`crossings` has it; nor is a surface that a program puts wholly on the other side of another between two
+        steps, unless it is inside a solid then. Computed on each access, on the host.
+        """
+        crossed = self._read(self._work.results[Result.NEW_CROSSINGS])
+        inside = len(np.unique(self.inside.particles))
+        return Penetrated(self.remaining, crossed, inside, self.totals.penetrated_steps)
+
     @functools.cached_property
     def _inside_finder(self):
         return InsideFinder(self._mesh)
@@ -380,8 +401,11 @@ class SolverReport(ReportViews, WorldsOfReport):
         return values
 
     def __str__(self) -> str:
-        """Returns the steps so far, in one line, and what crosses at the start of the last."""
-        totals, gradients = self.totals, self.gradients
+        """Returns the steps so far in one line, what crosses at the start of the last, and is inside solids at its end.
+
+        Searches for what is inside, on the host.
+        """
+        totals, gradients, inside = self.totals, self.gradients, len(np.unique(self.inside.particles))
         line = (
             f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
             f"vertices, {totals.uncertified_steps} not certified"
@@ -399,6 +423,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         if self.crossings:
             line += f", {self.crossings} crossings at the start of the step"
             line += " (warp_bsc.repair_state removes those of a first step)"
+        if inside:
+            line += f", {inside} particles inside solids"
         if totals.remaining or totals.excluded:
             line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
         if self.filtered:

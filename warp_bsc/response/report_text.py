@@ -61,6 +61,15 @@ def _name_particles(model, particles):
     return named
 
 
+def set_bodies_warning(bodies: list[str]) -> str:
+    """Returns what to say of dynamic bodies, by name, whose pose a program writes between steps."""
+    named = bodies[:_NAMED] + ([f"{len(bodies) - _NAMED} more"] if len(bodies) > _NAMED else [])
+    return (
+        f"a program writes the pose of dynamic bodies between steps ({', '.join(named)}): the stage does not see their "
+        "way there, on which they pass through things. Add what a program moves with is_kinematic=True"
+    )
+
+
 def not_finite_warning(model: newton.Model, particles: np.ndarray) -> str:
     """Returns what to say of a step in which particles had no finite prediction, empty if that was an earlier step."""
     named = f" ({', '.join(_name_particles(model, particles))})" if len(particles) else ""

@@ -21,6 +21,8 @@ class StepTotals:
     strained_steps: wp.array[wp.int64]
     crossing_steps: wp.array[wp.int64]
     inverting_steps: wp.array[wp.int64]
+    penetrated_steps: wp.array[wp.int64]
+    set_bodies: wp.array[wp.int64]
     shape_not_followed: wp.array[wp.int64]  # the last shape with a change that the stage does not follow, from 1
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
@@ -47,6 +49,10 @@ class Totals:
         crossing_steps: Steps at whose start :attr:`.report.SolverReport.crossings` was more than 0.
         inverting_steps: Steps in which :attr:`.report.SolverReport.inversions` was more than 0; 0 if the stage was not
             asked to count them.
+        penetrated_steps: Steps of which ``passed`` or ``crossed`` of :attr:`.report.SolverReport.penetrated` was more
+            than 0.
+        set_bodies: Dynamic bodies, each once, whose pose a program wrote between steps time after time: the stage does
+            not see the way of such a body between two steps.
     """
 
     steps: int
@@ -61,6 +67,31 @@ class Totals:
     strained_steps: int
     crossing_steps: int
     inverting_steps: int
+    penetrated_steps: int
+    set_bodies: int
+
+
+@dataclass(frozen=True)
+class Penetrated:
+    """What passed through something; true if anything did in any step so far, or is inside something now.
+
+    Attributes:
+        passed: Contacts that the motion of the last step passes as it is stored, as
+            :attr:`.report.SolverReport.remaining`.
+        crossed: Faces that edges cross at the start of the last step beyond those that each crossed at the start of the
+            step before. A step that was not certified made them, or a program or another solver wrote them in between.
+            0 in a first step, and in the first one of worlds after ``reset``.
+        inside: Particles inside solids at the end of the last step, see :attr:`.report.SolverReport.inside`.
+        steps: Steps so far in which either of the first two was more than 0, ``totals.penetrated_steps``.
+    """
+
+    passed: int
+    crossed: int
+    inside: int
+    steps: int
+
+    def __bool__(self) -> bool:
+        return self.steps > 0 or self.inside > 0
 
 
 @dataclass(frozen=True)

@@ -117,6 +117,7 @@ class Result(IntEnum):
     FILTERED = 12  # pairs of the predicted motion that filters left out
     INVERTING = 13  # tetrahedra that the motion inverts or may invert, if they are looked at
     INVERTED = 14  # those that were or may have been inverted at the start
+    NEW_CROSSINGS = 15  # by which crossings of an edge are more than at the start of the step before, in all edges
 
 
 @wp.struct
@@ -194,7 +195,7 @@ def clear_status(status: SolveStatus):
         if i != Loop.RECOUNT:
             status.loop[i] = 0
     for j in range(status.results.shape[0]):
-        if j != Result.CROSSINGS:
+        if j != Result.CROSSINGS and j != Result.NEW_CROSSINGS:
             status.results[j] = 0
 
 

@@ -17,7 +17,7 @@ from .report import SolverReport
 from .schedule import MAX_ITERATIONS, Loop
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh, unseen_strands
-from .state.motion import ModelMotion, arrays_of
+from .state.motion import ModelMotion, arrays_of, find_set_bodies
 from .state.workspace import Workspace
 from .step import prepare
 from .worlds.count_worlds import WorldCounter
@@ -60,6 +60,7 @@ class CollisionStage(CouplingHooks):
         if not model.requires_grad:
             motion.remember(self._work.vertices.x1)
         self.report = SolverReport(self._work, responds=responds)
+        self._watches_bodies = motion.moves_bodies and not model.requires_grad
 
     def _warn_of_unseen(self, mesh: ModelMesh, distances: KeptDistances):
         """Warns of springs and particles that take no part, unless the program chose that by a number."""
@@ -133,6 +134,8 @@ class CollisionStage(CouplingHooks):
                 raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
             start = state_in if self._coupled is None else self._coupled.start_of(state_in)
             self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
+            if self._watches_bodies and self._coupled is None:
+                self._find_set_bodies(start)
             self._mask = mask
             if mask is not None:
                 self._world_mask.begin(start)
@@ -148,6 +151,12 @@ class CollisionStage(CouplingHooks):
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
         if not self.mesh.device.is_capturing:
             self.report.warn()
+
+    def _find_set_bodies(self, start):
+        """Counts dynamic bodies whose pose a program writes between steps, which the stage takes to be there."""
+        work, report = self._work, self.report
+        inputs = [self._motion.vertices, start.body_q, work.vertices.bodies.pose]
+        work.launch(find_set_bodies, work.body_count, inputs, [report.set_steps, report.device_totals.set_bodies])
 
     def _watched(self, tape, state_in, state_out):
         """Keeps the gradients of a step on a tape apart from those of what a program moves before it, and after it."""
@@ -195,6 +204,7 @@ class CollisionStage(CouplingHooks):
         if report.thickness is not None:
             work.launch(count_outrun, 1, [work.status], [report.device_totals])
         work.launch(count_step, 1, [work.status, report.last_substeps, report.last_strain], [report.device_totals])
+        wp.copy(work.last_crossings, work.crossings_of_edges)
         report.copy_totals()
 
     def _recount_crossings(self):
@@ -245,3 +255,4 @@ class CollisionStage(CouplingHooks):
         """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
         super().reset(state, world_mask, flags)
         self._motion.interrupt(world_mask)
+        self._work.forget_crossings(world_mask)

@@ -96,6 +96,8 @@ def count_step(status: SolveStatus, substeps: wp.array[int], strain: wp.array[fl
         totals.inverting_steps[0] += wp.int64(1)
     if results[Result.CROSSINGS] > 0:
         totals.crossing_steps[0] += wp.int64(1)
+    if results[Result.REMAINING] > 0 or results[Result.NEW_CROSSINGS] > 0:
+        totals.penetrated_steps[0] += wp.int64(1)
 
 
 @wp.kernel

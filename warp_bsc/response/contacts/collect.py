@@ -29,7 +29,9 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 
 
 @wp.func
-def _count_crossing(step: Step, edge: int, face: int, count: wp.array[int], of_worlds: wp.array[int]):
+def _count_crossing(
+    step: Step, edge: int, face: int, count: wp.array[int], of_worlds: wp.array[int], of_edges: wp.array[int]
+):
     mesh = step.mesh
     corners = wp.vec4i(mesh.edges[edge, 0], mesh.edges[edge, 1], mesh.faces[face, 0], mesh.faces[face, 1])
     movable = rules.owner_of(step.motion, corners) == ContactClass.OURS
@@ -37,6 +39,7 @@ def _count_crossing(step: Step, edge: int, face: int, count: wp.array[int], of_w
         if rules.crosses_face(step, edge, face):
             wp.atomic_add(count, 0, 1)
             wp.atomic_add(of_worlds, step.motion.world[corners[0]], 1)
+            wp.atomic_add(of_edges, edge, 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -48,11 +51,21 @@ def count_crossings(
     # out
     count: wp.array[int],
     of_worlds: wp.array[int],
+    of_edges: wp.array[int],
     threads: int,
 ):
     """Counts the pairs (edge, face) that certainly cross at the start and that the response can move."""
     for i in range(wp.tid(), filled_entries(pairs, counts, _QUEUED), threads):
-        _count_crossing(step, pairs[i][0], pairs[i][1], count, of_worlds)
+        _count_crossing(step, pairs[i][0], pairs[i][1], count, of_worlds, of_edges)
+
+
+@wp.kernel(enable_backward=False)
+def count_new_crossings(of_edges: wp.array[int], before: wp.array[int], status: SolveStatus):
+    """Counts how many more faces edges cross than at the start of the step before."""
+    edge = wp.tid()
+    more = of_edges[edge] - before[edge]
+    if more > 0:
+        wp.atomic_add(status.results, int(Result.NEW_CROSSINGS), more)
 
 
 @wp.func

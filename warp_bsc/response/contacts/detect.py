@@ -6,7 +6,7 @@ from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
 from ..schedule import Loop, Result, decide, decide_worlds
 from ..state.workspace import Workspace
-from .collect import collect_contacts, collect_penetrations, count_crossings, drop_if_full
+from .collect import collect_contacts, collect_penetrations, count_crossings, count_new_crossings, drop_if_full
 from .impacts import count_grazing
 from .queue import queues_of
 from .search import find_contacts_without_queues
@@ -18,13 +18,14 @@ def detect_crossings(work: Workspace) -> None:
 
 
 def _count_crossings(work):
-    candidates, crossings = work.crossing_candidates, work.results[Result.CROSSINGS]
-    crossings.zero_()
-    work.status.crossings.zero_()
+    candidates, crossings, of_edges = work.crossing_candidates, work.results[Result.CROSSINGS], work.crossings_of_edges
+    for counts in (crossings, work.results[Result.NEW_CROSSINGS], work.status.crossings, of_edges):
+        counts.zero_()
     retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
     with work.all_worlds():
-        inputs = [work.step, candidates.pairs, candidates.counts, crossings, work.status.crossings]
+        inputs = [work.step, candidates.pairs, candidates.counts, crossings, work.status.crossings, of_edges]
         work.launch_over_entries(count_crossings, inputs)
+    work.launch(count_new_crossings, len(of_edges), [of_edges, work.last_crossings, work.status])
 
 
 def detect_penetrations(work: Workspace, *, ahead: bool) -> None:

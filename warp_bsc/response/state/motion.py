@@ -14,8 +14,10 @@ from .structs import Bodies, Motion, MovedBodies, Vertices, add_zeros, body_of, 
 from .turns import BodyTurns
 from .vectors import to_double
 
-_SAME_POSE = 1e-5
+_SAME_POSE = wp.constant(1e-5)
 """Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
+SET_STEPS = wp.constant(4)
+"""Steps in a row that a dynamic body does not start where it ended the last one, after which a program moves it."""
 
 
 @wp.struct
@@ -107,6 +109,33 @@ def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, plan
             if x[axis] != last[i][axis]:
                 motion.interrupted[motion.world[i]] = 1
                 motion.interrupted[motion.interrupted.shape[0] - 1] = 1
+
+
+@wp.kernel(enable_backward=False)
+def find_set_bodies(
+    # in
+    motion: Motion,
+    starts: wp.array[wp.transform],
+    ends: wp.array[wp.transform],
+    # in and out
+    steps: wp.array[int],
+    count: wp.array[wp.int64],
+):
+    """Counts the steps in a row that each body which the response moves starts elsewhere than it ended the last one.
+
+    Then it counts bodies with :data:`SET_STEPS` of them, whose number stays. Worlds that start anew do not count.
+    """
+    body = wp.tid()
+    if steps[body] == SET_STEPS:
+        return
+    start, end = starts[body], ends[body]
+    q, last_q = wp.transform_get_rotation(start), wp.transform_get_rotation(end)
+    turned = wp.min(wp.length(q - last_q), wp.length(q + last_q))
+    shifted = wp.length(wp.transform_get_translation(start) - wp.transform_get_translation(end))
+    is_set = wp.max(turned, shifted) > _SAME_POSE and can_move(motion, body)
+    steps[body] = wp.where(is_set and continues(motion, motion.bodies.world[body]), steps[body] + 1, 0)
+    if steps[body] == SET_STEPS:
+        wp.atomic_add(count, 0, wp.int64(1))
 
 
 @wp.kernel(enable_backward=False)

@@ -24,7 +24,7 @@ from ..schedule import (
 )
 from ..solve.cluster import BLOCK, threads_of_cluster
 from ..tuning import DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, THREADS, TOLERANCE
-from .motion import ModelMotion
+from .motion import ModelMotion, takes_part
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
     NEVER,
@@ -42,6 +42,9 @@ from .structs import (
 )
 
 wp.set_module_options({"enable_backward": False})
+
+_VERY_MANY = wp.constant(2**30)
+"""Crossings of an edge than which there are never more."""
 
 
 @wp.kernel
@@ -84,6 +87,13 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
         dividing.placed[i] = NOT_PLACED
 
 
+@wp.kernel
+def _forget_crossings(world_mask: wp.array[wp.bool], step: Step, last_crossings: wp.array[int]):
+    edge = wp.tid()
+    if takes_part(world_mask, step.motion.world[step.mesh.edges[edge, 0]]):
+        last_crossings[edge] = _VERY_MANY
+
+
 class Workspace:
     """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
@@ -95,6 +105,8 @@ class Workspace:
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
+        crossings_of_edges: Faces that each edge crosses at the start of the step.
+        last_crossings: The same of the step before; very many in a first step, whose start is as a program made it.
         nearest: How far each vertex is from the nearest face in each of six directions [m], see
             :mod:`.contacts.nearest`; None if steps may be recorded.
         clipped: Where paths end that are clipped there.
@@ -145,6 +157,9 @@ class Workspace:
         arcs = None if self.turns is None else self.arcs
         self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances, arcs=arcs)
         self.crossing_candidates = CrossingCandidates(mesh)
+        edges = len(mesh.edges)
+        self.crossings_of_edges = wp.zeros(edges, dtype=int, device=device)
+        self.last_crossings = wp.full(edges, _VERY_MANY, dtype=int, device=device)
         self.step = step = Step()
         step.mesh = mesh.connectivity
         self.motion = motion
@@ -205,6 +220,13 @@ class Workspace:
             n = self.particle_count
             tetrahedra.first_inversion = wp.full(n, NEVER, dtype=wp.int64, device=self.device)
             self.ends = wp.zeros(n, dtype=wp.vec3, device=self.device)
+
+    def forget_crossings(self, world_mask: wp.array[wp.bool] | None = None) -> None:
+        """Makes the next step a first one, in the worlds of a mask as of :meth:`.ModelMotion.interrupt`, or in all."""
+        if world_mask is None:
+            self.last_crossings.fill_(_VERY_MANY)
+        else:
+            self.launch(_forget_crossings, len(self.last_crossings), [world_mask, self.step, self.last_crossings])
 
     def has_changed(self) -> bool:
         """Returns whether the response changed a particle or a body. Synchronizes with the device."""
