@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 import warp as wp
 from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledADMM, SolverCoupledProxy
-from newton_scenes import DT, SOLVERS, add_patch, bullet
+from newton_scenes import DT, SOLVERS, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
 
 
-def ball_over_sheet(device, mass=0.2):
-    """A ball that flies at a pinned sheet."""
+def ball_builder(mass):
+    """A ball above a pinned sheet."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     radius = 0.05
     inertia = wp.mat33(*(0.4 * mass * radius**2 * np.eye(3)).ravel().tolist())
@@ -20,7 +20,12 @@ def ball_over_sheet(device, mass=0.2):
     builder.add_shape_sphere(body, radius=radius, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5, density=0.0))
     add_patch(builder, 6, 0.05, (0.0, 0.0, 0.0), fixed=True)
     builder.color()
-    model = builder.finalize(device=device)
+    return builder
+
+
+def ball_over_sheet(device, mass=0.2):
+    """A ball that flies at a pinned sheet."""
+    model = ball_builder(mass).finalize(device=device)
     model.body_qd.assign(np.float32([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]]))
     return model
 
@@ -46,15 +51,15 @@ def entries(model, rigid, cloth):
     ]
 
 
-def with_proxy(model, inner="vbd", iterations=1, **options):
-    """A coupled solver in which the first body is a proxy in the entry of the cloth, and the stage in that entry."""
+def with_proxy(model, inner="vbd", iterations=1, bodies=(0,), report_worlds=False, **options):
+    """A coupled solver in which the first bodies are proxies in the entry of the cloth, and the stage in that entry."""
     stages = []
 
     def make(view):
-        stages.append(bsc.SolverCCD(SOLVERS[inner](view)))
+        stages.append(bsc.SolverCCD(SOLVERS[inner](view), report_worlds=report_worlds))
         return stages[-1]
 
-    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=[0], **options)]
+    proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=bodies, **options)]
     config = SolverCoupledProxy.Config(proxies=proxies, iterations=iterations)
     rigid = lambda view: newton.solvers.SolverSemiImplicit(view, angular_damping=0.0)  # noqa: E731
     return SolverCoupledProxy(model, entries(model, rigid, make), config), stages[0]
@@ -88,11 +93,75 @@ def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, ite
     solver, stage = with_proxy(model, inner, iterations, mode=mode)
     poses, state = fall(model, solver, steps)
     report = stage.report
-    assert (report.totals.steps, report.totals.uncertified_steps, report.crossings) == (iterations * steps, 0, 0)
+    assert report.totals.steps == iterations * steps
+    assert report.totals.uncertified_steps == report.totals.revoked_steps  # in its own view, the entry has no contacts
     lags = mode == "lagged" and iterations == 1
     np.testing.assert_allclose(poses[:, :3], expected[:, :3], atol=5e-3 if lags else 2e-3)
     assert poses[-1, 2] > 0.055 - steps * DT + 0.02
     assert (state.particle_q.numpy()[:, 2] < -0.01).any()
+
+
+@pytest.mark.parametrize("mode, iterations, mass", [("lagged", 1, 0.02), ("staggered", 1, 0.2), ("staggered", 2, 0.2)])
+def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass, device):
+    """If, and only if, exact detection finds that state free; until it is seen, the step is not certified."""
+    model = ball_over_sheet(device, mass)
+    solver, stage = with_proxy(model, iterations=iterations, mode=mode)
+    rollout, report, passing = Rollout(model, solver), stage.report, []
+    with pytest.warns(UserWarning, match=r"in the state of the program a step is not certified.* body 0 \('body_0'\)"):
+        for i in range(40):
+            crosses = rollout.find_crossings(rollout.vertices(rollout.states[0]))
+            rollout.step()
+            passing.append(bool(crosses or rollout.new_collisions))
+            assert not report.certified and report.uncertified_bodies.tolist() == [0]
+            assert (report.totals.revoked_steps, report.totals.unseen_steps) == (sum(passing[:-1]), 1)
+            if i % 2:
+                solver.sync_entry_states(rollout.states[0])
+                assert report.certified != passing[-1] and report.totals.revoked_steps == sum(passing)
+                assert report.uncertified_bodies.tolist() == [0] * passing[-1]
+                assert (report.crossings > 0) == bool(crosses) and report.totals.unseen_steps == 0
+    assert report.totals.uncertified_steps == sum(passing) and 0 < sum(passing) < 40
+
+
+def test_worlds_and_resets_of_a_program_are_told_apart(device):
+    """The ball of one world passes its sheet in the state of the program; a step that is reset is not seen."""
+    world = ball_builder(0.2)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.replicate(world, 2)
+    builder.color()
+    model = builder.finalize(device=device)
+    solver, stage = with_proxy(model, bodies=[0, 1], report_worlds=True, mode="staggered")
+    states, report = [model.state(), model.state()], stage.report
+    states[0].body_qd.assign(np.float32([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0], 6 * [0.0]]))
+
+    def step():
+        states[0].clear_forces()
+        solver.step(*states, None, None, DT)
+        states.reverse()
+        return report.worlds.certified.numpy().tolist()
+
+    for _ in range(40):
+        assert step() == [False, False]
+        solver.sync_entry_states(states[0])
+        if not report.certified:
+            break
+    assert report.worlds.certified.numpy().tolist() == [False, True] and report.totals.revoked_steps == 1
+    for crosses_at_start, unseen in ((True, 0), (False, 1)):
+        step()
+        for name in ("body_q", "body_qd", "joint_q", "joint_qd", "particle_q", "particle_qd"):
+            getattr(states[0], name).assign(getattr(model, name))
+        mask = wp.array([True, False, False], dtype=bool, device=device)
+        solver.reset(states[0], mask, newton.StateFlags.NONE)
+        step()
+        # the step before the reset is not seen, unless it is known already not to be free
+        assert (report.totals.revoked_steps, report.totals.unseen_steps) == (2, 1 + unseen), crosses_at_start
+        solver.sync_entry_states(states[0])
+        assert report.certified and report.worlds.certified.numpy().tolist() == [True, True]
+        assert (report.totals.revoked_steps, report.totals.unseen_steps) == (2, unseen)
+
+
+def test_shapes_that_an_entry_does_not_see_are_named(device):
+    with pytest.warns(UserWarning, match="does not see 'shape_1', which collide"):
+        with_proxy(two_balls_over_sheet(device))
 
 
 def test_a_body_hangs_on_cloth_over_a_sphere(device):
@@ -210,9 +279,10 @@ def test_a_captured_graph_steps_as_the_solver_does(device):
                 step_twice()
         for _ in range(6):
             wp.capture_launch(capture.graph) if captured else step_twice()
-        report = stages[0].report
-        assert (report.totals.steps, report.totals.uncertified_steps, report.crossings) == (12, 0, 0)
-        ends.append(np.concatenate([states[0].body_q.numpy().ravel(), states[0].particle_q.numpy().ravel()]))
+        totals = stages[0].report.totals
+        assert totals.steps == 12 and totals.uncertified_steps == totals.revoked_steps > 0 and totals.unseen_steps == 1
+        of_bodies, of_particles = states[0].body_q.numpy().ravel(), states[0].particle_q.numpy().ravel()
+        ends.append(np.concatenate([of_bodies, of_particles, [totals.revoked_steps]]))
     assert ends[0][2] < 0.04
     np.testing.assert_array_equal(*ends)
 
@@ -234,16 +304,21 @@ def test_what_two_entries_pass_of_each_other_is_met_in_the_next_step(iterations,
 
     own = [SolverCoupled.Entry(name=str(i), solver=make, particles=parts[i].tolist()) for i in range(2)]
     solver = SolverCoupledADMM(model, own, SolverCoupledADMM.Config(iterations=iterations))
-    start, end = model.state(), model.state()
-    gaps = []
+    rollout, gaps, passing = Rollout(model, solver), [], 0
     for _ in range(8):
-        start.clear_forces()
-        solver.step(start, end, None, None, DT)
-        start, end = end, start
-        lower, upper = (start.particle_q.numpy()[part, 2].mean() for part in parts)
+        crosses = rollout.find_crossings(rollout.vertices(rollout.states[0]))
+        rollout.step()
+        solver.sync_entry_states(rollout.states[0])
+        passes = bool(crosses or rollout.new_collisions)
+        assert all(stage.report.certified != passes for stage in stages)
+        passing += passes
+        lower, upper = (rollout.positions[part, 2].mean() for part in parts)
         gaps.append(upper - lower)
     assert gaps[2] < -0.01 and min(gaps[3:]) > 0.01
-    assert all(stage.report.totals.uncertified_steps == 0 and stage.report.crossings == 0 for stage in stages)
+    for stage in stages:
+        totals = stage.report.totals
+        assert (totals.uncertified_steps, totals.revoked_steps, totals.unseen_steps) == (passing, passing, 0)
+    assert passing > 0
 
 
 @pytest.mark.parametrize("resets", [False, True])
@@ -265,6 +340,7 @@ def test_proxies_start_where_a_program_sets_them_first(resets, device):
         solver.reset(start, flags=newton.StateFlags.NONE)
     start.clear_forces()
     solver.step(start, end, None, None, DT)
+    solver.sync_entry_states(end)
     assert stage.report.certified and stage.report.hits == 0
     # the sheet is at rest but for the rounding of its elastic forces; the ball would carry it by its radius
     np.testing.assert_allclose(end.particle_q.numpy(), model.particle_q.numpy(), rtol=0.0, atol=1e-8)

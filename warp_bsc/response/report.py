@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,7 +11,7 @@ from .._warnings import warn_caller
 from ..detection.intersections import find_intersections
 from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
-from .report_text import set_bodies_warning, shape_name
+from .report_text import revoked_warning, set_bodies_warning, shape_name
 from .report_totals import GradientTotals, Penetrated, StepTotals, Totals
 from .report_views import ReportViews
 from .schedule import Result, views_of
@@ -66,6 +67,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         self._said: set[str] = set()  # the warnings that have been given
         self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.thickness: wp.array[wp.float64] | None = None  # of that layer [m]
+        self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
         self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
 
     def copy_totals(self) -> None:
@@ -88,7 +90,10 @@ class SolverReport(ReportViews, WorldsOfReport):
         known = dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True))
         if known["not_finite_steps"] and self._responds:
             self._warn_once("not_finite", self._not_finite_warning)
-        if (known["uncertified_steps"] > known["not_finite_steps"] or known["remaining"]) and self._responds:
+        if known["revoked_steps"]:
+            self._warn_once("revoked", self._revoked_warning)
+        named = known["not_finite_steps"] + known["revoked_steps"]
+        if (known["uncertified_steps"] > named or known["remaining"]) and self._responds:
             self._warn_once("uncertified", self._uncertified_warning)
         if known["strained_steps"]:
             self._warn_once("strain", self._strain_warning)
@@ -121,6 +126,10 @@ class SolverReport(ReportViews, WorldsOfReport):
         labels, bodies = self._mesh.model.body_label, np.flatnonzero(self.set_steps.numpy() == SET_STEPS)
         return set_bodies_warning([f"body {body} ({labels[body]!r})" for body in bodies])
 
+    def _revoked_warning(self):
+        passed = self.coupled.find_passed()
+        return revoked_warning(self._mesh.model, passed if len(passed) else self.coupled.bodies)
+
     def _strain_warning(self):
         advice = "take shorter steps"
         if self.substeps_omitted is not None:
@@ -139,7 +148,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         Contacts that :attr:`excluded` counts, pairs that filters leave out (:attr:`filtered`), and contacts of which no
         vertex can be moved, are not part of this. A step with a position or velocity that is not finite, at the start
         or as it is predicted, is not certified. With ``inversions="prevented"``, :attr:`inversions` is 0 in a certified
-        step. :attr:`uncertified_vertices` lists the particles concerned.
+        step. :attr:`uncertified_vertices` lists the particles concerned. Behind a coupled
+        solver, a step is not certified until its end in the state of the program is seen, see :class:`.CouplingHooks`.
         """
         return bool(self._read(self._work.results[Result.CERTIFIED]))
 
@@ -191,9 +201,11 @@ class SolverReport(ReportViews, WorldsOfReport):
         """Edges that cross faces at the start of the last step, pair by pair, as far as a vertex of theirs can move.
 
         Only pairs that floating point certifies to cross count; :attr:`intersections` lists all of them. In a CUDA
-        graph the number is a lower bound if there are more candidates than its queues hold.
+        graph the number is a lower bound if there are more candidates than its queues hold. Behind a coupled solver,
+        it is at least that of the state of the program at the start of the last step whose end was seen.
         """
-        return self._read(self._work.results[Result.CROSSINGS])
+        crossings = self._read(self._work.results[Result.CROSSINGS])
+        return crossings if self.coupled is None else max(crossings, self.coupled.crossings)
 
     @property
     def inversions(self) -> int:
@@ -250,7 +262,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         """Bodies that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
 
         They are bodies of contacts that remain, if the response moves bodies, and those without a finite pose or
-        velocity. Gathered on the host, on each access.
+        velocity. Behind a coupled solver, they are also bodies of other entries, all until the end of the step is seen.
+        Gathered on the host, on each access.
         """
         model = self._mesh.model
         if self.certified or not model.body_count:
@@ -258,6 +271,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         first = model.particle_count
         listed = (self._work.vertices.changed.numpy() != 0) | (self._motion.vertices.is_not_finite.numpy() != 0)
         bodies = np.unique(self._mesh.shape_vertices.body[listed[first:]])
+        if self.coupled is not None:
+            bodies = np.union1d(bodies, self.coupled.find_bodies())
         return bodies[bodies >= 0].astype(np.int32)
 
     def _find_uncertified(self):
@@ -410,6 +425,10 @@ class SolverReport(ReportViews, WorldsOfReport):
             f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
             f"vertices, {totals.uncertified_steps} not certified"
         )
+        if totals.revoked_steps:
+            line += f" ({totals.revoked_steps} only in the state of the program)"
+        if totals.unseen_steps:
+            line += f", {totals.unseen_steps} whose end in the state of the program was not seen"
         if totals.substepped_steps:
             line += f", {totals.substepped_steps} in substeps"
         if self.substeps_omitted is not None and totals.strained_steps:

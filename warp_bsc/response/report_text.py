@@ -61,11 +61,15 @@ def _name_particles(model, particles):
     return named
 
 
+def _first(names: list[str]) -> str:
+    """Returns the first of some names, and how many more there are."""
+    return ", ".join(names[:_NAMED] + [f"{len(names) - _NAMED} more"] * (len(names) > _NAMED))
+
+
 def set_bodies_warning(bodies: list[str]) -> str:
     """Returns what to say of dynamic bodies, by name, whose pose a program writes between steps."""
-    named = bodies[:_NAMED] + ([f"{len(bodies) - _NAMED} more"] if len(bodies) > _NAMED else [])
     return (
-        f"a program writes the pose of dynamic bodies between steps ({', '.join(named)}): the stage does not see their "
+        f"a program writes the pose of dynamic bodies between steps ({_first(bodies)}): the stage does not see their "
         "way there, on which they pass through things. Add what a program moves with is_kinematic=True"
     )
 
@@ -76,6 +80,25 @@ def not_finite_warning(model: newton.Model, particles: np.ndarray) -> str:
     return (
         f"positions or velocities of particles{named} were not finite after the inner solver in a step: the particles "
         "stayed where they were, and the step is not certified (see report.not_finite)"
+    )
+
+
+def unseen_warning(labels: list[str]) -> str:
+    """Returns what to say of shapes, by their labels, that an entry of a coupled solver does not see."""
+    return (
+        f"the entry of a coupled solver does not see {_first([repr(label) for label in labels])}, which collide with "
+        "particles: its particles pass through them, and no certificate covers that; make proxies of their bodies"
+    )
+
+
+def revoked_warning(model: newton.Model, bodies: np.ndarray) -> str:
+    """Returns what to say of a step that is certified as an entry of a coupled solver sees it, but not in the end."""
+    named = _first([f"body {i} ({model.body_label[i]!r})" for i in bodies])
+    return (
+        "in the state of the program a step is not certified, although it is as its entry of a coupled solver sees it: "
+        f"{named or 'particles of another entry'} may pass through particles of this one. "
+        "report.totals.revoked_steps counts such steps; to have none, put SolverCCD around the coupled solver, see "
+        "Robots in the documentation"
     )
 
 

@@ -23,6 +23,8 @@ class StepTotals:
     inverting_steps: wp.array[wp.int64]
     penetrated_steps: wp.array[wp.int64]
     set_bodies: wp.array[wp.int64]
+    unseen_steps: wp.array[wp.int64]
+    revoked_steps: wp.array[wp.int64]
     shape_not_followed: wp.array[wp.int64]  # the last shape with a change that the stage does not follow, from 1
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
@@ -53,6 +55,10 @@ class Totals:
             than 0.
         set_bodies: Dynamic bodies, each once, whose pose a program wrote between steps time after time: the stage does
             not see the way of such a body between two steps.
+        unseen_steps: Steps behind a coupled solver whose end in the state of the program has not been seen: the last
+            one until ``sync_entry_states``, and those before a reset. Not in ``uncertified_steps`` for that.
+        revoked_steps: Of the steps that were not certified, those that are free of collisions as their entry sees them,
+            but not in the state of the program.
     """
 
     steps: int
@@ -69,6 +75,8 @@ class Totals:
     inverting_steps: int
     penetrated_steps: int
     set_bodies: int
+    unseen_steps: int
+    revoked_steps: int
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,10 @@ from .._one_thread import one_at_a_time
 from .._private_names.of_warp import paused_tape
 from .._warnings import warn_caller
 from .adjoint.between_steps import BetweenSteps
+from .integration.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
 from .integration.coupling_interface import CouplingHooks
 from .report import SolverReport
+from .report_text import unseen_warning
 from .schedule import MAX_ITERATIONS, Loop
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh, unseen_strands
@@ -77,6 +79,16 @@ class CollisionStage(CouplingHooks):
         """Keeps gradients apart of what a program moves between steps; ``bodies`` as of :class:`BetweenSteps`."""
         if self.model.requires_grad:
             self._between_steps = BetweenSteps(self.model, self.report.device_totals.ambiguous_moves, bodies=bodies)
+
+    def _make_check(self):
+        unseen = unseen_shapes(self.model)
+        if unseen:
+            warn_caller(unseen_warning(unseen))
+        if not has_elements_of_other_entries(self.mesh):
+            return None
+        worlds = None if self._counter is None else self._counter.worlds.certified
+        self.report.coupled = CoupledCheck(self._work, self.report.device_totals, worlds)
+        return self.report.coupled
 
     def _count_worlds(self, max_impulse: wp.array | None = None):
         """Makes the report have results by world."""
@@ -149,6 +161,7 @@ class CollisionStage(CouplingHooks):
         with paused_tape():
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
+                self.report.copy_totals()
         if not self.mesh.device.is_capturing:
             self.report.warn()
 
@@ -245,6 +258,8 @@ class CollisionStage(CouplingHooks):
         self._recount_crossings()
 
     def _follow_shapes(self):
+        if self._coupled is not None:
+            self._coupled.lose(None)
         self._motion.follow_shapes(self._work.vertices, self.report.device_totals.shape_not_followed)
         if not self.mesh.device.is_capturing:
             self.report.copy_totals()
@@ -256,3 +271,5 @@ class CollisionStage(CouplingHooks):
         super().reset(state, world_mask, flags)
         self._motion.interrupt(world_mask)
         self._work.forget_crossings(world_mask)
+        if self._coupled is not None:
+            self._coupled.lose(world_mask)

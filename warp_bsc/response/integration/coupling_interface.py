@@ -1,10 +1,14 @@
 """Newton's ``CouplingInterface`` for a stage behind another solver: the hooks of that solver, with two additions."""
 
+from typing import Any
+
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers.experimental.coupled import CouplingInterface
 
-from ..state.motion import ModelMotion, continues
+from ..._private_names.of_warp import paused_tape
+from ...detection.host_function import run_on_host
+from ..state.motion import ModelMotion, arrays_of, continues
 from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
@@ -97,11 +101,20 @@ class CouplingHooks(WrappedSolver):
     in each step behind VBD, whatever the mass and the relaxation, because VBD derives a velocity from the way of a
     proxy from its last pose to its source: the two bounce apart.
 
+    The stage resolves the motion in the view of its entry: its own particles, proxies where the stage has pushed them,
+    and the shapes that the entry has. The coupler moves bodies and particles of other entries, so that they may be
+    elsewhere in the state of the program. Therefore, if the entry sees some, the certificate of a step is of that
+    state, and given once the coupler gives it to the entry: when the next step begins, or when the program calls
+    ``coupled.sync_entry_states(state)``. Until then ``report.certified`` is false, and ``report.totals.unseen_steps``
+    counts the step. A step that is then not free of collisions is counted in ``uncertified_steps`` and
+    ``revoked_steps``, and warned of with the names of the bodies. A body that the program itself moves between two
+    steps counts as moved in the first. What is reset before it was seen is not seen.
+
     Limitations:
-        The stage resolves and certifies the motion in the view of its entry: the entry's own particles, proxies, and
-        the shapes that the entry has. Particles of another entry without proxies are obstacles if the view has their
-        faces; they lag a step. Two entries may therefore pass through each other in one step, and are pushed back in
-        the next. The report counts a step for each substep of the entry and each pass.
+        What other entries move meets the certificate where they end, not the response: two entries may pass through
+        each other in a step, which is then not certified, and are pushed back in the next. Particles of another entry
+        without proxies lag a step. What the entry does not see is not certified; a warning names shapes that are not
+        seen. The report counts a step for each substep of the entry and each pass.
 
         ``SolverCoupledADMM`` handles hard attachments of bodies to particles within one entry only if its solver is
         ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
@@ -118,12 +131,21 @@ class CouplingHooks(WrappedSolver):
         """
         self._hook("coupling_notify_iteration_restarts")(enabled)
         self._motion.interrupt()
-        self._coupled = _Coupled(self.model, self._motion, restarts=enabled)
+        self._coupled = _Coupled(self.model, self._motion, self._make_check(), restarts=enabled)
+
+    def _make_check(self) -> Any:
+        """Returns the :class:`.coupled_check.CoupledCheck` of the steps; None if the entry sees nothing of others."""
+        raise NotImplementedError
 
     def coupling_notify_input_state_update(self, state, flags, *, iteration_restart=False, dt=0.0) -> None:
-        """Delegates to the inner solver; in a step, makes proxies start where the last step ended."""
+        """Delegates to the inner solver, after a look at where the last step ended, if the coupler gives that.
+
+        In a step, proxies then start where the last step ended.
+        """
         options = {"iteration_restart": iteration_restart, "dt": dt}
-        self._hook("coupling_notify_input_state_update")(state, flags, **options)
+        if self._coupled is not None and not iteration_restart:
+            self._coupled.see(state, int(flags), dt)
+        self._hook("coupling_notify_input_state_update")(state, flags, **options)  # which may move proxies
         if self._coupled is not None and int(flags) & (StateFlags.BODY_Q | StateFlags.PARTICLE_Q):
             self._coupled.update_input(**options)
 
@@ -150,8 +172,10 @@ class CouplingHooks(WrappedSolver):
 class _Coupled:
     """State of a stage in a coupled simulation: where steps started and ended, and the impulses of the response."""
 
-    def __init__(self, model, motion, *, restarts):
-        self._model, self._motion, device = model, motion, model.device
+    def __init__(self, model, motion, check, *, restarts):
+        self._model, self._motion, self.check, device = model, motion, check, model.device
+        kinds = (StateFlags.PARTICLE_Q, model.particle_count), (StateFlags.BODY_Q, model.body_count)
+        self._all_positions = sum(int(flag) for flag, count in kinds if count)
         self._last, self._first, self._start = model.state(), model.state(), model.state()
         self._continues = False
         starts = motion.starts() if restarts else []
@@ -159,8 +183,19 @@ class _Coupled:
         self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
 
+    def see(self, state, flags, dt):
+        """Checks the last step if this is the state of the program, before the first pass over a step of ``dt`` [s].
+
+        If ``dt`` is 0, the program has asked the coupler to give its state.
+        """
+        if self.check is None or self._continues or flags & self._all_positions != self._all_positions:
+            return
+        given, own, begins = arrays_of(state), arrays_of(self._last), dt > 0.0
+        with paused_tape():
+            run_on_host(lambda: self.check.see(given, own, begins=begins), self._model.device)
+
     def update_input(self, *, iteration_restart, dt):
-        """Prepares for a pass over a step, for which a coupler has set positions; ``dt`` is 0 at a reset.
+        """Prepares for a pass over a step, for which a coupler has set positions; ``dt`` is 0 if no step begins.
 
         Each pass starts where the first one did, whatever the positions are.
         """
@@ -176,6 +211,11 @@ class _Coupled:
         self._continues = True
         self.body_impulses.zero_()  # those of an earlier pass
         self.particle_impulses.zero_()
+
+    def lose(self, world_mask):
+        """Takes into account that worlds were reset, ``world_mask`` as of :meth:`.ModelMotion.interrupt`."""
+        if self.check is not None:
+            self.check.lose(world_mask)
 
     def start_of(self, state):
         """Returns a state with the positions from which a step starts, given the state that it is called with."""
@@ -199,6 +239,8 @@ class _Coupled:
         outputs = [self.particle_impulses, self.body_impulses]
         inputs, size = [motion, vertices, self._model.particle_mass], max(map(len, outputs))
         wp.launch(_add_impulses, size, inputs=inputs, outputs=outputs, device=self._model.device)
+        if self.check is not None:
+            self.check.end()
 
 
 def _copy_positions(to, state):

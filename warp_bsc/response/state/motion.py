@@ -95,6 +95,14 @@ def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
         interrupted[interrupted.shape[0] - 1] = 1
 
 
+def interrupt_worlds(interrupted: wp.array[int], world_mask: wp.array[wp.bool] | None) -> None:
+    """Marks worlds as interrupted, with a mask as of :meth:`ModelMotion.interrupt`."""
+    if world_mask is None:
+        interrupted.fill_(1)
+    else:
+        wp.launch(_interrupt, len(interrupted), inputs=[world_mask, interrupted], device=interrupted.device)
+
+
 @wp.kernel(enable_backward=False)
 def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
@@ -358,11 +366,7 @@ class ModelMotion:
             world_mask: Which worlds, and as the last entry whether also everything that is in all worlds, shape
                 [world_count + 1]; None for everything.
         """
-        interrupted = self.vertices.interrupted
-        if world_mask is None:
-            interrupted.fill_(1)
-        else:
-            wp.launch(_interrupt, len(interrupted), inputs=[world_mask, interrupted], device=self.mesh.device)
+        interrupt_worlds(self.vertices.interrupted, world_mask)
 
     def follow_shapes(self, vertices: Vertices, not_followed: wp.array[wp.int64]) -> None:
         """Moves shapes to where the model has them now, as :meth:`.state.mesh.ModelMesh.follow_shapes`.
