@@ -9,7 +9,6 @@ import signal
 import time
 
 import pytest
-import warp as wp
 from pxr import Usd, UsdGeom
 from replay_files import Page
 from stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, animate, new_stage, save
@@ -17,6 +16,7 @@ from stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, ani
 from warp_bsc.cli import device
 from warp_bsc.cli.main import main
 from warp_bsc.cli.repair import add_to as add_repair
+from warp_bsc.detection import compilation
 
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 
@@ -219,14 +219,13 @@ def test_a_repair_that_compiles_says_so(tmp_path, capsys, monkeypatch, options):
     whole = run.repair_shot
 
     def compiled(*arguments, **named):
-        (tmp_path / "cache" / "wp_module").mkdir()
-        time.sleep(0.2)
+        compilation._report(is_cpu=True)
+        time.sleep(0.1)
+        compilation._report(is_cpu=True)
         yield from whole(*arguments, **named)
 
     path = crossing_twice(tmp_path)
-    assert repair(path, tmp_path / "first.usdc") == 0  # compiles what is not in the real cache
-    (tmp_path / "cache").mkdir()
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
+    assert repair(path, tmp_path / "first.usdc") == 0  # compiles what is not in the cache
     monkeypatch.setattr(device, "_SILENT_SECONDS", 0.02)
     monkeypatch.setattr(run, "repair_shot", compiled)
     capsys.readouterr()

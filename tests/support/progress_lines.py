@@ -1,6 +1,6 @@
 """Standard error of the program without its lines on progress, which only slow machines and cold caches print."""
 
-_PROGRESS = ("Compiling kernels for ",)
+_PROGRESS = ("Compiling kernels",)
 
 
 def without_progress(text: str) -> str:

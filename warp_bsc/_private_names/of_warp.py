@@ -2,7 +2,7 @@
 
 import contextlib
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import warp as wp
@@ -52,6 +52,27 @@ def may_run_in_threads(kernel: wp.Kernel) -> bool:
         _warn_of_one_thread()
         return False
     return mode == "release" and level != 0
+
+
+def on_compilation(report: Callable[[bool], None]) -> None:
+    """Has a function called before each compilation of a module of this package: with whether it is for the CPU.
+
+    Contract: ``warp._src.context.Module._run_codegen(options, is_cpu)`` is called once for each module that is
+    compiled, and for none that is in the cache. The kernels of a module are the values of ``kernels``; ``func`` is the
+    Python function of each. Where that name is gone, nothing is reported.
+    """
+    module = wp._src.context.Module
+    generate = getattr(module, "_run_codegen", None)
+    if generate is None:
+        return
+
+    @functools.wraps(generate)
+    def reported(self: Any, options: dict[str, Any], is_cpu: bool) -> Any:
+        if any((kernel.func.__module__ or "").startswith("warp_bsc.") for kernel in self.kernels.values()):
+            report(is_cpu)
+        return generate(self, options, is_cpu)
+
+    module._run_codegen = reported
 
 
 @functools.cache

@@ -10,7 +10,7 @@ from ..bench.repair import FILE, KNOWN_MESH, RepairRun, measure_repair
 from ..bench.repair_scenes import KINDS, KNOWN, TangledMesh, damaged, load_tangled
 from .bench_repair_tables import print_repair_runs, repair_runs_to_dict
 from .bench_runs import RunsProgress, add_json_file, report_runs
-from .device import find_device
+from .device import find_device, loading_kernels
 from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS
 from .options import Commands, add_command, add_device, natural
@@ -116,7 +116,7 @@ def _measure(
         for kind in arguments.kinds
         for number in numbers
     ]
-    with RunsProgress(len(meshes)) as progress:
+    with RunsProgress(len(meshes)) as progress, loading_kernels(device, progress.console):
         for done, (kind, name, make) in enumerate(meshes):
             progress.show(done, f"{kind} {name}")
             with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none

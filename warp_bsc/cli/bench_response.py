@@ -19,7 +19,7 @@ from ..bench.response import (
 )
 from .bench_response_tables import print_response_runs, response_runs_to_dict
 from .bench_runs import RunsProgress, add_json_file, report_runs
-from .device import find_device
+from .device import find_device, loading_kernels
 from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS
 from .options import Commands, add_command, add_device, distance, positive
@@ -174,7 +174,7 @@ def _measure(
 ) -> Generator[ResponseRun, None, None]:
     """Yields a run for each scene and configuration, and shows the progress."""
     pairs = [(scene, configuration) for scene in scenes for configuration in configurations]
-    with RunsProgress(len(pairs)) as progress:
+    with RunsProgress(len(pairs)) as progress, loading_kernels(device, progress.console):
         for done, (scene, configuration) in enumerate(pairs):
             title = f"{scene}, {configuration}"
             progress.show(done, f"{title}: starts")

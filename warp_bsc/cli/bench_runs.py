@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, TypeVar
 
+import rich.console
 import warp as wp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -110,6 +111,11 @@ class RunsProgress:
         columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
         self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._task = self._bar.add_task("Measuring", total=total)
+
+    @property
+    def console(self) -> rich.console.Console:
+        """Prints on standard error, on a terminal above the bar."""
+        return self._bar.console
 
     def __enter__(self) -> "RunsProgress":
         self._bar.start()

@@ -1,9 +1,8 @@
 """Finds the Warp device and loads kernels, with a message if they are compiled."""
 
 import contextlib
-import threading
+import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -11,11 +10,13 @@ import rich.console
 import warp as wp
 
 from ..detection import start
+from ..detection.compilation import duration, reported_to
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.proximities import ProximityFinder
 from ..detection.settings import Method
-from .tables import Console
+from .progress import LOG_SECONDS
+from .tables import Console, say
 
 __all__ = ["find_device", "load_detector", "loading_kernels"]
 
@@ -36,37 +37,30 @@ def find_device(name: str | None) -> wp.Device:
 
 @contextlib.contextmanager
 def loading_kernels(device: wp.DeviceLike, console: rich.console.Console | None = None) -> Iterator[None]:
-    """Prints a message if kernels are compiled in the block, and it takes more than two seconds.
+    """Prints a message if kernels are compiled in the block for more than two seconds, and then how many have been.
 
     Args:
         device: The device.
         console: Where to print it, such as above a bar that shows progress; standard error for None.
     """
     console = Console(stderr=True) if console is None else console
-    folder, finished = Path(wp.config.kernel_cache_dir or ""), threading.Event()
-    before = _changed_at(folder)
+    times = []  # of the compilations
+    due = _SILENT_SECONDS
 
-    def watch() -> None:
-        while not finished.wait(_SILENT_SECONDS):
-            if _changed_at(folder) != before:  # Warp compiles a module in a new folder there
-                console.print(f"Compiling kernels for {device}, once for each version: up to a few minutes.")
-                return
+    def report() -> None:
+        nonlocal due
+        times.append(time.monotonic())
+        seconds = times[-1] - times[0]
+        if seconds > due:
+            if due == _SILENT_SECONDS:
+                needed = duration(wp.get_device(device).is_cpu)
+                say(console, f"Compiling kernels for {device}, once for each version: {needed}.")
+            else:
+                say(console, f"Compiling kernels: {len(times) - 1} modules in {seconds:.0f} s.")
+            due = seconds + LOG_SECONDS
 
-    watching = threading.Thread(target=watch, daemon=True)
-    watching.start()
-    try:
+    with reported_to(report):
         yield
-    finally:
-        finished.set()
-        watching.join()
-
-
-def _changed_at(folder: Path) -> int:
-    """Returns when something was added to a folder or removed [ns], 0 if there is none."""
-    try:
-        return folder.stat().st_mtime_ns
-    except OSError:
-        return 0
 
 
 def load_detector(

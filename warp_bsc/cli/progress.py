@@ -9,9 +9,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .tables import Console, say
 
-__all__ = ["RunProgress"]
+__all__ = ["LOG_SECONDS", "RunProgress"]
 
-_LOG_SECONDS = 10.0
+LOG_SECONDS = 10.0
 """Time between two lines on the progress, where there is no terminal."""
 
 
@@ -60,7 +60,7 @@ class RunProgress:
             note += f"{', ' * bool(note)}{f'{1.0 / each:.1f}/s' if each < 1.0 else f'{each:.1f} s each'}"
             left = f", about {each * (total - done):,.0f} s left"
         self._bar.update(self._task, completed=done, total=total, note=note)
-        if self._bar.disable and done and now - self._last_line > _LOG_SECONDS:
+        if self._bar.disable and done and now - self._last_line > LOG_SECONDS:
             self._last_line = now
             say(self._bar.console, f"{self._activity}: {done} of {total}{', ' * bool(note)}{note}{left}")
 

@@ -18,6 +18,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import warp as wp
 
 from .._private_names.of_warp import may_run_in_threads
+from . import compilation  # noqa: F401 (says so where kernels are compiled)
 
 __all__ = [
     "THREADS_OF_MULTIPROCESSOR",
