@@ -1,29 +1,17 @@
-"""A vectorised Gymnasium environment in which fingers learn to lift cloths by what they feel, and its training.
-
-    python examples/cloth_env.py
+"""A vectorised Gymnasium environment in which fingers lift cloths by what they feel. Needs the extra ``gym``.
 
 Each of the worlds of ``cloth_worlds.py`` is an environment. An action closes and lifts two fingers; an observation has
 their places, the cloth's, and the contact forces on the fingers; the reward is what the cloth is lifted by, the share
 of its weight that the fingers carry, and a price of pressing harder than needed. Worlds whose episode has ended start
 anew in the next step, in which they take no part (``AutoresetMode.NEXT_STEP``), so that the others change no bit by it.
-
-Training is plain REINFORCE in PyTorch: a Gaussian policy, rewards to go without a critic, the mean of the worlds at
-each time as the baseline. Needs the extras ``gym`` and ``torch``; 16 worlds take some minutes on two cores. On a GPU,
-take more: ``--worlds 1024``.
+``train_cloth_env.py`` trains a policy.
 """
-
-import argparse
-import time
 
 import gymnasium
 import numpy as np
-import torch
-import warp as wp
 from cloth_worlds import HORIZON, OBSERVATIONS, SHIFT, ClothWorlds
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-
-DISCOUNT = 0.97
 
 
 class ClothEnv(gymnasium.vector.VectorEnv):
@@ -53,16 +41,32 @@ class ClothEnv(gymnasium.vector.VectorEnv):
         """Starts an episode in all worlds, or in those of ``options["reset_mask"]``, bool, shape [num_envs]."""
         if seed is not None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool)))
+        if mask.dtype != bool or mask.shape != (self.num_envs,):
+            raise ValueError(f"reset_mask must be bool, of shape ({self.num_envs},), not {mask.dtype} {mask.shape}")
         self._start(mask)
         self._done[mask] = False
         return self._observations(), {"certified": self._certified.copy()}
 
     def step(self, actions):
-        """Takes a control step in worlds whose episode goes on; the others start anew."""
+        """Takes a control step in worlds whose episode goes on; the others start anew.
+
+        Args:
+            actions: Speeds of closing and lifting as shares of the largest, finite, shape [num_envs, 2]; those beyond
+                1 count as 1.
+
+        Raises:
+            ValueError: If they have another shape, or are not finite. No world takes a step then.
+        """
+        actions = np.asarray(actions, dtype=np.float32)
+        if actions.shape != self.action_space.shape:
+            raise ValueError(f"actions must have the shape {self.action_space.shape}, not {actions.shape}")
+        wrong = np.flatnonzero(~np.isfinite(actions).all(axis=1))
+        if len(wrong):
+            raise ValueError(f"actions must be finite, not {actions[wrong[0]].tolist()}, in worlds {wrong.tolist()}")
         resets = self._done
         active = ~resets
-        self.worlds.step(np.asarray(actions, dtype=np.float32), active)
+        self.worlds.step(actions, active)
         rewards, terminated = self.worlds.rewards.numpy().copy(), self.worlds.terminated.numpy().copy()
         self._certified &= self.worlds.certified.numpy()
         if resets.any():
@@ -80,102 +84,3 @@ class ClothEnv(gymnasium.vector.VectorEnv):
 
 
 gymnasium.register("warp_bsc/ClothLift-v0", vector_entry_point=ClothEnv)
-
-
-class Policy(torch.nn.Module):
-    """A Gaussian policy whose mean is a small network."""
-
-    def __init__(self, inputs, outputs):
-        super().__init__()
-        self.mean = torch.nn.Sequential(torch.nn.Linear(inputs, 32), torch.nn.Tanh(), torch.nn.Linear(32, outputs))
-        self.log_deviation = torch.nn.Parameter(torch.full((outputs,), -0.5))
-        torch.nn.init.zeros_(self.mean[2].weight)
-        torch.nn.init.zeros_(self.mean[2].bias)
-
-    def forward(self, observations):
-        """Returns the distribution of actions."""
-        return torch.distributions.Normal(self.mean(observations), self.log_deviation.exp())
-
-
-def roll_out(env, policy, *, explore=True):
-    """Runs one episode in each world.
-
-    Returns:
-        Observations, actions, rewards, and whether the world took part, with shapes [steps, worlds, ...]; and how many
-        episodes ended in a lifted cloth.
-    """
-    observations, _ = env.reset()
-    rows, alive, lifted = [], np.ones(env.num_envs, dtype=bool), 0
-    for _ in range(HORIZON):
-        seen = torch.from_numpy(observations)
-        with torch.no_grad():
-            distribution = policy(seen)
-            actions = distribution.sample() if explore else distribution.mean
-        observations, rewards, terminated, truncated, _ = env.step(actions.numpy())
-        rows.append((seen, actions, torch.from_numpy(rewards * alive), torch.from_numpy(alive.copy())))
-        lifted += int((alive & terminated & (rewards > 0.0)).sum())
-        alive &= ~(terminated | truncated)
-        if not alive.any():
-            break
-    return *(torch.stack(column) for column in zip(*rows, strict=True)), lifted
-
-
-def train(worlds=16, iterations=40, seed=0, device=None):
-    """Trains a policy.
-
-    Returns:
-        The mean return of an episode in each iteration, the return and the share of lifted cloths of new episodes
-        without exploration, before training and after, and the environment.
-    """
-    torch.manual_seed(seed)
-    env = gymnasium.make_vec("warp_bsc/ClothLift-v0", num_envs=worlds, device=device)
-    env.reset(seed=seed)
-    policy = Policy(len(OBSERVATIONS), 2)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=0.02)
-
-    def measure():
-        _, _, rewards, _, lifted = roll_out(env, policy, explore=False)
-        return float(rewards.sum(dim=0).mean()), lifted / worlds
-
-    history, measured = [], [measure()]
-    for iteration in range(iterations):
-        seen, actions, rewards, alive, lifted = roll_out(env, policy)
-        returns = torch.zeros_like(rewards)
-        to_go = torch.zeros(worlds)
-        for step in reversed(range(len(rewards))):
-            to_go = rewards[step] + DISCOUNT * to_go
-            returns[step] = to_go
-        advantages = returns - returns.mean(dim=1, keepdim=True)
-        advantages /= advantages[alive].std() + 1e-6
-        log_likelihoods = policy(seen).log_prob(actions).sum(dim=2)
-        loss = -(log_likelihoods * advantages)[alive].mean()
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
-        optimizer.step()
-        history.append(float(rewards.sum(dim=0).mean()))
-        if iteration % 5 == 0 or iteration == iterations - 1:
-            print(f"iteration {iteration}: return {history[-1]:.2f}, {lifted} of {worlds} lifted", flush=True)
-    measured.append(measure())
-    return history, measured, env
-
-
-def main():
-    """Trains with the options of the command line, and prints the returns of new episodes before and after."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", type=int, default=16)
-    parser.add_argument("--iterations", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
-    args = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    start, processor = time.perf_counter(), time.process_time()
-    _, measured, env = train(args.worlds, args.iterations, args.seed, args.device)
-    print(f"{time.perf_counter() - start:.0f} s, {time.process_time() - processor:.0f} s of processor time")
-    for when, (mean, lifted) in zip(("before", "after"), measured, strict=True):
-        print(f"{when} training, new episodes return {mean:.2f}, and {lifted:.0%} of the cloths are lifted")
-    print(env.unwrapped.worlds.solver.report)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,5 +1,8 @@
 """The worlds in which fingers lift cloths, stepped and reset by world; and their interface for Gymnasium."""
 
+import importlib
+import sys
+
 import cloth_worlds
 import numpy as np
 import pytest
@@ -71,13 +74,51 @@ def test_a_world_that_starts_anew_ends_as_before_and_touches_no_other(worlds):
         np.testing.assert_array_equal(one, other)
 
 
-def test_gymnasium(device):
-    """The environment by the vector interface: spaces, seeds, resets in the next step and by a mask."""
+@pytest.fixture(scope="module")
+def environment(device):
+    """The environment, which needs no PyTorch."""
     gymnasium = pytest.importorskip("gymnasium")
-    pytest.importorskip("torch")
-    import cloth_env  # noqa: PLC0415
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "torch", None)  # an import raises
+        importlib.import_module("cloth_env")
+    return gymnasium.make_vec("warp_bsc/ClothLift-v0", num_envs=WORLDS, device=str(device))
 
-    env = gymnasium.make_vec("warp_bsc/ClothLift-v0", num_envs=WORLDS, device=str(device))
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ([[0.0, 0.0], [np.nan, 0.0], [0.0, -np.inf]], r"actions must be finite, not \[nan, 0.0\], in worlds \[1, 2\]"),
+        ([0.0, 0.0], r"actions must have the shape \(3, 2\), not \(2,\)"),
+        (np.zeros((WORLDS, 3)), r"actions must have the shape \(3, 2\), not \(3, 3\)"),
+        (np.zeros((WORLDS + 1, 2)), r"actions must have the shape \(3, 2\), not \(4, 2\)"),
+    ],
+)
+def test_actions_that_are_none_are_refused(environment, actions, message):
+    """No world has taken a step then."""
+    before, _ = environment.reset(seed=7)
+    with pytest.raises(ValueError, match=message):
+        environment.step(actions)
+    np.testing.assert_array_equal(environment.unwrapped.worlds.observations.numpy(), before)
+
+
+@pytest.mark.parametrize("mask", [[1, 0, 1], [True, False], [[True]] * WORLDS])
+def test_a_mask_of_resets_that_is_none_is_refused(environment, mask):
+    with pytest.raises(ValueError, match=r"reset_mask must be bool, of shape \(3,\), not "):
+        environment.reset(options={"reset_mask": np.array(mask)})
+
+
+def test_training(device):
+    pytest.importorskip("gymnasium")
+    pytest.importorskip("torch")
+    import train_cloth_env  # noqa: PLC0415
+
+    history, measured, _ = train_cloth_env.train(WORLDS, iterations=1, device=str(device))
+    assert len(history) == 1 and np.isfinite(measured[1][0])
+
+
+def test_gymnasium(environment):
+    """The environment by the vector interface: spaces, seeds, resets in the next step and by a mask."""
+    gymnasium, env = pytest.importorskip("gymnasium"), environment
     assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
     env.action_space.seed(0)
     env = gymnasium.wrappers.vector.RecordEpisodeStatistics(env)
@@ -105,5 +146,3 @@ def test_gymnasium(device):
     observations, rewards, terminated, truncated, _ = env.step(np.ones((WORLDS, 2)))
     assert observations[:, -1][[0, 2]].tolist() == [0.0, 0.0] and rewards[[0, 2]].tolist() == [0.0, 0.0]
     assert not (terminated | truncated)[[0, 2]].any()
-    history, measured, _ = cloth_env.train(WORLDS, iterations=1, device=str(device))
-    assert len(history) == 1 and np.isfinite(measured[1][0])
