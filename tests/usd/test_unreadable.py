@@ -122,6 +122,14 @@ def add_missing_clips(stage):
     api.SetClipTimes([(0, 0), (1, 1)])
 
 
+def add_clips_without_faces(stage):
+    clip = new_stage(f"{save(stage).rsplit('/', 1)[0]}/clip.usda")
+    UsdGeom.Mesh(clip.OverridePrim("/World/Odd")).CreatePointsAttr().Set(FALLING, 0)
+    save(clip)
+    add_missing_clips(stage)
+    Usd.ClipsAPI(stage.GetPrimAtPath("/World/Odd")).SetClipAssetPaths(["./clip.usda"])
+
+
 def add_mesh_without_points(stage):
     add_mesh(stage, "/World/Odd", FALLING).GetPrim().RemoveProperty("points")
 
@@ -132,7 +140,8 @@ BROKEN = {
     add_points_of_another_type: "/World/Odd: attribute points holds float, not point3f[]",
     add_faces_of_another_type: "/World/Odd: faceVertexCounts is not a list of integers",
     add_missing_reference: "gone.usda",
-    add_missing_clips: "/World/Odd: its value clips have no faces, edges or points",
+    add_missing_clips: "/World/Odd: value clips default: 1 of 1 files cannot be opened; the first is ./gone.usda",
+    add_clips_without_faces: "/World/Odd: its value clips have no faces, edges or points",
     add_instancer_without_prototype: "/World/Odd: instance 0 is of prototype 0, which does not exist",
     add_instancer_of_itself: "/World/Odd: the point instancer contains itself",
     add_instancer_whose_arrays_do_not_fit: "/World/Odd[1]/Leaf: its instancer has no valid transform for it at time 0",

@@ -338,7 +338,7 @@ class Overlay:
                     ("Collisions found by warp-bsc replay.", SHOWN_BY, missing, summary.motion, summary.not_checked),
                 )
             ),
-            custom={"collisions": self._facts(summary)},
+            custom=("collisions", self._facts(summary)),
             asset={"name": f"Collisions in {Path(self._scene.path).name}", "version": f"warp-bsc {__version__}"},
             sublayer=source if source.startswith("../") else f"./{source}",
             root=self._root_path,
@@ -366,9 +366,7 @@ class Overlay:
         if summary.stopped:
             facts["stopped"] = summary.stopped
         if self._scene.left_out:
-            from pxr import Vt  # noqa: PLC0415 (slow)
-
-            facts["leftOut"] = Vt.StringArray(self._scene.left_out)
+            facts["leftOut"] = self._scene.left_out
         return facts
 
     def _groups(self, used: set[str]) -> list[LayerGroup]:

@@ -60,7 +60,7 @@ def find_meshes(
         except UnreadableError as error:
             left_out.add(error)
             continue
-        if mesh.is_empty and _has_clips(found.prim):  # a file of the clips may be missing
+        if mesh.is_empty and finder.has_clips(found.prim):
             left_out.add(UnreadableError(f"{file}: {mesh.name}: its value clips have no faces, edges or points"))
         elif mesh.is_empty:
             empty.append(mesh.name)
@@ -107,10 +107,3 @@ def find_meshes(
 def _listed(counts: Mapping[str, int]) -> str:
     """Returns numbers with the names that they count, such as "2 Cube, 1 Sphere"."""
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items()))
-
-
-def _has_clips(prim) -> bool:
-    """Returns whether values of a prim may come from value clips."""
-    return any(
-        prim.GetStage().GetPrimAtPath(path).HasAuthoredMetadata("clips") for path in prim.GetPath().GetPrefixes()
-    )

@@ -77,7 +77,7 @@ class LayerContent:
     Attributes:
         metadata: Metadata of the layer, by name.
         documentation: Text for people.
-        custom: Values for programs, by name.
+        custom: Name of a group of values for programs, and these by name; lists are of texts.
         asset: The ``assetInfo`` of the root prim.
         sublayer: Path of its sublayer, relative to its own folder. It is not read.
         root: Path of the prim above all prims, of purpose guide.
@@ -92,7 +92,7 @@ class LayerContent:
 
     metadata: dict[str, Any]
     documentation: str
-    custom: dict[str, Any]
+    custom: tuple[str, dict[str, Any]]
     asset: dict[str, Any]
     sublayer: str
     root: str
@@ -167,7 +167,11 @@ def write_text_layer(content: LayerContent, write: Callable[[str], None]) -> Non
 
 def _describe(layer, content):
     """Sets the metadata of a layer."""
-    layer.customLayerData = content.custom
+    from pxr import Vt  # noqa: PLC0415 (slow)
+
+    group, values = content.custom
+    values = {name: Vt.StringArray(value) if isinstance(value, list) else value for name, value in values.items()}
+    layer.customLayerData = {group: values}
     layer.documentation = content.documentation
     for name, value in content.metadata.items():
         layer.pseudoRoot.SetInfo(name, value)

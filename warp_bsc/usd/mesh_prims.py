@@ -11,6 +11,7 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
+from .clips import has_clips, leave_out_clips
 from .instancers import Instance, find_instances, is_ever_shown
 from .shapes import is_shape
 from .skinning import find_bindings
@@ -70,6 +71,8 @@ class MeshPrimFinder:
         self._file = file
         self._left_out = left_out
         self._bindings: dict[Sdf.Path, Any] = {}  # by path; of a root, the error or None
+        self._clips: dict[Sdf.Path, bool] = {}  # whether the value clips of a prim are left out
+        self._with_clips: list[Sdf.Path] = []  # prims with others
         self.found: list[MeshPrim] = []
         self.unread: list[MeshPrim] = []
         self.other: Counter[str] = Counter()
@@ -85,6 +88,13 @@ class MeshPrimFinder:
             UnreadableError: If a skeleton or an instancer is broken and may not be left out.
         """
         for prim in prims:
+            if has_clips(prim):
+                # The prims of instances have other paths, and the clips of their prototype.
+                source = prim.GetPrimInPrototype().GetPath() if prim.IsInstanceProxy() else prim.GetPath()
+                if source not in self._clips:
+                    self._clips[source] = leave_out_clips(prim, self._file, self._left_out)
+                if not self._clips[source]:
+                    self._with_clips.append(prim.GetPath())
             if prim.IsA(UsdGeom.PointInstancer):
                 # Meshes below it are prototypes, which are not shown where they stand in the hierarchy.
                 prims.PruneChildren()
@@ -99,6 +109,10 @@ class MeshPrimFinder:
                 self.unread.append(MeshPrim(prim, instance, None))
             elif prim.IsA(UsdGeom.Gprim) and is_ever_shown(prim, instance.root if instance else None):
                 self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
+
+    def has_clips(self, prim: Usd.Prim) -> bool:
+        """Returns whether values of a prim may come from value clips that are not left out."""
+        return any(prim.GetPath().HasPrefix(path) for path in self._with_clips)
 
     def _find_bindings(self, root) -> bool:
         """Returns whether the bindings below a ``SkelRoot`` can be read."""
