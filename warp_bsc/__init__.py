@@ -32,7 +32,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.detector import CollisionDetector
     from .detection.differentiable import CollisionArrays
-    from .detection.mesh import CollisionMesh
+    from .detection.mesh import CollisionMesh, leave_out
+    from .detection.proximities import distances
     from .detection.query import (
         QueryResult,
         query_edge_edge,
@@ -92,6 +93,8 @@ _MODULES = {
     "SolverReport": "response.report",
     "StateRepairResult": "repair.state",
     "UnresolvedContour": "repair.results",
+    "distances": "detection.proximities",
+    "leave_out": "detection.mesh",
     "query_edge_edge": "detection.query",
     "query_points": "detection.query_points",
     "query_vertex_edge": "detection.query",
@@ -132,6 +135,8 @@ __all__ = [
     "StateRepairResult",
     "UnresolvedContour",
     "checker",
+    "distances",
+    "leave_out",
     "query_edge_edge",
     "query_points",
     "query_vertex_edge",

@@ -273,6 +273,17 @@ def calls() -> dict[str, Call]:
         {"x0": COORDINATES, "x1": COORDINATES, "arcs": without(OBJECTS, "None")},
         raises=detector.capture,
     )
+    for name in ("candidates", "collision_free_step"):
+        found[f"CollisionDetector.{name}"] = Call(
+            getattr(detector, name), {"x0": X, "x1": X}, {"x0": COORDINATES, "x1": COORDINATES}, raises=detector.detect
+        )
+    for name in ("has_intersections", "least_distance"):
+        found[f"CollisionDetector.{name}"] = Call(
+            getattr(detector, name),
+            {"x": X},
+            {"x": COORDINATES, "rings": NOT_COUNT} if name == "least_distance" else {"x": COORDINATES},
+            raises=detector.find_proximities,
+        )
     found["CollisionDetector.find_intersections"] = Call(detector.find_intersections, {"x": X}, {"x": COORDINATES})
     of_tets = bsc.CollisionDetector(bsc.CollisionMesh(FACES, 6, tets=tets, device="cpu"))
     found["CollisionDetector.inversions"] = Call(
@@ -351,6 +362,22 @@ def calls() -> dict[str, Call]:
             "x0": without(bad_arrays(X)) | {"rows": np.zeros((5, 3))},
             "x1": bad_arrays(X) | {"rows": np.zeros((5, 3)), "single": X.astype(np.float32)},
         },
+    )
+    pairs = without(bad_arrays(pairs, index=True), "bools")
+    found["distances"] = Call(
+        bsc.distances,
+        {"points": good[:, :2], "kind": "vertex_vertex"},
+        {
+            "points": bad_arrays(good[:, :2]) | not_finite(good[:, :2]) | {"huge": good[:, :2] + 1e305},
+            "kind": CHOICES,
+            "device": without(DEVICES),
+        },
+    )
+    part = bad_arrays(np.zeros(6, int), index=True)
+    found["leave_out"] = Call(
+        bsc.leave_out,
+        {"part": [0, 0, 0, 1, 1, 1], "pairs": [[0, 1]]},
+        {"part": without(part, "negative", "huge"), "pairs": pairs | {"many": [[i, 0] for i in range(1, 40)]}},
     )
     vertices = without(bad_arrays(np.array([1]), index=True), "None")
     found["repair"] = Call(

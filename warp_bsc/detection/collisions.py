@@ -6,13 +6,58 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
+import warp as wp
 
 from .contact_buffer import ContactRows, HostContacts, empty_contacts
 from .differentiable import CollisionArrays
 from .settings import Counts, DistanceKind, Method, PairCounts
 from .stage_timer import StageTimer, StageTimers
 
-__all__ = ["CapturedCollisions", "Collisions", "DetectionStats", "StageCounts", "add_stats"]
+__all__ = [
+    "Candidates",
+    "CapturedCollisions",
+    "Collisions",
+    "DetectionStats",
+    "FreeStep",
+    "StageCounts",
+    "add_stats",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The pairs that a detection tests: the swept boxes of no others overlap. Their number is their length.
+
+    Attributes:
+        vertex_face: (vertex, face), sorted, int32, shape [n, 2].
+        edge_edge: (edge, edge), the smaller first, edges as in ``mesh.edges``, sorted, int32, shape [m, 2].
+        vertex_edge: (point, edge), edges that no face has, with a minimum distance only, sorted, int32, shape [k, 2].
+        vertex_vertex: (point, point), the smaller first, likewise, sorted, int32, shape [l, 2].
+    """
+
+    vertex_face: np.ndarray
+    edge_edge: np.ndarray
+    vertex_edge: np.ndarray
+    vertex_vertex: np.ndarray
+
+    def __len__(self) -> int:
+        """Returns the number of pairs of all kinds."""
+        return sum(len(pairs) for pairs in vars(self).values())
+
+
+@dataclass(frozen=True, eq=False)
+class FreeStep:
+    """The part of a motion before its first collision.
+
+    Attributes:
+        step: Its share of the motion, in [0, 1].
+        x: Positions at its end, between ``x0`` and ``x1``, of their type, an array of the kind of ``x1``.
+        certified: Whether the motion from ``x0`` to ``x`` is certified to be free of collisions.
+    """
+
+    step: float
+    x: np.ndarray | wp.array
+    certified: bool
 
 
 @dataclass(frozen=True)
@@ -96,6 +141,7 @@ def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
 class Collisions:
     """The collisions of one motion, sorted, the same on every run and every device.
 
+    Their number is their length, so that ``if collisions`` asks whether there are any; it does not read the device.
     They are in arrays of their own, on the device until they are first read, which later detections do not change. A
     detector reuses these arrays once no reference to the result is left.
 
@@ -118,6 +164,21 @@ class Collisions:
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
     _timer: StageTimer | StageTimers = field(repr=False)
+
+    def __len__(self) -> int:
+        """Returns the number of pairs of all kinds."""
+        return sum(rows.count for rows in self._rows.values())
+
+    def __repr__(self) -> str:
+        """Returns the number of pairs of each kind that the mesh has, and whether they are certified to be all."""
+        counts = [f"{rows.count:,} {kind.display_name}" for kind, rows in self._rows.items()]
+        flags = ["certified" if self.certified else "not certified", *self.overflows]
+        return f"Collisions({', '.join(counts + flags)})"
+
+    @property
+    def free(self) -> bool:
+        """Whether the motion is certified to be free of collisions."""
+        return self.certified and not len(self)
 
     @functools.cached_property
     def _vertex_face_contacts(self) -> HostContacts:
@@ -256,6 +317,10 @@ class CapturedCollisions:
 
     arrays: CollisionArrays | None
     _read: Callable[[], Collisions] = field(repr=False)
+
+    def __bool__(self) -> bool:
+        """Raises a TypeError: there is a number of collisions once :meth:`read` has read them from the device."""
+        raise TypeError("the truth of captured collisions is that of read(), which waits for the device")
 
     def read(self) -> Collisions:
         """Returns the collisions of the last replay; on CUDA those of the detector's last detection, in a graph or not.

@@ -13,7 +13,9 @@ from .face_order import order_faces
 from .settings import DistanceKind, PairKind
 from .start import checked_device
 
-__all__ = ["CollisionMesh", "DevicePlaces"]
+__all__ = ["CollisionMesh", "DevicePlaces", "leave_out"]
+
+_MOST_LISTED = 31
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,3 +345,48 @@ class CollisionMesh:
             edge = self.edges[mixed[0]]
             raise ValueError(f"world must be one for an edge, but edge {edge.tolist()} has {worlds[edge].tolist()}")
         return worlds.astype(np.int32)
+
+
+def leave_out(part: ArrayLike | wp.array, pairs: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Returns groups and masks of vertices that leave out the pairs of parts in a list.
+
+    They are arguments of :class:`CollisionMesh` and of :class:`warp_bsc.CollisionFilter`::
+
+        group, mask = bsc.leave_out(part, [(0, 0), (0, 1)])  # not within part 0, nor between 0 and 1
+        mesh = bsc.CollisionMesh(faces, len(part), group=group, mask=mask)
+
+    An element whose vertices are of several parts is left out with another one if some vertices of both are.
+
+    Args:
+        part: Part of each vertex, integers, shape [vertex_count].
+        pairs: Pairs of parts that do not collide, in any order, integers, shape [n, 2], of at most 31 parts together.
+
+    Returns:
+        Groups and masks as bits, uint32, each of shape [vertex_count].
+
+    Raises:
+        TypeError: If an argument holds no integers.
+        ValueError: If it has another shape, a pair names a part that no vertex has, or the pairs more than 31 parts.
+    """
+    parts, listed = (as_numpy(v, name, "an array of integers") for v, name in ((part, "part"), (pairs, "pairs")))
+    listed = listed.reshape(0, 2).astype(int) if listed.shape == (0,) else listed
+    for values, name in ((parts, "part"), (listed, "pairs")):
+        if values.dtype.kind not in "iu":
+            raise TypeError(f"{name} must be an array of integers, not of {values.dtype}")
+    if parts.ndim != 1:
+        raise ValueError(f"part must have shape (vertex_count,), not {parts.shape}")
+    if listed.ndim != 2 or listed.shape[1] != 2:
+        raise ValueError(f"pairs must have shape (n, 2), not {listed.shape}")
+    numbers, bits = np.unique(listed, return_inverse=True)
+    unknown = numbers[~np.isin(numbers, parts)]
+    if len(unknown):
+        raise ValueError(f"pairs name part {unknown[0]}, which no vertex has")
+    if len(numbers) > _MOST_LISTED:
+        raise ValueError(f"pairs must name at most {_MOST_LISTED} parts, not {len(numbers)}")
+    group, mask = np.ones(len(parts), np.uint32), np.full(len(parts), 0xFFFFFFFF, np.uint32)
+    for bit, number in enumerate(numbers):
+        group[parts == number] = 2 << bit
+    for (first, second), (bit, other) in zip(listed, bits.reshape(-1, 2).tolist(), strict=True):
+        mask[parts == first] &= ~np.uint32(2 << other)
+        mask[parts == second] &= ~np.uint32(2 << bit)
+    return group, mask

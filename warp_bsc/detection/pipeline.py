@@ -22,6 +22,7 @@ from .settings import (
     Counts,
     DistanceKind,
     Method,
+    PairCounts,
     PairKind,
     checked_tolerance,
 )
@@ -264,6 +265,8 @@ class DetectionPipeline:
         changed: wp.array | None = None,
         proximities: bool = True,
         sort: bool = False,
+        keep_separated: bool = False,
+        queued: bool = False,
         timer: StageTimer = _UNTIMED,
         side_stream: wp.Stream | None = None,
     ) -> None:
@@ -277,20 +280,21 @@ class DetectionPipeline:
                 None for all.
             proximities: Whether contacts with minimum distances of a response include pairs that are only near.
             sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
+            keep_separated: As of :meth:`.BroadPhase.pair_elements`.
+            queued: Whether to take the candidates of the last run, which kept those that an axis separates, in place of
+                seeking them: each position at the end is to be between its own there and that at the start.
             timer: Measures the stages.
             side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
         """
         self._captured |= bool(self.mesh.device.is_capturing)
-        self._pad_arcs()
-        self.counters.array.zero_()
         if self._filtered_of_worlds is not None:
             self._filtered_of_worlds.zero_()
         with timer.stage("broad phase"):
-            self._broad_phase.pair_elements(x0, x1, *_queues(self.vertex_face, self.edge_edge), changed=changed)
-            if self.points:
-                self._broad_phase.pair_points(x0, x1, *_queues(*self.points), changed=changed)
-            if self.mesh.device.is_cpu:
-                self._launch_count_not_finite(x0, x1)
+            if queued:
+                counts = {kind.label: PairCounts(queued=counts.queued) for kind, counts in self.counts.pairs.items()}
+                self.counters.array.assign(Counts(0, 0, **counts).values())
+            else:
+                self.find_candidates(x0, x1, changed=changed, keep_separated=keep_separated)
         narrow_phases = [(n, self.mesh.device_elements(n.kind)) for n in self.narrow_phases]
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
         if self._min_distances is not None:
@@ -324,6 +328,26 @@ class DetectionPipeline:
     def broad_phase(self) -> BroadPhase:
         """The broad phase, whose boxes are those of the last run."""
         return self._broad_phase
+
+    def find_candidates(
+        self, x0: wp.array, x1: wp.array, *, changed: wp.array | None = None, keep_separated: bool = False
+    ) -> None:
+        """Enqueues the candidates in the queues of the narrow phases, which do not run.
+
+        Args:
+            x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
+            x1: Positions at the end, of the same type.
+            changed: As of :meth:`find_contacts`.
+            keep_separated: As of :meth:`.BroadPhase.pair_elements`.
+        """
+        self._pad_arcs()
+        self.counters.array.zero_()
+        options = {"changed": changed, "keep_separated": keep_separated}
+        self._broad_phase.pair_elements(x0, x1, *_queues(self.vertex_face, self.edge_edge), **options)
+        if self.points:
+            self._broad_phase.pair_points(x0, x1, *_queues(*self.points), **options)
+        if self.mesh.device.is_cpu:
+            self._launch_count_not_finite(x0, x1)
 
     def find_overlapping(self, x0: wp.array, x1: wp.array) -> None:
         """Enqueues all pairs whose swept boxes overlap in the queues of the narrow phases, which do not run.

@@ -7,7 +7,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .. import checker
-from .._arguments import check_finite, check_instance, checked_distance
+from .._arguments import check_finite, check_instance, checked_choice, checked_coordinates, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.distance import DISTANCE_ERROR, closest_points
 from ..kernels.pipeline.pairs import points_of_pair
@@ -18,15 +18,20 @@ from .distance_phase import pair_distances
 from .exact_stage import are_within_distance
 from .launch import launch_over_queue, made_once, retry_until_fits
 from .mesh import CollisionMesh
+from .query_points import mesh_of_rows
 from .rings import Rings, are_within_rings, make_rings
-from .settings import NO_GRADIENTS, Count, Counters, DistanceKind, capacity_for
+from .settings import NO_GRADIENTS, Count, Counters, DistanceKind, PairCounts, capacity_for
+from .start import checked_device
 
-__all__ = ["Proximities", "ProximityFinder"]
+__all__ = ["Proximities", "ProximityFinder", "distances", "least_distance"]
 
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LARGEST = 2.0**1000
 """Largest coordinate: differences and their sums stay finite."""
+_SMALLEST = 2.0**-1000
+_FIRST_SEARCHED = 0.125
+"""Distance within which the least distance is sought first, as a share of the mean length of an edge."""
 
 
 @made_once
@@ -151,6 +156,14 @@ class _ProximityQueue:
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         return pairs[order], self.distance.numpy()[: self._count][order], self.position.numpy()[: self._count][order]
 
+    def launch(self, x: wp.array, elements: wp.array, rings: Rings, distance: float) -> None:
+        """Keeps the candidates that are at most a distance apart, or may be."""
+        inputs = [x, int(self.kind), elements, rings, wp.float64(distance), self.candidates]
+        outputs = [self.counts, self.pairs, self.distance, self.position]
+        launch_over_queue(
+            _keep_proximities(x.dtype), self.candidates, self.counts, Count.QUEUED, inputs=inputs, outputs=outputs
+        )
+
 
 class ProximityFinder:
     """Finds the pairs of elements that are near each other in one configuration after another, with the same buffers.
@@ -269,20 +282,62 @@ class ProximityFinder:
         # their enlarged boxes
         self._broad_phase.pair_elements(lower, upper, *queues[:4], keep_separated=True)
         self._broad_phase.pair_points(lower, upper, *queues[4:], keep_separated=True)
-        mesh = self._mesh
         for queue in self._queues:
-            launch_over_queue(
-                _keep_proximities(x.dtype),
-                queue.candidates,
-                queue.counts,
-                Count.QUEUED,
-                inputs=[
-                    x,
-                    int(queue.kind),
-                    mesh.device_elements(queue.kind),
-                    self._rings,
-                    wp.float64(self._distance),
-                    queue.candidates,
-                ],
-                outputs=[queue.counts, queue.pairs, queue.distance, queue.position],
-            )
+            queue.launch(x, self._mesh.device_elements(queue.kind), self._rings, self._distance)
+
+
+def least_distance(mesh: CollisionMesh, x: ArrayLike | wp.array, rings: int) -> float:
+    """Returns the least distance of two elements, see :meth:`.detector.CollisionDetector.least_distance`."""
+    x = mesh.device_positions(x, "x")
+    positions = x.numpy().astype(np.float64)
+    check_finite(positions, "x", mesh.vertices)
+    used, ends = positions[mesh.vertices], positions[mesh.edges]
+    extent = float(np.linalg.norm(np.ptp(used, axis=0))) if len(used) else 0.0
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    distance = max(_FIRST_SEARCHED * float(lengths.mean()) if len(lengths) else 0.0, 2.0**-20 * extent, _SMALLEST)
+    while True:
+        found = ProximityFinder(mesh, distance, rings=rings).find(x).distance
+        if len(found):
+            return float(found.min())
+        if distance > extent:
+            return np.inf
+        distance *= 8.0
+
+
+def distances(points: ArrayLike | wp.array, kind: str, *, device: wp.DeviceLike = None) -> np.ndarray:
+    """Returns the distance of each pair of elements at rest.
+
+    It is computed in double precision, and off by at most 2^-40 of the largest component of the vectors along both
+    edges of the face or along the two edges, and between the first corners.
+
+    Args:
+        points: Positions, float32 or float64, rows p a b c of a vertex and a face or a b c d of two edges, shape
+            [n, 4, 3]; rows p a b of a vertex and an edge, shape [n, 3, 3]; rows p q of two vertices, shape [n, 2, 3].
+            Any unit of length. Those of the first half of a row of :func:`warp_bsc.query_points`.
+        kind: "vertex_face", "edge_edge", "vertex_edge" or "vertex_vertex".
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+
+    Returns:
+        Distances, float64, shape [n].
+
+    Raises:
+        TypeError: If an argument has another type.
+        ValueError: If the points have another shape or type, are not finite, more than 2^1000 or 2^29 rows or more, or
+            the kind or the device is unknown.
+    """
+    name = checked_choice(kind, "kind", [kind.label for kind in DistanceKind])
+    of_kind = DistanceKind[name.upper()]
+    if isinstance(points, wp.array):
+        device = points.device if device is None else device
+    points = checked_coordinates(points, (of_kind.points, 3), "points")
+    largest = float(np.abs(points).max(initial=0.0))
+    if largest > _LARGEST:
+        raise ValueError(f"points must be at most 2^1000 to have distances, not {largest:g}")
+    device = checked_device(device)
+    x, elements, pairs = mesh_of_rows(of_kind, points, device)
+    queue = _ProximityQueue(of_kind, wp.zeros(len(Count), dtype=wp.int64, device=device), len(points), device)
+    queue.candidates.assign(pairs)
+    queue.counts.assign(PairCounts(queued=len(points)).values())
+    queue.launch(x, elements, Rings(), np.inf)
+    queue.grow(len(points), len(points))
+    return queue.read()[1]

@@ -14,6 +14,7 @@ from .distance_phase import decide_distances_on_host, run_distance_phases
 from .launch import retry_until_fits
 from .narrow_phase import NarrowPhase, decide_on_host
 from .query_arrays import QueryArrays, query_into
+from .query_points import mesh_of_rows
 from .rings import Rings
 from .settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
 from .stage_timer import StageTimer
@@ -273,20 +274,9 @@ def _query(
     check_finite(points, "points")
     distance = checked_distances(min_distance, "min_distance", n)
     device = checked_device(device)
-    # a mesh in which each query has vertices of its own
-    dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
     half = kind.points
-    x0 = wp.array(np.ascontiguousarray(points[:, :half]).reshape(-1, 3), dtype=dtype, device=device)
-    x1 = wp.array(np.ascontiguousarray(points[:, half:]).reshape(-1, 3), dtype=dtype, device=device)
-    vertices = np.arange(half * n, dtype=np.int32).reshape(n, half)
-    rows = np.arange(n, dtype=np.int32)
-    if kind == DistanceKind.EDGE_EDGE:
-        elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
-    else:
-        elements, pairs = vertices[:, 1:], np.stack([vertices[:, 0], rows], axis=1)
-        if kind == DistanceKind.VERTEX_VERTEX:
-            pairs = vertices
-    elements = wp.array(np.ascontiguousarray(elements), dtype=int, device=device)
+    x0, elements, pairs = mesh_of_rows(kind, points[:, :half], device)
+    x1 = mesh_of_rows(kind, points[:, half:], device)[0]
     counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
     narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
     narrow_phase.queue.assign(pairs)

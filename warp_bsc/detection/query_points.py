@@ -5,8 +5,9 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .._arguments import as_numpy, checked_choice, checked_shape
+from .settings import DistanceKind
 
-__all__ = ["query_points"]
+__all__ = ["mesh_of_rows", "query_points"]
 
 _CORNERS = {"vertex_face": (1, 3), "edge_edge": (2, 2), "vertex_edge": (1, 2), "vertex_vertex": (1, 1)}
 """Number of vertices of both elements, by kind of pair."""
@@ -73,6 +74,27 @@ def query_points(
         _check_detected(pairs, first, second)
     corners = np.concatenate([first, second], axis=1)
     return np.concatenate([x0[corners], x1[corners]], axis=1)
+
+
+def mesh_of_rows(kind: DistanceKind, points: np.ndarray, device: wp.Device) -> tuple[wp.array, wp.array, np.ndarray]:
+    """Returns a mesh in which each pair has vertices of its own: positions, second elements, and the pairs.
+
+    Args:
+        kind: The kind of pair.
+        points: The points of each pair at one time, float32 or float64, shape [n, kind.points, 3].
+        device: The device of the positions and the elements.
+    """
+    n, count = points.shape[:2]
+    dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
+    x = wp.array(np.ascontiguousarray(points).reshape(-1, 3), dtype=dtype, device=device)
+    vertices, rows = np.arange(count * n, dtype=np.int32).reshape(n, count), np.arange(n, dtype=np.int32)
+    if kind == DistanceKind.EDGE_EDGE:
+        elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
+    elif kind == DistanceKind.VERTEX_VERTEX:
+        elements, pairs = vertices[:, 1:], vertices
+    else:
+        elements, pairs = vertices[:, 1:], np.stack([vertices[:, 0], rows], axis=1)
+    return x, wp.array(np.ascontiguousarray(elements), dtype=int, device=device), pairs
 
 
 def _check_detected(pairs: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
