@@ -41,6 +41,24 @@ def benchmark_queries():
     }
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_normals_of_motion_in_one_plane_are_those_of_the_plane(kind, device):
+    """The documented limit: perpendicular to the velocity; opposite to it only where the elements have no plane."""
+    points = np.random.default_rng(3).normal(size=(200, 8, 3))
+    points[..., 2] = 0.5
+    result = query(kind, points, device=device)
+    assert result.hit.sum() > 20
+    np.testing.assert_allclose(np.abs(result.normal[result.hit]), [[0.0, 0.0, 1.0]] * result.hit.sum(), atol=1e-12)
+    # edges along x, or a face that is one; the first element moves down, then nothing moves
+    first = [[0.5, 0, 1], [1.5, 0, 1]] if kind == "edge_edge" else [[0.5, 0, 1]]
+    start = np.array([*first, *[[0, 0, 0], [2, 0, 0], [1, 0, 0]][: 4 - len(first)]], float)
+    end = np.where(np.arange(4)[:, None] < len(first), start - [0, 0, 2], start)
+    rows = np.array([[start, end], [start * [1, 1, 0], start * [1, 1, 0]]]).reshape(2, 8, 3)
+    result = query(kind, rows, device=device)
+    assert result.hit.all()
+    np.testing.assert_allclose(result.normal, [[0.0, 0.0, 1.0]] * 2, atol=1e-12)
+
+
 @pytest.mark.data
 @pytest.mark.parametrize("kind", KINDS)
 def test_exact_is_right_on_the_benchmark(benchmark_queries, kind):

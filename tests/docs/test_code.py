@@ -60,6 +60,21 @@ def test_detector(tmp_path, capsys):
     assert "[[3, 0], [4, 0], [5, 0]]" in output and re.search(r"\n2\.0\n0\.489\d+ True\n0\.2499995\d+ False\n", output)
 
 
+def test_from_ipctk(tmp_path, capsys):
+    names, output = run("from_ipctk.md", tmp_path, capsys)
+    shown = [
+        line.split("#")[1].strip()
+        for line in blocks_of("from_ipctk.md")[0]
+        for line in line.split("\n")
+        if "  #" in line
+    ]
+    lines = output.splitlines()
+    assert lines[0].startswith("0.249999") and lines[0].endswith(" True")
+    assert lines[1:5] == ["True False", "False True", "[[3, 4], [3, 5]]", "6 [[3, 0], [4, 0], [5, 0]]"] == shown[1:5]
+    assert lines[6:] == ["False", "[[3, 0]] 1.0", "1.0", "[1.]", "0"]
+    assert names["r"].hit.all() and names["group"].tolist() == [2] * 3 + [4] * 3
+
+
 def test_kernels(tmp_path, capsys):
     names, output = run("kernels.md", tmp_path, capsys)
     assert names["count"].numpy().tolist() == [1] and output.startswith("[1]\n")

@@ -235,15 +235,24 @@ class Collisions:
 
     @property
     def vertex_face_normal(self) -> np.ndarray:
-        """Unit normals, against the velocity of the vertex relative to the face, float64, shape [n, 3].
+        """Unit normals of the faces at contact, float64, shape [n, 3].
 
+        They are on the side from which the vertex comes: against its velocity relative to the face. A vertex that moves
+        in the plane of the face comes from neither: its normal is that of the plane, of either sign, perpendicular to
+        the velocity, so that a push along it parts nothing. A face that has collapsed has no plane: the normal is
+        opposite to the velocity, and (0, 0, 1) where there is none.
         With a minimum distance those of all pairs are along the closest points, from the second element to the first.
         """
         return self._vertex_face_contacts.normal
 
     @property
     def edge_edge_normal(self) -> np.ndarray:
-        """Unit normals, against the velocity of the first edge relative to the second, float64, shape [m, 3]."""
+        """Unit normals of both edges at contact, float64, shape [m, 3].
+
+        They are perpendicular to both, against the velocity of the first relative to the second, and otherwise as
+        :attr:`vertex_face_normal`: perpendicular to that velocity for edges that move in their plane, opposite to it
+        for edges that are parallel.
+        """
         return self._edge_edge_contacts.normal
 
     @property

@@ -35,9 +35,10 @@ class QueryResult:
         coordinates: Where they touch or come within the minimum distance, float64, shape [n, 3]: barycentric
             coordinates in the face, (s, r, 0) along the edges, (s, 0, 0) along the edge of a vertex-edge pair; NaN
             where there is no hit. None for a query without times.
-        normal: Unit normal of the contact, against the velocity of the vertex or first edge relative to the other
-            feature; with a minimum distance from the other feature to it. float64, shape [n, 3]; NaN where there is
-            no hit. None for a query without times.
+        normal: Unit normal of the face, or of both edges, against the velocity of the vertex or first edge
+            relative to the other feature, see :attr:`.Collisions.vertex_face_normal` for motion in one plane; with a
+            minimum distance from the other feature to it. float64, shape [n, 3]; NaN where there is no hit. None for a
+            query without times.
     """
 
     hit: np.ndarray
