@@ -52,6 +52,24 @@ def test_gradients_under_jit_are_those_of_central_differences(states, device):
         np.testing.assert_allclose((actual * direction).sum(), expected, atol=0.01 * np.linalg.norm(actual))
 
 
+def test_a_rollout_without_jit_is_compiled_once(device):
+    """What JAX compiles it keeps: memory would grow with each call."""
+    solver = rollouts.bouncing_patch(device)
+    state, controls = map(as_single, rollouts.arguments(solver.model))
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(lambda name, *_values, **_details: compiled.append(name))
+
+    def loss(state):
+        return warp_bsc.jax.rollout(solver, state, controls, dt=DT, steps=STEPS)["particle_q"].sum()
+
+    counts = []
+    for _ in range(3):
+        compiled.clear()
+        jax.grad(loss)(state)
+        counts.append(sum("backend_compile" in name for name in compiled))
+    assert counts[0] > 0 and counts[2] == 0
+
+
 def test_wrong_use(device):
     solver = rollouts.bouncing_patch(device)
     state, controls = map(as_single, rollouts.arguments(solver.model))

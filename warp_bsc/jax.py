@@ -37,7 +37,8 @@ def rollout(
     """Returns the states after steps of a solver, as differentiable functions of the first state and of controls.
 
     Can be called under :func:`jax.jit` and :func:`jax.grad`, and under :func:`jax.vmap` one after another; forward-mode
-    and second derivatives raise an error. The backward pass clears the gradients of arrays of the model.
+    and second derivatives raise an error. The backward pass clears the gradients of arrays of the model. The last 16
+    kinds of rollouts are kept, with their solvers.
 
     Args:
         solver: As for :func:`warp_bsc.torch.rollout`, like ``dt``, ``steps`` and ``states``.
@@ -63,11 +64,16 @@ def rollout(
                 raise TypeError(f"{argument}[{name!r}] must be of float32, not {array.dtype}")
     shapes = [{name: tuple(array.shape) for name, array in arrays.items()} for arrays in given]
     options = RolloutOptions(solver, dt, steps, states, *shapes)
-    return _differentiable(options)(*given)
+    return _differentiable(solver, options.dt, options.steps, states, *(tuple(x.items()) for x in shapes))(*given)
 
 
-def _differentiable(options: RolloutOptions):
-    """Returns the rollout with these options, as a function of the state and the controls."""
+@functools.lru_cache(maxsize=16)
+def _differentiable(solver: SolverBase, dt: float, steps: int, states: str, *shapes: tuple):
+    """Returns a rollout as a function of the state and the controls, always the same for the same arguments.
+
+    JAX compiles each function that it calls, and keeps what it compiled.
+    """
+    options = RolloutOptions(solver, dt, steps, states, *map(dict, shapes))
     rows = (options.steps,) if options.every else ()
     results = {
         name: jax.ShapeDtypeStruct((*rows, *options.shape_of(name)), np.float32) for name in options.result_names()
