@@ -1,6 +1,7 @@
 """The contact layer: results are continuous, gradients hold across changes of contacts, bounces give restitution."""
 
 import itertools
+import warnings
 
 import newton
 import numpy as np
@@ -10,6 +11,7 @@ from newton.solvers.experimental.coupled import CouplingInterface
 from newton_scenes import Rollout
 
 import warp_bsc as bsc
+from warp_bsc.response.tuning import START_DEPTH
 
 DT = 1.0 / 600.0
 STEPS = 40
@@ -435,3 +437,30 @@ def test_the_stage_puts_a_layer_in_where_the_model_asks_for_gradients(device):
     assert (distances.radius.numpy() == 0.015).all() and distances.of_planes.numpy().tolist() == [0.015]
     kept = layer_of(min_distance=0.01)  # neighbours beyond the next stay out of the layer
     assert kept.thickness == pytest.approx(0.45 * 0.04 - 0.01, rel=0.01)
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-8, 0.5, 0.95, 1.05])
+@pytest.mark.parametrize("floor", ["plane", "mesh"])
+def test_a_start_in_the_layer_is_named_and_gradients_are_finite(floor, share, device):
+    """A patch that slides flat at a height; of one on the floor the sides are not known, and nothing pushes it."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    add_square(builder, 2, 0.05, (0.011, 0.013, share * LAYER), velocity=(1.0, 0.0, 0.0), **SOFT)
+    add_floor(builder, floor)
+    model = builder.finalize(device=device, requires_grad=True)
+    solver = layered(semi_implicit(model), friction=0.2, restitution=0.5)
+    states = [model.state() for _ in range(5)]
+    with warnings.catch_warnings(record=True) as said, wp.Tape() as tape:
+        warnings.simplefilter("always")
+        for start, end in itertools.pairwise(states):
+            start.clear_forces()
+            solver.step(start, end, model.control(), None, DT)
+    named = [str(warning.message) for warning in said if "deep in the contact layer" in str(warning.message)]
+    in_layer = 1.0 - share > START_DEPTH and (share > 0.0 or floor == "plane")
+    if share > 0.0 or floor == "plane":  # beside it, edges in the plane of the patch are near
+        assert [text.partition(" ")[0] for text in named] == (["9"] if in_layer else [])
+    thrown = states[-1].particle_q.numpy()[:, 2].max() - share * LAYER
+    assert (thrown > 0.2 * LAYER) == in_layer or share == 0.5
+    states[-1].particle_q.grad.fill_(wp.vec3(0.0, 0.0, 1.0))
+    tape.backward()
+    for name in ("particle_q", "particle_qd"):
+        assert np.isfinite(getattr(states[0], name).grad.numpy()).all()

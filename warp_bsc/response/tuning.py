@@ -94,6 +94,8 @@ LAYER_THICKNESS = 0.25, 0.45
 """Thickness, as a share of the median edge length, and its limit as a share of the shortest edge length."""
 PATHS_IN_LAYER = wp.constant(2.0)
 """Paths of a step that a layer should hold, see :mod:`.layer.thickness`; with a quarter less, gradients fail."""
+START_DEPTH = 0.1
+"""Depth at the start, as a share of the thickness, of which a layer warns: what rests on it may be as deep."""
 PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""

@@ -27,6 +27,7 @@ from ..._arguments import checked_distance, checked_number
 from ..._one_thread import one_at_a_time
 from ..._private_names.of_newton import body_q_prev
 from ..._private_names.of_warp import paused_tape
+from ..._warnings import warn_caller
 from ...detection.host_function import run_on_host
 from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
@@ -41,7 +42,7 @@ from ..state.friction_table import FrictionTable
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, arrays_of
 from ..state.structs import add_zeros
-from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE
+from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE, START_DEPTH
 from . import kernels
 from .adjoint import RecordedPushes, go_back, record_pushes
 from .pushes import Layer
@@ -56,7 +57,9 @@ class ContactLayer(WrappedSolver):
     contacts come and go. Particles and dynamic bodies push each other, as in the stage. Pushes conserve linear
     momentum, but angular momentum only to the first order of the step, as they act along directions at y (see above).
 
-    Cloth rests on the layer, and should start outside of it: otherwise it is pushed out within a few steps.
+    Cloth rests on the layer, and should start outside of it: otherwise it is pushed out within a few steps, and thrown,
+    of which the layer warns in its first step. Elements that touch, at the start of a step or at its end, are left to
+    the stage.
 
     Limitations:
         Only contacts within one step are seen: what a program moves between steps is passed on to the stage. Contacts
@@ -148,7 +151,7 @@ class ContactLayer(WrappedSolver):
         rule.is_chosen.fill_(int(thickness is not None))
         rule.least = wp.full(4, np.inf, dtype=float, device=device)
         rule.largest = wp.full(4, -np.inf, dtype=float, device=device)
-        self._chooses_thickness = thickness is None
+        self._chooses_thickness, self._checks_start = thickness is None, True
         pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
         self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
@@ -255,6 +258,8 @@ class ContactLayer(WrappedSolver):
         self._motion.set_end(end, dt)
         if self._chooses_thickness:
             self._choose_thickness(dt)
+        if self._checks_start and not self.mesh.device.is_capturing:
+            self._check_start()
         self._detect()
         layer, detector, bodies = self._layer, self._detector, self._body_count
         layer.dt = dt
@@ -274,6 +279,27 @@ class ContactLayer(WrappedSolver):
         if bodies:
             self._launch(kernels.move_bodies, bodies, [layer, self._poses, end, body_q_prev(self.solver)])
         return recorded
+
+    def _check_start(self):
+        """Warns of particles that start deep in the layer, in the first step outside a graph."""
+        self._checks_start = False
+        layer, count = self._layer, self.model.particle_count
+        depths = wp.zeros(len(self._y), dtype=wp.float64, device=self.mesh.device)
+        motion, planes = layer.motion, layer.planes
+        x1, end = motion.x1, planes.end
+        motion.x1, planes.end = motion.x0, planes.start
+        self._detect()
+        self._launch_over(kernels.find_depths, queues_of(self._detector), depths)
+        self._launch(kernels.find_depths_at_planes, count, [layer, depths])
+        motion.x1, planes.end = x1, end
+        of_particles = depths.numpy()[:count] * (self.mesh.inverse_masses.numpy()[:count] > 0.0)
+        deep = np.count_nonzero(of_particles > START_DEPTH * self.thickness)
+        if deep:
+            warn_caller(
+                f"{deep} particles start up to {1e3 * of_particles.max():.3g} mm deep in the contact layer of "
+                f"{1e3 * self.thickness:.3g} mm, which throws them out: start farther apart, or give SolverCCD a "
+                "ContactLayer(solver, thickness=...) that is thinner"
+            )
 
     def _choose_thickness(self, dt):
         """Chooses the thickness on the device, in the first step; a captured one may run again, and keeps it then."""

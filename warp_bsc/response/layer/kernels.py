@@ -63,6 +63,29 @@ def sum_shares(layer: Layer, queue: PairQueue, sums: wp.array[wp.int64], differe
 
 
 @wp.kernel(enable_backward=False)
+def find_depths(layer: Layer, queue: PairQueue, depths: wp.array[wp.float64]):
+    """Finds the largest depth of a contact of each vertex [m]."""
+    i = wp.tid()
+    if not has_pair(queue, i):
+        return
+    corners = vertices_of(queue, i)
+    _weights, _normal, depth = contact_of_pair(layer, queue.kind, corners)
+    for j in range(4):
+        wp.atomic_max(depths, corners[j], depth)
+
+
+@wp.kernel(enable_backward=False)
+def find_depths_at_planes(layer: Layer, depths: wp.array[wp.float64]):
+    """Increases the largest depth of each particle to that of its contacts with planes [m]."""
+    vertex = wp.tid()
+    of_worlds, world = layer.planes.of_worlds, layer.motion.world[vertex]
+    for place in range(of_worlds.shape[1]):
+        if of_worlds[world, place] >= 0:
+            _normal, depth = contact_with_plane(layer, of_worlds[world, place], vertex)
+            depths[vertex] = wp.max(depths[vertex], depth)
+
+
+@wp.kernel(enable_backward=False)
 def finish_shares(
     layer: Layer,
     counts: wp.array[wp.int64],

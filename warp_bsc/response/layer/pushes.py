@@ -16,6 +16,8 @@ from ..state.vectors import ONE, ZERO, to_double
 from ..tuning import PARALLEL_IN_LAYER
 
 _ROOT_OF_2 = wp.constant(2.0**0.5)
+_ROUNDING = wp.constant(wp.float64(2.0**-40))
+"""Distance up to which elements touch, as a share of their coordinates: 4,096 times what one rounds to."""
 
 
 @wp.struct
@@ -59,7 +61,8 @@ def position_between(motion: Motion, vertex: int, theta: wp.float64) -> wp.vec3d
 def contact_of_pair(layer: Layer, kind: int, corners: wp.vec4i):
     """Returns the weights of four vertices in a contact, its normal, and its depth in the layer [m], 0 if it is not.
 
-    Elements are in contact only if they are on the same sides of each other as at the start: not if they have passed.
+    Elements are in contact only if they are on the same sides of each other as at the start: not if they have passed,
+    nor if they touch, at the start or now, so that rounding would decide on which side they are.
     """
     _kappa, theta = gains(layer.restitution[0])
     a = position_between(layer.motion, corners[0], theta)
@@ -70,7 +73,9 @@ def contact_of_pair(layer: Layer, kind: int, corners: wp.vec4i):
     vector = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d
     distance = wp.length(vector)
     depth = layer.thickness[0] + distance_of_corners(kind, corners, layer.distances.radius) - distance
-    if depth <= ZERO or distance <= ZERO:
+    largest = wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.max(wp.abs(c)), wp.max(wp.abs(d))))
+    rounding = _ROUNDING * largest
+    if depth <= ZERO or distance <= rounding:
         return weights, vector, ZERO
     normal = vector / distance
     if are_within_rings(corners, firsts_of(kind), layer.distances.rings):
@@ -78,7 +83,7 @@ def contact_of_pair(layer: Layer, kind: int, corners: wp.vec4i):
     if owner_of(layer.motion, corners) != ContactClass.OURS:
         return weights, normal, ZERO
     _weights, at_start = closest_vector(layer.motion, corners, kind)
-    if not wp.dot(normal, at_start) > ZERO:  # nor if it is not a number
+    if not wp.dot(normal, at_start) > rounding:  # nor if it is not a number
         return weights, normal, ZERO
     if kind == EDGE_EDGE:
         u = b - a
