@@ -193,16 +193,6 @@ def test_positions_in_place_of_a_number_are_told_where_they_belong():
             bsc.CollisionMesh(*arguments)
 
 
-def test_lists_of_whole_numbers_are_positions(device):
-    mesh = bsc.CollisionMesh([[0, 1, 2]], 4, points=[3], device=device)
-    x0 = [[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, 1]]
-    x1 = [[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -3]]
-    detector = bsc.CollisionDetector(mesh, min_distance=0.5)
-    found = detector.detect(x0, np.array(x1, np.int16))
-    assert found.vertex_face.tolist() == [[3, 0]]
-    assert found.vertex_face_toi[0] == detector.detect(np.array(x0, float), np.array(x1, float)).vertex_face_toi[0]
-
-
 def test_bad_positions_are_refused():
     detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2]], 4))
     x = np.zeros((4, 3))
