@@ -163,21 +163,21 @@ def checked_shape(array: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
     """Returns an array of coordinates, as NumPy, finite or not.
 
     Args:
-        array: Coordinates, float32 or float64, first dimension n, then ``shape``; integers of at most 2^53, if it is a
-            list or of NumPy.
+        array: Coordinates, float32 or float64, first dimension n, then ``shape``; in lists also integers of at most
+            2^53, which are no type that somebody chose.
         shape: All dimensions except the first.
         name: Name of the array in errors.
 
     Returns:
-        NumPy array, float64 for integers.
+        NumPy array, float64 for lists.
 
     Raises:
         TypeError: If its entries are no numbers.
         ValueError: If the shape or the type is wrong, entries are masked, or an integer is larger.
     """
-    of_device = hasattr(array, "numpy")
+    is_list = isinstance(array, list | tuple)
     array = as_numpy(array, name)
-    if array.dtype.kind in "iu" and not of_device:
+    if array.dtype.kind in "iu" and is_list:
         if array.size and max(int(array.max()), -int(array.min())) > 2**53:
             raise ValueError(f"{name} must have integers of at most 2^53, which are exact in float64")
         array = array.astype(np.float64)

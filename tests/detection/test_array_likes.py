@@ -11,7 +11,7 @@ X1 = [[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, -3], [2, 1, 2]]
 def test_lists_of_whole_numbers_are_positions(device):
     mesh = bsc.CollisionMesh([(0, 1, 2)], 5, points=[3], edges=[[3, 4]], world=[0] * 5, group=[1] * 5, device=device)
     detector = bsc.CollisionDetector(mesh, min_distance=0.5)
-    found, expected = detector.detect(X0, X1), detector.detect(np.array(X0, float), np.array(X1, np.int16))
+    found, expected = detector.detect(X0, X1), detector.detect(np.array(X0, float), np.array(X1, float))
     assert found.vertex_face.tolist() == [[3, 0]]
     assert found.vertex_face_toi[0] == expected.vertex_face_toi[0]
     assert len(detector.detect(X0, X1, only=[False] * 4 + [True])) <= len(found)

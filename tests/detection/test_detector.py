@@ -201,11 +201,9 @@ def test_bad_positions_are_refused():
     with pytest.raises(ValueError, match="x0 must have shape"):
         detector.detect(np.zeros((4, 2)), x)
     with pytest.raises(ValueError, match="float32 or float64"):
-        detector.detect(x.astype(np.float16), x)
-    with pytest.raises(ValueError, match="float32 or float64"):
-        detector.detect(wp.zeros(4, dtype=wp.vec3i, device="cpu"), x)
+        detector.detect(x.astype(int), x)
     with pytest.raises(ValueError, match="x0 must have integers of at most 2"):
-        detector.detect(x.astype(int) - 2**53 - 1, x)
+        detector.detect((x.astype(int) - 2**53 - 1).tolist(), x)
     with pytest.raises(ValueError, match=r"x1 must be .* as x0"):
         detector.detect(x, x.astype(np.float32))
     bad = x.copy()

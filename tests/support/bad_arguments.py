@@ -84,7 +84,8 @@ def bad_arrays(good: np.ndarray, *, index: bool = False) -> dict[str, Any]:
     if index:
         values |= {"floats": good.astype(float), "negative": np.full_like(good, -1), "huge": np.full_like(good, 2**40)}
     else:
-        values |= {"huge integers": good.astype(int) - 2**53 - 1, "half precision": good.astype(np.float16)}
+        huge = (good.astype(int) - 2**53 - 1).tolist()
+        values |= {"integers": good.astype(int), "huge": huge, "half precision": good.astype(np.float16)}
     return values
 
 
@@ -486,7 +487,7 @@ def calls_of_solvers() -> dict[str, Call]:
         "too few": bsc.FrictionTable([[0.1]], particle_material=np.zeros(count - 1, dtype=int)),
         "shapes": bsc.FrictionTable([[0.1]], shape_material=[0]),
     }
-    coefficients = without(bad_arrays(np.zeros((2, 2))), "huge integers", "half precision") | {
+    coefficients = without(bad_arrays(np.zeros((2, 2))), "integers", "half precision") | {
         "not square": np.zeros((2, 1)),
         "empty": np.zeros((0, 0)),
         "not symmetric": [[0.1, 0.2], [0.3, 0.1]],
