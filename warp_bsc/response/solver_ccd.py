@@ -51,7 +51,7 @@ class SolverCCD(CollisionStage):
     elements that cross or touch at the start of the step, vertices that begin in the solid of an infinite plane, and
     contacts of which no vertex can be moved: these are left to the inner solver. A particle whose predicted position or
     velocity is not finite, in the step or a substep, stays where it was; neither such a step nor one with a start
-    position that is not finite is certified, in :attr:`report.worlds` the world of the particle alone.
+    position that is not finite is certified, in ``report.worlds`` the world of the particle alone.
 
     A kinematic particle or body that a program moves between two steps takes that way in the second step: it starts
     where the last step ended, and in the first step where the model puts it (``particle_q``, ``body_q``). If a movable
