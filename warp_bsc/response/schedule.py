@@ -20,8 +20,8 @@ queues cannot grow in a CUDA graph. :mod:`.contacts.search` then finds contacts 
 third row. Recorded steps cannot be searched, and freeze at once.
 
 What makes a step uncertified? Contacts that are left, a last detection that was incomplete, or start positions that are
-not finite, see :func:`decide`; and predictions that are not finite, whatever stands in their place. Where inversions are
-prevented, tetrahedra that still invert as well.
+not finite, see :func:`decide`; and predictions that are not finite, whatever stands in their place. Where inversions
+are prevented, tetrahedra that still invert as well.
 
 Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration divides
 what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the
