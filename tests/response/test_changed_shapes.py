@@ -135,9 +135,9 @@ def sheets_over_balls(device, radius, at=(0.0, 0.0, -0.05)):
 def test_steps_after_a_change_are_those_of_a_stage_of_the_changed_model(graph, device):
     """Bit by bit, in the world whose ball grew and in the one whose ball stayed; also in a graph captured before."""
     expected = Rollout(sheets_over_balls(device, (0.02, 0.06)), None)
-    expected.solver = bsc.SolverCCD(Changed(expected.model))
+    expected.solver = bsc.SolverCCD(Changed(expected.model), substeps=None)  # as in graphs of a GPU behind Changed
     model = sheets_over_balls(device, (0.02, 0.02))
-    stage, states = bsc.SolverCCD(Changed(model)), (model.state(), model.state())
+    stage, states = bsc.SolverCCD(Changed(model), substeps=None), (model.state(), model.state())
 
     def step():
         if graph == "within":
@@ -201,9 +201,10 @@ def test_a_body_that_moves_while_its_shape_changes_is_swept_with_the_new_shape(d
         change(model, scale={0: (0.05, 0.0, 0.0)})
         rollout.solver.notify_model_changed(SHAPES_CHANGED)
         rollout.states[0].body_q.assign([pose(0.0, 0.0, -0.1, (1.0, 0.0, 0.0), 1.0)])
+        report = rollout.solver.report
         with pytest.warns(UserWarning, match="strained"):
             rollout.step()
-        report = rollout.solver.report
+            assert report.strain > 0.2
         assert report.certified and report.hits > 10 and report.crossings == 0
         ends.append(rollout.positions)
     np.testing.assert_array_equal(*ends)

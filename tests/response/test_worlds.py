@@ -298,6 +298,7 @@ def test_strain_and_what_is_inside_by_world(device):
     solver = bsc.SolverCCD(Changed(model), substeps=None, report_worlds=True)
     with pytest.warns(UserWarning, match="edges pass through faces at the start"):
         solver.step(model.state(), model.state(), model.control(), None, DT)
+        assert solver.report.crossings > 0
     strain = solver.report.worlds.strain.numpy()
     assert strain[0] > 0.05 and strain[0] == pytest.approx(solver.report.strain)
     assert strain[1:].tolist() == [0.0, 0.0]
