@@ -315,7 +315,7 @@ def test_broken_scene(capsys, scenes):
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Falling"))
     mesh.GetPointsAttr().Set([(0, 0, 0), (1, 0, 0), (0, float("nan"), 0)], 3)
     stage.GetRootLayer().Save()
-    line = fail(capsys, "replay", scenes / "broken.usda", "--device", "cpu")
+    line = fail(capsys, "replay", scenes / "broken.usda", "--device", "cpu", "--strict")
     for part in ("broken.usda", "/World/Falling", "vertex 2", "time 3"):
         assert part in line
 

@@ -138,7 +138,7 @@ def test_interrupted_in_the_middle_of_a_record(stage, tmp_path, monkeypatch):
 def test_broken_scene_leaves_what_was_finished(stage, tmp_path, capsys):
     points = [(0, 0, 0), (1, 0, 0), (0, float("nan"), 0)]
     UsdGeom.Mesh(stage.GetPrimAtPath("/World/Falling")).GetPointsAttr().Set(points, 3)
-    replay(stage, status=2)
+    replay(stage, "--strict", status=2)
     check_partial(tmp_path, 2, "vertex 2 is not finite at time 3")
     assert "vertex 2 is not finite" in capsys.readouterr().err
 

@@ -126,8 +126,8 @@ def test_two_workers_write_the_same_files(troubled, alone, tmp_path, capsys):
     found = with_names(json.loads(alone["hits.json"]))
     assert found["complete"] and found["hits"] + len(found["ignored"]) > 0
     assert [re.sub(r" at time.*| is not.*", "", line) for line in found["left_out"]] == [
-        "from time 8 on: /World/Breaks: vertex 3",
-        "from time 16 on: /World/BreaksLater: vertex 3",
+        "from time 8 to 10: /World/Breaks: vertex 3",
+        "from time 16 to 18: /World/BreaksLater: vertex 3",
     ]
     assert [span["meshes"] for span in found["intersections"] if span["inside"]] == [["/World/Enters", "/World/Case"]]
     assert any("/World/Jumps jumps 2 times" in warning for warning in found["warnings"])
@@ -282,7 +282,7 @@ def test_an_error_in_a_worker(tmp_path, capsys):
     add_sheet(stage, "/World/A", 0.0, broken=11)
     path, said, found = save(stage), [], []
     for count in ("1", "2"):
-        found.append(run(path, tmp_path / count, "--workers", count, status=2))
+        found.append(run(path, tmp_path / count, "--workers", count, "--strict", status=2))
         said.append(capsys.readouterr().err.splitlines()[-1])
     assert said[0] == said[1] and "/World/A: vertex 3 is not finite at time 11" in said[0]
     assert not say_where(found[1], found[0])

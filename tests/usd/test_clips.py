@@ -106,7 +106,10 @@ def test_clips_that_may_be_missing(stage):
         assert found["left_out"] == [] and any("their manifest ./gone.usda" in text for text in found["warnings"])
 
 
-@pytest.mark.parametrize("changes", [{}, {"times": None}, {"manifestAssetPath": None}], ids=str)
+WHOLE = [{}, {"times": None}, {"manifestAssetPath": None}, {"templateAssetPath": "./gone.#.usda"} | RANGE]
+
+
+@pytest.mark.parametrize("changes", WHOLE, ids=["all", "without times", "without manifest", "with a template beside"])
 def test_whole_clips_are_read(stage, changes):
     set_clips(stage, changes)
     found = find(stage, "--strict")

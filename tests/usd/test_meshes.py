@@ -171,6 +171,21 @@ def test_instances_come_and_go(stage):
     assert "/World/Leaves[1]/Leaf appears at time 2" in warnings
 
 
+def test_instances_that_appear_have_one_note(stage):
+    positions = {0: [(9, 0, 0)], 1: [(place, 0, 0) for place in range(9, 19)], 2: [(9, 0, 1)]}
+    instancer = add_instancer(stage, "/World/Leaves", positions, ["/World/Leaves/Leaf"])
+    numbers = instancer.GetProtoIndicesAttr()
+    numbers.Clear()
+    for time, value in positions.items():
+        numbers.Set([0] * len(value), time)
+    add_mesh(stage, "/World/Leaves/Leaf", FALLING)
+    split = "its motion is split there, a jump is not checked"
+    assert find(stage)["warnings"] == [
+        f"each of 9 meshes of /World/Leaves appears at time 1: {split}",
+        f"each of 9 meshes of /World/Leaves vanishes at time 2: {split}",
+    ]
+
+
 @pytest.mark.parametrize("orientation", ["rightHanded", "leftHanded"])
 def test_orientation(stage, orientation):
     floor = add_floor(stage)

@@ -195,10 +195,10 @@ class HitsCsv(RecordFile):
     def tail(self, summary: Summary) -> str:
         """Returns lines on rows that a limit leaves out, missing intervals and parts that are left out, if any are."""
         limited = str(not_listed(summary, with_end=summary.is_complete) or "")
-        lines = f"# limit: {limited}\n" * bool(limited)
+        lines = "".join(f"# left out: {reason}\n" for reason in summary.scene.left_out)
+        lines += f"# limit: {limited}\n" * bool(limited)
         if not summary.is_complete:
             lines += f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"
-        lines += "".join(f"# left out: {reason}\n" for reason in summary.scene.left_out)
         return lines
 
 

@@ -70,7 +70,8 @@ def leave_out_clips(prim: Usd.Prim, file: str | os.PathLike, left_out: LeftOut) 
 
 def _faults(api: Usd.ClipsAPI, name: str, values: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Yields faults of a set of clips, in words, each with the path of the file that is missing, if one is."""
-    needed = _NEEDED_OF_TEMPLATE if "templateAssetPath" in values else _NEEDED
+    is_template = "templateAssetPath" in values and "assetPaths" not in values  # paths come first
+    needed = _NEEDED_OF_TEMPLATE if is_template else _NEEDED
     for key, kind in {"primPath": str, **needed}.items():
         if is_empty(value := values.get(key)):
             yield f"they have no {key}", ""
@@ -82,7 +83,7 @@ def _faults(api: Usd.ClipsAPI, name: str, values: dict[str, Any]) -> Iterator[tu
     clips = list(api.ComputeClipAssetPaths(name))
     if not clips:
         yield f"no file matches {values['templateAssetPath']}", ""
-    for _, number in values.get("active", ()):
+    for _, number in () if is_template else values["active"]:
         if not 0 <= number < len(clips):
             yield f"clip {number:g} is active, but there are {len(clips)}", ""
     if gone := [clip.path for clip in clips if not (clip.resolvedPath or _is_in_memory(clip))]:
@@ -93,7 +94,7 @@ def _faults(api: Usd.ClipsAPI, name: str, values: dict[str, Any]) -> Iterator[tu
         yield f"their manifest {manifest.path} cannot be opened", manifest.path
     opened = _open(clips[0])
     if not opened:
-        return  # OpenUSD has a message on what is broken
+        return  # reading what is below raises the error
     if not opened.GetPrimAtPath(path):
         yield f"{clips[0].path} has no prim {path}", ""
     if manifest and declared:

@@ -37,6 +37,8 @@ _BETWEEN = 0.382  # where between two samples transforms are tested for bends; h
 _MOST_TIMES = 1_000_000
 _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 
+_States = dict[float, tuple[bytes, bytes] | None]
+
 
 class UsdMesh:
     """A mesh prim, or one instance of it.
@@ -154,12 +156,13 @@ class UsdMesh:
         self.name = found.name
         self._where = f"{self._file}: {self.name}"
         self._instance = instance = found.instance
+        self._whole: _States = {}  # its states before parts are left out, if any are
         self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that it stands for
         states = self._states
         if instance:
             present = instance.are_present(self._break_codes)
             states = [state if here else None for state, here in zip(states, present.tolist(), strict=True)]
-        self.states: dict[float, tuple[bytes, bytes] | None] = {}
+        self.states: _States = {}
         last = b"", b""
         for time, state in zip(self._breaks, states, strict=True):
             if state != last:
@@ -221,7 +224,7 @@ class UsdMesh:
 
     def state_at(self, time: float) -> tuple[bytes, bytes] | None:
         """Returns its state at a time, see :attr:`states`."""
-        return next(state for since, state in reversed(self.states.items()) if since <= time)
+        return _state_at(self.states, time)
 
     def changes(self) -> Iterator[tuple[float, str]]:
         """Yields the times at which it changes and, in words, what it does then; without those at which it breaks."""
@@ -230,8 +233,8 @@ class UsdMesh:
                 yield time, "appears" if old is None else "vanishes" if new is None else "changes its topology"
 
     def can_be_read(self, time: float) -> bool:
-        """Returns whether all of it can be read at a time, or it is not there then."""
-        if self.state_at(time) is None:
+        """Returns whether all of it can be read at a time, or it is not there; parts left out before do not matter."""
+        if _state_at(self._whole or self.states, time) is None:
             return True
         try:
             points = self.read_points(time)
@@ -245,6 +248,7 @@ class UsdMesh:
 
     def leave_out(self, since: float, until: float) -> None:
         """Removes the mesh from a time, minus infinity for the first, up to before another, infinity for the last."""
+        self._whole = self._whole or self.states
         last = {} if until == math.inf else {until: self.state_at(until)}
         kept = {time: state for time, state in self.states.items() if not since <= time <= until}
         self.states = dict(sorted((kept | {since: None} | last).items()))
@@ -589,3 +593,7 @@ class UsdMesh:
             if now and then and now != then:
                 return Usd.TimeCode(times[following - 1])
         return code
+
+
+def _state_at(states: _States, time: float) -> tuple[bytes, bytes] | None:
+    return next(state for since, state in reversed(states.items()) if since <= time)

@@ -27,7 +27,10 @@ Times that differ by less than a millionth of a time code, or of the whole time 
 rounding produces them in files, and OpenUSD uses them to separate the end of a value clip from the start of the next.
 
 When a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
-begins.
+begins. Points keep their places until a sample with other polygons, whether or not it has as many points. If a mesh
+changes or jumps at the last time, one more interval, without motion, has it as it is then.
+
+Blend shapes bend the paths of points where a weight is that of an in-between: these times are sampled as well.
 
 Precision
 ---------
@@ -36,9 +39,9 @@ stored ones in single precision; otherwise all are computed and returned in doub
 
 What cannot be read
 -------------------
-Broken meshes and instances are left out from the time at which they break, and files that cannot be opened and may
-hold geometry are left out as a whole; :attr:`Scene.left_out` names them. The rest is read as long as something in it
-moves. A scene in which nothing ever moves is read at one time.
+Broken meshes and instances are left out while they are broken. Files that cannot be opened and may hold geometry, value
+clips that OpenUSD passes over and tetrahedra are left out as a whole. :attr:`Scene.left_out` names all of them. The
+rest is read. A scene in which nothing ever moves is read at one time.
 
 :attr:`Scene.warnings` names the contents that are not read (other curves and shapes without polygons, unselected
 meshes), the changes to the motion, turns by half a turn or more from one time to the next, which straight paths do not
@@ -168,7 +171,7 @@ class Scene:
         Raises:
             TypeError: If an argument has another type.
             FileNotFoundError: If there is no such file.
-            ValueError: If the file is not USD, has no readable mesh, or no mesh is selected; if ``strict``, also if a
+            ValueError: If the file is not USD, has no mesh, or no mesh is selected; if ``strict``, also if a
                 part cannot be read. The message names the argument, or the file, the prim and the time.
         """
         stage, path = None, source
