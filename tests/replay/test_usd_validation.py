@@ -45,6 +45,14 @@ def test_errors(stage):
     assert "cross from time 1 to 1: at most " in intersections[1][1]
 
 
+def test_duplicates_are_a_warning(stage):
+    add_mesh(stage, "/World/Again", moved(FALLING, (0.5, 1.0, -0.25)))
+    save(stage)
+    name, text, prims = found(stage)[-1]
+    assert (name, sorted(prims)) == ("Duplicates", ["/World/Again", "/World/Crossing"])
+    assert text.startswith("2 meshes are duplicates of each other, from 0 to 1: ")
+
+
 def test_times(stage):
     until = UsdValidation.ValidationTimeRange(Gf.Interval(0.0, 0.25))
     assert [name for name, _, _ in found(stage, until)] == ["Intersection"]

@@ -110,8 +110,9 @@ def open_scene(arguments: argparse.Namespace) -> Scene:
         raise ValueError("--fail-on new needs --baseline")
     if "distance" in arguments.fail_on and arguments.clearance is None:
         raise ValueError("--fail-on distance needs --clearance")
-    if not arguments.intersections and (arguments.ignore_initial or "intersections" in arguments.fail_on):
-        raise ValueError("--ignore-initial and --fail-on intersections need --intersections")
+    at_rest = arguments.ignore_initial or arguments.fail_on & {"intersections", "duplicates"}
+    if at_rest and not arguments.intersections:
+        raise ValueError("--ignore-initial and --fail-on intersections and duplicates need --intersections")
     if arguments.resume and not is_saved:
         raise ValueError("--resume needs --json FILE")
     if arguments.limit and not outputs:
@@ -252,6 +253,7 @@ def run_replay(scene: Scene, arguments: argparse.Namespace, device: str, baselin
         "intersections": any(sample.crossings or sample.inside for sample in summary.intersections),
         "collisions": summary.hits > 0,
         "distance": bool(summary.nearest),
+        "duplicates": bool(summary.duplicate_spans),
         "new": baseline is not None and bool(baseline.new_in(summary)),
     }
     if any(fails[reason] for reason in arguments.fail_on):

@@ -35,7 +35,8 @@ transform moves it. Linear curves and points are included, with half their
 widths as radii. Rotations are sampled at every whole time code as well.
 At the time samples themselves, find the edges that pass through faces and the
 meshes that are wholly inside closed ones, including obstacles and linear
-curves; if nothing moves, at one time.
+curves, and meshes that are duplicates of each other; if nothing moves, at one
+time.
 Parts that cannot be read are named and left out. Files are written atomically.
 If Ctrl-C, SIGTERM, SIGHUP or an error stops the run, it leaves valid files of
 the finished intervals, marked partial. If it is killed, --json leaves a file
@@ -153,6 +154,7 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
             "intersections": "edges through faces, meshes inside others",
             "collisions": "",
             "distance": "proximities, with --clearance",
+            "duplicates": "meshes that are there twice",
             "new": "findings that --baseline does not contain",
         },
     )

@@ -62,6 +62,10 @@ def print_replay(console: Console, summary: Summary) -> None:
         say(console, f"No collision in {count(len(intervals), 'interval')}.")
     if summary.intersections:
         _print_intersections(console, summary)
+    for span in summary.duplicate_spans[:LONGEST]:
+        say(console, f"{span.describe(LONGEST)}.")
+    if (more := len(summary.duplicate_spans) - LONGEST) > 0:
+        say(console, f"  and {count(more, 'more group')} of duplicates; --json has all.")
     if summary.clearance is not None:
         _print_proximities(console, summary, summary.clearance)
     if summary.ignored:
@@ -132,7 +136,11 @@ def print_new(console: Console, new: list[NewFinding]) -> None:
         return
     say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
     for what, meshes, start, end in new[:LONGEST]:
-        finding = " is inside ".join(meshes) if what == "is inside" else f"{_pair(meshes)} {what}"
+        finding = f"{_pair((meshes[0], meshes[-1]))} {what}"
+        if what == "is inside":
+            finding = " is inside ".join(meshes)
+        elif what == "are duplicates":
+            finding = f"{meshes[0]} and {count(len(meshes) - 1, 'other')} are duplicates"
         when = f"at {start:g}" if start == end else f"from {start:g} to {end:g}"
         say(console, f"  {finding} {when}")
     if len(new) > LONGEST:

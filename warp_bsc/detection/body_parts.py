@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from .._sorted_keys import distinct
 from .intersections import Intersections
 from .mesh import CollisionMesh
 
@@ -17,14 +18,16 @@ class BodyParts:
         body: Body of each part, shape [part_count].
         closed: Whether an even number of its faces meet at each edge, shape [part_count].
         oriented: Whether its faces pass each edge as often in one direction as in the other, shape [part_count].
-        of_face: Part of each face, then of each edge without faces, shape [n].
+        of_face: Part of each face, then of each edge without faces, -1 for those that are left out, shape [n].
         first_vertex: The first vertex of each part, shape [part_count].
     """
 
     def __init__(self, mesh: CollisionMesh, bodies: np.ndarray):
-        """Connects the faces and the edges without faces of each body."""
+        """Connects the faces and the edges without faces of each body; -1 leaves one out."""
         self._edges, count = mesh.edges, mesh.vertex_count
-        faces, face_edges = mesh.cells[: len(bodies)], mesh.cell_edges[: len(bodies)]
+        is_taken = bodies >= 0
+        faces, face_edges = mesh.cells[: len(bodies)][is_taken], mesh.cell_edges[: len(bodies)][is_taken]
+        bodies = bodies[is_taken]
         # the nodes of a vertex that bodies share come after all vertices
         last_body = np.zeros(count, dtype=np.int64)
         last_body[faces] = bodies[:, None]
@@ -39,9 +42,10 @@ class BodyParts:
         is_root = used & (roots == np.arange(len(roots)))
         part_count = int(is_root.sum())
         self._of_node = np.where(used, (np.cumsum(is_root) - 1)[roots], -1)
-        self.of_face = self._of_node[nodes[:, 0]]
+        self.of_face = np.full(len(is_taken), -1)
+        self.of_face[is_taken] = of_face = self._of_node[nodes[:, 0]]
         self.body = np.zeros(part_count, dtype=np.int64)
-        self.body[self.of_face] = bodies
+        self.body[of_face] = bodies
         vertices, shared = np.arange(count), self._node_vertices[count:]
         first, last = np.searchsorted(shared, vertices), np.searchsorted(shared, vertices, side="right")
         self._first_node = np.where(is_shared, count + first, vertices)
@@ -53,7 +57,7 @@ class BodyParts:
         self.first_vertex = self._ordered_vertices[self._starts]
 
         proper = edges >= 0  # others are between corners in one vertex
-        of_side = np.broadcast_to(self.of_face[:, None], edges.shape)[proper]
+        of_side = np.broadcast_to(of_face[:, None], edges.shape)[proper]
         forward = faces == mesh.edges[face_edges, 0]
         counts = np.bincount(edges[proper], minlength=len(of_edges))
         sums = np.bincount(edges[proper], np.where(forward[proper], 1, -1), len(of_edges))
@@ -87,7 +91,7 @@ class BodyParts:
         ranges = np.repeat(firsts, counts), np.repeat(firsts + counts, counts)
         one, other = expand_ranges(*ranges)
         sharing = pair_keys(np.stack([of_node[one], of_node[other]], axis=1), len(self.body))
-        return np.union1d(keys, sharing), np.unique(keys[found.crosses[rows]])
+        return distinct(np.concatenate([keys, sharing])), distinct(keys[found.crosses[rows]])
 
     def touching_edges(self, found: Intersections) -> tuple[np.ndarray, np.ndarray]:
         """Returns all edges of parts that meet faces of bodies, or have a vertex of them.
@@ -129,7 +133,7 @@ class BodyParts:
         rows, first = self._parts_at(ends[:, 0])
         other_rows, other = self._parts_at(ends[:, 1])
         count = len(self.body)
-        both = np.intersect1d(rows * count + first, other_rows * count + other)
+        both = np.intersect1d(rows * count + first, other_rows * count + other, assume_unique=True)
         return both // count, both % count
 
 

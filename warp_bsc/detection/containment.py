@@ -70,7 +70,8 @@ class ContainmentFinder:
 
         Args:
             mesh: The mesh. Its faces turn counterclockwise seen from outside. Bodies may have vertices in common.
-            bodies: Body of each face, then of each of ``mesh.free_edges``, integers from 0, shape [n].
+            bodies: Body of each face, then of each of ``mesh.free_edges``, integers from 0, shape [n]. Those with -1
+                are left out; their vertices belong to others as well.
         """
         self._mesh, self._bodies = mesh, bodies.astype(np.int64)
 
@@ -94,6 +95,8 @@ class ContainmentFinder:
         pairs = pairs[is_sought(parts.body[pairs])]
         if not len(pairs):
             return none
+        has_part = parts.of_face[found.pairs[:, 1]] >= 0
+        found = Intersections(found.pairs[has_part], found.crosses[has_part])
         meeting, passing = parts.meeting(found)
         touching = pair_keys(pairs, len(low)), pair_keys(pairs[:, ::-1], len(low))
         is_touching = np.isin(touching[0], meeting) | np.isin(touching[1], meeting)
@@ -131,7 +134,8 @@ class ContainmentFinder:
             return none
         queries, query_of_pair = np.unique(of_body[kept], axis=0, return_inverse=True)
         compared = np.stack([query_of_pair.reshape(-1), pairs[kept, 1]], axis=1)  # NumPy 2.0 shapes it otherwise
-        sides = self._find_sides(x, points[queries[:, 0]], compared, np.ones(len(queries), dtype=bool))
+        used, place = np.unique(queries[:, 0], return_inverse=True)
+        sides = self._find_sides(x, points[used], place, compared, np.ones(len(queries), dtype=bool))
         return queries[sides.inside & ~sides.on_surface]
 
     @functools.cached_property
@@ -160,8 +164,9 @@ class ContainmentFinder:
         firsts = np.cumsum(counts) - counts
         rows, places = expand_ranges(firsts[case_of_query], (firsts + counts)[case_of_query])
         compared = np.stack([rows, pairs[order[places], 1]], axis=1)
+        used, place = np.unique(vertices, return_inverse=True)
         points = x[vertices]
-        sides = self._find_sides(x, points, compared, touches[case_of_query])
+        sides = self._find_sides(x, x[used], place, compared, touches[case_of_query])
         inside, decided = sides.inside, ~sides.on_surface
         yes = np.bincount(case_of_query, decided & inside, len(cases)) > 0
         no = np.bincount(case_of_query, decided & ~inside, len(cases)) > 0
@@ -177,45 +182,60 @@ class ContainmentFinder:
         order = np.lexsort((vertices[rows], bodies[:, 1], bodies[:, 0]))
         return Containment(bodies[order], vertices[rows[order]], first_faces[order])
 
-    def _find_sides(self, x: np.ndarray, points: np.ndarray, compared: np.ndarray, may_touch: np.ndarray) -> _Sides:
+    def _find_sides(
+        self, x: np.ndarray, points: np.ndarray, place: np.ndarray, compared: np.ndarray, may_touch: np.ndarray
+    ) -> _Sides:
         """Returns on which side of its body each query is.
+
+        A point and a face are decided once, however many queries compare them: those of bodies in one place are many.
 
         Args:
             x: Positions of the vertices, shape [vertex_count, 3].
-            points: Point of each query, of the same type, shape [n, 3].
+            points: The points, of the same type, shape [p, 3].
+            place: Point of each query, shape [n].
             compared: Pairs of a query and a closed part of its body, shape [m, 2].
             may_touch: For which queries to look whether the point is on a part, shape [n].
         """
-        parts, keys_compared = self._parts, pair_keys(compared, len(self._parts.body))
+        parts = self._parts
+        keys_compared = pair_keys(np.stack([place[compared[:, 0]], compared[:, 1]], axis=1), len(parts.body))
+        order = np.argsort(keys_compared, kind="stable")
+        keys_compared, queries = keys_compared[order], compared[order, 0]
         faces = self._faces_ahead(x, points, compared[:, 1])
         corners = x[self._mesh.faces[faces]].astype(np.float64)
         low, high = corners.min(axis=1), corners.max(axis=1)
 
-        def pair_up(box_low: np.ndarray, axes: int) -> np.ndarray:
-            """Returns queries and faces whose box contains the point along the first axes of y, z and x."""
+        def pair_up(box_low: np.ndarray, axes: int, sought: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Returns points and faces whose box contains the point along the first axes of y, z and x.
+
+            Only those are returned that a sought query compares: pairs of a point and a face; and rows of a pair and a
+            query, in two arrays.
+            """
             turned = [1, 2, 0]
             found = _enclosing(points[:, turned], points[:, turned], box_low[:, turned], high[:, turned], axes)
             keys = found[:, 0] * len(parts.body) + parts.of_face[faces[found[:, 1]]]
-            return found[np.isin(keys, keys_compared)]
+            bounds = np.searchsorted(keys_compared, keys), np.searchsorted(keys_compared, keys, side="right")
+            pairs, at = expand_ranges(*bounds)
+            kept = sought[queries[at]]
+            is_first = np.diff(pairs[kept], prepend=-1) > 0
+            return found[pairs[kept][is_first]], np.cumsum(is_first) - 1, queries[at[kept]]
 
-        on_surface = np.zeros(len(points), dtype=bool)
+        on_surface = np.zeros(len(place), dtype=bool)
         if may_touch.any():
-            met = pair_up(low, 3)
-            met = met[may_touch[met[:, 0]]]
-            on_surface[met[points_on_faces(self._mesh, x, points[met[:, 0]], faces[met[:, 1]]), 0]] = True
+            met, pairs, rows = pair_up(low, 3, may_touch)
+            on_surface[rows[points_on_faces(self._mesh, x, points[met[:, 0]], faces[met[:, 1]])[pairs]]] = True
         # rays along +x, of the others
-        met = pair_up(np.where([True, False, False], -np.inf, low), 2)
-        met = met[~on_surface[met[:, 0]]]
+        met, pairs, rows = pair_up(np.where([True, False, False], -np.inf, low), 2, ~on_surface)
         signs = checker.rays_pass_faces(points[met[:, 0]].astype(np.float64), corners[met[:, 1]]).astype(np.int64)
-        met, signs = met[signs != 0], signs[signs != 0]
-        rows, faces = met[:, 0], faces[met[:, 1]]
+        passes = signs[pairs] != 0
+        pairs, rows = pairs[passes], rows[passes]
+        signs, faces = signs[pairs], faces[met[pairs, 1]]
         keys, pair_of_ray = np.unique(rows * len(parts.body) + parts.of_face[faces], return_inverse=True)
         turns = np.where(
             parts.oriented[keys % len(parts.body)],
             np.bincount(pair_of_ray, signs, len(keys)),
             np.bincount(pair_of_ray, minlength=len(keys)) % 2,
         )
-        inside = np.bincount(keys // len(parts.body), turns, len(points)) != 0
+        inside = np.bincount(keys // len(parts.body), turns, len(place)) != 0
         return _Sides(on_surface, inside, rows, faces)
 
     def _choose_vertices(
@@ -251,7 +271,8 @@ class ContainmentFinder:
         for bit, is_aside in enumerate((x[:, 0] < low[0], *(x[:, 1:] < low[1:]).T, *(x[:, 1:] > high[1:]).T)):
             sides |= is_aside.astype(np.uint8) << bit
         a, b, c = (sides[corners] for corners in self._mesh.faces.T)
-        return np.flatnonzero(is_compared[self._parts.of_face[: len(a)]] & (a & b & c == 0))
+        part = self._parts.of_face[: len(a)]
+        return np.flatnonzero((part >= 0) & is_compared[part] & (a & b & c == 0))
 
 
 def _enclosing(

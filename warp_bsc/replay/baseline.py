@@ -3,7 +3,7 @@
 import json
 import os
 from collections import defaultdict
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import orjson
 
@@ -14,25 +14,25 @@ from .summary import Summary
 
 __all__ = ["Baseline", "NewFinding"]
 
-Event = Literal["collides", "crosses", "is inside", "is near"]
-"""What two meshes may do in a replay."""
+Event = Literal["collides", "crosses", "is inside", "is near", "are duplicates"]
+"""What meshes may do in a replay."""
 
 _WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit"}
 """The options that do not change what is compared; ``intersections`` is checked by itself."""
 
 
 class NewFinding(NamedTuple):
-    """An interval, or a time, in which two meshes do something that they did not do then in an earlier replay.
+    """An interval, or a time, in which meshes do something that they did not do then in an earlier replay.
 
     Attributes:
-        what: ``"collides"``, ``"crosses"``, ``"is inside"`` or ``"is near"``.
-        meshes: Names of the two.
+        what: ``"collides"``, ``"crosses"``, ``"is inside"``, ``"is near"`` or ``"are duplicates"``.
+        meshes: Names of the two, or of all duplicates.
         start: Start of the interval, or the time, as a time code.
         end: End of the interval, or the time.
     """
 
     what: Event
-    meshes: tuple[str, str]
+    meshes: tuple[str, ...]
     start: float
     end: float
 
@@ -60,7 +60,7 @@ class Baseline:
         """
         self.path = os.fspath(path)
         self._spans: dict[str, defaultdict[tuple[str, ...], list[tuple[float, float]]]] = {
-            event: defaultdict(list) for event in ("collides", "crosses", "is inside", "is near")
+            event: defaultdict(list) for event in get_args(Event)
         }
         try:
             with naming(path):
@@ -77,6 +77,8 @@ class Baseline:
                     self._add("crosses", span)
             for span in found["proximity_spans"]:
                 self._add("is near", span)
+            for span in found["duplicate_spans"]:
+                self._add("are duplicates", span)
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
         if not is_complete:
@@ -98,6 +100,9 @@ class Baseline:
         found: list[NewFinding] = []
         for interval in summary.intervals:
             found += [NewFinding("collides", meshes, interval.start, interval.end) for meshes in interval.mesh_pairs]
+            found += [
+                NewFinding("are duplicates", group, interval.start, interval.end) for group in interval.duplicates
+            ]
         for sample in summary.intersections:
             crossing = [meshes for meshes, (crossings, _) in sample.mesh_pairs.items() if crossings]
             found += [NewFinding("crosses", meshes, sample.time, sample.time) for meshes in crossing]
@@ -110,9 +115,14 @@ class Baseline:
     def lacks(self, finding: NewFinding) -> bool:
         """Returns whether the meshes did not do that at that time in the earlier replay.
 
-        Meshes that crossed at a time, or one of which was inside the other, were near each other then.
+        Meshes that crossed at a time, or one of which was inside the other, were near each other then. Duplicates may
+        have been more.
         """
         what, meshes, start, end = finding
+        if what == "are duplicates":
+            groups = self._spans[what].items()
+            spans = [span for group, spans in groups if set(group) >= {*meshes} for span in spans]
+            return not any(since <= start and end <= until for since, until in spans)
         events = [what, *(("crosses", "is inside") if what == "is near" else ())]
         spans = [span for event in events for span in self._spans[event].get(tuple(sorted(meshes)), ())]
         if what == "collides":  # intervals that only meet are two

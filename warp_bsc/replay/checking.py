@@ -24,6 +24,7 @@ from ..usd.interval import Interval
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
+from .duplicates import Duplicates
 from .results import IntervalResult, Work, summarize, summarize_intersections
 from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, find_strand_contacts, join_contacts
@@ -239,7 +240,12 @@ class _SegmentNamer:
         self._mesh = detector.mesh
         self._strand_mesh = detector.strands.mesh if detector.strands else None
         bodies = detector.strands.bodies if detector.strands else segment.face_meshes
-        self._containment = ContainmentFinder(self._strand_mesh or self._mesh, bodies) if checks.intersections else None
+        self._duplicates = self._containment = None
+        if checks.intersections:
+            self._duplicates = Duplicates(segment)
+            bodies = self._duplicates.without_twins(bodies)
+            self._containment = ContainmentFinder(self._strand_mesh or self._mesh, bodies)
+        self._named_duplicates = self._duplicates.named(checks.selection) if self._duplicates else ()
         self._intersections: tuple[Intersections, SceneIntersections] | None = None  # those named last
         self._proximities: tuple[Proximities, SceneProximities] | None = None
 
@@ -282,6 +288,7 @@ class _SegmentNamer:
             certified=certified,
             stats=stats,
             validation=validation,
+            duplicates=self._named_duplicates,
         )
         return IntervalResult(summary, contacts, intersections, proximities, None)
 
@@ -294,14 +301,15 @@ class _SegmentNamer:
             time: Time code.
         """
         if self._intersections is None or self._intersections[0] is not found:
-            assert self._containment
+            assert self._containment and self._duplicates
             selection, meshes = self._checks.selection, self.segment.meshes
 
             def are_checked(pairs: np.ndarray) -> np.ndarray:
                 ignored = selection.ignored_pairs(meshes, pairs) | selection.may_be_inside(meshes, pairs)
                 return selection.counted_pairs(meshes, pairs) & ~ignored
 
-            inside = self._containment.find(x, found, are_checked)
+            inside = self._containment.find(x, found, self._duplicates.may_be_checked(are_checked))
+            inside = self._duplicates.with_twins(inside, are_checked)
             mesh = self._strand_mesh or self._mesh
             self._intersections = (
                 found,

@@ -145,6 +145,7 @@ class HitsJson(RecordFile):
             "intersections": [
                 with_numbers(span, numbers) | {"trend": span.trend} for span in summary.intersection_spans
             ],
+            "duplicate_spans": [with_numbers(span, numbers) for span in summary.duplicate_spans],
             "proximity_spans": [with_numbers(span, numbers) for span in summary.proximity_spans],
             "nearest": [with_numbers(nearest, numbers) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,

@@ -14,6 +14,7 @@ MAX_PAIRS = 10_000
 
 _MAX_ROWS = 10  # of the small tables
 _MAX_DISAGREEMENTS = 200
+_MAX_NAMES = 100  # of duplicates
 
 Depths = dict[tuple[str, str], tuple[float, float]]
 """The largest depth of two meshes and its time, by their sorted names."""
@@ -46,6 +47,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         tiles.append((f"{first.time:.6g}", "time code of the first"))
     if looked:
         tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
+    if spans := summary.duplicate_spans:
+        tiles.append((f"{len({name for span in spans for name in span.meshes}):,}", "meshes that are duplicates"))
     if depths:
         tiles.append((f"{max(depth for depth, _ in depths.values()):.4g}", "largest depth"))
     if summary.clearance is not None:
@@ -91,7 +94,12 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
             *named[:_MAX_ROWS],
             *([("Other display names", f"{len(named) - _MAX_ROWS:,}")] if len(named) > _MAX_ROWS else ()),
         ],
-        "notes": [summary.motion, *scene.warnings],
+        "notes": [
+            *(f"{span.describe(_MAX_NAMES)}." for span in spans[:_MAX_ROWS]),
+            *([f"{len(spans) - _MAX_ROWS:,} more groups of duplicates."] if len(spans) > _MAX_ROWS else ()),
+            summary.motion,
+            *scene.warnings,
+        ],
         "validation": None,
     }
     if not summary.is_complete:
@@ -113,7 +121,7 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
 
 def _nothing_found(summary: Summary) -> str:
     """Returns a sentence on what was checked if nothing was found in a whole replay, else an empty text."""
-    found = summary.hits or any(at.pairs for at in summary.proximities)
+    found = summary.hits or summary.duplicate_spans or any(at.pairs for at in summary.proximities)
     if found or not summary.is_complete or not all(at.is_empty for at in summary.intersections):
         return ""
     if summary.scene.is_still and not summary.intersections:

@@ -139,6 +139,8 @@ class IntervalSummary:
         phases: Number of pairs of meshes that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None if
             intersections were not checked.
         proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
+        duplicates: Groups of meshes that are duplicates, see :class:`~warp_bsc.replay.duplicates.Duplicates`, by their
+            names, in the scene's order; empty if intersections were not checked.
     """
 
     index: int
@@ -159,6 +161,7 @@ class IntervalSummary:
     separate_hits: int | None
     phases: tuple[int, ...] | None
     proximities: tuple[ProximitySummary, ProximitySummary] | None
+    duplicates: tuple[tuple[str, ...], ...]
 
     @property
     def hits(self) -> int:
@@ -230,6 +233,7 @@ def summarize(
     certified: bool,
     stats: DetectionStats,
     validation: Validation | None,
+    duplicates: tuple[tuple[str, ...], ...],
 ) -> IntervalSummary:
     """Returns the numbers of an interval; the arguments are attributes of its result and its summary."""
     interval, earliest = contacts.interval, None
@@ -275,6 +279,7 @@ def summarize(
         separate_hits=None if contacts.separate is None else int(contacts.separate.sum()),
         phases=phases,
         proximities=proximity_summaries,
+        duplicates=duplicates,
     )
 
 

@@ -7,7 +7,15 @@ from functools import cached_property
 from ..usd.scene import Scene
 from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 
-__all__ = ["CERTIFIED_FOR", "CollisionSpan", "IntersectionSpan", "ProximitySpan", "Summary", "ValidationSummary"]
+__all__ = [
+    "CERTIFIED_FOR",
+    "CollisionSpan",
+    "DuplicateSpan",
+    "IntersectionSpan",
+    "ProximitySpan",
+    "Summary",
+    "ValidationSummary",
+]
 
 CERTIFIED_FOR = "vertices that move straight or turn about one axis between the times checked"
 """The motion that a certificate holds for."""
@@ -110,6 +118,28 @@ class ProximitySpan:
     until: float
     distance: float
     nearest_at: float
+
+
+@dataclass(frozen=True)
+class DuplicateSpan:
+    """Consecutive intervals of a scene in all of which meshes are duplicates of each other.
+
+    Attributes:
+        meshes: Their names, in the scene's order.
+        since: Start of the first interval, as a time code.
+        until: End of the last interval.
+    """
+
+    meshes: tuple[str, ...]
+    since: float
+    until: float
+
+    def describe(self, most: int) -> str:
+        """Returns the duplicates in words, with at most some of their names."""
+        names, more = ", ".join(self.meshes[:most]), len(self.meshes) - most
+        when = f"at {self.since:g}" if self.since == self.until else f"from {self.since:g} to {self.until:g}"
+        others = f" and {more:,} more" if more > 0 else ""
+        return f"{len(self.meshes):,} meshes are duplicates of each other, {when}: {names}{others}"
 
 
 @dataclass(frozen=True)
@@ -235,6 +265,18 @@ class Summary:
                     span = replace(span, distance=distance, nearest_at=sample.time)
                 running[meshes] = replace(span, until=sample.time)
         return sorted([*spans, *running.values()], key=lambda span: (span.since, span.distance))
+
+    @cached_property
+    def duplicate_spans(self) -> list[DuplicateSpan]:
+        """The times over which meshes are duplicates of each other, by their start."""
+        spans, running = [], {}
+        for interval in self.intervals:
+            for meshes in [meshes for meshes in running if meshes not in interval.duplicates]:
+                spans.append(running.pop(meshes))
+            for meshes in interval.duplicates:
+                before = running.get(meshes, DuplicateSpan(meshes, interval.start, interval.end))
+                running[meshes] = replace(before, until=interval.end)
+        return sorted([*spans, *running.values()], key=lambda span: span.since)
 
     @cached_property
     def nearest(self) -> list[Nearest]:

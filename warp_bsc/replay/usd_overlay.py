@@ -365,6 +365,8 @@ class Overlay:
             facts["timesWithIntersections"] = sum(bool(at.crossings + at.touches) for at in summary.intersections)
         if summary.stopped:
             facts["stopped"] = summary.stopped
+        if summary.duplicate_spans:
+            facts["duplicates"] = [span.describe(len(span.meshes)) for span in summary.duplicate_spans]
         if self._scene.left_out:
             facts["leftOut"] = self._scene.left_out
         return facts

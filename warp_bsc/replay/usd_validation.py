@@ -27,9 +27,11 @@ from .summary import Summary
 
 __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 
+_MOST_NAMES = 10  # of duplicates, in words
+
 NAME = f"{__name__}:Collisions"
 """Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for parts that are not checked;
-its warning is ``Inside``, for a mesh that is wholly inside another, perhaps intentionally."""
+its warnings are ``Inside``, for a mesh that is wholly inside another, perhaps intentionally, and ``Duplicates``."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""
@@ -72,6 +74,9 @@ def find_errors(stage: Usd.Stage, time_range: UsdValidation.ValidationTimeRange)
         elif span.crossings:
             text = f"{_pair(span.meshes)} cross from time {span.since:g} to {span.until:g}: at most {span.most:,} edges"
             errors.append(_error("Intersection", text, stage, prims))
+    for span in summary.duplicate_spans:
+        prims, text = [paths[name] for name in span.meshes], span.describe(_MOST_NAMES)
+        errors.append(_error("Duplicates", text, stage, prims, UsdValidation.ValidationErrorType.Warn))
     return errors
 
 

@@ -102,16 +102,19 @@ class Selection:
 
     def ignored_pairs(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
         """Returns whether each pair of meshes is ignored; arguments and result as of :meth:`counted_pairs`."""
+        ignored = np.zeros(len(pairs), dtype=bool)
         if not (self.ignore or self.ignored_names) or not len(pairs):
-            return np.zeros(len(pairs), dtype=bool)
-        keys, rows = np.unique(np.sort(pairs, axis=1) @ np.array([len(meshes), 1]), return_inverse=True)
-        return np.array([self._ignores(meshes[key // len(meshes)], meshes[key % len(meshes)]) for key in keys])[rows]
-
-    def _ignores(self, a: NamedMesh, b: NamedMesh) -> bool:
-        return tuple(sorted([a.name, b.name])) in self.ignored_names or any(
-            (_matches(a, first) and _matches(b, second)) or (_matches(b, first) and _matches(a, second))
-            for first, second in self.ignore
-        )
+            return ignored
+        used, rows = np.unique(pairs, return_inverse=True)
+        a, b = rows.reshape(-1, 2).T
+        for patterns in self.ignore:
+            first, second = (np.array([_matches(meshes[mesh], pattern) for mesh in used]) for pattern in patterns)
+            ignored |= (first[a] & second[b]) | (first[b] & second[a])
+        if self.ignored_names:
+            keys, rows = np.unique(np.sort(pairs, axis=1) @ np.array([len(meshes), 1]), return_inverse=True)
+            names = (sorted(meshes[number].name for number in divmod(key, len(meshes))) for key in keys.tolist())
+            ignored |= np.array([tuple(pair) in self.ignored_names for pair in names])[rows]
+        return ignored
 
     def may_be_inside(self, meshes: Sequence[NamedMesh], pairs: np.ndarray) -> np.ndarray:
         """Returns whether the first mesh of each pair may be inside the second; arguments of :meth:`counted_pairs`."""
