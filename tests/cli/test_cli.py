@@ -189,7 +189,7 @@ def test_recording_of_newton(capsys):
 
 
 def test_progress_without_a_terminal(capsys, falling_scene, monkeypatch):
-    monkeypatch.setattr("warp_bsc.cli.progress._LOG_SECONDS", -1.0)
+    monkeypatch.setattr("warp_bsc.cli.progress.LOG_SECONDS", -1.0)
     assert main(["replay", falling_scene, "--device", "cpu"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(",")[0] for line in lines] == [f"Replaying: {done} of 4" for done in (1, 2, 3, 4)]
