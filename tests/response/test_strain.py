@@ -103,26 +103,29 @@ def test_strain_is_reported_and_warned_of_once(device):
 
 
 def test_numbers_of_substeps_rise_at_once_and_fall_slowly(device):
-    """Half as many after 16 calm steps; after 32, if the next ones had to take more again."""
-    number, calm, patience = (wp.full(1, n, dtype=int, device=device) for n in (8, 0, 16))
+    """Half as many after 16 calm steps; a number that soon was too small is not tried again at rest."""
+    number, calm, fewest = (wp.full(1, n, dtype=int, device=device) for n in (8, 0, 0))
     choices = wp.array([2, 4, 8, 16, 32], dtype=int, device=device)
-    nothing, lasting = (wp.zeros(1, dtype=float, device=device) for _ in range(2))
+    nothing, lasting, own = (wp.zeros(1, dtype=float, device=device) for _ in range(3))
 
     def steps(count, needed):
         """Takes steps whose strain asks for a number of substeps, and returns those of the last."""
         for _ in range(count):
             n = max(1, int(number.numpy()[0]))
             strain = wp.full(1, needed * float(SUBSTEP_STRAIN * STRAIN) / n, dtype=float, device=device)
-            arrays = [strain, nothing, choices, number, calm, patience, lasting]
+            arrays = [own, strain, nothing, choices, number, calm, fewest, lasting]
             wp.launch(predict_substeps, 1, inputs=arrays, device=device)
         return int(number.numpy()[0])
 
-    assert steps(15, 1.0) == 8 and steps(2, 1.0) == 4
+    assert steps(16, 1.0) == 8 and steps(1, 1.0) == 4
     assert steps(1, 7.0) == 8  # too soon
-    assert steps(30, 1.0) == 8 and steps(3, 1.0) == 4
-    assert steps(1, 31.0) == 32
+    assert steps(2000, 1.0) == 8  # 4 are not tried again
+    assert steps(1, 31.0) == 32  # something new
     assert steps(100, 17.0) == 32  # more than half
     assert steps(200, 0.0) == 0
+    number.fill_(8)
+    own.fill_(0.05)  # of a whole step, without contacts
+    assert steps(200, 0.0) == 8
 
 
 class Review:
@@ -130,7 +133,7 @@ class Review:
 
     def __init__(self, device):
         self.device = device
-        self.number, self.calm, self.patience = self._new(4), self._new(0), self._new(16)
+        self.number, self.calm, self.fewest = self._new(4), self._new(0), self._new(0)
         self.missed, self.lasting = self._new(0.0, float), self._new(0.0, float)
         self.choices = wp.array(SUBSTEPS, dtype=int, device=device)
 
@@ -142,14 +145,15 @@ class Review:
         self.number.fill_(4)
         for number, final in enumerate(final_strains, 1):
             pending, strains = self._new(1), [self._new(strain, float), self._new(final, float)]
-            inputs = [*strains, self.choices, self._new(number), self.number, self.missed, self.lasting]
+            inputs = [*strains, self.choices, self._new(number), self._new(1), self.number, self.missed, self.lasting]
             chosen = wp.zeros(len(SUBSTEPS), dtype=int, device=self.device)
             outputs = [pending, chosen, self._new(0), self._new(0), self._new(0.0, float)]
             wp.launch(review_substeps, 1, inputs, outputs, device=self.device)
             if not pending.numpy()[0]:
                 break
-        outputs = [self.number, self.calm, self.patience, self.lasting]
-        wp.launch(predict_substeps, 1, [*strains, self.choices], outputs, device=self.device)
+        outputs = [self.number, self.calm, self.fewest, self.lasting]
+        inputs = [self._new(0.0, float), *strains, self.choices]
+        wp.launch(predict_substeps, 1, inputs, outputs, device=self.device)
         return number
 
 

@@ -361,7 +361,7 @@ def filtered_worlds(seeds, device):
     return model, bsc.CollisionFilter(particle_group=group, particle_mask=2, shape_group=shapes, shape_mask=2)
 
 
-@pytest.mark.filterwarnings("ignore:contacts strained")
+@pytest.mark.filterwarnings("ignore:a step strained")
 @pytest.mark.parametrize(
     "tree, options",
     [

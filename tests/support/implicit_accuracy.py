@@ -110,7 +110,7 @@ def main():
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--json", metavar="FILE", help="file to which the errors are written as well")
     arguments = parser.parse_args()
-    warnings.filterwarnings("ignore", "a step of VBD|contacts strained|contacts passed")
+    warnings.filterwarnings("ignore", "a step of VBD|a step strained|contacts passed")
     wp.config.quiet = True
     console, table, rows = Console(), Table("scene", "iterations", "polish", "residual", "errors"), []
     for scene in arguments.scenes:

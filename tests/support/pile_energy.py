@@ -105,7 +105,7 @@ def main():
     parser.add_argument("--substeps", choices=("auto", "none"), default="auto")
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    warnings.filterwarnings("ignore", "contacts strained")
+    warnings.filterwarnings("ignore", "a step strained")
     wp.config.quiet = True
     substeps = "auto" if arguments.substeps == "auto" else None
     options = {"substeps": substeps, "device": arguments.device, "cells": arguments.cells}

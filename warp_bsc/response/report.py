@@ -131,13 +131,13 @@ class SolverReport(ReportViews, WorldsOfReport):
         return revoked_warning(self._mesh.model, passed if len(passed) else self.coupled.bodies)
 
     def _strain_warning(self):
-        advice = "take shorter steps"
+        advice = "take shorter steps or more iterations"
         if self.substeps_omitted is not None:
             advice += f" (substeps='auto' takes none: {self.substeps_omitted})"
         elif not self.totals.substepped_steps:
             advice += ", or pass substeps='auto'"
-        cause = "as its solver does not see them"
-        return f"contacts strained an edge by more than {float(MAX_STRAIN):.0%} in a step, {cause}: {advice}"
+        cause = "its solver does not see the contacts, or its iterations are too few for the step"
+        return f"a step strained an edge by more than {float(MAX_STRAIN):.0%}, as {cause}: {advice}"
 
     @property
     def certified(self) -> bool:
@@ -434,7 +434,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         if self.substeps_omitted is not None and totals.strained_steps:
             line += f", none in substeps ({self.substeps_omitted})"
         if totals.strained_steps:
-            line += f", {totals.strained_steps} in which contacts strained an edge by more than {float(MAX_STRAIN):.0%}"
+            line += f", {totals.strained_steps} that strained an edge by more than {float(MAX_STRAIN):.0%}"
         if self.speed_limit_lifted:
             line += ", VBD's speed limit lifted where it brakes"
         if totals.inverting_steps:

@@ -88,8 +88,9 @@ class SolverCCD(CollisionStage):
 
     Limitations:
         The stage follows the inner solver, which does not see the contacts, except for Style3D. Without ``substeps``,
-        steps must be short against the time of sound through an element. A step that begins in substeps takes them also
-        if nothing touches.
+        steps must be short against the time of sound through an element. With ``substeps="auto"``, whole steps in
+        which nothing has touched yet are the inner solver's, however far it stretches cloth in them; after a contact,
+        steps are taken in substeps until a whole step strains no element by more than 1%, also if nothing touches.
 
     Attributes:
         solver: The inner solver, or the contact layer around it.
@@ -137,17 +138,17 @@ class SolverCCD(CollisionStage):
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             substeps: Substeps of the inner solver in a step that collides, so that it reacts to the contacts, see
                 :mod:`.substeps.substeps`: ``"auto"``, 2 to 1024, or None for none. With ``"auto"``, a step whose
-                contacts strain cloth, soft bodies or springs by more than 2% is taken in 2 to 32 substeps, and the next
-                ones are while they need it. It takes none behind Style3D, whose iterations see the contacts instead,
-                see :mod:`.substeps.style3d_contacts`, where gradients are asked for, in coupled solvers, and in CUDA
-                graphs behind solvers whose steps allocate; ``report.substeps_omitted`` says why. If the model requires
-                gradients, and behind a contact layer, a number makes as many steps of each, each with its contacts and
-                one of its own in the report, see :mod:`.substeps.small_steps`. In steps that may have
+                contacts strain cloth, soft bodies or springs by more than 2% is taken in 16 or 32 substeps, and the
+                next ones in 2 to 32 while they need it. It takes none behind Style3D, whose iterations see the contacts
+                instead, see :mod:`.substeps.style3d_contacts`, where gradients are asked for, in coupled solvers, and
+                in CUDA graphs behind solvers whose steps allocate; ``report.substeps_omitted`` says why. If the model
+                requires gradients, and behind a contact layer, a number makes as many steps of each, each with its
+                contacts and one of its own in the report, see :mod:`.substeps.small_steps`. In steps that may have
                 substeps, and behind Style3D, the stage resolves contacts of particles with shapes alone, also if
                 ``contacts`` are passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that
                 distance. Not so in short steps, in which weight moves what is at rest by no more than 1% of the median
-                edge length: ``SolverVBD`` gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If contacts
-                strain an edge by more than 20% in a step, or a substep, the stage warns once.
+                edge length: ``SolverVBD`` gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If an edge is
+                strained by more than 20% in a step, or a substep, the stage warns once.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
                 coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the

@@ -113,7 +113,7 @@ STRAIN = wp.constant(0.01)
 """Strain by contacts that ``"auto"`` leaves to a substep: elongation of an edge of cloth beyond its length at rest, or
 change of the length of an edge in a soft body, as a share of that length."""
 WHOLE_STRAIN = wp.constant(0.02)
-"""Strain by contacts up to which ``"auto"`` takes no substeps: piles, whose layers never quite rest, stay below."""
+"""Strain up to which ``"auto"`` takes no substeps: piles, whose layers never quite rest, stay below."""
 WEIGHT_STRAIN = 0.01
 """Way of what weight moves from rest in a step, as a share of the median edge length, up to which VBD gets all
 contacts that a program passes on; with twice as much, cloth hops on their springs."""
@@ -123,12 +123,11 @@ SUBSTEP_STRAIN = wp.constant(1.5)
 """Strain by contacts in all substeps of a step, as a multiple of that in the step as a whole."""
 MAX_MISSED = wp.constant(20.0)
 """Most strain after the substeps, as a multiple of that left to one, with which they are repeated."""
-KEPT = wp.constant(0.5)
-CALM_STEPS, MAX_CALM_STEPS = wp.constant(16), wp.constant(1024)
-"""Share of the substeps of a step that its strain asks for; and steps with less after which there are half as many, at
-first and at most."""
-FREE_STEPS = wp.constant(4)
-"""Steps with little strain that count as much as one with none: nothing touches, or it does not push."""
+IMPACT_SUBSTEPS = wp.constant(16)
+"""Fewest substeps with which a world begins to take some: with 4, the impact of a drape leaves ten times the energy."""
+KEPT, CALM_STEPS = wp.constant(0.5), wp.constant(16)
+"""Share of the substeps of a step that its strain asks for; and steps with less after which there are half as many, and
+in which a world that takes fewer, or none, is on trial."""
 MAX_REPEATS = wp.constant(2)
 """Most times that substeps are repeated in a step, with more of them or with contacts that they missed."""
 LOWERED, LASTING = wp.constant(0.8), wp.constant(1.25)

@@ -10,7 +10,7 @@ from ..state.motion import StateArrays, moves_with_body, predicted_position, pre
 from ..state.planes import MovingPlanes
 from ..state.structs import ContactKind, Motion, Step, can_move, constraint_count
 from ..state.vectors import ZERO, to_single
-from ..tuning import CALM_STEPS
+from ..tuning import CALM_STEPS, STRAIN, WHOLE_STRAIN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,20 +21,28 @@ _NOT_PROJECTED = wp.constant(-2)
 @wp.kernel
 def begin_step(
     interrupted: wp.array[int],
+    has_constraints: wp.array[int],
+    extrapolates: bool,
     # in and out
     number: wp.array[int],
     calm: wp.array[int],
-    patience: wp.array[int],
+    fewest: wp.array[int],
     lasting: wp.array[float],
     # out
+    is_extrapolated: wp.array[int],
     needs_whole_step: wp.array[int],
+    own_strain: wp.array[float],
     strain: wp.array[float],
     final_strain: wp.array[float],
     is_chosen: wp.array[int],
     must_choose: wp.array[int],
 ):
-    """Forgets the predicted substeps of worlds that were interrupted; says whether a world has none. Clears others."""
+    """Says which worlds need no whole step: those with predicted substeps that had contacts. Clears others.
+
+    Forgets the predicted substeps of worlds that were interrupted; brings the trial of those without nearer its end.
+    """
     world = wp.tid()
+    own_strain[world] = 0.0
     strain[world] = 0.0
     final_strain[world] = 0.0
     if world == 0:
@@ -44,9 +52,12 @@ def begin_step(
     if interrupted[world] == 1:
         number[world] = 0
         calm[world] = 0
-        patience[world] = CALM_STEPS
+        fewest[world] = 0
         lasting[world] = 0.0
     if number[world] == 0:
+        calm[world] = wp.min(calm[world] + 1, 0)
+    is_extrapolated[world] = wp.where(extrapolates and number[world] > 0, has_constraints[world], 0)
+    if is_extrapolated[world] == 0:
         needs_whole_step[0] = 1
 
 
@@ -58,14 +69,14 @@ def extrapolate(
     particle_world: wp.array[int],
     gravity: wp.array[wp.vec3],
     dt: float,
-    number: wp.array[int],
+    is_extrapolated: wp.array[int],
     # out
     motion: Motion,
     end: StateArrays,
 ):
-    """Predicts the motion of particles by their velocities, gravity and forces, in worlds with predicted substeps."""
+    """Predicts the motion of particles by their velocities, gravity and forces, in worlds that need no whole step."""
     i = wp.tid()
-    if number[motion.world[i]] == 0:
+    if is_extrapolated[motion.world[i]] == 0:
         return
     x0 = start.particle_q[i]
     x1 = x0
@@ -117,26 +128,35 @@ def use_predicted_substeps(
     # in
     step: Step,
     has_constraints: wp.array[int],
-    extrapolates: bool,
+    is_extrapolated: wp.array[int],
     choices: wp.array[int],
     # in and out
     status: SolveStatus,
+    calm: wp.array[int],
+    own_strain: wp.array[float],
     number: wp.array[int],
     # out
     is_chosen: wp.array[int],
     substeps: wp.array[int],
     chooses: wp.array[int],
 ):
-    """Marks the predicted numbers of substeps; says whether a world with constraints has none.
+    """Marks the predicted numbers of substeps; says whether a world without may need some.
 
-    A world without constraints takes the whole step, if there is one.
+    A world whose contacts have ended takes the whole step, unless that strains it by itself; in a world on trial with
+    whole steps, the strain counts too. Otherwise a contact that ends would change how stiff elements are.
     """
     world = wp.tid()
-    if has_constraints[world] == 0 and not extrapolates:
+    touches = has_constraints[world] == 1
+    on_trial = number[world] == 0 and calm[world] < 0
+    if is_extrapolated[world] == 1 or not (on_trial or (number[world] > 0 and not touches)):
+        own_strain[world] = 0.0
+    strains = own_strain[world] > wp.where(on_trial, WHOLE_STRAIN, STRAIN)
+    if number[world] > 0 and is_extrapolated[world] == 0 and not (touches or strains):
         number[world] = 0
+        calm[world] = -CALM_STEPS
     if number[world] > 0:
         mark_choice(choices, number[world], is_chosen, substeps)
-    elif status.loop[Loop.UNFINISHED] == 1 and (has_constraints[world] == 1 or step.constraints.count[0] == 0):
+    elif strains or (status.loop[Loop.UNFINISHED] == 1 and (touches or step.constraints.count[0] == 0)):
         chooses[0] = 1
 
 

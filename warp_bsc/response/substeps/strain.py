@@ -8,13 +8,13 @@ from ..schedule import Loop, SolveStatus
 from ..state.structs import Motion
 from ..state.workspace import Workspace
 from ..tuning import (
+    CALM_STEPS,
     COMPRESSION,
     FORGOTTEN,
-    FREE_STEPS,
+    IMPACT_SUBSTEPS,
     KEPT,
     LASTING,
     LOWERED,
-    MAX_CALM_STEPS,
     MAX_MISSED,
     MAX_REPEATS,
     SOLID,
@@ -31,14 +31,15 @@ wp.set_module_options({"enable_backward": False})
 def measure_strain(
     # in
     motion: Motion,
-    x1: wp.array[wp.vec3],
+    before: wp.array[wp.vec3],
+    after: wp.array[wp.vec3],
     edges: wp.array[wp.vec2i],
     lengths: wp.array[float],
     is_solid: wp.array[bool],
     # out
     strain: wp.array[float],
 ):
-    """Finds the largest strain of an edge between predicted positions and ``x1`` in each world.
+    """Finds the largest strain of an edge from positions ``before`` to those ``after``, in each world.
 
     Cloth that is compressed buckles, and resists less than cloth that is stretched: a quarter of its compression
     counts, and of the strain of a solid a third.
@@ -46,11 +47,11 @@ def measure_strain(
     i = wp.tid()
     a = edges[i][0]
     b = edges[i][1]
-    predicted = wp.length(motion.x1[a] - motion.x1[b])
-    length = wp.length(x1[a] - x1[b])
-    change = wp.max(length - wp.max(predicted, lengths[i]), COMPRESSION * (wp.min(predicted, lengths[i]) - length))
+    start = wp.length(before[a] - before[b])
+    length = wp.length(after[a] - after[b])
+    change = wp.max(length - wp.max(start, lengths[i]), COMPRESSION * (wp.min(start, lengths[i]) - length))
     if is_solid[i]:
-        change = SOLID * wp.abs(length - predicted)
+        change = SOLID * wp.abs(length - start)
     if change > 0.0:
         wp.atomic_max(strain, motion.world[a], change / lengths[i])
 
@@ -67,10 +68,9 @@ def _choice(choices: wp.array[int], predicted: float) -> int:
 
 
 @wp.func
-def _lose_calm(calm: wp.array[int], patience: wp.array[int], world: int):
-    """Doubles the calm steps that a world needs for fewer substeps, if it has soon needed more again."""
-    if calm[world] < 0:
-        patience[world] = wp.min(2 * patience[world], MAX_CALM_STEPS)
+def _take_more(n: int, calm: wp.array[int], fewest: wp.array[int], world: int):
+    """Ends a trial of ``n`` substeps, which failed and are not tried again at rest; else a rest that is over."""
+    fewest[world] = wp.where(calm[world] < 0, n + 1, 0)
     calm[world] = 0
 
 
@@ -85,6 +85,7 @@ def _lasts(strain: float, lasting: wp.array[float], world: int) -> bool:
 @wp.kernel
 def choose_substeps(
     # in
+    own_strain: wp.array[float],
     strain: wp.array[float],
     has_constraints: wp.array[int],
     choices: wp.array[int],
@@ -92,24 +93,24 @@ def choose_substeps(
     status: SolveStatus,
     number: wp.array[int],
     calm: wp.array[int],
-    patience: wp.array[int],
+    fewest: wp.array[int],
     lasting: wp.array[float],
     # out
     is_chosen: wp.array[int],
     substeps: wp.array[int],
     largest: wp.array[float],
 ):
-    """Chooses the substeps of each world that has none, 0 where contacts strain little; ``substeps`` are the most."""
+    """Chooses the substeps of each world that has none, 0 where it is strained little; ``substeps`` are the most."""
     world = wp.tid()
     status.loop[Loop.RECOUNT] = 0  # the start remains where crossings are counted
-    if number[world] == 0 and has_constraints[world] == 1:
-        n = int(0)
-        if not _lasts(strain[world], lasting, world) and strain[world] > WHOLE_STRAIN:
-            n = _choice(choices, strain[world] / STRAIN)
-        number[world] = n
-        if n > 0:
-            mark_choice(choices, n, is_chosen, substeps)
-            _lose_calm(calm, patience, world)
+    if number[world] == 0:
+        most = own_strain[world]
+        if has_constraints[world] == 1 and not _lasts(strain[world], lasting, world):
+            most = wp.max(most, strain[world])
+        if most > WHOLE_STRAIN:
+            number[world] = wp.max(IMPACT_SUBSTEPS, _choice(choices, most / STRAIN))
+            mark_choice(choices, number[world], is_chosen, substeps)
+            _take_more(0, calm, fewest, world)
         else:
             largest[world] = strain[world]
 
@@ -127,6 +128,7 @@ def review_substeps(
     final_strain: wp.array[float],
     choices: wp.array[int],
     passes: wp.array[int],
+    has_constraints: wp.array[int],
     # in and out
     number: wp.array[int],
     missed_strain: wp.array[float],
@@ -156,7 +158,9 @@ def review_substeps(
     missed_strain[world] = final
     missed = wp.where(final <= LASTING * lasting[world], 0.0, final / STRAIN)
     too_few = predicted > 2.0 * float(n) and n < choices[choices.shape[0] - 1]
-    if passes[0] <= MAX_REPEATS and (too_few or (missed > 2.0 and missed < MAX_MISSED)):
+    if passes[0] <= MAX_REPEATS and (
+        too_few or (missed > 2.0 and (missed < MAX_MISSED or has_constraints[world] == 0))
+    ):
         number[world] = wp.max(n, _choice(choices, predicted))
         is_pending[world] = 1
         repeats[0] = 1
@@ -168,35 +172,39 @@ def review_substeps(
 @wp.kernel
 def predict_substeps(
     # in
+    own_strain: wp.array[float],
     strain: wp.array[float],
     final_strain: wp.array[float],
     choices: wp.array[int],
     # in and out
     number: wp.array[int],
     calm: wp.array[int],
-    patience: wp.array[int],
+    fewest: wp.array[int],
     lasting: wp.array[float],
 ):
     """Predicts the substeps of the next step in each world that took some, by the strain of this step.
 
     They become fewer slowly, half as many once a number of steps needed less than half of them: with another
-    number, elements come to rest elsewhere, and the difference sets them in motion.
+    number, elements come to rest elsewhere, and the difference sets them in motion. A number that soon turns out to be
+    too small is not tried again until the world needs more than it came from, or nothing touches.
     """
     world = wp.tid()
     n = number[world]
     if n > 0:
         final = final_strain[world]
         predicted = wp.max(_predicted(n, strain[world]), wp.where(_lasts(final, lasting, world), 0.0, final / STRAIN))
+        predicted = wp.max(predicted, own_strain[world] / STRAIN)
+        fewer = _choice(choices, 0.5 * float(n))
         if predicted > float(n):
             number[world] = _choice(choices, predicted)
-            _lose_calm(calm, patience, world)
+            _take_more(n, calm, fewest, world)
         elif predicted >= KEPT * float(n):
             calm[world] = wp.min(calm[world] + 1, 0)
-        elif calm[world] < patience[world]:
-            calm[world] += wp.where(predicted > 0.0, 1, FREE_STEPS)
+        elif calm[world] < CALM_STEPS or fewer < fewest[world]:
+            calm[world] += 1
         else:
-            number[world] = _choice(choices, 0.5 * float(n))
-            calm[world] = -patience[world]
+            number[world] = fewer
+            calm[world] = -CALM_STEPS
 
 
 class StrainMeter:
@@ -208,14 +216,16 @@ class StrainMeter:
         columns = zip(edges_at_rest(work.mesh.model), (wp.vec2i, float, bool), strict=True)
         self._edges = [wp.array(values, dtype=dtype, device=work.device) for values, dtype in columns]
 
-    def measure(self, motion: Motion, strain: wp.array[float]) -> None:
+    def measure(self, motion: Motion, strain: wp.array[float], *, own: bool = False) -> None:
         """Increases ``strain`` to that between predicted positions and positions as they are, of each world.
 
         Args:
             motion: The motion, as the inner solver predicted it.
             strain: Shape [worlds].
+            own: Whether to measure the prediction itself, from the start of the motion on.
         """
-        self._work.launch(measure_strain, len(self._edges[0]), [motion, self._work.vertices.x1, *self._edges], [strain])
+        ends = (motion.x0, motion.x1) if own else (motion.x1, self._work.vertices.x1)
+        self._work.launch(measure_strain, len(self._edges[0]), [motion, *ends, *self._edges], [strain])
 
 
 def edges_at_rest(model: newton.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -6,11 +6,16 @@ step only. The stretch between solver and contacts falls with the length of the 
 before the substeps; the motion of the whole step is detected and certified after them.
 
 With ``"auto"``, a world takes whole steps first. If contacts strain an element by more than ``WHOLE_STRAIN`` against
-the prediction of the inner solver, the step is repeated, in the smallest number of ``SUBSTEPS`` that brings the strain
-below ``STRAIN``, if it is in proportion to the length of a substep. The next step begins in substeps, as many as the
-strain of these asks for; without bodies, behind a solver that only moves particles, it takes no whole step before them,
-and the contacts are those of particles that fly on. If substeps turn out to be too few, or if contacts that they did
-not know strain an element after them, the step is repeated with more, or with these contacts too.
+the prediction of the inner solver, the step is repeated, in ``IMPACT_SUBSTEPS`` or the smallest number of ``SUBSTEPS``
+above it that brings the strain below ``STRAIN``, if it is in proportion to the length of a substep. The next step
+begins in substeps, as many as the strain of these asks for, fewer only after a while; without bodies, behind a solver
+that only moves particles, it takes no whole step before them, and the contacts are those of particles that fly on. If
+substeps turn out to be too few, or if contacts that they did not know strain an element after them, the step is
+repeated with more, or with these contacts too.
+
+Where nothing touches any more, the next step is a whole one first. Whole steps of the inner solver may stretch elements
+that substeps do not, as its iterations converge less: substeps go on until a whole step strains elements by no more
+than ``STRAIN``, and begin again if one of the next ``CALM_STEPS`` whole steps does by more than ``WHOLE_STRAIN``.
 
 Substeps share the iterations of VBD and Style3D, each with at least ``SUBSTEP_ITERATIONS``: many substeps of few
 iterations converge better than few of many (Macklin et al. 2019). A substep begins with the position multipliers of the
@@ -40,7 +45,7 @@ from ..solve.bodies import begin_bodies
 from ..state.motion import ModelMotion, arrays_of
 from ..state.workspace import Workspace
 from ..step import add_proximities, begin, detect_contacts, find_contacts, resolve_contacts
-from ..tuning import CALM_STEPS, SUBSTEP_ITERATIONS
+from ..tuning import SUBSTEP_ITERATIONS
 from . import kernels
 from .strain import StrainMeter, choose_substeps, predict_substeps, review_substeps
 
@@ -128,7 +133,8 @@ class Substeps:
         if self._chooses:
             self._strain, self._final_strain = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
             self._calm = wp.zeros(worlds, dtype=int, device=device)  # steps with fewer
-            self._patience = wp.full(worlds, int(CALM_STEPS), dtype=int, device=device)
+            self._fewest, self._is_extrapolated = (wp.zeros(worlds, dtype=int, device=device) for _ in range(2))
+            self._own_strain = wp.zeros(worlds, dtype=float, device=device)  # of the whole step, without contacts
             self._missed_strain, self._lasting = (wp.zeros(worlds, dtype=float, device=device) for _ in range(2))
             self._device_choices = wp.array(self._choices, dtype=int, device=device)
             self._is_chosen = wp.zeros(len(self._choices), dtype=int, device=device)
@@ -153,12 +159,14 @@ class Substeps:
         self._start.assign(state)
         if self._chooses:
             self._needs_whole_step.zero_()
-            inputs = [self._motion.vertices.interrupted, self._number, self._calm, self._patience, self._lasting]
-            outputs = [self._needs_whole_step, self._strain, self._final_strain, self._is_chosen, self._must_choose]
+            inputs = [self._motion.vertices.interrupted, self._has_constraints, self._extrapolates]
+            inputs += [self._number, self._calm, self._fewest, self._lasting]
+            outputs = [self._is_extrapolated, self._needs_whole_step, self._own_strain, self._strain]
+            outputs += [self._final_strain, self._is_chosen, self._must_choose]
             self._work.launch(kernels.begin_step, self._work.worlds, inputs, outputs)
 
     def take_whole_step(self, *arguments, can_branch: bool, **options) -> None:
-        """Steps the inner solver, with its arguments, unless all worlds have predicted substeps, and need no more.
+        """Steps the inner solver, with its arguments, unless no world needs it, as all have predicted substeps.
 
         Where a step cannot be in the body of a condition, the inner solver takes it in any case.
         """
@@ -195,10 +203,13 @@ class Substeps:
         work.motion = self._motion  # also after an error in a substep
         if self._extrapolates:
             model, start = work.mesh.model, self._start
-            inputs = [arrays_of(start), start.particle_f, model.particle_world, model.gravity, dt, self._number]
+            inputs = [arrays_of(start), start.particle_f, model.particle_world, model.gravity, dt]
+            inputs.append(self._is_extrapolated)
             outputs = [self._motion.vertices, arrays_of(state)]
             work.launch(kernels.extrapolate, model.particle_count, inputs, outputs)
         self.strain.zero_()
+        if self._chooses:
+            self._meter.measure(self._motion.vertices, self._own_strain, own=True)
         if self.taken is not None:
             self.taken.zero_()
         find_contacts(work)
@@ -219,7 +230,8 @@ class Substeps:
         """Chooses the substeps of each world: the predicted ones, or those that follow from a resolved whole step."""
         work = self._work
         self.substeps.zero_()
-        inputs = [work.step, self._has_constraints, self._extrapolates, self._device_choices, work.status, self._number]
+        inputs = [work.step, self._has_constraints, self._is_extrapolated, self._device_choices]
+        inputs += [work.status, self._calm, self._own_strain, self._number]
         outputs = [self._is_chosen, self.substeps, self._must_choose]
         work.launch(kernels.use_predicted_substeps, work.worlds, inputs, outputs)
         wp.capture_if(self._must_choose, self._resolve_and_choose, dt=dt)
@@ -229,8 +241,8 @@ class Substeps:
         work = self._work
         resolve_contacts(work, dt)
         self._meter.measure(self._motion.vertices, self._strain)
-        inputs = [self._strain, self._has_constraints, self._device_choices, work.status]
-        inputs += [self._number, self._calm, self._patience, self._lasting]
+        inputs = [self._own_strain, self._strain, self._has_constraints, self._device_choices, work.status]
+        inputs += [self._number, self._calm, self._fewest, self._lasting]
         outputs = [self._is_chosen, self.substeps, self.strain]
         work.launch(choose_substeps, work.worlds, inputs, outputs)
         wp.capture_if(self.substeps, self._find_contacts_again)
@@ -257,8 +269,8 @@ class Substeps:
             self._repeats.fill_(1)
             wp.capture_while(self._repeats, self._take_chosen_numbers, step=step)
             self._report_worlds()
-            inputs = [self._strain, self._final_strain, self._device_choices]
-            outputs = [self._number, self._calm, self._patience, self._lasting]
+            inputs = [self._own_strain, self._strain, self._final_strain, self._device_choices]
+            outputs = [self._number, self._calm, self._fewest, self._lasting]
             work.launch(predict_substeps, work.worlds, inputs, outputs)
         else:
             self._take_number_of_substeps(self._choices[0], step)
@@ -284,8 +296,8 @@ class Substeps:
         for array in (self._final_strain, self._is_chosen, self._repeats):
             array.zero_()
         self._meter.measure(self._motion.vertices, self._final_strain)
-        inputs = [self._strain, self._final_strain, self._device_choices, self._passes, self._number]
-        inputs += [self._missed_strain, self._lasting]
+        inputs = [self._strain, self._final_strain, self._device_choices, self._passes]
+        inputs += [self._has_constraints, self._number, self._missed_strain, self._lasting]
         outputs = [self._is_pending, self._is_chosen, self.substeps, self._repeats, self.strain]
         work.launch(review_substeps, work.worlds, inputs, outputs)
 
