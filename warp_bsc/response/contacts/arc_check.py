@@ -63,8 +63,10 @@ def _count_contacts(
     if wp.tid() == 0 and has_overflowed(counts, capacities):
         status.results[Result.CERTIFIED] = 0
     for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
-        _count(step, first, i, arcs, status)
-        _count(step, second, i, arcs, status)
+        number = int(0)
+        while number < 2:  # one body for both, which is large
+            _count(step, wp.where(number == 0, first, second), i, arcs, status)
+            number += 1
 
 
 def check_arcs(work: Workspace) -> None:

@@ -315,8 +315,10 @@ def collect_contacts(
     if can_search and has_overflowed(counts, capacities):
         return
     for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
-        _collect_contact(step, first, i, arcs, dividing, status)
-        _collect_contact(step, second, i, arcs, dividing, status)
+        number = int(0)
+        while number < 2:  # one body for both, which is large
+            _collect_contact(step, wp.where(number == 0, first, second), i, arcs, dividing, status)
+            number += 1
 
 
 @wp.kernel

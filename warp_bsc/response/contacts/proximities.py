@@ -95,10 +95,12 @@ def collect_proximities(
 ):
     """Adds constraints for the proximities among the candidates of two queues."""
     for i in range(wp.tid(), wp.max(pair_count(vertex_face), pair_count(edge_edge)), threads):
-        if has_pair(vertex_face, i):
-            _consider(step, vertex_face.kind, vertex_face.pairs[i], vertices_of(vertex_face, i), nearest, status)
-        if has_pair(edge_edge, i):
-            _consider(step, edge_edge.kind, edge_edge.pairs[i], vertices_of(edge_edge, i), nearest, status)
+        number = int(0)
+        while number < 2:  # one body for both, which is large
+            queue = wp.where(number == 0, vertex_face, edge_edge)
+            if has_pair(queue, i):
+                _consider(step, queue.kind, queue.pairs[i], vertices_of(queue, i), nearest, status)
+            number += 1
 
 
 @wp.func
