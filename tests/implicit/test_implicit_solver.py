@@ -51,7 +51,7 @@ def test_the_limit_of_vbd_is_a_solved_step(scene, device):
 def test_gradients_of_steps_that_are_not_solved_warn_and_polish_mends_them(device):
     model = hanging_cloth(device)
     rough = Rollout(model, iterations=2, polish=0)
-    with pytest.warns(UserWarning, match="more than 1% of the weight"), wp.Tape():
+    with pytest.warns(UserWarning, match="1% of the weight .* pass polish=3, or .*substeps=4"), wp.Tape():
         rough.run(rough.begin())
         report = rough.adjoint.report
         assert report.steps == rough.steps
@@ -204,6 +204,52 @@ def test_solves_whose_matrix_is_not_positive_definite_are_counted(size, expected
     rollout.backward()
     report = rollout.adjoint.report
     assert (report.solves, report.failed_solves, report.indefinite_solves) == (1, 0, expected)
+    assert report.rejected_solves == expected  # its residual is above the limit
+
+
+def compressed_springs(device, offsets):
+    """In each world, a mass halfway between two held points on springs of twice that length, some way off their line.
+
+    Without gravity. On the line it is in balance: its forces across it are k y, with k = 2 * 60 N/m.
+    """
+    scene = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    for offset in offsets:
+        builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        for x, y, mass in ((-0.05, 0.0, 0.0), (0.0, offset, 0.02), (0.05, 0.0, 0.0)):
+            builder.add_particle(wp.vec3(x, y, 0.0), wp.vec3(), mass, radius=0.01)
+        for end in (0, 2):
+            builder.add_spring(1, end, 60.0, 0.0, 0.0)
+        builder.spring_rest_length[:] = [0.1, 0.1]
+        scene.add_world(builder)
+    scene.color()
+    return scene.finalize(device=device, requires_grad=True)
+
+
+@pytest.mark.filterwarnings("ignore:a step of VBD")
+def test_gradients_of_an_unsolved_step_with_an_indefinite_matrix_are_nan_those_of_a_balance_are_exact(device):
+    """On the line, (m / dt^2 - k) dy1 = m / dt dv0; off it, ten iterations leave two thirds of the weight."""
+    rollout = Rollout(compressed_springs(device, (0.0, 0.01)), steps=1, polish=0, start=(0.0, 0.0, 0.0))
+    rollout.velocity[:], rollout.weights[:] = 0.0, 0.0
+    rollout.weights[0, :, 1] = 1.0
+    gradient = rollout.backward()[0].particle_qd.grad.numpy()[[1, 4]]
+    report = rollout.adjoint.report
+    with pytest.warns(UserWarning, match="indefinite.* gradients are NaN .*substeps=4.* bending stiffness"):
+        assert (report.solves, report.failed_solves, report.indefinite_solves, report.rejected_solves) == (1, 0, 2, 1)
+    balanced, unsolved = report.residuals
+    assert balanced == 0.0 and unsolved > 0.1
+    expected = 0.02 / DT / (0.02 / DT**2 - 120.0)
+    np.testing.assert_allclose(gradient[0], (0.0, expected, 0.0), rtol=1e-5, atol=1e-12)
+    assert np.isnan(gradient[1]).all()
+
+
+def test_polish_is_not_advised_to_a_program_that_passes_it(device):
+    model = hanging_cloth(device, n=4)
+    model.particle_q.assign((model.particle_q.numpy() * (0.7, 0.7, 1.0)).astype(np.float32))  # compressed
+    with pytest.warns(UserWarning, match="of the weight") as said:
+        gradient = Rollout(model, steps=1, iterations=1, polish=3).backward()[0].particle_qd.grad.numpy()
+    assert np.isnan(gradient[model.particle_inv_mass.numpy() > 0.0]).all()
+    words = [str(warning.message) for warning in said]
+    assert not any("polish" in word for word in words) and any("substeps=4" in word for word in words)
 
 
 @pytest.mark.filterwarnings("ignore:.*of the weight")

@@ -97,17 +97,19 @@ def test_the_first_step_chooses_the_thickness(height, speed, expected, device):
     assert given.thickness == pytest.approx(0.005)
 
 
-def test_steps_that_pass_the_layer_are_counted(device):
+@pytest.mark.parametrize(("substeps", "advice"), [("auto", "or pass substeps=4"), (2, "or more substeps")])
+def test_steps_that_pass_the_layer_are_counted(substeps, advice, device):
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     add_square(builder, 3, 0.04, (0.0, 0.0, 0.06), velocity=(0.0, 0.0, -30.0), **FREE)
     below = wp.transform(wp.vec3(0.0, 0.0, -0.02), wp.quat_identity())
     builder.add_shape_box(-1, xform=below, hx=0.2, hy=0.2, hz=0.02)
-    solver = bsc.SolverCCD(semi_implicit(builder.finalize(device=device, requires_grad=True)))
+    model = builder.finalize(device=device, requires_grad=True)
+    solver = bsc.SolverCCD(semi_implicit(model), substeps=substeps)
     rollout = Rollout(solver.model, solver)
-    collided = 0
-    with pytest.warns(UserWarning, match="contacts passed the contact layer in one step"):
+    collided, dt = 0, DT if substeps == "auto" else substeps * DT
+    with pytest.warns(UserWarning, match=f"contacts passed the contact layer in one step.* {advice}"):
         for _ in range(4):
-            rollout.step(DT)
+            rollout.step(dt)
             collided += solver.report.hits > 0
     assert solver.report.gradients.outrun_steps == collided == 1
     assert "contact layer of 17.9 mm, which contacts passed in 1 steps" in str(solver.report)

@@ -193,17 +193,25 @@ def report_residuals(
 @wp.kernel
 def count_solves(
     # in
+    limit: wp.float64,
+    residuals: wp.array[wp.float64],
     failed: wp.array[int],
     indefinite: wp.array[int],
     # out
+    rejected: wp.array[int],
     counts: wp.array[wp.int64],
 ):
-    """Counts a solve, the worlds in which it failed, and those whose matrix was not positive definite."""
+    """Counts a solve, the worlds in which it failed, and those whose matrix was not positive definite.
+
+    Of these, it marks and counts the worlds whose step ended with a residual above the limit.
+    """
     w = wp.tid()
     if w == 0:
         wp.atomic_add(counts, 2, wp.int64(1))
     wp.atomic_add(counts, 3, wp.int64(failed[w]))
     wp.atomic_add(counts, 6, wp.int64(indefinite[w]))
+    rejected[w] = wp.where(residuals[w] <= limit, 0, indefinite[w])
+    wp.atomic_add(counts, 7, wp.int64(rejected[w]))
 
 
 @wp.kernel

@@ -10,6 +10,11 @@ from .worlds import Worlds
 RESIDUAL_LIMIT = 0.01
 """Residual of a step, relative to the weight, above which a step warns: gradients may be off by 10% or more."""
 
+_POLISH = 3
+"""Newton steps that finish most steps of ten iterations."""
+
+_SHORTER = "take shorter steps, as SolverCCD does with substeps=4, or more of them"
+
 
 class ImplicitReport:
     """Residuals of steps and failures of linear solves; reading an attribute synchronizes with the device.
@@ -19,13 +24,13 @@ class ImplicitReport:
     the larger it is, the less they are those of the result that was computed.
     """
 
-    def __init__(self, worlds: Worlds):
-        """Makes a report of no steps."""
-        self._worlds = worlds
+    def __init__(self, worlds: Worlds, polish: int):
+        """Makes a report of no steps, which are finished by ``polish`` Newton steps."""
+        self._worlds, self._polish = worlds, polish
         device, count = worlds.of_particles.device, worlds.count
         self.device_residuals = wp.zeros((2, count), dtype=wp.float64, device=device)  # last, largest
-        self.device_counts = wp.zeros(7, dtype=wp.int64, device=device)
-        self._host = wp.zeros(7, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
+        self.device_counts = wp.zeros(8, dtype=wp.int64, device=device)
+        self._host = wp.zeros(8, dtype=wp.int64, device="cpu", pinned=device.is_cuda)
         self._said = set()
 
     @property
@@ -68,9 +73,19 @@ class ImplicitReport:
         """Linear solves that found their matrix not to be positive definite, each world of a step for itself.
 
         Forces then move particles on in a direction instead of back, as where an element is compressed: the end of
-        the step balances them, but it is no minimum of energy. Gradients are those of that balance.
+        the step balances them, but it is no minimum of energy. Gradients are those of that balance, if the step
+        reached it: :attr:`rejected_solves` has the others.
         """
         return self._count(6)
+
+    @property
+    def rejected_solves(self) -> int:
+        """Linear solves in :attr:`indefinite_solves` of a world that ended a step with more than 0.01 of the weight.
+
+        The step is far from any balance, and other balances are near, so that gradients could be of any size: they are
+        NaN.
+        """
+        return self._count(7)
 
     @property
     def overflowed_steps(self) -> int:
@@ -104,13 +119,20 @@ class ImplicitReport:
 
     def warn(self) -> None:
         """Warns once each of steps not converged and of gradients that are NaN, as far as the host knows."""
-        _, unconverged, _, failed, overflowed, ambiguous, _ = self._host.numpy()
+        _, unconverged, _, failed, overflowed, ambiguous, _, rejected = self._host.numpy()
         if unconverged:
+            advice = "give VBD more iterations, " + ("" if self._polish >= _POLISH else f"pass polish={_POLISH}, ")
             self._warn_once(
                 "residual",
                 f"a step of VBD on a tape ended with forces of more than {RESIDUAL_LIMIT:.0%} of the weight (see "
-                "report.residuals): gradients are those of a solved step, not of this one; give VBD more iterations, "
-                "or pass polish=3",
+                f"report.residuals): gradients are those of a solved step, not of this one; {advice}or {_SHORTER}",
+            )
+        if rejected:
+            self._warn_once(
+                "rejected",
+                f"the matrix of a step that ended with forces of more than {RESIDUAL_LIMIT:.0%} of the weight is "
+                "indefinite, as where cloth buckles: gradients are NaN (see report.rejected_solves); "
+                f"{_SHORTER}, or give cloth more bending stiffness",
             )
         if failed:
             self._warn_once("solve", "a linear solve did not converge: gradients are NaN (see report.failed_solves)")

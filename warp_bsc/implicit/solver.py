@@ -61,7 +61,9 @@ class SolverImplicitAdjoint(WrappedSolver):
     solved, and its residual says so. Shorter steps have fewer.
 
     Gradients are those of a solved step. As VBD makes a number of iterations, and not as many as it takes, the report
-    has the force that is left in every step on a tape, and a step with much of it warns. ``polish`` removes it.
+    has the force that is left in every step on a tape, and a step with much of it warns. ``polish`` removes it. Where
+    more than 0.01 of the weight is left and the matrix is not positive definite, gradients are NaN, and
+    ``report.rejected_solves`` counts them.
 
     Behind the collision stage, ``SolverCCD(SolverImplicitAdjoint(SolverVBD(model)))``, gradients go through both.
 
@@ -123,10 +125,11 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._polish = Polish(equations, worlds, self.polish, max_iterations) if self.polish else None
         self._poses = BodyPoses(solver)
         self._has_dynamic_bodies = self._poses.has_dynamic()
-        self.report = ImplicitReport(worlds)
-        moves_bodies, counts = not solver.integrate_with_external_rigid_solver, self.report.device_counts[5:]
+        self.report = ImplicitReport(worlds, self.polish)
+        moves_bodies, counts = not solver.integrate_with_external_rigid_solver, self.report.device_counts[5:6]
         self._between_steps = BetweenSteps(model, counts, bodies=moves_bodies)
         self._sums = wp.zeros((2, worlds.count), dtype=wp.float64, device=model.device)
+        self._rejected = wp.zeros(worlds.count, dtype=int, device=model.device)
         self._tape, self._first, self._launches, self._detected = _no_tape, None, 0, []
         self._of_end, self._free = equations.zeros(), equations.zeros()
         self._x0 = wp.zeros(model.particle_count, dtype=wp.vec3, device=model.device)
@@ -257,10 +260,11 @@ class SolverImplicitAdjoint(WrappedSolver):
         ends = state_out.particle_q, state_out.particle_qd
         starts = state_in.particle_q, state_in.particle_qd, state_in.particle_f
         step: Step | None = None
+        residuals: wp.array | None = None
         cuts = self._cuts()
 
         def forward():
-            nonlocal step
+            nonlocal step, residuals
             v0 = wp.clone(starts[1], requires_grad=False)
             force = None if starts[2] is None else wp.clone(starts[2], requires_grad=False)
             recorded, pairs = record_contacts(contacts, copies=True), self._record_pairs()
@@ -268,12 +272,14 @@ class SolverImplicitAdjoint(WrappedSolver):
             if self._polish is not None:
                 self._polish_end(x0, state_out, dt, cuts)
             self._measure(pairs)
+            residuals = wp.clone(self.report.device_residuals[0])
             step = Step(dt, x0, v0, wp.clone(ends[0], requires_grad=False), force, recorded, pairs, poses)
 
         def backward():
             assert step is not None
             with self._lock:
-                self._backward(step, poses, *(None if array is None else array.grad for array in (*starts, *ends)))
+                gradients = (None if array is None else array.grad for array in (*starts, *ends))
+                self._backward(step, poses, residuals, *gradients)
 
         run_on_host(forward, device)
         arrays = [array for array in (*starts, *ends) if array is not None and array.requires_grad]
@@ -312,7 +318,7 @@ class SolverImplicitAdjoint(WrappedSolver):
             self._launch(kernels.count_dropped, 1, [pairs.dropped], [report.device_counts])
         report.copy_counts()
 
-    def _backward(self, step: Step, poses: Poses, of_x0, of_v0, of_force, of_x1, of_v1):
+    def _backward(self, step: Step, poses: Poses, residuals, of_x0, of_v0, of_force, of_x1, of_v1):
         """Turns gradients with respect to the end of a step into those with respect to all that it depends on."""
         equations, n = self._equations, len(step.x0)
         equations.load(step)
@@ -320,11 +326,12 @@ class SolverImplicitAdjoint(WrappedSolver):
         self._launch(kernels.of_end, n, [dt, of_x1, of_v1, equations.is_fixed], [self._of_end, self._free])
         equations.differentiate(transposed=True)
         multipliers = self._linear.solve(self._free)
-        if step.pairs is not None:
-            inputs = [self._worlds.of_particles, step.pairs.dropped, wp.float64(math.nan)]
+        inputs = [wp.float64(RESIDUAL_LIMIT), residuals, self._linear.failed, self._linear.indefinite]
+        outputs = [self._rejected, self.report.device_counts]
+        self._launch(kernels.count_solves, self._worlds.count, inputs, outputs)
+        for lost in [self._rejected] + ([] if step.pairs is None else [step.pairs.dropped]):
+            inputs = [self._worlds.of_particles, lost, wp.float64(math.nan)]
             self._launch(matrix_kernels.set_failed, n, inputs, [multipliers])
-        inputs = [self._linear.failed, self._linear.indefinite]
-        self._launch(kernels.count_solves, self._worlds.count, inputs, [self.report.device_counts])
         self.report.copy_counts()
         by_forces = equations.add_gradients(multipliers, self._of_end, of_v0, of_force)
         if of_x0 is not None:

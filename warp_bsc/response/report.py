@@ -34,7 +34,7 @@ _NOT_FOLLOWED = (
     "collision: it collides as it was, at its new pose; put a new stage behind the solver"
 )
 _NOT_WATCHED = "a stage counts inversions only if it is asked to: pass inversions='reported' or 'prevented'"
-_LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it; shorten steps"
+_LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it"
 
 
 class SolverReport(ReportViews, WorldsOfReport):
@@ -102,7 +102,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         if known["inverting_steps"] and not self._prevents_inversions:
             self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
         if known["outrun_steps"] and self._mesh.model.requires_grad:
-            self._warn_once("layer", lambda: _LAYER_WARNING)
+            self._warn_once("layer", lambda: f"{_LAYER_WARNING}; {self._shorter_steps}")
         if known["shape_not_followed"]:
             shape = shape_name(self._mesh.model, known["shape_not_followed"] - 1)
             self._warn_once("shapes", lambda: f"{shape} {_NOT_FOLLOWED}")
@@ -131,13 +131,20 @@ class SolverReport(ReportViews, WorldsOfReport):
         return revoked_warning(self._mesh.model, passed if len(passed) else self.coupled.bodies)
 
     def _strain_warning(self):
-        advice = "take shorter steps or more iterations"
+        advice = f"give it more iterations, {self._shorter_steps}"
         if self.substeps_omitted is not None:
             advice += f" (substeps='auto' takes none: {self.substeps_omitted})"
-        elif not self.totals.substepped_steps:
-            advice += ", or pass substeps='auto'"
         cause = "its solver does not see the contacts, or its iterations are too few for the step"
         return f"a step strained an edge by more than {float(MAX_STRAIN):.0%}, as {cause}: {advice}"
+
+    @property
+    def _shorter_steps(self):
+        """Advice that the program has not taken yet; where gradients are asked for, substeps are a number."""
+        if self.totals.substepped_steps:
+            return "take shorter steps" + (", or more substeps" if self._mesh.model.requires_grad else "")
+        if self._mesh.model.requires_grad:
+            return "take shorter steps, or pass substeps=4"
+        return "take shorter steps" + ("" if self.substeps_omitted else ", or pass substeps='auto'")
 
     @property
     def certified(self) -> bool:
