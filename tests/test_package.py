@@ -93,6 +93,7 @@ LIBRARIES = {
         "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
         "warp_bsc/bench/newton_process.py",  # runs them
         "warp_bsc/bench/crossings.py",  # of a model
+        "warp_bsc/bench/elastic_energy.py",  # of a model
         "warp_bsc/bench/response_simulation.py",  # steps its solvers
         "warp_bsc/bench/response_scenes.py",  # makes models
         "warp_bsc/bench/penetration_scenes.py",

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_bsc.bench import response_scenes
 from warp_bsc.bench.crossings import CrossingCounter
+from warp_bsc.bench.elastic_energy import ElasticEnergy
 from warp_bsc.bench.response import (
     CONFIGURATIONS,
     REFERENCE,
@@ -20,6 +21,7 @@ from warp_bsc.bench.response import (
 )
 from warp_bsc.bench.response_scenes import NotRunnable, build_scene
 from warp_bsc.bench.response_simulation import Samples, Simulation, energy_gained, largest_stretch, total_energy
+from warp_bsc.implicit.equations import _elastic_elements
 
 
 def measure(scene, configuration, *, device, **options):
@@ -56,7 +58,7 @@ def test_samples_of_a_state(device):
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -10.0))
     for x in (0.0, 1.0):
         builder.add_particle(wp.vec3(x, 0.0, 0.0), wp.vec3(), x)
-    builder.add_spring(0, 1, 1.0, 0.0, 0.0)
+    builder.add_spring(0, 1, 8.0, 0.0, 0.0)
     inertia = wp.mat33(*np.diag([3.0, 3.0, 3.0]).ravel().tolist())
     builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0)), mass=2.0, inertia=inertia, lock_inertia=True)
     at = wp.transform(wp.vec3(0.0, 0.0, 7.0))
@@ -70,10 +72,83 @@ def test_samples_of_a_state(device):
     assert (samples.stretch, samples.speed) == (pytest.approx([0.5]), pytest.approx([2.0]))
     ball = 2.0 * 10.0 * 1.0 + 0.5 * 2.0 * 1.0 + 0.5 * 3.0 * 4.0
     kinematic = 0.0 if model.body_inv_mass.numpy()[1] == 0.0 else 2.0 * 70.0 + 0.5 * 2.0 * 16.0
-    assert samples.energy[0] == pytest.approx([0.5 * 1.0 * 4.0 + ball + kinematic])
+    assert samples.energy[0] == pytest.approx([0.5 * 1.0 * 4.0 + 0.5 * 8.0 * 0.25 + ball + kinematic])
     state.particle_q.assign(np.array([[0, 0, 0], [np.nan, 0, 0]], dtype=np.float32))
     assert not samples.add(state)
     assert len(samples.stretch) == 1
+
+
+def elements(device):
+    """In world 0 a spring, a triangle and a tetrahedron, in world 1 two triangles at an edge; all at rest."""
+    first, second = newton.ModelBuilder(), newton.ModelBuilder()
+    for x in [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)] * 2:
+        first.add_particle(wp.vec3(*x), wp.vec3(), 1.0)
+    first.add_spring(0, 1, 6.0, 0.0, 0.0)
+    first.add_triangle(0, 1, 2, tri_ke=3.0, tri_ka=5.0, tri_kd=0.0)
+    first.add_tetrahedron(4, 5, 6, 7, k_mu=3.0, k_lambda=5.0, k_damp=0.0)
+    for x in [(1, 0, 0), (-1, 0, 0), (0, -1, 0), (0, 1, 0)]:
+        second.add_particle(wp.vec3(*x), wp.vec3(), 1.0)
+    second.add_edge(0, 1, 2, 3, edge_ke=0.5, edge_kd=0.0)
+    scene = newton.ModelBuilder()
+    scene.add_world(first)
+    scene.add_world(second)
+    scene.color()
+    return scene.finalize(device=device)
+
+
+def test_the_elastic_energy_of_elements_by_hand(device):
+    """Twice as long along x: of mu, half of its 3 more, less its excess of 1; of lambda + mu, half of 1."""
+    model = elements(device)
+    energy, x = ElasticEnergy(model), model.particle_q.numpy()
+    assert energy.of(x) == pytest.approx([0.0, 0.0], abs=1e-12)
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    assert energy.of(x @ turn.T + (1.0, 2.0, 3.0)) == pytest.approx([0.0, 0.0], abs=1e-12)
+    density = 0.5 * 3.0 * 3.0 - 3.0 + 0.5 * 8.0
+    stretched = x.copy()
+    stretched[1, 0], stretched[5, 0] = 2.0, 2.0
+    assert energy.of(stretched) == pytest.approx([0.5 * 6.0 + density / 2.0 + density / 6.0, 0.0])
+    bent = x.copy()
+    bent[9] = (0.0, 0.0, 1.0)  # by a right angle, along an edge of length 2
+    assert energy.of(bent) == pytest.approx([0.0, 0.5 * 0.5 * 2.0 * (0.5 * np.pi) ** 2])
+
+
+def test_forces_are_minus_the_derivative_of_the_elastic_energy(device):
+    """The forces are those of gradients through VBD, which tests/implicit compares with VBD."""
+    model = elements(device)
+    energy, x = ElasticEnergy(model), model.particle_q.numpy().astype(np.float64)
+    x += np.random.default_rng(4).normal(0.0, 0.1, x.shape)
+    forces = wp.zeros(len(x), dtype=wp.vec3d, device=device)
+    at = wp.array(x, dtype=wp.vec3d, device=device)
+    for kind in _elastic_elements(model):
+        kind.load(at, at)
+        kind.add_forces(1.0, forces)
+    derivative = np.zeros_like(x)
+    for i in np.ndindex(x.shape):
+        step = np.zeros_like(x)
+        step[i] = 1e-6
+        derivative[i] = (energy.of(x + step).sum() - energy.of(x - step).sum()) / 2e-6
+    assert np.abs(derivative).max() > 1.0
+    np.testing.assert_allclose(forces.numpy(), -derivative, atol=1e-6)
+
+
+def test_no_energy_is_gained_in_flight_nor_by_a_swing(device):
+    """Two masses that swing about a centre in free fall, by the closed form of both motions."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -10.0))
+    for x in (0.0, 1.0):
+        builder.add_particle(wp.vec3(x, 0.0, 0.0), wp.vec3(), 0.5)
+    builder.add_spring(0, 1, 100.0, 0.0, 0.0)
+    model = builder.finalize(device=device)
+    state, samples, rate = model.state(), Samples(model), 20.0  # the square root of twice the stiffness by the mass
+    for time in np.linspace(0.0, 0.5, 21):
+        place, speed = 0.1 * np.sin(rate * time), 0.1 * rate * np.cos(rate * time)
+        height, fall = 3.0 * time - 5.0 * time**2, 3.0 - 10.0 * time
+        x, v = [[-place, 0, height], [1 + place, 0, height]], [[-speed, 0, fall], [speed, 0, fall]]
+        state.particle_q.assign(np.array(x, dtype=np.float32))
+        state.particle_qd.assign(np.array(v, dtype=np.float32))
+        assert samples.add(state)
+    energy = np.array(samples.energy)
+    assert energy == pytest.approx(2 * 0.5 * 0.5 * (9.0 + 4.0), rel=1e-5)
+    assert energy_gained(energy) < 1e-4
 
 
 def test_the_measures_of_a_run():

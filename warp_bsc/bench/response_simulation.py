@@ -14,6 +14,7 @@ from ..response.solver_ccd import SolverCCD
 from ..response.state.mesh import host_array
 from ..response.substeps.strain import edges_at_rest
 from .crossings import CrossingCounter
+from .elastic_energy import ElasticEnergy
 from .response_scenes import Scene
 
 __all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "total_energy"]
@@ -274,7 +275,7 @@ class Samples:
     Attributes:
         stretch: The largest elongation of an edge that can move, as a share of its length at rest.
         speed: The mean speed of movable particles [m/s].
-        energy: The kinetic and gravitational energy of each world [J].
+        energy: The kinetic, gravitational and elastic energy of each world [J], see :class:`.ElasticEnergy`.
         restarts: Indices of ``energy`` and worlds, where the energy of a world begins anew.
     """
 
@@ -297,6 +298,7 @@ class Samples:
         self._mass, self._moment, self._world = mass.astype(np.float64), moment, np.maximum(world, 0)
         gravity = host_array(model.gravity).reshape(-1, 3).astype(np.float64)
         self._gravity = gravity[self._world if len(gravity) > 1 else np.zeros_like(self._world)]
+        self._elastic = ElasticEnergy(model)
         self.stretch: list[float] = []
         self.speed: list[float] = []
         self.energy: list[np.ndarray] = []
@@ -319,13 +321,13 @@ class Samples:
 
     def _energy_of(self, state: newton.State) -> np.ndarray:
         x, v = host_array(state.particle_q), host_array(state.particle_qd)
-        turning = np.zeros(self._worlds)
+        others = self._elastic.of(x)
         if len(self._moment):
             velocity = host_array(state.body_qd).astype(np.float64)
             x, v = np.concatenate([x, host_array(state.body_q)[:, :3]]), np.concatenate([v, velocity[:, :3]])
             energies = 0.5 * self._moment * (velocity[:, 3:] ** 2).sum(axis=1)
-            turning = np.bincount(self._world[-len(energies) :], energies, minlength=self._worlds)
-        return total_energy(x, v, self._mass, self._gravity, self._world, self._worlds) + turning
+            others = others + np.bincount(self._world[-len(energies) :], energies, minlength=self._worlds)
+        return total_energy(x, v, self._mass, self._gravity, self._world, self._worlds) + others
 
 
 def _make_solver(scene: Scene, solver: str, *, has_self_contact: bool) -> Any:
