@@ -104,6 +104,15 @@ def test_reports(tmp_path, capsys):
     assert names["force"].shape == (3,) and "shape" in output
 
 
+@pytest.mark.filterwarnings("ignore:contacts strained", "ignore:in the state of the program")
+def test_robots(tmp_path, capsys):
+    """Only a stage in the coupled solver alone lets the arm into the cloth."""
+    names, output = run("newton/robots.md", tmp_path, capsys)
+    crossing, angles = np.array([line.split() for line in output.splitlines()], dtype=float).T
+    assert crossing.tolist() == [0, 0, 0, 0, 44] and angles.tolist() == [0.66, 0.93, 0.93, 0.93, 0.66]
+    assert names["stages"][0].report.totals.unseen_steps == 0
+
+
 def test_gradients(tmp_path, capsys):
     names, output = run("newton/gradients.md", tmp_path, capsys)
     assert names["solver"].report.totals.uncertified_steps == 0

@@ -107,6 +107,8 @@ def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass,
     model = ball_over_sheet(device, mass)
     solver, stage = with_proxy(model, iterations=iterations, mode=mode)
     rollout, report, passing = Rollout(model, solver), stage.report, []
+    unseen = with_proxy(model, iterations=iterations, mode=mode)[0]
+    expected, _ = fall(model, unseen, 40)  # a look changes nothing
     with pytest.warns(UserWarning, match=r"in the state of the program a step is not certified.* body 0 \('body_0'\)"):
         for i in range(40):
             crosses = rollout.find_crossings(rollout.vertices(rollout.states[0]))
@@ -120,6 +122,32 @@ def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass,
                 assert report.uncertified_bodies.tolist() == [0] * passing[-1]
                 assert (report.crossings > 0) == bool(crosses) and report.totals.unseen_steps == 0
     assert report.totals.uncertified_steps == sum(passing) and 0 < sum(passing) < 40
+    np.testing.assert_array_equal(rollout.states[0].body_q.numpy()[0], expected[-1])
+
+
+@pytest.mark.parametrize("mode", ["lagged", "staggered"])
+def test_a_stage_around_the_coupled_solver_keeps_the_state_of_the_program_free(mode, device, recwarn):
+    """Where the stage in the entry alone does not; the ball still feels the sheet."""
+    model = ball_over_sheet(device)
+    solver, entry = with_proxy(model, mode=mode)
+    rollout = Rollout(model, bsc.SolverCCD(solver))
+    for _ in range(40):
+        rollout.step()
+        assert rollout.solver.report.certified and not rollout.find_crossings(rollout.vertices(rollout.states[0]))
+    assert rollout.collisions == 0 and entry.report.totals.steps == 40
+    assert rollout.states[0].body_q.numpy()[0, 2] > 0.055 - 40 * DT + 0.02
+    assert not [warning for warning in recwarn if "in the state of the program" in str(warning.message)]
+
+
+def test_a_monitor_around_the_coupled_solver_counts_what_passes(device):
+    model = ball_over_sheet(device)
+    solver, _entry = with_proxy(model, mode="staggered")
+    rollout, uncertified = Rollout(model, bsc.CollisionMonitor(solver)), 0
+    for _ in range(40):
+        rollout.step()
+        assert rollout.solver.report.hits == len(rollout.new_collisions)
+        uncertified += bool(rollout.new_collisions)
+    assert rollout.solver.report.totals.uncertified_steps == uncertified > 0
 
 
 def test_worlds_and_resets_of_a_program_are_told_apart(device):

@@ -94,9 +94,8 @@ class StageTotals:
     """Totals of the reports of all stages of a run, see :class:`warp_bsc.SolverReport`.
 
     A stage behind an entry of a coupled solver takes a step for each substep of the entry and each pass of the coupler.
-    It certifies the motion in the view of its entry, which has the entry's own particles, proxies, the shapes that the
-    entry sees, and where they were at the start of the step, other entries' particles; crossings are counted in the
-    whole model.
+    It certifies the motion of what the entry sees in the state of the program; crossings are counted in the whole
+    model.
 
     Attributes:
         steps: Steps.

@@ -111,6 +111,13 @@ class SolverReport(ReportViews, WorldsOfReport):
         if known["ambiguous_moves"]:
             self._warn_once("moves", lambda: f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)")
 
+    def leave_state_to_other_stage(self) -> None:
+        """Makes the report warn of no step that is not certified in the state of the program alone.
+
+        A stage around the coupled solver says so of what it makes of that state.
+        """
+        self._said.add("revoked")
+
     def _warn_once(self, subject, message):
         if subject not in self._said:
             self._said.add(subject)

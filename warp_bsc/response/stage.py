@@ -3,9 +3,11 @@
 import contextlib
 import functools
 import time
+from typing import Any
 
 import newton
 import warp as wp
+from newton.solvers.experimental.coupled import SolverCoupled
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
@@ -14,6 +16,7 @@ from .._warnings import warn_caller
 from .adjoint.between_steps import BetweenSteps
 from .integration.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
 from .integration.coupling_interface import CouplingHooks
+from .integration.wrapped_solver import innermost
 from .report import SolverReport
 from .report_text import unseen_warning
 from .schedule import MAX_ITERATIONS, Loop
@@ -63,6 +66,11 @@ class CollisionStage(CouplingHooks):
             motion.remember(self._work.vertices.x1)
         self.report = SolverReport(self._work, responds=responds)
         self._watches_bodies = motion.moves_bodies and not model.requires_grad
+        coupled: Any = innermost(self.solver)
+        if isinstance(coupled, SolverCoupled):
+            for stage in map(coupled.solver, coupled.entry_names()):
+                if isinstance(stage, CollisionStage):
+                    stage.report.leave_state_to_other_stage()
 
     def _warn_of_unseen(self, mesh: ModelMesh, distances: KeptDistances):
         """Warns of springs and particles that take no part, unless the program chose that by a number."""
@@ -247,7 +255,7 @@ class CollisionStage(CouplingHooks):
 
         With ``SHAPE_PROPERTIES`` the stage follows poses, scales and friction of shapes, in each world. A shape that
         changes jumps, as in a reset: the next step begins with the new surface, and what is then inside it, or crosses
-        it, counts as that. What is not followed is warned of once, see :meth:`.state.mesh.ModelMesh.follow_shapes`.
+        it, counts as that. What is not followed is warned of once, see :class:`.state.mesh.ModelMesh`.
         """
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()

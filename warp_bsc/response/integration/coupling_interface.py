@@ -140,11 +140,14 @@ class CouplingHooks(WrappedSolver):
     def coupling_notify_input_state_update(self, state, flags, *, iteration_restart=False, dt=0.0) -> None:
         """Delegates to the inner solver, after a look at where the last step ended, if the coupler gives that.
 
-        In a step, proxies then start where the last step ended.
+        In a step, proxies then start where the last step ended. If it is but a look, for which a program has asked,
+        nothing is delegated: VBD would begin the next step anew.
         """
         options = {"iteration_restart": iteration_restart, "dt": dt}
         if self._coupled is not None and not iteration_restart:
             self._coupled.see(state, int(flags), dt)
+            if dt <= 0.0 and self._coupled.has_stepped:
+                return
         self._hook("coupling_notify_input_state_update")(state, flags, **options)  # which may move proxies
         if self._coupled is not None and int(flags) & (StateFlags.BODY_Q | StateFlags.PARTICLE_Q):
             self._coupled.update_input(**options)
@@ -178,6 +181,7 @@ class _Coupled:
         self._all_positions = sum(int(flag) for flag, count in kinds if count)
         self._last, self._first, self._start = model.state(), model.state(), model.state()
         self._continues = False
+        self.has_stepped = False  # since the last reset
         starts = motion.starts() if restarts else []
         self._starts = [(start, wp.clone(start)) for start in starts]
         self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
@@ -214,6 +218,7 @@ class _Coupled:
 
     def lose(self, world_mask):
         """Takes into account that worlds were reset, ``world_mask`` as of :meth:`.ModelMotion.interrupt`."""
+        self.has_stepped = False
         if self.check is not None:
             self.check.lose(world_mask)
 
@@ -235,6 +240,7 @@ class _Coupled:
 
     def finish(self, state, motion, vertices):
         """Keeps the positions at the end of a step, and adds the impulses of the response."""
+        self.has_stepped = True
         _copy_positions(self._last, state)
         outputs = [self.particle_impulses, self.body_impulses]
         inputs, size = [motion, vertices, self._model.particle_mass], max(map(len, outputs))

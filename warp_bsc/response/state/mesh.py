@@ -67,8 +67,13 @@ class ModelMesh(CollisionMesh):
     vertices in each. Infinite planes have no triangles and are listed separately.
 
     Later changes of the model do not change the mesh, except for positions and inverse masses, and poses and scales of
-    shapes, see :meth:`follow_shapes`. Shapes that do not collide with particles by their flags (``newton.ShapeFlags``)
-    are not part of it. Particles that are not active are, and are held where the program puts them.
+    shapes, which it follows when it is told to. It does not follow other changes of shapes that collide, or did: of
+    type, source, body, flags of collision, and margin if margins are used; the third scale of a barrel, a capsule that
+    becomes a sphere or was one, and a plane that becomes infinite or was so. What such a shape collides with is as it
+    was, but for its pose.
+
+    Shapes that do not collide with particles by their flags (``newton.ShapeFlags``) are not part of the mesh. Particles
+    that are not active are, and are held where the program puts them.
 
     Attributes:
         model: The model.
@@ -79,7 +84,7 @@ class ModelMesh(CollisionMesh):
         device_world: World of each vertex, Warp array of int, shape [vertex_count].
         device_shape_vertices: ``shape_vertices`` as Warp arrays.
         device_planes: ``planes`` as Warp arrays.
-        placed_shapes: Both for kernels, :class:`.state.shapes.PlacedShapes`.
+        placed_shapes: Both for kernels, ``state.shapes.PlacedShapes``.
         connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
         shape_filter: Groups and masks of the shapes on the device, for infinite planes; empty without a filter.
@@ -107,7 +112,7 @@ class ModelMesh(CollisionMesh):
             collision_filter: Groups and masks of particles and shapes; None to leave out no pairs.
             separates_bodies: Whether shapes of a model with bodies take part that collide with shapes, but not with
                 particles; a filter leaves out their pairs with particles.
-            uses_margins: Whether distances that pairs keep follow from margins of shapes, see :meth:`follow_shapes`.
+            uses_margins: Whether distances that pairs keep follow from margins of shapes.
 
         Raises:
             TypeError: If ``segments`` is no integer.
@@ -254,10 +259,6 @@ class ModelMesh(CollisionMesh):
 
     def follow_shapes(self, not_followed: wp.array[wp.int64]) -> None:
         """Moves vertices and planes to where poses and scales of shapes have them now. Can be captured in a CUDA graph.
-
-        Not followed are other changes of shapes that collide, or did: of type, source, body, flags of collision, and
-        margin if margins are used; the third scale of a barrel, a capsule that becomes a sphere or was one, and a plane
-        that becomes infinite or was so. What such a shape collides with is as it was, but for its pose.
 
         Args:
             not_followed: Written where something is not followed: the last such shape, counted from 1, shape [1].

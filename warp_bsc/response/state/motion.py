@@ -369,7 +369,7 @@ class ModelMotion:
         interrupt_worlds(self.vertices.interrupted, world_mask)
 
     def follow_shapes(self, vertices: Vertices, not_followed: wp.array[wp.int64]) -> None:
-        """Moves shapes to where the model has them now, as :meth:`.state.mesh.ModelMesh.follow_shapes`.
+        """Moves shapes to where the model has them now, as ``ModelMesh.follow_shapes``.
 
         The last step is made to have ended there, so that nothing sweeps the way.
 
