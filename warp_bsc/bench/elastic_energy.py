@@ -1,5 +1,7 @@
 """Elastic energy of cloth, soft bodies and springs: of what VBD has the forces, see :mod:`..implicit.energies`."""
 
+from typing import Any
+
 import newton
 import numpy as np
 
@@ -59,7 +61,8 @@ class ElasticEnergy:
         return total
 
 
-def _read(model, name):
+def _read(model: newton.Model, name: str) -> Any:
+    """Returns an array on the host, numbers in float64; None if there are no such elements."""
     array = getattr(model, name)
     if array is None or not len(array):
         return None
