@@ -156,7 +156,7 @@ def inversions_of_motion(
     (found,) = np.nonzero(inverts)
     times, are_within = toi.numpy()[found], within_tolerance.numpy()[found]
     if method == "exact" and not are_within.all():
-        status.assign(np.where(inverts & ~within_tolerance.numpy(), np.int8(UNSURE), np.int8(FREE)))
+        status.assign(np.where(inverts & ~within_tolerance.numpy(), UNSURE, FREE).astype(np.int8))
         at_start = _decided(mesh, x0, x0, status)[found] == HIT  # their time is 0, as no earlier one is
         left = ~are_within & ~at_start
         times[left] = checker.tetrahedron_toi(_points(mesh.tets[found[left]], x0, x1))[:, 0]
