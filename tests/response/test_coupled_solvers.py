@@ -150,6 +150,21 @@ def test_a_monitor_around_the_coupled_solver_counts_what_passes(device):
     assert rollout.solver.report.totals.uncertified_steps == uncertified > 0
 
 
+def test_shapes_that_change_in_a_coupled_model_are_followed(device):
+    """The step before is not seen any more: its end would be that of other shapes."""
+    model = ball_over_sheet(device)
+    solver, stage = with_proxy(model)
+    states = model.state(), model.state()
+    solver.step(*states, None, None, DT)
+    model.shape_scale.assign(np.float32([[0.03, 0.0, 0.0]]))
+    solver.notify_model_changed(newton.ModelFlags.SHAPE_PROPERTIES)
+    radii = np.linalg.norm(stage.mesh.device_shape_vertices.position.numpy(), axis=1)
+    np.testing.assert_allclose(radii, 0.03, rtol=1e-6)
+    solver.step(*states[::-1], None, None, DT)
+    solver.sync_entry_states(states[0])
+    assert stage.report.certified and stage.report.totals.unseen_steps == 1
+
+
 def test_worlds_and_resets_of_a_program_are_told_apart(device):
     """The ball of one world passes its sheet in the state of the program; a step that is reset is not seen."""
     world = ball_builder(0.2)
