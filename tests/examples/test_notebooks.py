@@ -28,6 +28,7 @@ sys.path.append({compilation.FOLDER!r})
 import compilation, warp
 warp.config.log_level = warp.LOG_WARNING
 warp.set_device({{device!r}})
+warp.config.cpu_compiler_flags = compilation.QUICK["cpu_compiler_flags"]
 compilation.compile_kernels_once()
 """
 """Runs before the first cell, so that notebooks take the kernels of the other tests."""
