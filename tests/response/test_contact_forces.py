@@ -74,6 +74,35 @@ def test_friction_on_a_ramp_is_mu_times_the_normal_force(device):
     assert abs(force[1]) < 0.01 * force[2]
 
 
+def test_pads_feel_the_weight_of_what_they_grip_and_its_velocity_is_its_motion(device):
+    """Of a triangle that two static pads hold by friction: they only keep their distance, and nothing else pushes."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    cloth = {"vertices": [wp.vec3(-0.05, 0.0, -0.03), wp.vec3(0.05, 0.0, -0.03), wp.vec3(0.0, 0.0, 0.06)], "scale": 1.0}
+    material = {"density": 1.0, "tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 0.0, "edge_ke": 0.0}
+    at = {"pos": wp.vec3(), "rot": wp.quat_identity(), "vel": wp.vec3()}
+    builder.add_cloth_mesh(indices=[0, 1, 2], **at, **cloth, **material)
+    for side in (-1.0, 1.0):
+        pad = wp.transform(wp.vec3(0.0, side * 0.00699, 0.0), wp.quat_identity())
+        cfg = newton.ModelBuilder.ShapeConfig(mu=1.0)
+        builder.add_shape_box(-1, xform=pad, hx=0.01, hy=0.005, hz=0.01, cfg=cfg)
+    builder.color()
+    model = builder.finalize(device=device)
+    options = {"report_contacts": True, "min_distance": 0.002, "substeps": None, "friction": 1.0}
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), **options)
+    mass, dt, (state, end), rows = model.particle_mass.numpy(), 1.0 / 240.0, (model.state() for _ in range(2)), []
+    for _ in range(80):
+        solver.step(state, end, None, None, dt)
+        state, end = end, state
+        force = solver.report.shape_impulse.numpy()[:, 2].sum() / dt
+        centre, velocity = (
+            x.numpy()[:, 2].astype(float) @ mass / mass.sum() for x in (state.particle_q, state.particle_qd)
+        )
+        rows.append((force, centre, velocity))
+    force, centre, velocity = np.array(rows[40:]).T
+    assert -force.mean() == pytest.approx(GRAVITY * mass.sum(), rel=0.01)
+    assert velocity.mean() == pytest.approx((centre[-1] - centre[0]) / (39 * dt), abs=1e-3)
+
+
 def test_the_impulse_of_a_bounce_is_the_change_of_momentum(device):
     """Of a rigid ball on the ground, which leaves with half of its speed."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))

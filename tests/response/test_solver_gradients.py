@@ -234,6 +234,51 @@ def test_gradient_of_a_step_is_that_of_central_differences(motion, friction, res
             np.testing.assert_allclose((gradients[which] * direction).sum(), expected, rtol=2e-3, atol=5e-3 * scale)
 
 
+def test_velocities_of_what_is_gripped_have_the_gradient_of_central_differences(device):
+    """Of a triangle between two fixed ones, nearer than it may be: pushes that move nothing allow the friction."""
+    start = [(-2, -1.5, -0.0092), (2.5, -1.4, -0.0093), (0.1, 2.8, -0.0094), (-1.9, 1.6, 0.0095), (2.2, 1.7, 0.0092)]
+    start += [(0.2, -2.6, 0.0093), (0.0, 0.0, 0.0003), (0.5, 0.06, 0.0), (0.1, 0.4, -0.0002)]
+    builder = newton.ModelBuilder()
+    at = {"pos": wp.vec3(), "rot": wp.quat_identity(), "vel": wp.vec3(), "scale": 1.0, "density": 1.0}
+    builder.add_cloth_mesh(vertices=[wp.vec3(*vertex) for vertex in start], indices=[*range(9)], **at)
+    builder.particle_mass[:6] = 6 * [0.0]
+    model = builder.finalize(device=device, requires_grad=True)
+    friction = wp.array([0.001], dtype=float, device=device, requires_grad=True)
+    solver = bsc.SolverCCD(Still(model), contact_layer=False, friction=friction, restitution=0.0, min_distance=0.01)
+    random, (state, end), dt = np.random.default_rng(5), (model.state() for _ in range(2)), 0.01
+    wanted, cotangent = state.particle_q.numpy().astype(float), np.zeros((9, 3))
+    wanted[6:] += [(0.01, 0.002, 1e-4), (0.012, 0.004, -1e-4), (0.009, 0.003, 2e-4)]
+    velocity = (wanted - state.particle_q.numpy()) / dt
+    cotangent[6:] = random.normal(size=(3, 3))
+
+    def step(coefficient, change=0.0):
+        friction.assign(np.float32([coefficient]))
+        end.particle_q.assign(wanted.astype(np.float32))
+        end.particle_qd.assign((velocity + change).astype(np.float32))
+        solver.step(state, end, None, None, dt)
+        return (end.particle_qd.numpy()[6:] * cotangent[6:]).sum(), end.particle_qd.numpy()[6:]
+
+    _, held = step(0.001)
+    assert np.abs(held).max() < 0.2 and np.abs(velocity[6:]).max() > 1.0  # it does not move
+    with wp.Tape() as tape:
+        step(0.001)
+    friction.grad.zero_()
+    end.particle_qd.grad.assign(cotangent.astype(np.float32))
+    tape.backward()
+    direction = np.zeros((9, 3))
+    direction[6:] = random.normal(size=(3, 3))
+    for found, unit, along in (
+        (friction.grad.numpy()[0], 1.0, 0.0),
+        ((end.particle_qd.grad.numpy() * direction).sum(), 0.0, direction),
+    ):
+        central = []  # results jump where the active set changes: by the best of several lengths
+        for exponent in range(8, 13):
+            h = 2.0**-exponent * (0.001 if unit else 1.0)
+            ends = [step(0.001 + sign * h * unit, sign * h * along)[0] for sign in (1.0, -1.0)]
+            central.append((ends[0] - ends[1]) / (2.0 * h))
+        assert np.abs(found / np.array(central) - 1.0).min() < 2e-3, central
+
+
 def test_grazing_contacts_are_flagged_and_gradients_finite(device):
     """A triangle glides over another at a slope of a thousandth of a degree."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))

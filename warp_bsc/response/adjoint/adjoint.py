@@ -41,9 +41,10 @@ class RecordedStep:
         motion, constraints, record = work.motion, work.constraints, work.record
         self.mesh, self.friction, self.moves_bodies = motion.mesh, motion.friction, motion.moves_bodies
         self.restored = restored = RestoredStep()
-        restored.status, restored.dt, restored.step = copied(work.status, ["loop", "results"]), dt, work.step
+        restored.status, restored.step = copied(work.status, ["loop", "results"]), work.step
         restored.planes = copied(motion.planes, ("start", "end", "friction"))
         step = restored.step
+        step.dt = dt
         step.motion = copied(motion.vertices, ("x0", "x1", "velocity", "is_not_finite", "friction"))
         step.motion.materials = copied_materials(motion.vertices.materials)
         names = "x1", "velocity", "particle_delta_x", "particle_delta_v", "outcome"
@@ -170,7 +171,7 @@ class StepAdjoint:
         self._through_centres(step.motion.bodies.end)
         self._through_poses()
         shapes, planes = mesh.device_shape_vertices, mesh.device_planes
-        inputs = [step.motion, shapes.body, shapes.position, mesh.model.particle_count, self._restored.dt]
+        inputs = [step.motion, shapes.body, shapes.position, mesh.model.particle_count, step.dt]
         self._launch_adjoint(pose_kernels.place_shape_vertices, len(shapes.body), inputs)
         inputs = [step.motion, planes.point, planes.normal, planes.body, self._restored.planes]
         self._launch_adjoint(pose_kernels.place_planes, len(planes.body), inputs)

@@ -95,7 +95,7 @@ def initialize_multipliers(restored: RestoredStep, swept: Projection):
     i = wp.tid()
     step = restored.step
     if i < step.constraints.count[0] and has_pushed(step, i):
-        first = initial_velocity_multiplier(step, i, restored.dt)
+        first = initial_velocity_multiplier(step, i)
         swept.multiplier_change[i] = first
         swept.previous_change[i] = first
         _add_change(step, i, first, swept)
@@ -277,7 +277,7 @@ def truncate_paths(restored: RestoredStep, times: wp.array[wp.float64], paths: P
         x0 = to_double(motion.x0[vertex])
         path = truncated_path(x0, to_double(vertices.x1[vertex]), times[entry])
         paths.end[entry] = to_single(x0 + path)
-        paths.velocity[entry] = to_single(path / restored.dt)
+        paths.velocity[entry] = to_single(path / restored.step.dt)
     elif body >= 0:
         start = motion.bodies.start[body]
         if record.kind[entry] == NO_CONTACT:
@@ -287,7 +287,7 @@ def truncate_paths(restored: RestoredStep, times: wp.array[wp.float64], paths: P
             share = SHARE_OF_PATH * times[entry]
             end = pose_between(motion.bodies, body, start, vertices.bodies.pose[body], share)
             paths.pose[entry] = end
-            paths.twist[entry] = velocity_between(motion.bodies, body, start, end, restored.dt)
+            paths.twist[entry] = velocity_between(motion.bodies, body, start, end, restored.step.dt)
 
 
 @wp.func

@@ -33,7 +33,6 @@ class RestoredStep:
     status: SolveStatus
     record: StepRecord
     cursor: Cursor
-    dt: wp.float64  # length of the step [s]
 
 
 @wp.struct

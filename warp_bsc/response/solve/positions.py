@@ -70,7 +70,7 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
             friction = wp.float64(constraints.friction[i])
             path = sweeps.path_of(step, i)
             active = distance > tolerance or not sweeps.is_held_by_friction(
-                multiplier, normal, path, friction, tolerance
+                multiplier, normal, path, friction, ZERO, tolerance
             )
     if active:
         sweeps.activate(step, i)

@@ -8,7 +8,7 @@ et al. 2015) carries it through a stack in few sweeps.
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot
-from ..contacts.constraints import gap, moves_body
+from ..contacts.constraints import TOUCH, gap, moves_body
 from ..schedule import MAX_SWEEPS, Loop, SolveStatus
 from ..state.fixed_sum import add_to_sum
 from ..state.record import StepRecord, end_sweep, is_recording, record_entry
@@ -46,10 +46,11 @@ def _multiplier_after(
     inverse_mass_along: wp.float64,
     inverse_mass_across: wp.float64,
     friction: wp.float64,
+    least: wp.float64,
 ) -> wp.vec3d:
     """Returns a multiplier after a step towards no excess along the normal and no motion across it.
 
-    Along the normal it only pushes; across, it is limited by friction (Coulomb).
+    Along the normal it only pushes; across, it is limited by friction (Coulomb) of that, or of a ``least`` push.
     """
     mass = ONE / inverse_mass_along  # few divisions: they take most of the time of a sweep
     mass_across = mass
@@ -59,7 +60,7 @@ def _multiplier_after(
     along = wp.max(before - mass * excess, ZERO)
     across = multiplier - mass_across * motion
     across -= wp.dot(across, normal) * normal
-    limit = friction * along
+    limit = friction * wp.max(along, least)
     square = wp.length_sq(across)
     if square > limit * limit:
         across *= limit / wp.sqrt(square)
@@ -86,7 +87,7 @@ def position_multiplier_after(step: Step, i: int, pushes_only: bool) -> wp.vec3d
     if pushes_only and excess >= ZERO:
         return old
     friction = wp.float64(step.constraints.friction[i])
-    return _multiplier_after(old, step.constraints.normal[i], excess, path_of(step, i), along, across, friction)
+    return _multiplier_after(old, step.constraints.normal[i], excess, path_of(step, i), along, across, friction, ZERO)
 
 
 @wp.func
@@ -110,22 +111,46 @@ def velocity_multiplier_after(step: Step, i: int) -> wp.vec3d:
     velocity = relative(step.constraints.weights[i], step.constraints.vertices[i], step.vertices.velocity)
     friction = wp.float64(step.constraints.friction[i])
     excess = excess_speed(step, i)
-    return _multiplier_after(old, step.constraints.normal[i], excess, velocity, along, across, friction)
+    least = resisted_push(step, i)
+    return _multiplier_after(old, step.constraints.normal[i], excess, velocity, along, across, friction, least)
 
 
 @wp.func
-def initial_velocity_multiplier(step: Step, i: int, dt: wp.float64) -> wp.vec3d:
+def resisted_push(step: Step, i: int) -> wp.float64:
+    """Returns the impulse along the normal of a push in positions that something resists, as in a grip [kg m/s].
+
+    It changes no velocity along the normal, but allows friction as it does in positions, so that what is gripped has
+    no velocity either. A push that has made half of the way to the separation is not resisted.
+    """
+    constraints = step.constraints
+    normal = constraints.normal[i]
+    push = wp.dot(constraints.position_multiplier[i], normal)
+    left = -gap(step, i)
+    if push <= wp.float64(2.0) * TOUCH or left <= ZERO:
+        return ZERO
+    predicted = wp.dot(normal, relative(constraints.weights[i], constraints.vertices[i], step.motion.x1))
+    share = left / wp.max(constraints.separation[i] - predicted, left)
+    return push * wp.max(wp.float64(2.0) * share - ONE, ZERO) / step.dt
+
+
+@wp.func
+def initial_velocity_multiplier(step: Step, i: int) -> wp.vec3d:
     """Returns the impulse that goes with the position multiplier, without the part that made the separation."""
-    return step.constraints.position_multiplier[i] * (step.constraints.approach[i] / dt)
+    return step.constraints.position_multiplier[i] * (step.constraints.approach[i] / step.dt)
 
 
 @wp.func
 def is_held_by_friction(
-    multiplier: wp.vec3d, normal: wp.vec3d, motion: wp.vec3d, friction: wp.float64, tolerance: wp.float64
+    multiplier: wp.vec3d,
+    normal: wp.vec3d,
+    motion: wp.vec3d,
+    friction: wp.float64,
+    least: wp.float64,
+    tolerance: wp.float64,
 ) -> bool:
     """Returns whether friction is solved: there is no motion across the normal, or the contact slides."""
     along = wp.dot(multiplier, normal)
-    if wp.length(multiplier - along * normal) >= SLIDING * friction * along:
+    if wp.length(multiplier - along * normal) >= SLIDING * friction * wp.max(along, least):
         return True
     return wp.length(motion - wp.dot(motion, normal) * normal) <= CREEP * tolerance
 

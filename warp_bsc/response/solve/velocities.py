@@ -1,5 +1,7 @@
 """Projection of velocities: sweeps over the constraints that pushed, then the turns that restore angular momentum."""
 
+import functools
+
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
@@ -28,14 +30,14 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _initialize_multiplier(step: Step, dt: wp.float64, i: int):
+def _initialize_multiplier(step: Step, i: int):
     """Initializes the velocity multiplier of a constraint, if it pushed, as if the contact had acted at its time.
 
     This conserves angular momentum, because the two sides of a contact meet in one point at that time only.
     """
     vertices, constraints = step.vertices, step.constraints
     if has_pushed(step, i):
-        impulse = sweeps.initial_velocity_multiplier(step, i, dt)
+        impulse = sweeps.initial_velocity_multiplier(step, i)
         constraints.velocity_multiplier[i] = impulse
         for j in range(4):
             vertices.active[constraints.vertices[i][j]] = 1
@@ -47,37 +49,39 @@ def _initialize_multiplier(step: Step, dt: wp.float64, i: int):
 
 
 @wp.kernel
-def initialize_velocity_multipliers(step: Step, dt: wp.float64, threads: int):
+def initialize_velocity_multipliers(step: Step, threads: int):
     """Initializes the velocity multipliers of all constraints."""
     for i in range(wp.tid(), constraint_count(step), threads):
-        _initialize_multiplier(step, dt, i)
+        _initialize_multiplier(step, i)
 
 
 @wp.func
-def _activate_constraint(step: Step, tolerance: wp.float64, dt: wp.float64, i: int):
+def _activate_constraint(step: Step, tolerance: wp.float64, i: int):
     """Adds a constraint to the active set, if it pushed, and its contact points are still near each other."""
     constraints = step.constraints
     multiplier = constraints.velocity_multiplier[i]
-    if wp.length_sq(multiplier) == ZERO:
+    acts = wp.length_sq(multiplier) > ZERO
+    if not acts:
         if not has_pushed(step, i) or gap(step, i) > constraints.separation[i] - min_distance_of(step, i):
             return
-    tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / dt
+    tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / step.dt
     excess = sweeps.excess_speed(step, i)
     active = excess < -tolerance
-    if not active and wp.length_sq(multiplier) > ZERO:
+    least = sweeps.resisted_push(step, i)
+    if not active and (acts or least > ZERO):
         velocity = relative(constraints.weights[i], constraints.vertices[i], step.vertices.velocity)
         friction = wp.float64(constraints.friction[i])
-        held = sweeps.is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, tolerance)
-        active = excess > tolerance or not held
+        held = sweeps.is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, least, tolerance)
+        active = (acts and excess > tolerance) or not held
     if active:
         sweeps.activate(step, i)
 
 
 @wp.kernel
-def activate_velocity_constraints(step: Step, tolerance: wp.float64, dt: wp.float64, threads: int):
+def activate_velocity_constraints(step: Step, tolerance: wp.float64, threads: int):
     """Fills the active set for velocities."""
     for i in range(wp.tid(), constraint_count(step), threads):
-        _activate_constraint(step, tolerance, dt, i)
+        _activate_constraint(step, tolerance, i)
 
 
 @wp.func
@@ -130,7 +134,6 @@ def _sweep(
     record: StepRecord,
     particle_count: int,
     tolerance: wp.float64,
-    dt: wp.float64,
     sweeps_per_batch: int,
     sums: wp.array2d[wp.int64],
     threads: int,
@@ -142,7 +145,7 @@ def _sweep(
             sums[world, column] = wp.int64(0)
     count = constraint_count(step)
     for i in range(thread, count, threads):
-        _initialize_multiplier(step, dt, i)
+        _initialize_multiplier(step, i)
     wait_for_others()
     for vertex in range(thread, particle_count, threads):
         _update_vertex(step, status, record, True, vertex)
@@ -153,7 +156,7 @@ def _sweep(
     more = status.loop[Loop.MORE_SWEEPS]
     while more == 1:
         for i in range(thread, count, threads):
-            _activate_constraint(step, tolerance, dt, i)
+            _activate_constraint(step, tolerance, i)
         wait_for_others()
         active_count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
@@ -178,18 +181,16 @@ def project(work: Workspace, dt: float) -> None:
     Then restores angular momentum: turns all that collided in each world where nothing is held, which removes the
     torque that contacts added.
     """
+    work.step.dt = dt
     if work.sweeping_threads:
-        work.sweep_at_once(_sweep, [work.tolerance, dt, int(SWEEPS_PER_BATCH), work.moments])
+        work.sweep_at_once(_sweep, [work.tolerance, int(SWEEPS_PER_BATCH), work.moments])
         return
     work.launch_over_bodies(move_to_end)
-    work.launch_over_constraints(initialize_velocity_multipliers, dt)
+    work.launch_over_constraints(initialize_velocity_multipliers)
     _update(work, last=True)
-    work.repeat_sweeps(lambda: _activate(work, dt), project_velocities, _update)
+    activate = functools.partial(work.launch_over_constraints, activate_velocity_constraints, work.tolerance)
+    work.repeat_sweeps(activate, project_velocities, _update)
     _restore_angular_momentum(work)
-
-
-def _activate(work, dt):
-    work.launch_over_constraints(activate_velocity_constraints, work.tolerance, dt)
 
 
 def _update(work, last):

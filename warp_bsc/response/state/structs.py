@@ -183,6 +183,7 @@ class Step:
     constraints: Constraints
     separation: wp.float64  # distance that projection moves contacts apart [m]
     restitution: wp.array[float]  # share of the approaching velocity that comes back, one number
+    dt: wp.float64  # length of the step whose velocities are projected [s]
 
 
 @wp.func
