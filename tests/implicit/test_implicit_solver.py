@@ -246,7 +246,9 @@ def test_polish_is_not_advised_to_a_program_that_passes_it(device):
     model = hanging_cloth(device, n=4)
     model.particle_q.assign((model.particle_q.numpy() * (0.7, 0.7, 1.0)).astype(np.float32))  # compressed
     with pytest.warns(UserWarning, match="of the weight") as said:
-        gradient = Rollout(model, steps=1, iterations=1, polish=3).backward()[0].particle_qd.grad.numpy()
+        rollout = Rollout(model, steps=1, iterations=1, polish=3)
+        gradient = rollout.backward()[0].particle_qd.grad.numpy()
+        assert rollout.adjoint.report.rejected_solves == 1
     assert np.isnan(gradient[model.particle_inv_mass.numpy() > 0.0]).all()
     words = [str(warning.message) for warning in said]
     assert not any("polish" in word for word in words) and any("substeps=4" in word for word in words)

@@ -94,10 +94,8 @@ def test_pads_feel_the_weight_of_what_they_grip_and_its_velocity_is_its_motion(d
         solver.step(state, end, None, None, dt)
         state, end = end, state
         force = solver.report.shape_impulse.numpy()[:, 2].sum() / dt
-        centre, velocity = (
-            x.numpy()[:, 2].astype(float) @ mass / mass.sum() for x in (state.particle_q, state.particle_qd)
-        )
-        rows.append((force, centre, velocity))
+        means = [x.numpy()[:, 2].astype(float) @ mass / mass.sum() for x in (state.particle_q, state.particle_qd)]
+        rows.append((force, *means))
     force, centre, velocity = np.array(rows[40:]).T
     assert -force.mean() == pytest.approx(GRAVITY * mass.sum(), rel=0.01)
     assert velocity.mean() == pytest.approx((centre[-1] - centre[0]) / (39 * dt), abs=1e-3)

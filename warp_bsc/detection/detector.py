@@ -178,10 +178,11 @@ class CollisionDetector:
     def collision_free_step(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> FreeStep:
         """Returns how far a motion goes before its first collision, and the positions there.
 
-        This takes less time than to detect all collisions of a motion that has an early one: those of a few vertices
-        bound the earliest time, pairs are sought up to there, and tested on motions that are shortened until one is
-        free. So positions at its end are certified as they are rounded: go on from ``FreeStep.x``. The step ends before
-        the earliest time of impact by about the tolerance of the detector, or by more where rounded positions collide.
+        On a CPU this takes less time than to detect all collisions of a motion that has an early one: those of a few
+        vertices bound the earliest time, pairs are sought up to there, and tested on motions that are shortened until
+        one is free. On a GPU, where all are soon detected, its several detections take more. Positions at its end are
+        certified as they are rounded: go on from ``FreeStep.x``. The step ends before the earliest time of impact by
+        about the tolerance of the detector, or by more where rounded positions collide.
 
         Args:
             x0: Positions at the start, as of :meth:`detect`.
