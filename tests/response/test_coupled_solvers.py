@@ -122,6 +122,7 @@ def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass,
                 assert report.uncertified_bodies.tolist() == [0] * passing[-1]
                 assert (report.crossings > 0) == bool(crosses) and report.totals.unseen_steps == 0
     assert report.totals.uncertified_steps == sum(passing) and 0 < sum(passing) < 40
+    assert report.penetrated and report.totals.penetrated_steps == sum(passing)
     np.testing.assert_array_equal(rollout.states[0].body_q.numpy()[0], expected[-1])
 
 

@@ -56,7 +56,7 @@ def _part(surface: Surface, x: np.ndarray, faces: np.ndarray) -> wp.Mesh:
     """Returns some faces as a mesh that Warp can search.
 
     Raises:
-        ValueError: If there are none: a mesh of no faces corrupts the memory of a GPU (Warp 1.19, its issue 1765).
+        ValueError: If there are none: a mesh of no faces corrupts the memory of a GPU in Warp 1.19.
     """
     if not len(faces):
         raise ValueError("faces must not be empty")

@@ -16,7 +16,6 @@ from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .step import inspect
-from .write_back import finish_inspection
 
 
 class CollisionMonitor(CollisionStage):
@@ -85,10 +84,7 @@ class CollisionMonitor(CollisionStage):
         with self._timed():
             self._motion.set_end(end, dt)
             with self._masked(mask):
-                work = self._work
-                inspect(work)
-                inputs = [work.vertices.outcome, self.model.particle_count]
-                work.launch(finish_inspection, self.mesh.vertex_count, inputs, [work.status])
+                inspect(self._work)
                 if self._counter is not None:
                     self._counter.count()
                 self._count_step()

@@ -52,7 +52,7 @@ class Totals:
         inverting_steps: Steps in which :attr:`.report.SolverReport.inversions` was more than 0; 0 if the stage was not
             asked to count them.
         penetrated_steps: Steps of which ``passed`` or ``crossed`` of :attr:`.report.SolverReport.penetrated` was more
-            than 0.
+            than 0, and those in ``revoked_steps``.
         set_bodies: Dynamic bodies, each once, whose pose a program wrote between steps time after time: the stage does
             not see the way of such a body between two steps.
         unseen_steps: Steps behind a coupled solver whose end in the state of the program has not been seen: the last
@@ -90,7 +90,7 @@ class Penetrated:
             step before. A step that was not certified made them, or a program or another solver wrote them in between.
             0 in a first step, and in the first one of worlds after ``reset``.
         inside: Particles inside solids at the end of the last step, see :attr:`.report.SolverReport.inside`.
-        steps: Steps so far in which either of the first two was more than 0, ``totals.penetrated_steps``.
+        steps: Steps so far in which something passed, ``totals.penetrated_steps``.
     """
 
     passed: int

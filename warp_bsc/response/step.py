@@ -18,6 +18,7 @@ from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
 from .state.workspace import Workspace
+from .write_back import finish_inspection
 
 
 def resolve(work: Workspace, dt: float, recorder: StepRecorder | None = None) -> None:
@@ -127,6 +128,8 @@ def inspect(work: Workspace) -> None:
     """Detects the contacts of the motion, and leaves it as it is; ``remaining`` of the status counts them."""
     begin(work)
     detect.detect(work)
+    inputs = [work.vertices.outcome, work.particle_count]
+    work.launch(finish_inspection, len(work.vertices.outcome), inputs, [work.status])
 
 
 def begin(work: Workspace, recorder: StepRecorder | None = None) -> None:

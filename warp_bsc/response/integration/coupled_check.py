@@ -12,14 +12,13 @@ import warp as wp
 from newton import BodyFlags, Model, ParticleFlags, ShapeFlags
 
 from ...detection.intersections import find_intersections
-from ..contacts import detect
 from ..report_totals import StepTotals
 from ..schedule import Loop, Result, SolveStatus
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, StateArrays, arrays_of, interrupt_worlds
 from ..state.structs import add_zeros
 from ..state.workspace import Workspace
-from ..write_back import finish_inspection
+from ..step import inspect
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,6 +139,8 @@ def _conclude(
         if not is_free:
             totals.uncertified_steps[0] += wp.int64(step.certified[0])
             totals.revoked_steps[0] += wp.int64(step.certified[0])
+            if status.results[Result.NEW_CROSSINGS] == 0:  # a step that has some is counted
+                totals.penetrated_steps[0] += wp.int64(step.certified[0])
         elif not is_lost:
             status.results[Result.CERTIFIED] = step.certified[0]
         step.awaits[0] = 0
@@ -221,15 +222,9 @@ class CoupledCheck:
 
     def _inspect(self):
         """Detects the motion from the start to the end, and counts what crosses at the start."""
-        work = self._work
         self._motion.set_end(arrays_of(self._end), 1.0)
-        work.loop[Loop.RECOUNT].fill_(1)
-        work.begin(None)
-        detect.detect_crossings(work)
-        detect.detect(work)
-        work.launch(
-            finish_inspection, self.mesh.vertex_count, [work.vertices.outcome, work.particle_count], [work.status]
-        )
+        self._work.loop[Loop.RECOUNT].fill_(1)
+        inspect(self._work)
 
     def find_bodies(self) -> np.ndarray:
         """Returns the bodies of other entries that the certificate of the last step lacks, sorted, int32, shape [n].

@@ -10,9 +10,6 @@ from newton import GeoType
 
 wp.set_module_options({"enable_backward": False})
 
-_BARREL = wp.constant(int(GeoType.CYLINDER))
-"""The type of a barrel, a cylinder with a third scale, whose vertices are stored for its own scale."""
-
 
 @wp.struct
 class Shapes:
@@ -72,7 +69,7 @@ def _takes_scale(kind: int, before: wp.vec3, now: wp.vec3) -> bool:
     """Returns whether the triangles of a shape can take another scale; others would need other triangles."""
     if before == now:
         return True
-    if kind == _BARREL:
+    if kind == int(GeoType.CYLINDER):  # a third scale makes it a barrel, whose vertices are stored for its own scale
         return before[2] <= 0.0 and now[2] <= 0.0
     if kind == int(GeoType.CAPSULE):
         return (before[1] > 0.0) == (now[1] > 0.0)
@@ -95,7 +92,7 @@ def _local_position(kind: int, unit: wp.vec4d, scale: wp.vec3) -> wp.vec3d:
     """
     x, y, z = wp.float64(scale[0]), wp.float64(scale[1]), wp.float64(scale[2])
     u, v, w = unit[0], unit[1], unit[2]
-    if kind == _BARREL and scale[2] > 0.0:
+    if kind == int(GeoType.CYLINDER) and scale[2] > 0.0:
         return wp.vec3d(u, v, w)
     if kind == int(GeoType.SPHERE):
         return wp.vec3d(u * x, v * x, w * x)
