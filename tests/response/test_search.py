@@ -12,11 +12,11 @@ from sheets import crumpled
 import warp_bsc as bsc
 from warp_bsc.detection import pipeline
 from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.response.contacts.detect import inspect
 from warp_bsc.response.contacts.proximities import add_proximities
 from warp_bsc.response.schedule import Result
 from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import NEVER
-from warp_bsc.response.step import inspect
 
 CAPACITY = 4
 

@@ -9,13 +9,13 @@ from newton.solvers import SolverBase
 from .._arguments import checked_flag
 from .._one_thread import one_at_a_time
 from ..detection.host_function import run_on_host
+from .contacts.detect import inspect
 from .options import default_separation, friction_of
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter, checked_filter
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
-from .step import inspect
 
 
 class CollisionMonitor(CollisionStage):

@@ -18,7 +18,6 @@ from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
 from .state.workspace import Workspace
-from .write_back import finish_inspection
 
 
 def resolve(work: Workspace, dt: float, recorder: StepRecorder | None = None) -> None:
@@ -122,14 +121,6 @@ def prepare(work: Workspace) -> None:
     for values in (work.status.loop, work.status.detection, work.status.results):
         values.zero_()
     work.vertices.outcome.zero_()
-
-
-def inspect(work: Workspace) -> None:
-    """Detects the contacts of the motion, and leaves it as it is; ``remaining`` of the status counts them."""
-    begin(work)
-    detect.detect(work)
-    inputs = [work.vertices.outcome, work.particle_count]
-    work.launch(finish_inspection, len(work.vertices.outcome), inputs, [work.status])
 
 
 def begin(work: Workspace, recorder: StepRecorder | None = None) -> None:

@@ -6,10 +6,23 @@ from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.launch import retry_until_fits
 from ..schedule import Loop, Result, decide, decide_worlds
 from ..state.workspace import Workspace
+from ..write_back import finish_inspection
 from .collect import collect_contacts, collect_penetrations, count_crossings, count_new_crossings, drop_if_full
 from .impacts import count_grazing
 from .queue import queues_of
 from .search import find_contacts_without_queues
+
+
+def inspect(work: Workspace) -> None:
+    """Detects the contacts of a motion without movable bodies, and leaves it as it is.
+
+    ``remaining`` of the status counts them.
+    """
+    work.begin(None)
+    detect_crossings(work)
+    detect(work)
+    inputs = [work.vertices.outcome, work.particle_count]
+    work.launch(finish_inspection, len(work.vertices.outcome), inputs, [work.status])
 
 
 def detect_crossings(work: Workspace) -> None:

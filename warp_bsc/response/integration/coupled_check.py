@@ -12,13 +12,13 @@ import warp as wp
 from newton import BodyFlags, Model, ParticleFlags, ShapeFlags
 
 from ...detection.intersections import find_intersections
+from ..contacts.detect import inspect
 from ..report_totals import StepTotals
 from ..schedule import Loop, Result, SolveStatus
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, StateArrays, arrays_of, interrupt_worlds
 from ..state.structs import add_zeros
 from ..state.workspace import Workspace
-from ..step import inspect
 
 wp.set_module_options({"enable_backward": False})
 
