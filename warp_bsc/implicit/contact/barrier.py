@@ -1,0 +1,131 @@
+"""The barrier between elements that are near each other, and friction, by their closest points.
+
+The energy of a gap g below a reach D is -k (g - D)^2 ln(g / D): infinite where elements touch, and smooth at D. Within
+a Newton step the closest points are fixed. Friction is Coulomb's, smoothed below a velocity, under the load of the
+Newton step.
+
+References:
+    M. Li, Z. Ferguson, T. Schneider, T. Langlois, D. Zorin, D. Panozzo, C. Jiang and D. M. Kaufman, Incremental
+    Potential Contact, ACM Transactions on Graphics 39(4), 2020, doi:10.1145/3386569.3392425.
+    M. Li, D. M. Kaufman and C. Jiang, Codimensional Incremental Potential Contact, ACM Transactions on Graphics 40(4),
+    2021, doi:10.1145/3450626.3459767 (additive continuous collision detection).
+"""
+
+import warp as wp
+
+from ...kernels.distance import closest_points
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...response.state.vectors import HALF, ONE, ZERO
+
+wp.set_module_options({"enable_backward": False})
+
+_TWO = wp.constant(wp.float64(2.0))
+_THREE = wp.constant(wp.float64(3.0))
+_FOUR = wp.constant(wp.float64(4.0))
+CURVATURE_AT_HALF = 6.386294361119891
+"""Curvature of the barrier at half of its reach, in its stiffness."""
+KEPT_GAP = wp.constant(wp.float64(0.1))
+"""Share of its gap that a pair keeps in a Newton step."""
+_NEXT = wp.constant(wp.float64(0.9))
+"""Share of a safe time by which the search for an impact goes on."""
+_SEARCHES = wp.constant(48)
+"""Most steps of that search; it ends early, and safe, after them."""
+
+
+@wp.func
+def barrier_energy(gap: wp.float64, reach: wp.float64) -> wp.float64:
+    """Returns the energy of a gap, more than 0, for a stiffness of 1."""
+    if gap >= reach:
+        return ZERO
+    short = gap - reach
+    return -short * short * wp.log(gap / reach)
+
+
+@wp.func
+def barrier_slope(gap: wp.float64, reach: wp.float64) -> wp.float64:
+    """Returns the derivative of :func:`barrier_energy` by the gap."""
+    short = gap - reach
+    return -_TWO * short * wp.log(gap / reach) - short * short / gap
+
+
+@wp.func
+def barrier_curvature(gap: wp.float64, reach: wp.float64) -> wp.float64:
+    """Returns the second derivative of :func:`barrier_energy` by the gap."""
+    short = (gap - reach) / gap
+    return -_TWO * wp.log(gap / reach) - _FOUR * short + short * short
+
+
+@wp.func
+def friction_energy(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
+    """Returns the work of smoothed friction over a slid length, under a limit of 1."""
+    if slid >= smoothing:
+        return slid
+    return slid * slid / smoothing * (ONE - slid / (_THREE * smoothing)) + smoothing / _THREE
+
+
+@wp.func
+def friction_slope(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
+    """Returns the derivative of :func:`friction_energy` over the slid length."""
+    if slid >= smoothing:
+        return ONE / slid
+    return (_TWO - slid / smoothing) / smoothing
+
+
+@wp.func
+def friction_curvature(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
+    """Returns the second derivative of :func:`friction_energy`."""
+    if slid >= smoothing:
+        return ZERO
+    return (_TWO - _TWO * slid / smoothing) / smoothing
+
+
+@wp.func
+def closest_weights_and_gap(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Returns the weights of four points in the vector between the closest points of two elements, and its length."""
+    if kind == EDGE_EDGE:
+        at, distance, _error = closest_points(EDGE_EDGE, b - a, d - c, c - a)
+        return wp.vec4d(ONE - at[0], at[0], at[1] - ONE, -at[1]), distance
+    at, distance, _error = closest_points(VERTEX_FACE, c - b, d - b, a - b)
+    return wp.vec4d(ONE, at[0] + at[1] - ONE, -at[0], -at[1]), distance
+
+
+@wp.func
+def safe_share(
+    kind: int,
+    # points
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    d: wp.vec3d,
+    # their displacements
+    p: wp.vec3d,
+    q: wp.vec3d,
+    r: wp.vec3d,
+    s: wp.vec3d,
+    distance: wp.float64,
+    kept: wp.float64,
+) -> wp.float64:
+    """Returns a share of the displacements up to which two elements keep a tenth of their gap, 1 for all of them.
+
+    Additive continuous collision detection (Li et al. 2021), a lower bound; ``distance`` is that of the elements, and
+    ``kept`` what is subtracted from it to get their gap.
+    """
+    mean = wp.float64(0.25) * (p + q + r + s)
+    one, two, three, four = wp.length(p - mean), wp.length(q - mean), wp.length(r - mean), wp.length(s - mean)
+    way = one + wp.max(two, wp.max(three, four))
+    if kind == EDGE_EDGE:
+        way = wp.max(one, two) + wp.max(three, four)
+    gap = distance - kept
+    if way <= (ONE - KEPT_GAP) * gap:
+        return ONE
+    least = KEPT_GAP * gap
+    time = (ONE - KEPT_GAP) * gap / way
+    for _k in range(_SEARCHES):
+        _weights, now = closest_weights_and_gap(kind, a + time * p, b + time * q, c + time * r, d + time * s)
+        ahead = _NEXT * (now - kept - least) / way
+        if now - kept < least + KEPT_GAP * least or not ahead > ZERO:
+            return time
+        time += ahead
+        if time >= ONE:
+            return ONE
+    return time

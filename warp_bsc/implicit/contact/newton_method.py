@@ -1,0 +1,274 @@
+"""Newton's method on the energy of a step: inertia, elasticity, barriers and friction. Read :meth:`NewtonMethod.solve`.
+
+Each Newton step solves for displacements by conjugate gradients, takes the share of them that brings no two elements
+together, and less of it where the energy does not fall. Conditions are on the device, as in :mod:`...response.step`.
+"""
+
+import numpy as np
+import warp as wp
+
+from ...detection.launch import retry_until_fits
+from ...response.contacts.queue import queues_of
+from ...response.state.structs import allocate
+from ...response.state.workspace import Workspace
+from . import pairs, steps
+from .conjugate_gradients import BLOCK, Vectors, solve_worlds
+from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
+from .pairs import BarrierSettings, Candidates, Trial
+from .rows import add_blocks, make_rows
+from .system import Contacts, Progress, Unknowns
+
+_TRUNCATIONS = 4
+"""Passes in which the ways of single vertices are cut, before that of their world is."""
+_REACH_OF_EDGE = 0.1
+"""Reach of a barrier as a share of the median length of edges."""
+_SHORT_EDGE = 0.25
+"""Largest reach as a share of the shortest edge at a vertex."""
+_SMOOTHING_SPEED = 1e-3
+"""Speed below which friction is smoothed [m/s]."""
+_LEAST_SPEED = 1e-3
+"""Speed by which no unknown changes any more where a step ends [m/s]."""
+_UNIT_SPEED = 1e-5
+"""Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
+_TOLERANCE = 1e-2
+_MAX_ITERATIONS = 200
+LATE_STEPS = 16
+"""Newton steps after which a step ends, even if something that a program moves has not arrived."""
+
+
+class NewtonMethod:
+    """Solves one step after the other, with the same buffers, on the device of the model."""
+
+    def __init__(self, work: Workspace, *, max_steps: int):
+        """Allocates buffers.
+
+        Args:
+            work: The workspace of the steps: motion, mesh and detection.
+            max_steps: Newton steps of a step at most.
+        """
+        self._work, self.max_steps = work, max_steps
+        mesh = self._mesh = work.mesh
+        model, device = mesh.model, mesh.device
+        particles, vertices = model.particle_count, mesh.vertex_count
+        self._elements, of_elements = elements_of_model(model)
+        world = mesh.device_world.numpy()[:particles]
+        order = np.argsort(world, kind="stable")
+        assert (order == np.arange(particles)).all()
+        unknown = np.arange(particles)
+        self._count = particles
+        unknowns = self._unknowns = Unknowns()
+
+        def array(values):
+            return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
+
+        unknowns.of_vertex = array(np.append(unknown, np.full(vertices - particles, -1)))
+        unknowns.world = array(world)
+        unknowns.of_worlds = array(np.searchsorted(world, np.arange(work.worlds + 1)))
+        unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
+        unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
+        self._rows = make_rows(of_elements, unknown, self._count, device)
+        first = self._rows.first.numpy()
+        self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(first)))
+        self._element_count = sum(map(len, of_elements))
+        self._derivatives = Derivatives()
+        corners = sum(v.size for v in of_elements)
+        blocks = sum(len(v) * n * n for v, n in zip(of_elements, SIZES, strict=True))
+        self._derivatives.gradient = wp.zeros(corners, dtype=wp.vec3, device=device)
+        self._derivatives.block = wp.zeros(blocks, dtype=wp.mat33, device=device)
+        self._vectors = allocate(Vectors, self._count, device)
+        self.progress = allocate(Progress, work.worlds, device)
+        self._trial = allocate(Trial, vertices, device)
+        self._goal, self._lower, self._upper, self._moved = (
+            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
+        )
+        self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
+        self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
+        self._flags = wp.zeros(2, dtype=int, device=device)
+        self._goes_on, self._search = self._flags[0:1], self._flags[1:2]
+        self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
+        self._settings = BarrierSettings()
+        reach = self._reach(mesh)
+        self._settings.reach = wp.array(reach, dtype=float, device=device)
+        margin = np.where(np.isfinite(reach), reach, 0.0)
+        self._margin = wp.array(margin + 0.5 * margin.max(initial=0.0), dtype=float, device=device)
+        masses = model.particle_mass.numpy()[model.particle_inv_mass.numpy() > 0]
+        mass = float(masses.mean()) if len(masses) else 1.0
+        self._settings.units = 1.0 / (mass * _UNIT_SPEED**2)
+        self._candidates: list[Candidates] = []
+        self._contacts = Contacts()
+
+    def _reach(self, mesh) -> np.ndarray:
+        """Returns the gap from which each vertex pushes [m], infinite for shapes."""
+        model, particles = mesh.model, mesh.model.particle_count
+        reach = np.full(mesh.vertex_count, np.inf)
+        x = np.zeros((mesh.vertex_count, 3))
+        x[:particles] = model.particle_q.numpy()
+        edges = mesh.edges[(mesh.edges < particles).all(axis=1)]
+        lengths = np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
+        usual = _REACH_OF_EDGE * float(np.median(lengths)) if len(lengths) else np.inf
+        reach[:particles] = usual
+        for k in range(2):
+            np.minimum.at(reach, edges[:, k], _SHORT_EDGE * lengths)
+        radius = model.particle_radius.numpy()
+        reach[:particles] = np.where(radius > 0, np.minimum(reach[:particles], radius), reach[:particles])
+        return reach
+
+    def solve(self, v0: wp.array, particle_q: wp.array, particle_qd: wp.array, dt: float) -> None:
+        """Finds where the particles end that the motion of the workspace predicts, and writes it there and here.
+
+        Args:
+            v0: Velocities at the start [m/s].
+            particle_q: Where positions at the end are written [m].
+            particle_qd: Where velocities at the end are written [m/s].
+            dt: Length of the step [s].
+        """
+        work, motion = self._work, self._work.step.motion
+        vertices = self._mesh.vertex_count
+        self._dt = float(dt)
+        self._settings.dt = dt
+        self._settings.smoothing = _SMOOTHING_SPEED * dt
+        inputs = [motion, v0, float(dt), self._margin, self._unknowns]
+        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
+        self._launch(steps.begin_step, vertices, inputs, outputs)
+        self.iterations.zero_()
+        self._find_candidates()
+        self._bound()
+        self._launch(steps.take, vertices, [motion, self._unknowns, self.progress], [self._trial])
+        self._launch(_update_planes, work.worlds, [self.progress], [self._plane_share])
+        self._goes_on.fill_(1)
+        wp.capture_while(self._goes_on, self._take_newton_step)
+        inputs = [self._trial, self._unknowns, float(dt), motion.x0]
+        outputs = [motion, work.vertices, particle_q, particle_qd]
+        self._launch(steps.finish, vertices, inputs, outputs)
+
+    def _find_candidates(self):
+        """Finds the pairs that may come near each other within the boxes."""
+        work, detector = self._work, self._work.detector
+
+        def find():
+            detector.find_candidates(self._lower, self._upper, keep_separated=True)
+
+        retry_until_fits(find, detector, work.device)
+        queues = queues_of(detector, candidates=True)
+        if [len(c.kept) for c in self._candidates] != [len(q.pairs) for q in queues]:
+            self._allocate(queues)
+        inputs = [work.step, self._settings, work.status.crossings, *self._candidates]
+        work.launch_over_entries(pairs.prepare_candidates, inputs)
+
+    def _allocate(self, queues):
+        device, self._candidates = self._work.device, []
+        for queue in queues:
+            candidates = Candidates()
+            candidates.queue = queue
+            candidates.kept = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
+            candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
+            self._candidates.append(candidates)
+        capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
+        contacts = self._contacts = allocate(Contacts, capacity, device, count=1, first=self._count + 1, entries=4 * capacity)
+        self._counts = wp.zeros(self._count + 1, dtype=int, device=device)
+        self._ends = wp.zeros(self._count + 1, dtype=int, device=device)
+        assert contacts is not None
+
+    def _bound(self):
+        """Takes the displacements down until no two elements meet on them: of single vertices, then of worlds."""
+        work, motion = self._work, self._work.step.motion
+        for k in range(_TRUNCATIONS + 1):
+            by_vertex = k < _TRUNCATIONS
+            inputs = [motion, *self._candidates, self._trial, self.progress, by_vertex, self._limit]
+            work.launch_over_entries(pairs.bound_by_pairs, inputs)
+            if work.max_penetrations:
+                inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, self.progress]
+                self._launch(pairs.bound_by_planes, work.particle_count, [*inputs, by_vertex], [self._limit])
+            if by_vertex:
+                self._launch(steps.truncate, self._mesh.vertex_count, [self._unknowns], [self._limit, self._trial])
+        self._launch(steps.take_bound, work.worlds, [], [self.progress])
+
+    def _take_newton_step(self):
+        work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
+        unknowns, contacts, vertices = self._unknowns, self._contacts, self._mesh.vertex_count
+        dt = wp.float64(self._dt)
+        self._launch(steps.begin_newton_step, work.worlds, [], [progress])
+        self._launch(steps.find_remaining, vertices, [motion, unknowns, progress.active], [trial])
+        inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active]
+        self._launch(differentiate, self._element_count, inputs, [self._derivatives])
+        inputs = [self._derivatives, self._row_of_block, unknowns.world, progress.active]
+        self._launch(add_blocks, len(self._row_of_block), inputs, [self._rows])
+        self._find_contacts()
+        inputs = [self._derivatives, contacts, unknowns, trial, self._goal, motion.inverse_mass, dt, progress.active]
+        self._launch(steps.assemble, self._count, inputs, [self._rows, self._vectors])
+        threads = work.worlds * (BLOCK if work.device.is_cuda else 1)
+        wp.launch(
+            solve_worlds,
+            threads,
+            inputs=[
+                self._rows,
+                contacts,
+                unknowns,
+                progress.active,
+                wp.float64(_TOLERANCE),
+                _MAX_ITERATIONS,
+                self._vectors,
+                self.iterations,
+            ],
+            device=work.device,
+            block_dim=BLOCK,
+        )
+        inputs = [motion, unknowns, self._vectors, self._lower, self._upper, self._settings.units]
+        self._launch(steps.displace, vertices, inputs, [trial, progress])
+        self._bound()
+        self._add_energies(False, progress.energy)
+        self._search.fill_(1)
+        wp.capture_while(self._search, self._try)
+        self._launch(steps.take, vertices, [motion, unknowns, progress], [trial])
+        self._goes_on.zero_()
+        inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
+        self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
+
+    def _find_contacts(self):
+        """Finds what is near at the positions, and lists it by unknown."""
+        work, motion, contacts = self._work, self._work.step.motion, self._contacts
+        contacts.count.zero_()
+        inputs = [self._settings, self._trial, self._unknowns, self.progress.active, contacts]
+        work.launch_over_entries(pairs.find_near, [motion, *self._candidates, *inputs])
+        if work.max_penetrations:
+            inputs = [motion, work.motion.planes, self._plane_share, *inputs]
+            self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
+        self._counts.zero_()
+        work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns, self._counts])
+        wp.utils.array_scan(self._counts, contacts.first, inclusive=False)
+        wp.copy(self._ends, contacts.first)
+        work.launch_over_entries(pairs.list_entries, [contacts, self._unknowns, self._ends])
+
+    def _try(self):
+        """Computes the energy at the displaced positions, and halves the shares of worlds where it has risen."""
+        self._add_energies(True, self.progress.trial)
+        self._search.zero_()
+        self._launch(steps.decide_search, self._work.worlds, [], [self.progress, self._search])
+
+    def _add_energies(self, displaced, energy):
+        work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
+        outputs = [self._moved]
+        self._launch(steps.write_moved, self._mesh.vertex_count, [motion, trial, progress, displaced], outputs)
+        inputs = [self._elements, self._element_count, motion, self._settings, trial, self._goal, self._unknowns]
+        inputs += [progress, displaced, self._moved]
+        self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
+        inputs = [self._settings, trial, progress, displaced, energy]
+        work.launch_over_entries(pairs.add_pair_energies, [motion, *self._candidates, *inputs])
+        work.launch_over_entries(pairs.add_friction_energies, [motion, self._contacts, *inputs])
+        if work.max_penetrations:
+            inputs = [motion, work.motion.planes, self._plane_share, *inputs]
+            self._launch(pairs.add_plane_energies, work.particle_count, inputs[:-1], [energy])
+
+    def _launch(self, kernel, size, inputs, outputs):
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
+
+
+@wp.kernel
+def _update_planes(
+    # in
+    progress: Progress,
+    # out
+    plane_share: wp.array[float],
+):
+    """Moves planes by the share of their way that a step begins with."""
+    plane_share[wp.tid()] = progress.scale[wp.tid()]

@@ -1,0 +1,669 @@
+"""Pairs of elements that may come near each other in a step, those that are near, and the bounds that they set."""
+
+import warp as wp
+
+from ...detection.approach_phase import distances_of_pair
+from ...kernels.pipeline.queues import take_slot_int
+from ...response.contacts.constraints import friction_on_plane, pair_friction
+from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
+from ...response.contacts.rules import ContactClass, crossed_at_start, owner_of
+from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
+from ...response.state.structs import Motion, Step
+from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
+from . import barrier
+from .system import Contacts, Progress, Unknowns, contact_count, displacement, unknown_of_corner
+
+wp.set_module_options({"enable_backward": False})
+
+_LEAST_GAP = wp.constant(wp.float64(0.1))
+"""Share of its distance at the start that a pair which starts within its minimum distance may give up."""
+_UNITS_LIMIT = wp.constant(wp.float64(2.0**60))
+
+
+@wp.struct
+class Candidates:
+    """Pairs of one kind that may come near each other in the step.
+
+    Attributes:
+        queue: The pairs.
+        kept: Distance that each pair keeps in any case [m].
+        reach: Gap beyond that from which its barrier pushes [m]; 0 of a pair that is excluded.
+    """
+
+    queue: PairQueue
+    kept: wp.array[wp.float64]
+    reach: wp.array[float]
+
+
+@wp.struct
+class BarrierSettings:
+    """What barriers and friction depend on.
+
+    Attributes:
+        dt: Length of the step [s].
+        reach: Of each vertex: gap from which it pushes [m], infinite for shapes.
+        smoothing: Length below which friction is smoothed [m].
+        units: Units of energy in a joule.
+    """
+
+    dt: wp.float64
+    reach: wp.array[float]
+    smoothing: wp.float64
+    units: wp.float64
+
+
+@wp.struct
+class Trial:
+    """Positions, and displacements from them, of which each world takes a share.
+
+    Attributes:
+        x: Positions of vertices [m].
+        displaced: Displacements [m].
+        share: Share of its displacement that a vertex takes of what its world takes.
+    """
+
+    x: wp.array[wp.vec3]
+    displaced: wp.array[wp.vec3]
+    share: wp.array[float]
+
+
+@wp.func
+def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3:
+    """Returns the position of a vertex after a share of its displacement, rounded as it is stored."""
+    return trial.x[vertex] + (scale * trial.share[vertex]) * trial.displaced[vertex]
+
+
+@wp.func
+def _reach_of(settings: BarrierSettings, corners: wp.vec4i) -> float:
+    reach = settings.reach[corners[0]]
+    for j in range(1, 4):
+        reach = wp.min(reach, settings.reach[corners[j]])
+    return reach
+
+
+@wp.func
+def _inverse_mass(motion: Motion, vertex: int) -> float:
+    inverse = motion.inverse_mass[vertex]
+    if inverse == 0.0 and motion.bodies.of_vertex:
+        body = motion.bodies.of_vertex[vertex]
+        if body >= 0:
+            inverse = motion.bodies.inverse_mass[body]
+    return inverse
+
+
+@wp.func
+def _stiffness(motion: Motion, settings: BarrierSettings, corners: wp.vec4i, is_edges: bool) -> wp.float64:
+    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is the reduced mass over dt^2."""
+    first = wp.float64(_inverse_mass(motion, corners[0]))
+    second = wp.float64(_inverse_mass(motion, corners[2]) + _inverse_mass(motion, corners[3]))
+    if is_edges:
+        first = wp.float64(0.5) * (first + wp.float64(_inverse_mass(motion, corners[1])))
+        second = wp.float64(0.5) * second
+    else:
+        second = (second + wp.float64(_inverse_mass(motion, corners[1]))) / wp.float64(3.0)
+    return ONE / ((first + second) * settings.dt * settings.dt * wp.float64(barrier.CURVATURE_AT_HALF))
+
+
+@wp.func
+def _prepare(step: Step, candidates: Candidates, settings: BarrierSettings, crossings: wp.array[int], i: int):
+    motion, queue = step.motion, candidates.queue
+    corners = vertices_of(queue, i)
+    candidates.reach[i] = 0.0
+    candidates.kept[i] = ZERO
+    if owner_of(motion, corners) != ContactClass.OURS:
+        return
+    a, b, c, d = corners_of(motion.x0, corners)
+    start = ZERO
+    if motion.distances.radius:
+        found, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
+        start = found
+        candidates.kept[i] = wp.min(kept, (ONE - _LEAST_GAP) * found)
+    else:
+        _weights, found = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+        start = found
+    if not start > ZERO:
+        return
+    if crossings[motion.world[corners[0]]] > 0:
+        if crossed_at_start(step, queue.kind, queue.pairs[i]):
+            return
+    candidates.reach[i] = _reach_of(settings, corners)
+
+
+@wp.kernel
+def prepare_candidates(
+    # in
+    step: Step,
+    settings: BarrierSettings,
+    crossings: wp.array[int],
+    # in and out
+    vertex_face: Candidates,
+    edge_edge: Candidates,
+    threads: int,
+):
+    """Writes distances that candidates keep, and excludes those that touch or cross at the start of the step."""
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = vertex_face
+            if number == 1:
+                of = edge_edge
+            if has_pair(of.queue, i):
+                _prepare(step, of, settings, crossings, i)
+            number += 1
+
+
+@wp.func
+def _add_contact(
+    motion: Motion,
+    contacts: Contacts,
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    shifted: wp.vec3d,
+    approach: wp.float64,
+    gap: wp.float64,
+    reach: wp.float64,
+    stiffness: wp.float64,
+    friction: float,
+    key: wp.int64,
+):
+    """Adds a contact, with the derivatives of its barrier and friction.
+
+    ``shifted`` is how far the second point has moved since the start beside its corners, ``approach`` how far what a
+    program moves goes along the normal in this Newton step.
+    """
+    slot = take_slot_int(contacts.count)
+    if slot >= contacts.corners.shape[0]:
+        return
+    load = -stiffness * barrier.barrier_slope(gap, reach)
+    curvature = stiffness * barrier.barrier_curvature(gap, reach)
+    slid, given = -shifted, ZERO
+    for j in range(4):
+        v = corners[j]
+        slid += weights[j] * (to_double(trial.x[v]) - to_double(motion.x0[v]))
+        if unknowns.of_vertex[v] == -1:
+            given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
+    slid -= wp.dot(slid, normal) * normal
+    gradient = (-load + curvature * (given - approach)) * normal
+    hessian = curvature * wp.outer(normal, normal)
+    if friction > 0.0 and load > ZERO:
+        length, limit = wp.length(slid), wp.float64(friction) * load
+        slope = limit * barrier.friction_slope(length, settings.smoothing)
+        gradient += slope * slid
+        across = wp.identity(n=3, dtype=wp.float64) - wp.outer(normal, normal)
+        if length > ZERO:
+            along = slid / length
+            more = limit * barrier.friction_curvature(length, settings.smoothing) - slope
+            across = slope * across + more * wp.outer(along, along)
+        else:
+            across = slope * across
+        hessian += across
+    contacts.corners[slot] = corners
+    contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
+    contacts.normal[slot] = to_single(normal)
+    contacts.load[slot] = float(load)
+    contacts.friction[slot] = friction
+    contacts.gradient[slot] = to_single(gradient)
+    single = wp.mat33()
+    for row in range(3):
+        for column in range(3):
+            single[row, column] = float(hessian[row, column])
+    contacts.hessian[slot] = single
+    contacts.key[slot] = key
+
+
+@wp.func
+def _find_near(
+    motion: Motion,
+    candidates: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    contacts: Contacts,
+    i: int,
+):
+    reach = wp.float64(candidates.reach[i])
+    if reach == ZERO:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    if active[motion.world[corners[0]]] == 0:
+        return
+    a, b, c, d = corners_of(trial.x, corners)
+    weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    gap = distance - candidates.kept[i]
+    if gap >= reach or not gap > ZERO:
+        return
+    normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
+    stiffness = _stiffness(motion, settings, corners, queue.kind == 1)
+    pair = queue.pairs[i]
+    key = (wp.int64(queue.kind) << wp.int64(62)) | (wp.int64(pair[0]) << wp.int64(31)) | wp.int64(pair[1])
+    friction = pair_friction(motion, corners)
+    _add_contact(
+        motion,
+        contacts,
+        settings,
+        trial,
+        unknowns,
+        corners,
+        weights,
+        normal,
+        wp.vec3d(),
+        ZERO,
+        gap,
+        reach,
+        stiffness,
+        friction,
+        key,
+    )
+
+
+@wp.kernel
+def find_near(
+    # in
+    motion: Motion,
+    vertex_face: Candidates,
+    edge_edge: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    # out
+    contacts: Contacts,
+    threads: int,
+):
+    """Adds contacts for the candidates that are near each other, in active worlds."""
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = vertex_face
+            if number == 1:
+                of = edge_edge
+            if has_pair(of.queue, i):
+                _find_near(motion, of, settings, trial, unknowns, active, contacts, i)
+            number += 1
+
+
+@wp.func
+def _plane_gap(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int):
+    """Returns the distance that a particle keeps from a plane, and the reach of its barrier, 0 if it is excluded."""
+    if is_filtered_by_plane(motion, planes, i, vertex):
+        return ZERO, ZERO
+    start, error = signed_distance(planes.start[i], motion.x0[vertex])
+    start -= error
+    if not start > ZERO:
+        return ZERO, ZERO
+    kept = ZERO
+    if motion.distances.radius:
+        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], (ONE - _LEAST_GAP) * start)
+    return kept, wp.float64(settings.reach[vertex])
+
+
+@wp.func
+def _plane_at(planes: MovingPlanes, i: int, share: float) -> wp.vec4d:
+    """Returns a plane after a share of its way in the step."""
+    t = wp.float64(share)
+    plane = (ONE - t) * planes.start[i] + t * planes.end[i]
+    return plane / wp.length(wp.vec3d(plane[0], plane[1], plane[2]))
+
+
+@wp.kernel
+def find_near_planes(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    # out
+    contacts: Contacts,
+):
+    """Adds contacts for the particles that are near infinite planes, in active worlds."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if motion.inverse_mass[vertex] == 0.0 or active[world] == 0:
+        return
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        plane = _plane_at(planes, i, plane_share[world])
+        distance, _error = signed_distance(plane, trial.x[vertex])
+        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        gap = distance - kept
+        if gap >= reach or not gap > ZERO:
+            continue
+        normal = wp.vec3d(plane[0], plane[1], plane[2])
+        stiffness = ONE / (
+            wp.float64(motion.inverse_mass[vertex])
+            * settings.dt
+            * settings.dt
+            * wp.float64(barrier.CURVATURE_AT_HALF)
+        )
+        key = (wp.int64(2) << wp.int64(61)) | (wp.int64(vertex) << wp.int64(31)) | wp.int64(i)
+        there, _error_there = signed_distance(planes.end[i], trial.x[vertex])
+        since, _since_error = signed_distance(planes.start[i], trial.x[vertex])
+        _add_contact(
+            motion,
+            contacts,
+            settings,
+            trial,
+            unknowns,
+            wp.vec4i(vertex),
+            wp.vec4d(ONE, ZERO, ZERO, ZERO),
+            normal,
+            (since - distance) * normal,
+            distance - there,
+            gap,
+            reach,
+            stiffness,
+            friction_on_plane(motion, planes, i, vertex),
+            key,
+        )
+
+
+@wp.kernel
+def count_entries(
+    # in
+    contacts: Contacts,
+    unknowns: Unknowns,
+    # out
+    counts: wp.array[int],
+    threads: int,
+):
+    """Counts the contacts of each unknown that is solved for."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        for j in range(4):
+            if contacts.weights[i][j] != 0.0:
+                vertex = contacts.corners[i][j]
+                u = unknown_of_corner(unknowns, vertex)
+                if u >= 0:
+                    if unknowns.is_free[u] != 0:
+                        wp.atomic_add(counts, u, 1)
+                        if unknowns.of_vertex[vertex] < 0:
+                            wp.atomic_add(counts, u + 1, 1)
+
+
+@wp.kernel
+def list_entries(
+    # in
+    contacts: Contacts,
+    unknowns: Unknowns,
+    # in and out
+    ends: wp.array[int],
+    threads: int,
+):
+    """Lists the contacts of each unknown, whose ``ends`` begin as the first of them."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        for j in range(4):
+            if contacts.weights[i][j] != 0.0:
+                vertex = contacts.corners[i][j]
+                u = unknown_of_corner(unknowns, vertex)
+                if u >= 0:
+                    if unknowns.is_free[u] != 0:
+                        contacts.entries[wp.atomic_add(ends, u, 1)] = 4 * i + j
+                        if unknowns.of_vertex[vertex] < 0:
+                            contacts.entries[wp.atomic_add(ends, u + 1, 1)] = 4 * i + j
+
+
+@wp.func
+def sort_entries(contacts: Contacts, u: int):
+    """Orders the contacts of an unknown by their pair, so that sums do not depend on the order of threads."""
+    first, end = contacts.first[u], contacts.first[u + 1]
+    for n in range(first + 1, end):
+        entry = contacts.entries[n]
+        key, place = contacts.key[entry >> 2], entry & 3
+        m = n - 1
+        while m >= first:
+            other = contacts.entries[m]
+            before = contacts.key[other >> 2]
+            if before < key or (before == key and (other & 3) < place):
+                break
+            contacts.entries[m + 1] = other
+            m -= 1
+        contacts.entries[m + 1] = entry
+
+
+# Bounds
+
+
+@wp.func
+def _bound(
+    motion: Motion,
+    candidates: Candidates,
+    trial: Trial,
+    progress: Progress,
+    by_vertex: bool,
+    limit: wp.array[float],
+    i: int,
+):
+    if candidates.reach[i] == 0.0:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    world = motion.world[corners[0]]
+    if progress.active[world] == 0:
+        return
+    a, b, c, d = corners_of(trial.x, corners)
+    scale = progress.scale[world]
+    p = to_double(moved(trial, scale, corners[0])) - a
+    q = to_double(moved(trial, scale, corners[1])) - b
+    r = to_double(moved(trial, scale, corners[2])) - c
+    s = to_double(moved(trial, scale, corners[3])) - d
+    # far apart for their ways: no need to find the closest points
+    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
+    kept = candidates.kept[i]
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    if way <= (ONE - barrier.KEPT_GAP) * (distance - kept):
+        return
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, distance, kept))
+    if share < 1.0:
+        if by_vertex:
+            for j in range(4):
+                wp.atomic_min(limit, corners[j], share)
+        else:
+            wp.atomic_min(progress.bound, world, share)
+
+
+@wp.kernel
+def bound_by_pairs(
+    # in
+    motion: Motion,
+    vertex_face: Candidates,
+    edge_edge: Candidates,
+    trial: Trial,
+    progress: Progress,
+    by_vertex: bool,
+    # in and out
+    limit: wp.array[float],
+    threads: int,
+):
+    """Finds the share of displacements up to which no two elements meet: by vertex, or for all of a world."""
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = vertex_face
+            if number == 1:
+                of = edge_edge
+            if has_pair(of.queue, i):
+                _bound(motion, of, trial, progress, by_vertex, limit, i)
+            number += 1
+
+
+@wp.kernel
+def bound_by_planes(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    by_vertex: bool,
+    # in and out
+    limit: wp.array[float],
+):
+    """Finds the share of displacements up to which no particle meets an infinite plane, as :func:`bound_by_pairs`."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if motion.inverse_mass[vertex] == 0.0 or progress.active[world] == 0:
+        return
+    scale, now = progress.scale[world], plane_share[world]
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        if reach == ZERO:
+            continue
+        before, _error = signed_distance(_plane_at(planes, i, now), trial.x[vertex])
+        then = now + (1.0 - now) * scale
+        after, _error_after = signed_distance(_plane_at(planes, i, then), moved(trial, scale, vertex))
+        gap, left = before - kept, after - kept
+        if left < barrier.KEPT_GAP * gap:
+            share = float((ONE - barrier.KEPT_GAP) * gap / (gap - left))
+            if by_vertex:
+                wp.atomic_min(limit, vertex, share)
+            else:
+                wp.atomic_min(progress.bound, world, share)
+
+
+# Energies
+
+
+@wp.func
+def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.float64):
+    """Adds an energy [J] to that of a world, in units, so that the sum does not depend on the order of threads."""
+    scaled = wp.clamp(units * value, -_UNITS_LIMIT, _UNITS_LIMIT)
+    wp.atomic_add(energy, world, wp.int64(wp.rint(scaled)))
+
+
+@wp.func
+def _pair_energy(
+    motion: Motion,
+    candidates: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    energy: wp.array[wp.int64],
+    i: int,
+):
+    reach = wp.float64(candidates.reach[i])
+    if reach == ZERO:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    world = motion.world[corners[0]]
+    if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
+        return
+    scale = wp.where(displaced, progress.scale[world], 0.0)
+    a, b = to_double(moved(trial, scale, corners[0])), to_double(moved(trial, scale, corners[1]))
+    c, d = to_double(moved(trial, scale, corners[2])), to_double(moved(trial, scale, corners[3]))
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    gap = distance - candidates.kept[i]
+    if gap < reach:
+        value = wp.float64(1.0e30)
+        if gap > ZERO:
+            stiffness = _stiffness(motion, settings, corners, queue.kind == 1)
+            value = stiffness * barrier.barrier_energy(gap, reach)
+        add_energy(energy, world, value, settings.units)
+
+
+@wp.kernel
+def add_pair_energies(
+    # in
+    motion: Motion,
+    vertex_face: Candidates,
+    edge_edge: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # in and out
+    energy: wp.array[wp.int64],
+    threads: int,
+):
+    """Adds the energies of barriers between elements, at positions or at the displaced ones."""
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = vertex_face
+            if number == 1:
+                of = edge_edge
+            if has_pair(of.queue, i):
+                _pair_energy(motion, of, settings, trial, progress, displaced, energy, i)
+            number += 1
+
+
+@wp.kernel
+def add_friction_energies(
+    # in
+    motion: Motion,
+    contacts: Contacts,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # in and out
+    energy: wp.array[wp.int64],
+    threads: int,
+):
+    """Adds the work of friction, under the loads and along the planes of the contacts."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        corners, weights = contacts.corners[i], contacts.weights[i]
+        world = motion.world[corners[0]]
+        limit = contacts.friction[i] * contacts.load[i]
+        if limit > 0.0 and not (displaced and progress.searches[world] == 0):
+            scale = wp.where(displaced, progress.scale[world], 0.0)
+            slid, normal = wp.vec3d(), to_double(contacts.normal[i])
+            for j in range(4):
+                v = corners[j]
+                slid += wp.float64(weights[j]) * (to_double(moved(trial, scale, v)) - to_double(motion.x0[v]))
+            slid -= wp.dot(slid, normal) * normal
+            value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
+            add_energy(energy, world, value, settings.units)
+
+
+@wp.kernel
+def add_plane_energies(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # in and out
+    energy: wp.array[wp.int64],
+):
+    """Adds the energies of barriers at infinite planes."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if motion.inverse_mass[vertex] == 0.0 or progress.active[world] == 0:
+        return
+    if displaced and progress.searches[world] == 0:
+        return
+    scale, now = wp.where(displaced, progress.scale[world], 0.0), plane_share[world]
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        plane = _plane_at(planes, i, now + (1.0 - now) * scale)
+        distance, _error = signed_distance(plane, moved(trial, scale, vertex))
+        gap = distance - kept
+        if gap < reach:
+            value = wp.float64(1.0e30)
+            if gap > ZERO:
+                mass = ONE / wp.float64(motion.inverse_mass[vertex])
+                stiffness = mass / (settings.dt * settings.dt * wp.float64(barrier.CURVATURE_AT_HALF))
+                value = stiffness * barrier.barrier_energy(gap, reach)
+            add_energy(energy, world, value, settings.units)

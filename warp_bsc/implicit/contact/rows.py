@@ -1,0 +1,113 @@
+"""The Hessian of a step without contacts: sparse rows of 3 x 3 blocks, whose places do not change."""
+
+import numpy as np
+import warp as wp
+
+from .elasticity import SIZES, Derivatives
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Rows:
+    """Rows of blocks, one for each unknown, and the corners and blocks of elements that they are the sums of.
+
+    Attributes:
+        first: First block of each row, and the end of the last, shape [unknown_count + 1].
+        column: Unknown of each block; the first of a row is that of the diagonal.
+        block: The blocks [N/m].
+        first_source: First block of elements in each block of a row, and the end of the last.
+        source: Blocks of elements.
+        first_corner: First corner of elements in each unknown, and the end of the last.
+        corner: Corners of elements.
+    """
+
+    first: wp.array[int]
+    column: wp.array[int]
+    block: wp.array[wp.mat33]
+    first_source: wp.array[int]
+    source: wp.array[int]
+    first_corner: wp.array[int]
+    corner: wp.array[int]
+
+
+def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, device: wp.Device) -> Rows:
+    """Returns the rows of elements.
+
+    Args:
+        vertices: Particles of the elements of each kind, -1 for none, shape [n, size].
+        unknown: Unknown of each particle, shape [particle_count].
+        count: Number of unknowns.
+        device: Where to put them.
+    """
+    diagonal = np.arange(count, dtype=np.int64)
+    keys, sources = [diagonal * (count + 1)], [np.full(count, -1, dtype=np.int64)]
+    corner_rows, corners, first_corner, first_block = [], [], 0, 0
+    for v, size in zip(vertices, SIZES, strict=True):
+        u = np.where(v >= 0, unknown[np.maximum(v, 0)] if len(unknown) else -1, -1)
+        exists = (u[:, :, None] >= 0) & (u[:, None, :] >= 0)
+        numbers = first_block + np.arange(len(v) * size * size).reshape(len(v), size, size)
+        keys.append((u[:, :, None] * count + u[:, None, :])[exists])
+        sources.append(numbers[exists])
+        of_corners = first_corner + np.arange(len(v) * size).reshape(len(v), size)
+        corner_rows.append(u[u >= 0])
+        corners.append(of_corners[u >= 0])
+        first_corner += len(v) * size
+        first_block += len(v) * size * size
+    key, source = np.concatenate(keys), np.concatenate(sources)
+    order = np.argsort(key, kind="stable")
+    key, source = key[order], source[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    row, column = key[starts] // count, key[starts] % count
+    ends = np.append(starts[1:], len(key))
+    # the diagonal first in its row, then in order of columns
+    order = np.lexsort((column, column != row, row))
+    counts = (ends - starts)[order]
+    first_source = np.append(0, np.cumsum(counts))
+    at = np.repeat(starts[order] - first_source[:-1], counts) + np.arange(len(key))
+    source = source[at]
+    kept = source >= 0  # the diagonal has an entry of its own, which is none of an element
+    kept_before = np.append(0, np.cumsum(kept))
+    corner_row, corner = np.concatenate(corner_rows), np.concatenate(corners)
+    by_row = np.argsort(corner_row, kind="stable")
+
+    def array(values):
+        return wp.array(values.astype(np.int32), dtype=int, device=device)
+
+    rows = Rows()
+    rows.first = array(np.searchsorted(row[order], np.arange(count + 1)))
+    rows.column = array(column[order])
+    rows.block = wp.zeros(len(order), dtype=wp.mat33, device=device)
+    rows.first_source, rows.source = array(kept_before[first_source]), array(source[kept])
+    rows.first_corner = array(np.searchsorted(corner_row[by_row], np.arange(count + 1)))
+    rows.corner = array(corner[by_row])
+    return rows
+
+
+@wp.kernel
+def add_blocks(
+    # in
+    derivatives: Derivatives,
+    row_of_block: wp.array[int],
+    world: wp.array[int],
+    active: wp.array[int],
+    # out
+    rows: Rows,
+):
+    """Adds the blocks of elements up, in active worlds."""
+    k = wp.tid()
+    if active[world[row_of_block[k]]] == 0:
+        return
+    total = wp.mat33()
+    for n in range(rows.first_source[k], rows.first_source[k + 1]):
+        total += derivatives.block[rows.source[n]]
+    rows.block[k] = total
+
+
+@wp.func
+def sum_of_corners(rows: Rows, derivatives: Derivatives, u: int) -> wp.vec3:
+    """Returns the gradient of the energy of all elements by an unknown [N]."""
+    total = wp.vec3()
+    for n in range(rows.first_corner[u], rows.first_corner[u + 1]):
+        total += derivatives.gradient[rows.corner[n]]
+    return total

@@ -1,0 +1,426 @@
+"""Kernels of a Newton step: prediction, gradient, displacements, energies, and what each world does next."""
+
+import warp as wp
+
+from ...response.state.structs import Motion, Vertices
+from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
+from .conjugate_gradients import Vectors
+from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
+from .pairs import BarrierSettings, Trial, add_energy, moved, sort_entries
+from .rows import Rows, sum_of_corners
+from .system import Contacts, Progress, Unknowns, contact_gradient, displacement
+
+wp.set_module_options({"enable_backward": False})
+
+_ARMIJO = wp.constant(wp.float64(1e-4))
+"""Share of the fall of energy along a straight line that a share of the displacements has to reach."""
+_NOISE = wp.constant(wp.float64(1e-9))
+"""Rise of energy that may be rounding, as a share of it."""
+_LEAST_SCALE = wp.constant(float(2.0**-12))
+
+
+@wp.kernel
+def predict_positions(
+    # in
+    x0: wp.array[wp.vec3],
+    v0: wp.array[wp.vec3],
+    force: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    flags: wp.array[int],
+    active_flag: int,
+    gravity: wp.array[wp.vec3],
+    world: wp.array[int],
+    dt: float,
+    # out
+    x1: wp.array[wp.vec3],
+    v1: wp.array[wp.vec3],
+):
+    """Moves particles as if nothing but gravity and external forces acted on them."""
+    i = wp.tid()
+    x, v = x0[i] + wp.vec3(), v0[i] + wp.vec3()
+    if inverse_mass[i] > 0.0 and (flags[i] & active_flag) != 0:
+        acceleration = gravity[wp.max(world[i], 0) % gravity.shape[0]] + wp.vec3()
+        if force:
+            acceleration = acceleration + inverse_mass[i] * force[i]
+        v = v + dt * acceleration
+        x = x + dt * v
+    x1[i] = x
+    v1[i] = v
+
+
+@wp.kernel
+def begin_step(
+    # in
+    motion: Motion,
+    v0: wp.array[wp.vec3],
+    dt: float,
+    margin: wp.array[float],
+    unknowns: Unknowns,
+    # out
+    goal: wp.array[wp.vec3],
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    trial: Trial,
+    progress: Progress,
+    plane_share: wp.array[float],
+):
+    """Takes the motion as predicted: where inertia alone leads, the way on which the step begins, and boxes around it.
+
+    It begins without what gravity and other forces do in the step.
+    """
+    v = wp.tid()
+    x0, x1 = motion.x0[v], motion.x1[v]
+    goal[v] = x1
+    trial.x[v] = x0
+    way = x1 - x0
+    u = unknowns.of_vertex[v]
+    if u >= 0:
+        unknowns.is_free[u] = 0
+        if motion.inverse_mass[v] > 0.0 and motion.is_not_finite[v] == 0:
+            unknowns.is_free[u] = 1
+            way = dt * v0[v]
+    trial.displaced[v] = way
+    trial.share[v] = 1.0
+    first, last = wp.min(x0, wp.min(x1, x0 + way)), wp.max(x0, wp.max(x1, x0 + way))
+    pad = margin[v] + 0.25 * wp.length(last - first)
+    if u < 0 or motion.inverse_mass[v] == 0.0:
+        pad = margin[v]
+    lower[v] = first - wp.vec3(pad)
+    upper[v] = last + wp.vec3(pad)
+    if v < progress.active.shape[0]:
+        progress.active[v] = 1
+        progress.steps[v] = 0
+        progress.scale[v] = 1.0
+        progress.bound[v] = 1.0
+        plane_share[v] = 0.0
+
+
+@wp.kernel
+def truncate(
+    # in
+    unknowns: Unknowns,
+    # in and out
+    limit: wp.array[float],
+    trial: Trial,
+):
+    """Takes the shares of vertices that are solved for down to their bounds, and clears these."""
+    v = wp.tid()
+    if unknowns.of_vertex[v] >= 0:
+        if unknowns.is_free[unknowns.of_vertex[v]] != 0:
+            share = limit[v]
+            if share < 1.0:
+                trial.share[v] = trial.share[v] * wp.where(share > 0.05, share, 0.0)
+    limit[v] = 1.0
+
+
+@wp.kernel
+def take_bound(
+    # in and out
+    progress: Progress,
+):
+    """Takes the share of each world down to its bound."""
+    w = wp.tid()
+    progress.scale[w] = progress.scale[w] * progress.bound[w]
+    progress.bound[w] = 1.0
+
+
+@wp.func
+def _inverse(block: wp.mat33, least: float) -> wp.mat33:
+    """Returns the inverse of a symmetric block; of its absolute value where that is not positive definite."""
+    a, b, c = block[0, 0], block[0, 1], block[0, 2]
+    d, e, f = block[1, 1], block[1, 2], block[2, 2]
+    minor = a * d - b * b
+    determinant = wp.determinant(block)
+    size = wp.max(a, wp.max(d, f))
+    if a > 0.0 and minor > 1.0e-6 * a * d and determinant > 1.0e-6 * minor * f:
+        return wp.inverse(block)
+    q, values = wp.eig3(0.5 * (block + wp.transpose(block)))
+    for k in range(3):
+        values[k] = 1.0 / wp.max(wp.abs(values[k]), wp.max(least, 1.0e-6 * size))
+    return q * wp.diag(values) * wp.transpose(q)
+
+
+@wp.kernel
+def assemble(
+    # in
+    elements_derivatives: Derivatives,
+    contacts: Contacts,
+    unknowns: Unknowns,
+    trial: Trial,
+    goal: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    dt: wp.float64,
+    active: wp.array[int],
+    # in and out
+    rows: Rows,
+    vectors: Vectors,
+):
+    """Computes the gradient of the energy by each unknown, and what preconditions; adds inertia to the diagonal.
+
+    The displacements begin as 0, those of particles that a program moves as their ways.
+    """
+    u = wp.tid()
+    if active[unknowns.world[u]] == 0:
+        return
+    sort_entries(contacts, u)
+    if unknowns.is_free[u] == 0:
+        vectors.gradient[u] = wp.vec3()
+        vectors.solution[u] = trial.displaced[u]
+        vectors.inverse[u] = wp.mat33()
+        vectors.direction[u] = wp.vec3()
+        return
+    inertia = ONE / (wp.float64(inverse_mass[u]) * dt * dt)
+    first = rows.first[u]
+    rows.block[first] = rows.block[first] + float(inertia) * wp.identity(n=3, dtype=float)
+    gradient, block = contact_gradient(contacts, unknowns, u)
+    gradient += sum_of_corners(rows, elements_derivatives, u)
+    gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
+    vectors.gradient[u] = gradient
+    vectors.solution[u] = wp.vec3()
+    vectors.inverse[u] = _inverse(rows.block[first] + block, float(inertia))
+
+
+@wp.kernel
+def find_remaining(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    # out
+    trial: Trial,
+):
+    """Writes the ways that are left of what a program moves, before a solve."""
+    v = wp.tid()
+    if active[motion.world[v]] == 0:
+        return
+    u = unknowns.of_vertex[v]
+    given = u == -1
+    if u >= 0:
+        given = unknowns.is_free[u] == 0
+    if given:
+        trial.displaced[v] = motion.x1[v] - trial.x[v]
+
+
+@wp.kernel
+def displace(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    vectors: Vectors,
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    units: wp.float64,
+    # out
+    trial: Trial,
+    progress: Progress,
+):
+    """Writes the displacements of vertices after a solve, within the boxes in which pairs were sought."""
+    v = wp.tid()
+    world = motion.world[v]
+    if progress.active[world] == 0:
+        return
+    u = unknowns.of_vertex[v]
+    is_free = u != -1
+    if u >= 0:
+        is_free = unknowns.is_free[u] != 0
+    if not is_free:
+        trial.share[v] = 1.0
+        way = wp.length(trial.displaced[v])
+        if way > 0.0:
+            wp.atomic_max(progress.remaining, world, way)
+        return
+    d = displacement(unknowns, v, vectors.solution)
+    x = trial.x[v]
+    share = float(1.0)
+    for axis in range(3):
+        to = x[axis] + d[axis]
+        if to > upper[v][axis]:
+            share = wp.min(share, (upper[v][axis] - x[axis]) / d[axis])
+        elif to < lower[v][axis]:
+            share = wp.min(share, (lower[v][axis] - x[axis]) / d[axis])
+    trial.displaced[v] = d
+    trial.share[v] = wp.max(share, 0.0)
+    wp.atomic_max(progress.change, world, wp.length(d))
+    add_energy(progress.slope, world, wp.float64(share * wp.dot(d, vectors.gradient[u])), units)
+
+
+@wp.kernel
+def begin_newton_step(
+    # in and out
+    progress: Progress,
+):
+    """Clears what a Newton step measures."""
+    w = wp.tid()
+    progress.change[w] = 0.0
+    progress.remaining[w] = 0.0
+    progress.slope[w] = wp.int64(0)
+    progress.scale[w] = 1.0
+    progress.bound[w] = 1.0
+    progress.searches[w] = progress.active[w]
+    progress.energy[w] = wp.int64(0)
+
+
+@wp.kernel
+def add_energies(
+    # in
+    elements: Elements,
+    element_count: int,
+    motion: Motion,
+    settings: BarrierSettings,
+    trial: Trial,
+    goal: wp.array[wp.vec3],
+    unknowns: Unknowns,
+    progress: Progress,
+    displaced: bool,
+    moved_positions: wp.array[wp.vec3],
+    # in and out
+    energy: wp.array[wp.int64],
+):
+    """Adds the energies of elements, and the inertia of particles, at positions or at the displaced ones."""
+    i = wp.tid()
+    if i < element_count:
+        kind = kind_of(elements, i)
+        world = motion.world[first_vertex(elements, kind, i - elements.first[kind])]
+        if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
+            return
+        value = element_energy(elements, i, kind, moved_positions, motion.x0, settings.dt)
+        add_energy(energy, world, value, settings.units)
+        return
+    u = i - element_count
+    world = unknowns.world[u]
+    if progress.active[world] == 0 or (displaced and progress.searches[world] == 0) or unknowns.is_free[u] == 0:
+        return
+    off = to_double(moved_positions[u]) - to_double(goal[u])
+    inertia = HALF / (wp.float64(motion.inverse_mass[u]) * settings.dt * settings.dt)
+    add_energy(energy, world, inertia * wp.dot(off, off), settings.units)
+
+
+@wp.kernel
+def write_moved(
+    # in
+    motion: Motion,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # out
+    moved_positions: wp.array[wp.vec3],
+):
+    """Writes positions, or the displaced ones."""
+    v = wp.tid()
+    world = motion.world[v]
+    if progress.active[world] != 0:
+        moved_positions[v] = moved(trial, wp.where(displaced, progress.scale[world], 0.0), v)
+
+
+@wp.kernel
+def decide_search(
+    # in and out
+    progress: Progress,
+    # out
+    search: wp.array[int],
+):
+    """Halves the shares of worlds whose energy has not fallen enough; not while something a program moves is coming."""
+    w = wp.tid()
+    if progress.active[w] == 0 or progress.searches[w] == 0:
+        progress.trial[w] = wp.int64(0)
+        return
+    before = wp.float64(progress.energy[w])
+    allowed = before + _NOISE * wp.abs(before)
+    allowed += _ARMIJO * wp.float64(progress.scale[w]) * wp.min(wp.float64(progress.slope[w]), ZERO)
+    falls = wp.float64(progress.trial[w]) <= allowed
+    progress.trial[w] = wp.int64(0)
+    if falls or progress.remaining[w] > 0.0:
+        progress.searches[w] = 0
+        return
+    progress.scale[w] = 0.5 * progress.scale[w]
+    if progress.scale[w] < _LEAST_SCALE:
+        progress.scale[w] = 0.0
+        progress.searches[w] = 0
+        return
+    search[0] = 1
+
+
+@wp.kernel
+def take(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    progress: Progress,
+    # in and out
+    trial: Trial,
+):
+    """Moves vertices by the shares of their worlds; what a program moves arrives exactly."""
+    v = wp.tid()
+    world = motion.world[v]
+    if progress.active[world] == 0:
+        return
+    scale = progress.scale[world]
+    u = unknowns.of_vertex[v]
+    given = u == -1
+    if u >= 0:
+        given = unknowns.is_free[u] == 0
+    if given and scale == 1.0:
+        trial.x[v] = motion.x1[v]
+    else:
+        trial.x[v] = moved(trial, scale, v)
+
+
+@wp.kernel
+def decide_step(
+    # in
+    least_change: float,
+    max_steps: int,
+    max_late_steps: int,
+    # in and out
+    progress: Progress,
+    plane_share: wp.array[float],
+    # out
+    goes_on: wp.array[int],
+):
+    """Ends worlds whose unknowns hardly change, or that have taken all their Newton steps.
+
+    Where something that a program moves has not arrived, there may be more of them.
+    """
+    w = wp.tid()
+    if progress.active[w] == 0:
+        return
+    scale = progress.scale[w]
+    plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
+    progress.steps[w] = progress.steps[w] + 1
+    arrived = scale == 1.0 or progress.remaining[w] == 0.0
+    steps = progress.steps[w]
+    ends = arrived and (progress.change[w] <= least_change or steps >= max_steps)
+    if scale == 0.0 and arrived:
+        ends = True
+    if ends or steps >= max_late_steps:
+        progress.active[w] = 0
+        return
+    goes_on[0] = 1
+
+
+@wp.kernel
+def finish(
+    # in
+    trial: Trial,
+    unknowns: Unknowns,
+    dt: float,
+    x0: wp.array[wp.vec3],
+    # in and out
+    motion: Motion,
+    vertices: Vertices,
+    particle_q: wp.array[wp.vec3],
+    particle_qd: wp.array[wp.vec3],
+):
+    """Writes where the step ends, and the velocity that took vertices there."""
+    v = wp.tid()
+    x = trial.x[v]
+    u = unknowns.of_vertex[v]
+    if u >= 0:
+        if unknowns.is_free[u] != 0:
+            velocity = (x - x0[v]) / dt
+            motion.x1[v] = x
+            motion.velocity[v] = velocity
+            vertices.x1[v] = x
+            vertices.velocity[v] = velocity
+            particle_q[v] = x
+            particle_qd[v] = velocity

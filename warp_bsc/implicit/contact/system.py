@@ -1,0 +1,159 @@
+"""The unknowns of a step, and what kernels know of them and of their worlds."""
+
+import warp as wp
+
+from .rows import Rows
+
+wp.set_module_options({"enable_backward": False})
+
+NOT_UNKNOWN = wp.constant(-1)
+"""In place of the unknown of a vertex that is where a program puts it."""
+
+
+@wp.struct
+class Unknowns:
+    """The unknowns of a step: displacements of particles, and of a body its shift and its turn, one after the other.
+
+    Attributes:
+        of_vertex: Unknown of each vertex of the mesh; :data:`NOT_UNKNOWN`, or -2 less the first unknown of its body.
+        world: World of each unknown.
+        of_worlds: First unknown of each world, and the end of the last.
+        is_free: 1 for each unknown that is solved for; the others are given.
+        arm: Of each vertex of a body that is solved for, from its centre of mass [m].
+    """
+
+    of_vertex: wp.array[int]
+    world: wp.array[int]
+    of_worlds: wp.array[int]
+    is_free: wp.array[int]
+    arm: wp.array[wp.vec3]
+
+
+@wp.struct
+class Progress:
+    """How far each world is with its step.
+
+    Attributes:
+        active: 1 while a world takes another Newton step, shape [worlds], like all that follow.
+        steps: Newton steps so far.
+        scale: Share of the displacements that is taken.
+        bound: Share of the displacements before two elements meet.
+        searches: 1 while the share of the world is to be halved, as its energy has risen.
+        energy: Energy at the positions, in units.
+        trial: Energy at the displaced positions, in units.
+        slope: Derivative of the energy along the displacements, in units.
+        change: Largest displacement of an unknown [m].
+        remaining: Largest way of what a program moves that is left [m].
+    """
+
+    active: wp.array[int]
+    steps: wp.array[int]
+    scale: wp.array[float]
+    bound: wp.array[float]
+    searches: wp.array[int]
+    energy: wp.array[wp.int64]
+    trial: wp.array[wp.int64]
+    slope: wp.array[wp.int64]
+    change: wp.array[float]
+    remaining: wp.array[float]
+
+
+@wp.struct
+class Contacts:
+    """Pairs of elements that are near each other, and particles near planes, with their closest points as fixed.
+
+    The energy of one, as a function of the vector between the closest points, has ``gradient`` and ``hessian``.
+
+    Attributes:
+        count: Number of contacts, shape [1].
+        corners: Vertices; of a particle at a plane, four times the particle.
+        weights: Of the vertices in the vector from the second closest point to the first.
+        normal: Unit vector from the second closest point to the first.
+        load: Force that pushes them apart [N].
+        friction: Coefficient.
+        gradient: [N].
+        hessian: Positive semidefinite [N/m].
+        key: Number of the pair, by which contacts of an unknown are ordered.
+        first: First entry of each unknown, and the end of the last.
+        entries: Contact and place of the vertex in it, as four times the contact plus the place.
+    """
+
+    count: wp.array[int]
+    corners: wp.array[wp.vec4i]
+    weights: wp.array[wp.vec4]
+    normal: wp.array[wp.vec3]
+    load: wp.array[float]
+    friction: wp.array[float]
+    gradient: wp.array[wp.vec3]
+    hessian: wp.array[wp.mat33]
+    key: wp.array[wp.int64]
+    first: wp.array[int]
+    entries: wp.array[int]
+
+
+@wp.func
+def unknown_of_corner(unknowns: Unknowns, vertex: int) -> int:
+    """Returns the unknown of a vertex, the first of its body, or -1."""
+    u = unknowns.of_vertex[vertex]
+    return wp.where(u < -1, -2 - u, u)
+
+
+@wp.func
+def displacement(unknowns: Unknowns, vertex: int, d: wp.array[wp.vec3]) -> wp.vec3:
+    """Returns the displacement of a vertex, given those of unknowns; 0 where a program puts it."""
+    u = unknowns.of_vertex[vertex]
+    if u >= 0:
+        return d[u]
+    if u < -1:
+        return d[-2 - u] + wp.cross(d[-1 - u], unknowns.arm[vertex])
+    return wp.vec3()
+
+
+@wp.func
+def contact_count(contacts: Contacts) -> int:
+    """Returns the number of contacts; those that did not fit are counted, but are not there."""
+    return wp.min(contacts.count[0], contacts.corners.shape[0])
+
+
+@wp.func
+def product(rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.array[wp.vec3]) -> wp.vec3:
+    """Returns the row of an unknown of the product of the Hessian with a vector."""
+    total = wp.vec3()
+    for k in range(rows.first[u], rows.first[u + 1]):
+        total += rows.block[k] * p[rows.column[k]]
+    for n in range(contacts.first[u], contacts.first[u + 1]):
+        entry = contacts.entries[n]
+        i = entry >> 2
+        corners, weights = contacts.corners[i], contacts.weights[i]
+        between = wp.vec3()
+        for j in range(4):
+            if weights[j] != 0.0:
+                between += weights[j] * displacement(unknowns, corners[j], p)
+        total += _by_corner(unknowns, corners[entry & 3], u, weights[entry & 3] * (contacts.hessian[i] * between))
+    return total
+
+
+@wp.func
+def _by_corner(unknowns: Unknowns, vertex: int, u: int, force: wp.vec3) -> wp.vec3:
+    """Returns what a force on a vertex is to an unknown: itself, or its torque if that is the turn of a body."""
+    if unknowns.of_vertex[vertex] == -1 - u:  # the unknown behind the first of the body
+        return wp.cross(unknowns.arm[vertex], force)
+    return force
+
+
+@wp.func
+def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int):
+    """Returns the gradient of the energy of contacts by an unknown, and their block of the diagonal."""
+    gradient, block = wp.vec3(), wp.mat33()
+    for n in range(contacts.first[u], contacts.first[u + 1]):
+        entry = contacts.entries[n]
+        i = entry >> 2
+        weight, vertex = contacts.weights[i][entry & 3], contacts.corners[i][entry & 3]
+        gradient += _by_corner(unknowns, vertex, u, weight * contacts.gradient[i])
+        if unknowns.of_vertex[vertex] == -1 - u:
+            r = unknowns.arm[vertex]
+            turn = wp.skew(r)
+            block += weight * weight * (turn * contacts.hessian[i] * wp.transpose(turn))
+        else:
+            block += weight * weight * contacts.hessian[i]
+    return gradient, block
