@@ -104,6 +104,7 @@ def safe_share(
     s: wp.vec3d,
     distance: wp.float64,
     kept: wp.float64,
+    least: wp.float64,
 ) -> wp.float64:
     """Returns a share of the displacements up to which two elements keep a tenth of their gap, 1 for all of them.
 
@@ -115,17 +116,22 @@ def safe_share(
     way = one + wp.max(two, wp.max(three, four))
     if kind == EDGE_EDGE:
         way = wp.max(one, two) + wp.max(three, four)
-    gap = distance - kept
-    if way <= (ONE - KEPT_GAP) * gap:
+    gap = distance - kept - least
+    if way <= gap:
         return ONE
-    least = KEPT_GAP * gap
-    time = (ONE - KEPT_GAP) * gap / way
+    time = gap / way
     for _k in range(_SEARCHES):
         _weights, now = closest_weights_and_gap(kind, a + time * p, b + time * q, c + time * r, d + time * s)
-        ahead = _NEXT * (now - kept - least) / way
-        if now - kept < least + KEPT_GAP * least or not ahead > ZERO:
+        gap = now - kept - least
+        if gap < KEPT_GAP * least:
             return time
-        time += ahead
+        time += _NEXT * gap / way
         if time >= ONE:
             return ONE
     return time
+
+
+@wp.func
+def least_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
+    """Returns the gap that a pair keeps in a Newton step: half of it, or less than half of the reach of its barrier."""
+    return wp.min(HALF * gap, wp.float64(0.3) * reach)

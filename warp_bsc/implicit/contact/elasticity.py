@@ -206,7 +206,13 @@ def _membrane_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.ar
 
 @wp.func
 def _differentiate_membrane(
-    elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
+    elements: Elements,
+    e: int,
+    x: wp.array[wp.vec3],
+    x0: wp.array[wp.vec3],
+    dt: wp.float64,
+    is_convex: bool,
+    out: Derivatives,
 ):
     corner, place = elements.first[_FIRST_CORNER] + 3 * e, elements.first[_FIRST_BLOCK] + 9 * e
     mu, lame = wp.float64(elements.tri_materials[e, 0]), wp.float64(elements.tri_materials[e, 1])
@@ -225,10 +231,27 @@ def _differentiate_membrane(
     g0, g1 = wp.cross(f1, normal), wp.cross(normal, f0)  # derivatives of the ratio of areas
     stress_0, stress_1 = mu * f0 + pressure * g0, mu * f1 + pressure * g1
     # d^2 ratio = n n^T (f1.f1, -f0.f1; -f0.f1, f0.f0) / ratio, and (0, -[n]; [n], 0)
-    across = (pressure / ratio) * wp.outer(normal, normal)
-    h00 = mu * _identity() + lame * wp.outer(g0, g0) + wp.dot(f1, f1) * across
-    h11 = mu * _identity() + lame * wp.outer(g1, g1) + wp.dot(f0, f0) * across
-    h01 = lame * wp.outer(g0, g1) - wp.dot(f0, f1) * across - pressure * _cross_matrix(normal)
+    s00 = mu + pressure / ratio * wp.dot(f1, f1)
+    s11 = mu + pressure / ratio * wp.dot(f0, f0)
+    s01 = -pressure / ratio * wp.dot(f0, f1)
+    within = pressure
+    if is_convex:
+        within = wp.clamp(pressure, -mu, mu)
+        mean, half = HALF * (s00 + s11), HALF * (s00 - s11)
+        radius = wp.sqrt(half * half + s01 * s01)
+        if mean - radius < ZERO:
+            top = wp.max(mean + radius, ZERO)
+            scale_p = ZERO
+            if radius > ZERO:
+                scale_p = HALF * top / radius
+            s00 = HALF * top + scale_p * half
+            s11 = HALF * top - scale_p * half
+            s01 = scale_p * s01
+    nn = wp.outer(normal, normal)
+    plane = _identity() - nn
+    h00 = mu * plane + lame * wp.outer(g0, g0) + s00 * nn
+    h11 = mu * plane + lame * wp.outer(g1, g1) + s11 * nn
+    h01 = lame * wp.outer(g0, g1) + s01 * nn - within * _cross_matrix(normal)
     damping = wp.float64(elements.tri_materials[e, 2])
     if damping > ZERO:
         r0, r1 = _membrane_frame(elements, e, x0)
@@ -239,9 +262,13 @@ def _differentiate_membrane(
         stress_0 += rate_00 * f0 + rate_01 * f1
         stress_1 += rate_01 * f0 + rate_11 * f1
         p00, p11 = wp.outer(f0, f0), wp.outer(f1, f1)
-        h00 += rate_00 * _identity() + scale * (_TWO * p00 + p11)
-        h11 += rate_11 * _identity() + scale * (_TWO * p11 + p00)
-        h01 += rate_01 * _identity() + scale * wp.outer(f1, f0)
+        h00 += scale * (_TWO * p00 + p11)
+        h11 += scale * (_TWO * p11 + p00)
+        h01 += scale * wp.outer(f1, f0)
+        if not is_convex:
+            h00 += rate_00 * _identity()
+            h11 += rate_11 * _identity()
+            h01 += rate_01 * _identity()
     pose, area = elements.tri_poses[e], wp.float64(elements.tri_areas[e])
     a, b = wp.float64(pose[0, 0]), wp.float64(pose[0, 1])
     c, d = wp.float64(pose[1, 0]), wp.float64(pose[1, 1])
@@ -401,7 +428,13 @@ def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp
 
 @wp.func
 def _differentiate_tetrahedron(
-    elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
+    elements: Elements,
+    e: int,
+    x: wp.array[wp.vec3],
+    x0: wp.array[wp.vec3],
+    dt: wp.float64,
+    is_convex: bool,
+    out: Derivatives,
 ):
     corner, place = elements.first[_FIRST_CORNER + 2] + 4 * e, elements.first[_FIRST_BLOCK + 2] + 16 * e
     mu, lame = wp.float64(elements.tet_materials[e, 0]), wp.float64(elements.tet_materials[e, 1])
@@ -422,9 +455,13 @@ def _differentiate_tetrahedron(
     h00 = mu * _identity() + lame * wp.outer(g0, g0)
     h11 = mu * _identity() + lame * wp.outer(g1, g1)
     h22 = mu * _identity() + lame * wp.outer(g2, g2)
-    h01 = lame * wp.outer(g0, g1) - pressure * _cross_matrix(f2)
-    h02 = lame * wp.outer(g0, g2) + pressure * _cross_matrix(f1)
-    h12 = lame * wp.outer(g1, g2) - pressure * _cross_matrix(f0)
+    within = pressure
+    if is_convex:
+        most = mu / wp.sqrt(wp.max(wp.ddot(f, f) / _THREE, ONE))
+        within = wp.clamp(pressure, -most, most)
+    h01 = lame * wp.outer(g0, g1) - within * _cross_matrix(f2)
+    h02 = lame * wp.outer(g0, g2) + within * _cross_matrix(f1)
+    h12 = lame * wp.outer(g1, g2) - within * _cross_matrix(f0)
     damping = wp.float64(elements.tet_materials[e, 2])
     if damping > ZERO:
         g = _tetrahedron_frame(elements, e, pose, x0)
@@ -434,12 +471,19 @@ def _differentiate_tetrahedron(
         s1 += rate[1, 0] * f0 + rate[1, 1] * f1 + rate[1, 2] * f2
         s2 += rate[2, 0] * f0 + rate[2, 1] * f1 + rate[2, 2] * f2
         p = wp.outer(f0, f0) + wp.outer(f1, f1) + wp.outer(f2, f2)
-        h00 += rate[0, 0] * _identity() + scale * (wp.outer(f0, f0) + p)
-        h11 += rate[1, 1] * _identity() + scale * (wp.outer(f1, f1) + p)
-        h22 += rate[2, 2] * _identity() + scale * (wp.outer(f2, f2) + p)
-        h01 += rate[0, 1] * _identity() + scale * wp.outer(f1, f0)
-        h02 += rate[0, 2] * _identity() + scale * wp.outer(f2, f0)
-        h12 += rate[1, 2] * _identity() + scale * wp.outer(f2, f1)
+        h00 += scale * (wp.outer(f0, f0) + p)
+        h11 += scale * (wp.outer(f1, f1) + p)
+        h22 += scale * (wp.outer(f2, f2) + p)
+        h01 += scale * wp.outer(f1, f0)
+        h02 += scale * wp.outer(f2, f0)
+        h12 += scale * wp.outer(f2, f1)
+        if not is_convex:
+            h00 += rate[0, 0] * _identity()
+            h11 += rate[1, 1] * _identity()
+            h22 += rate[2, 2] * _identity()
+            h01 += rate[0, 1] * _identity()
+            h02 += rate[0, 2] * _identity()
+            h12 += rate[1, 2] * _identity()
     h10, h20, h21 = wp.transpose(h01), wp.transpose(h02), wp.transpose(h12)
     for i in range(4):
         b = _corner_weights(pose, i)
@@ -475,7 +519,13 @@ def _spring_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.arra
 
 @wp.func
 def _differentiate_spring(
-    elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
+    elements: Elements,
+    e: int,
+    x: wp.array[wp.vec3],
+    x0: wp.array[wp.vec3],
+    dt: wp.float64,
+    is_convex: bool,
+    out: Derivatives,
 ):
     corner, place = elements.first[_FIRST_CORNER + 3] + 2 * e, elements.first[_FIRST_BLOCK + 3] + 4 * e
     a, b = elements.spring_indices[e, 0], elements.spring_indices[e, 1]
@@ -486,7 +536,10 @@ def _differentiate_spring(
     tension = stiffness * (length - wp.float64(elements.spring_rest_length[e])) + damping * (length - length_0)
     along = between / length
     outer = wp.outer(along, along)
-    block = _single((stiffness + damping) * outer + (tension / length) * (_identity() - outer))
+    across = tension / length
+    if is_convex:
+        across = wp.max(across, ZERO)
+    block = _single((stiffness + damping) * outer + across * (_identity() - outer))
     force = to_single(tension * along)
     out.gradient[corner] = force
     out.gradient[corner + 1] = -force
@@ -523,23 +576,27 @@ def differentiate(
     dt: wp.float64,
     world: wp.array[int],
     active: wp.array[int],
+    convex: wp.array[int],
     # out
     out: Derivatives,
 ):
     """Computes the gradient and the Hessian of each element, in active worlds.
 
-    The Hessian of bending is that of Gauss and Newton: without the curvature of the angle.
+    The Hessian of bending is that of Gauss and Newton: without the curvature of the angle. In ``convex`` worlds, those
+    of others are without their negative curvature too, or more.
     """
     i = wp.tid()
     kind = kind_of(elements, i)
     e = i - elements.first[kind]
-    if active[world[first_vertex(elements, kind, e)]] == 0:
+    in_world = world[first_vertex(elements, kind, e)]
+    if active[in_world] == 0:
         return
+    is_convex = convex[in_world] != 0
     if kind == ElementKind.MEMBRANE:
-        _differentiate_membrane(elements, e, x, x0, dt, out)
+        _differentiate_membrane(elements, e, x, x0, dt, is_convex, out)
     elif kind == ElementKind.BENDING:
         _differentiate_bending(elements, e, x, x0, dt, out)
     elif kind == ElementKind.TETRAHEDRON:
-        _differentiate_tetrahedron(elements, e, x, x0, dt, out)
+        _differentiate_tetrahedron(elements, e, x, x0, dt, is_convex, out)
     else:
-        _differentiate_spring(elements, e, x, x0, dt, out)
+        _differentiate_spring(elements, e, x, x0, dt, is_convex, out)

@@ -83,9 +83,11 @@ class NewtonMethod:
         )
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
+        self._whole = wp.zeros(vertices, dtype=float, device=device)
         self._flags = wp.zeros(2, dtype=int, device=device)
         self._goes_on, self._search = self._flags[0:1], self._flags[1:2]
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
+        self._convex = wp.ones(work.worlds, dtype=int, device=device)
         self._settings = BarrierSettings()
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
@@ -169,11 +171,11 @@ class NewtonMethod:
         self._ends = wp.zeros(self._count + 1, dtype=int, device=device)
         assert contacts is not None
 
-    def _bound(self):
+    def _bound(self, truncations=_TRUNCATIONS):
         """Takes the displacements down until no two elements meet on them: of single vertices, then of worlds."""
         work, motion = self._work, self._work.step.motion
-        for k in range(_TRUNCATIONS + 1):
-            by_vertex = k < _TRUNCATIONS
+        for k in range(truncations + 1):
+            by_vertex = k < truncations
             inputs = [motion, *self._candidates, self._trial, self.progress, by_vertex, self._limit]
             work.launch_over_entries(pairs.bound_by_pairs, inputs)
             if work.max_penetrations:
@@ -189,7 +191,7 @@ class NewtonMethod:
         dt = wp.float64(self._dt)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns, progress.active], [trial])
-        inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active]
+        inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
         inputs = [self._derivatives, self._row_of_block, unknowns.world, progress.active]
         self._launch(add_blocks, len(self._row_of_block), inputs, [self._rows])
@@ -215,9 +217,17 @@ class NewtonMethod:
         )
         inputs = [motion, unknowns, self._vectors, self._lower, self._upper, self._settings.units]
         self._launch(steps.displace, vertices, inputs, [trial, progress])
-        self._bound()
+        self._bound(0)
         self._add_energies(False, progress.energy)
-        self._search.fill_(1)
+        self._add_energies(True, progress.trial)
+        inputs = [motion, unknowns, self._lower, self._upper]
+        self._launch(steps.begin_truncation, vertices, inputs, [trial, progress, self._whole])
+        self._bound(_TRUNCATIONS)
+        self._add_energies(True, progress.trial_cut)
+        self._launch(steps.choose_truncation, work.worlds, [self._whole], [progress])
+        self._launch(steps.undo_truncation, vertices, [motion, progress], [trial])
+        self._search.zero_()
+        self._launch(steps.decide_search, work.worlds, [], [progress, self._search])
         wp.capture_while(self._search, self._try)
         self._launch(steps.take, vertices, [motion, unknowns, progress], [trial])
         self._goes_on.zero_()

@@ -460,9 +460,10 @@ def _bound(
     way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     kept = candidates.kept[i]
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-    if way <= (ONE - barrier.KEPT_GAP) * (distance - kept):
+    least = barrier.least_gap(distance - kept, wp.float64(candidates.reach[i]))
+    if way <= distance - kept - least:
         return
-    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, distance, kept))
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, distance, kept, least))
     if share < 1.0:
         if by_vertex:
             for j in range(4):
@@ -526,8 +527,9 @@ def bound_by_planes(
         then = now + (1.0 - now) * scale
         after, _error_after = signed_distance(_plane_at(planes, i, then), moved(trial, scale, vertex))
         gap, left = before - kept, after - kept
-        if left < barrier.KEPT_GAP * gap:
-            share = float((ONE - barrier.KEPT_GAP) * gap / (gap - left))
+        least = barrier.least_gap(gap, reach)
+        if left < least:
+            share = float((gap - least) / (gap - left))
             if by_vertex:
                 wp.atomic_min(limit, vertex, share)
             else:

@@ -109,7 +109,7 @@ def truncate(
         if unknowns.is_free[unknowns.of_vertex[v]] != 0:
             share = limit[v]
             if share < 1.0:
-                trial.share[v] = trial.share[v] * wp.where(share > 0.05, share, 0.0)
+                trial.share[v] = trial.share[v] * share
     limit[v] = 1.0
 
 
@@ -230,18 +230,85 @@ def displace(
             wp.atomic_max(progress.remaining, world, way)
         return
     d = displacement(unknowns, v, vectors.solution)
-    x = trial.x[v]
+    trial.displaced[v] = d
+    trial.share[v] = 1.0
+    wp.atomic_min(progress.bound, world, _share_within(trial.x[v], d, lower[v], upper[v]))
+    wp.atomic_max(progress.change, world, wp.length(d))
+    add_energy(progress.slope, world, wp.float64(wp.dot(d, vectors.gradient[u])), units)
+
+
+@wp.func
+def _share_within(x: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> float:
+    """Returns the share of a displacement that stays in a box."""
     share = float(1.0)
     for axis in range(3):
-        to = x[axis] + d[axis]
-        if to > upper[v][axis]:
-            share = wp.min(share, (upper[v][axis] - x[axis]) / d[axis])
-        elif to < lower[v][axis]:
-            share = wp.min(share, (lower[v][axis] - x[axis]) / d[axis])
-    trial.displaced[v] = d
-    trial.share[v] = wp.max(share, 0.0)
-    wp.atomic_max(progress.change, world, wp.length(d))
-    add_energy(progress.slope, world, wp.float64(share * wp.dot(d, vectors.gradient[u])), units)
+        if x[axis] + d[axis] > upper[axis]:
+            share = wp.min(share, (upper[axis] - x[axis]) / d[axis])
+        elif x[axis] + d[axis] < lower[axis]:
+            share = wp.min(share, (lower[axis] - x[axis]) / d[axis])
+    return wp.max(share, 0.0)
+
+
+@wp.kernel
+def begin_truncation(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    # in and out
+    trial: Trial,
+    progress: Progress,
+    whole: wp.array[float],
+):
+    """Lets worlds that take less than all of their displacements try to cut those of single vertices instead."""
+    v = wp.tid()
+    if v < progress.active.shape[0]:
+        whole[v] = progress.scale[v]
+        progress.searches[v] = 0
+        if progress.active[v] != 0 and progress.scale[v] < 1.0:
+            progress.searches[v] = 1
+        progress.scale[v] = 1.0
+    u = unknowns.of_vertex[v]
+    if u != -1:
+        trial.share[v] = _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v])
+        if u >= 0:
+            if unknowns.is_free[u] == 0:
+                trial.share[v] = 1.0
+
+
+@wp.kernel
+def choose_truncation(
+    # in
+    whole: wp.array[float],
+    # in and out
+    progress: Progress,
+):
+    """Keeps the cuts of single vertices in worlds whose energy is lower with them."""
+    w = wp.tid()
+    if progress.active[w] == 0:
+        return
+    cuts = progress.searches[w] != 0 and progress.trial_cut[w] < progress.trial[w]
+    if cuts:
+        progress.trial[w] = progress.trial_cut[w]
+    else:
+        progress.scale[w] = whole[w]
+    progress.cuts[w] = int(cuts)
+    progress.searches[w] = 1
+
+
+@wp.kernel
+def undo_truncation(
+    # in
+    motion: Motion,
+    progress: Progress,
+    # out
+    trial: Trial,
+):
+    """Lets vertices take all that their world takes, where it cuts none."""
+    v = wp.tid()
+    if progress.cuts[motion.world[v]] == 0:
+        trial.share[v] = 1.0
 
 
 @wp.kernel
@@ -258,6 +325,9 @@ def begin_newton_step(
     progress.bound[w] = 1.0
     progress.searches[w] = progress.active[w]
     progress.energy[w] = wp.int64(0)
+    progress.trial[w] = wp.int64(0)
+    progress.trial_cut[w] = wp.int64(0)
+    progress.cuts[w] = 0
 
 
 @wp.kernel

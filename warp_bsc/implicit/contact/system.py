@@ -41,6 +41,8 @@ class Progress:
         searches: 1 while the share of the world is to be halved, as its energy has risen.
         energy: Energy at the positions, in units.
         trial: Energy at the displaced positions, in units.
+        trial_cut: The same, with displacements of single vertices cut.
+        cuts: 1 if those are cut.
         slope: Derivative of the energy along the displacements, in units.
         change: Largest displacement of an unknown [m].
         remaining: Largest way of what a program moves that is left [m].
@@ -53,6 +55,8 @@ class Progress:
     searches: wp.array[int]
     energy: wp.array[wp.int64]
     trial: wp.array[wp.int64]
+    trial_cut: wp.array[wp.int64]
+    cuts: wp.array[int]
     slope: wp.array[wp.int64]
     change: wp.array[float]
     remaining: wp.array[float]
