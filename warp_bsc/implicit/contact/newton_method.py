@@ -91,6 +91,7 @@ class NewtonMethod:
         self._settings = BarrierSettings()
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
+        self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
         margin = np.where(np.isfinite(reach), reach, 0.0)
         self._margin = wp.array(margin + 0.5 * margin.max(initial=0.0), dtype=float, device=device)
         masses = model.particle_mass.numpy()[model.particle_inv_mass.numpy() > 0]
@@ -114,6 +115,17 @@ class NewtonMethod:
         radius = model.particle_radius.numpy()
         reach[:particles] = np.where(radius > 0, np.minimum(reach[:particles], radius), reach[:particles])
         return reach
+
+    def _elasticity(self, mesh) -> np.ndarray:
+        """Returns the stiffness of the tetrahedra around each vertex, mu V |b|^2 of each, of shape functions b [N/m]."""
+        model, found = mesh.model, np.zeros(mesh.vertex_count)
+        if model.tet_count:
+            poses, materials = model.tet_poses.numpy().astype(float), model.tet_materials.numpy()
+            gradients = np.concatenate([-poses.sum(axis=1, keepdims=True), poses], axis=1)
+            volume = 1.0 / (6.0 * np.linalg.det(poses))
+            stiffness = (materials[:, 0] * volume)[:, None] * (gradients**2).sum(axis=2)
+            np.add.at(found, model.tet_indices.numpy().reshape(-1, 4), stiffness)
+        return found
 
     def solve(self, v0: wp.array, particle_q: wp.array, particle_qd: wp.array, dt: float) -> None:
         """Finds where the particles end that the motion of the workspace predicts, and writes it there and here.

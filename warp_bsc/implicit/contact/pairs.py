@@ -9,7 +9,7 @@ from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices
 from ...response.contacts.rules import ContactClass, crossed_at_start, owner_of
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ...response.state.structs import Motion, Step
-from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
+from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
 from .system import Contacts, Progress, Unknowns, contact_count, displacement, unknown_of_corner
 
@@ -42,12 +42,14 @@ class BarrierSettings:
     Attributes:
         dt: Length of the step [s].
         reach: Of each vertex: gap from which it pushes [m], infinite for shapes.
+        elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
         smoothing: Length below which friction is smoothed [m].
         units: Units of energy in a joule.
     """
 
     dt: wp.float64
     reach: wp.array[float]
+    elasticity: wp.array[float]
     smoothing: wp.float64
     units: wp.float64
 
@@ -92,16 +94,29 @@ def _inverse_mass(motion: Motion, vertex: int) -> float:
 
 
 @wp.func
+def _compliance(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.float64:
+    """Returns how far a force of 1 N moves a vertex in the step [m/N], by its mass and the solid around it."""
+    inverse = wp.float64(_inverse_mass(motion, vertex))
+    return inverse / (ONE / (settings.dt * settings.dt) + inverse * wp.float64(settings.elasticity[vertex]))
+
+
+@wp.func
 def _stiffness(motion: Motion, settings: BarrierSettings, corners: wp.vec4i, is_edges: bool) -> wp.float64:
-    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is the reduced mass over dt^2."""
-    first = wp.float64(_inverse_mass(motion, corners[0]))
-    second = wp.float64(_inverse_mass(motion, corners[2]) + _inverse_mass(motion, corners[3]))
+    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart."""
+    first = _compliance(motion, settings, corners[0])
+    second = _compliance(motion, settings, corners[2]) + _compliance(motion, settings, corners[3])
     if is_edges:
-        first = wp.float64(0.5) * (first + wp.float64(_inverse_mass(motion, corners[1])))
-        second = wp.float64(0.5) * second
+        first = HALF * (first + _compliance(motion, settings, corners[1]))
+        second = HALF * second
     else:
-        second = (second + wp.float64(_inverse_mass(motion, corners[1]))) / wp.float64(3.0)
-    return ONE / ((first + second) * settings.dt * settings.dt * wp.float64(barrier.CURVATURE_AT_HALF))
+        second = (second + _compliance(motion, settings, corners[1])) / wp.float64(3.0)
+    return ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF))
+
+
+@wp.func
+def _stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.float64:
+    """Returns the stiffness of a barrier between a particle and a plane [N/m], see :func:`_stiffness`."""
+    return ONE / (_compliance(motion, settings, vertex) * wp.float64(barrier.CURVATURE_AT_HALF))
 
 
 @wp.func
@@ -340,12 +355,7 @@ def find_near_planes(
         if gap >= reach or not gap > ZERO:
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
-        stiffness = ONE / (
-            wp.float64(motion.inverse_mass[vertex])
-            * settings.dt
-            * settings.dt
-            * wp.float64(barrier.CURVATURE_AT_HALF)
-        )
+        stiffness = _stiffness_at_plane(motion, settings, vertex)
         key = (wp.int64(2) << wp.int64(61)) | (wp.int64(vertex) << wp.int64(31)) | wp.int64(i)
         there, _error_there = signed_distance(planes.end[i], trial.x[vertex])
         since, _since_error = signed_distance(planes.start[i], trial.x[vertex])
@@ -665,7 +675,5 @@ def add_plane_energies(
         if gap < reach:
             value = wp.float64(1.0e30)
             if gap > ZERO:
-                mass = ONE / wp.float64(motion.inverse_mass[vertex])
-                stiffness = mass / (settings.dt * settings.dt * wp.float64(barrier.CURVATURE_AT_HALF))
-                value = stiffness * barrier.barrier_energy(gap, reach)
+                value = _stiffness_at_plane(motion, settings, vertex) * barrier.barrier_energy(gap, reach)
             add_energy(energy, world, value, settings.units)
