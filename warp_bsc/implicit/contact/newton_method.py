@@ -20,6 +20,8 @@ from .system import Contacts, Progress, Unknowns
 
 _TRUNCATIONS = 4
 """Passes in which the ways of single vertices are cut, before that of their world is."""
+_PREDICTIONS = 2
+"""Solves of a Newton step after its first one, each of which holds what met in the one before."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
 _SHORT_EDGE = 0.25
@@ -87,6 +89,7 @@ class NewtonMethod:
         self._flags = wp.zeros(2, dtype=int, device=device)
         self._goes_on, self._search = self._flags[0:1], self._flags[1:2]
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
+        self._ahead = wp.zeros(work.worlds, dtype=int, device=device)
         self._convex = wp.ones(work.worlds, dtype=int, device=device)
         self._settings = BarrierSettings()
         reach = self._reach(mesh)
@@ -210,23 +213,9 @@ class NewtonMethod:
         self._find_contacts()
         inputs = [self._derivatives, contacts, unknowns, trial, self._goal, motion.inverse_mass, dt, progress.active]
         self._launch(steps.assemble, self._count, inputs, [self._rows, self._vectors])
-        threads = work.worlds * (BLOCK if work.device.is_cuda else 1)
-        wp.launch(
-            solve_worlds,
-            threads,
-            inputs=[
-                self._rows,
-                contacts,
-                unknowns,
-                progress.active,
-                wp.float64(_TOLERANCE),
-                _MAX_ITERATIONS,
-                self._vectors,
-                self.iterations,
-            ],
-            device=work.device,
-            block_dim=BLOCK,
-        )
+        self._solve_linear(progress.active)
+        for group in range(_PREDICTIONS):
+            self._hold_ahead(2 + group)
         inputs = [motion, unknowns, self._vectors, self._lower, self._upper, self._settings.units]
         self._launch(steps.displace, vertices, inputs, [trial, progress])
         self._bound(0)
@@ -246,6 +235,34 @@ class NewtonMethod:
         inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
         self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
 
+    def _solve_linear(self, active):
+        work = self._work
+        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS]
+        wp.launch(
+            solve_worlds,
+            work.worlds * (BLOCK if work.device.is_cuda else 1),
+            inputs=[*inputs, self._vectors, self.iterations],
+            device=work.device,
+            block_dim=BLOCK,
+        )
+
+    def _hold_ahead(self, group):
+        """Holds what would meet on the displacements, and solves again."""
+        work, motion, trial, contacts = self._work, self._work.step.motion, self._trial, self._contacts
+        unknowns, active = self._unknowns, self.progress.active
+        inputs = [motion, unknowns, self._vectors, active]
+        self._launch(steps.write_displacements, self._mesh.vertex_count, inputs, [trial])
+        self._ahead.zero_()
+        inputs = [trial, unknowns, self._vectors.inverse, active, group, contacts, self._ahead]
+        work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs])
+        if work.max_penetrations:
+            inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
+            self._launch(pairs.hold_at_planes, work.particle_count, inputs, [])
+        self._list_contacts()
+        inputs = [contacts, unknowns, self._derivatives, trial, self._goal, motion.inverse_mass, wp.float64(self._dt)]
+        self._launch(steps.assemble_again, self._count, [*inputs, self._ahead], [self._rows, self._vectors])
+        self._solve_linear(self._ahead)
+
     def _find_contacts(self):
         """Finds what is near at the positions, and lists it by unknown."""
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
@@ -255,6 +272,10 @@ class NewtonMethod:
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
             self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
+        self._list_contacts()
+
+    def _list_contacts(self):
+        work, contacts = self._work, self._contacts
         self._counts.zero_()
         work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns, self._counts])
         wp.utils.array_scan(self._counts, contacts.first, inclusive=False)

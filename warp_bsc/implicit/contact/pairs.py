@@ -168,6 +168,12 @@ def prepare_candidates(
 
 
 @wp.func
+def _key(group: int, kind: int, first: int, second: int) -> wp.int64:
+    """Returns a number of a pair, different for each pair of a kind, and for each group of contacts."""
+    return (wp.int64(8 * group + kind) << wp.int64(58)) | (wp.int64(first) << wp.int64(29)) | wp.int64(second)
+
+
+@wp.func
 def _add_contact(
     motion: Motion,
     contacts: Contacts,
@@ -256,7 +262,7 @@ def _find_near(
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
     stiffness = _stiffness(motion, settings, corners, queue.kind == 1)
     pair = queue.pairs[i]
-    key = (wp.int64(queue.kind) << wp.int64(62)) | (wp.int64(pair[0]) << wp.int64(31)) | wp.int64(pair[1])
+    key = _key(0, queue.kind, pair[0], pair[1])
     friction = pair_friction(motion, corners)
     _add_contact(
         motion,
@@ -356,7 +362,7 @@ def find_near_planes(
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         stiffness = _stiffness_at_plane(motion, settings, vertex)
-        key = (wp.int64(2) << wp.int64(61)) | (wp.int64(vertex) << wp.int64(31)) | wp.int64(i)
+        key = _key(1, 0, vertex, i)
         there, _error_there = signed_distance(planes.end[i], trial.x[vertex])
         since, _since_error = signed_distance(planes.start[i], trial.x[vertex])
         _add_contact(
@@ -438,6 +444,173 @@ def sort_entries(contacts: Contacts, u: int):
             contacts.entries[m + 1] = other
             m -= 1
         contacts.entries[m + 1] = entry
+
+
+# Contacts ahead
+
+_GOAL_OF_REACH, _GOAL_OF_GAP = wp.constant(wp.float64(0.6)), wp.constant(wp.float64(0.75))
+"""Gap to which a pair is held that would meet in a Newton step: of the reach of its barrier, or of its gap if less."""
+_STIFFER = wp.constant(float(10.0))
+"""How much stiffer it is held than what moves it."""
+
+
+@wp.func
+def _hold(
+    contacts: Contacts,
+    unknowns: Unknowns,
+    trial: Trial,
+    inverse: wp.array[wp.mat33],
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    short: wp.float64,
+    key: wp.int64,
+):
+    """Adds a contact that holds a pair which is farther apart along the normal than it shall be, ``short`` if less."""
+    compliance = float(0.0)
+    given = ZERO
+    n = to_single(normal)
+    for j in range(4):
+        v = corners[j]
+        u = unknowns.of_vertex[v]
+        w = float(weights[j])
+        if u == -1:
+            given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
+        elif u >= 0:
+            compliance += w * w * wp.dot(n, inverse[u] * n)
+        else:
+            turn = wp.cross(unknowns.arm[v], n)
+            compliance += w * w * (wp.dot(n, inverse[-2 - u] * n) + wp.dot(turn, inverse[-1 - u] * turn))
+    if not compliance > 0.0:
+        return
+    slot = take_slot_int(contacts.count)
+    if slot >= contacts.corners.shape[0]:
+        return
+    stiffness = _STIFFER / compliance
+    contacts.corners[slot] = corners
+    contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
+    contacts.normal[slot] = n
+    contacts.load[slot] = 0.0
+    contacts.friction[slot] = 0.0
+    contacts.gradient[slot] = (stiffness * float(given - short)) * n
+    contacts.hessian[slot] = stiffness * wp.outer(n, n)
+    contacts.key[slot] = key
+
+
+@wp.func
+def _hold_pair(
+    motion: Motion,
+    candidates: Candidates,
+    trial: Trial,
+    unknowns: Unknowns,
+    inverse: wp.array[wp.mat33],
+    active: wp.array[int],
+    group: int,
+    contacts: Contacts,
+    ahead: wp.array[int],
+    i: int,
+):
+    reach = wp.float64(candidates.reach[i])
+    if reach == ZERO:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    world = motion.world[corners[0]]
+    if active[world] == 0:
+        return
+    a, b, c, d = corners_of(trial.x, corners)
+    p, q, r, s = corners_of(trial.displaced, corners)
+    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
+    kept = candidates.kept[i]
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    gap = distance - kept
+    least = barrier.least_gap(gap, reach)
+    if way <= gap - least:
+        return
+    time = barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, distance, kept, least)
+    if time >= ONE:
+        return
+    e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
+    weights, then = barrier.closest_weights_and_gap(queue.kind, e, f, g, h)
+    if not then > ZERO:
+        return
+    normal = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / then
+    goal = kept + wp.min(_GOAL_OF_REACH * reach, _GOAL_OF_GAP * gap)
+    now = wp.dot(normal, weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d)
+    pair = queue.pairs[i]
+    key = _key(group, queue.kind, pair[0], pair[1])
+    _hold(contacts, unknowns, trial, inverse, corners, weights, normal, goal - now, key)
+    ahead[world] = 1
+
+
+@wp.kernel
+def hold_pairs(
+    # in
+    motion: Motion,
+    vertex_face: Candidates,
+    edge_edge: Candidates,
+    trial: Trial,
+    unknowns: Unknowns,
+    inverse: wp.array[wp.mat33],
+    active: wp.array[int],
+    group: int,
+    # in and out
+    contacts: Contacts,
+    ahead: wp.array[int],
+    threads: int,
+):
+    """Adds contacts that hold candidates which would meet on the displacements, in active worlds."""
+    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = vertex_face
+            if number == 1:
+                of = edge_edge
+            if has_pair(of.queue, i):
+                _hold_pair(motion, of, trial, unknowns, inverse, active, group, contacts, ahead, i)
+            number += 1
+
+
+@wp.kernel
+def hold_at_planes(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    inverse: wp.array[wp.mat33],
+    active: wp.array[int],
+    group: int,
+    # in and out
+    contacts: Contacts,
+    ahead: wp.array[int],
+):
+    """Adds contacts that hold particles which would enter infinite planes, as :func:`hold_pairs`."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if motion.inverse_mass[vertex] == 0.0 or active[world] == 0:
+        return
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        if reach == ZERO:
+            continue
+        gap, _error = signed_distance(_plane_at(planes, i, plane_share[world]), trial.x[vertex])
+        end = _plane_at(planes, i, 1.0)
+        left, _error_after = signed_distance(end, trial.x[vertex] + trial.displaced[vertex])
+        now, _error_now = signed_distance(end, trial.x[vertex])
+        gap -= kept
+        if left - kept < barrier.least_gap(gap, reach):
+            goal = kept + wp.min(_GOAL_OF_REACH * reach, _GOAL_OF_GAP * gap)
+            normal = wp.vec3d(end[0], end[1], end[2])
+            weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
+            key = _key(group, 7, vertex, i)
+            _hold(contacts, unknowns, trial, inverse, wp.vec4i(vertex), weights, normal, goal - now, key)
+            ahead[world] = 1
 
 
 # Bounds

@@ -181,6 +181,52 @@ def assemble(
 
 
 @wp.kernel
+def assemble_again(
+    # in
+    contacts: Contacts,
+    unknowns: Unknowns,
+    derivatives: Derivatives,
+    trial: Trial,
+    goal: wp.array[wp.vec3],
+    inverse_mass: wp.array[float],
+    dt: wp.float64,
+    ahead: wp.array[int],
+    # in and out
+    rows: Rows,
+    vectors: Vectors,
+):
+    """Computes the gradient and what preconditions again, after contacts were added; displacements stay."""
+    u = wp.tid()
+    if ahead[unknowns.world[u]] == 0:
+        return
+    sort_entries(contacts, u)
+    if unknowns.is_free[u] == 0:
+        return
+    inertia = ONE / (wp.float64(inverse_mass[u]) * dt * dt)
+    gradient, block = contact_gradient(contacts, unknowns, u)
+    gradient += sum_of_corners(rows, derivatives, u)
+    gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
+    vectors.gradient[u] = gradient
+    vectors.inverse[u] = _inverse(rows.block[rows.first[u]] + block, float(inertia))
+
+
+@wp.kernel
+def write_displacements(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    vectors: Vectors,
+    active: wp.array[int],
+    # out
+    trial: Trial,
+):
+    """Writes the displacements of vertices after a solve."""
+    v = wp.tid()
+    if active[motion.world[v]] != 0 and unknowns.of_vertex[v] != -1:
+        trial.displaced[v] = displacement(unknowns, v, vectors.solution)
+
+
+@wp.kernel
 def find_remaining(
     # in
     motion: Motion,
