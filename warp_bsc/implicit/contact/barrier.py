@@ -24,12 +24,12 @@ _THREE = wp.constant(wp.float64(3.0))
 _FOUR = wp.constant(wp.float64(4.0))
 CURVATURE_AT_HALF = 6.386294361119891
 """Curvature of the barrier at half of its reach, in its stiffness."""
-KEPT_GAP = wp.constant(wp.float64(0.1))
-"""Share of its gap that a pair keeps in a Newton step."""
-_NEXT = wp.constant(wp.float64(0.9))
-"""Share of a safe time by which the search for an impact goes on."""
-_SEARCHES = wp.constant(48)
-"""Most steps of that search; it ends early, and safe, after them."""
+_NEXT = wp.constant(wp.float64(0.999))
+"""Share of a safe time by which the search for an impact goes on: it may be rounded up."""
+_STALLED = wp.constant(wp.float64(1e-3))
+"""Share of displacements by which it goes on at least; it ends early, and safe, where it does not."""
+_PLANES = wp.constant(24)
+"""Most planes that it takes."""
 
 
 @wp.func
@@ -90,6 +90,15 @@ def closest_weights_and_gap(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d:
 
 
 @wp.func
+def _closing_time(first: wp.float64, second: wp.float64, rate: wp.float64, other: wp.float64, least: wp.float64):
+    """Returns when a point at ``first``, along a direction, comes as near as ``least`` to one at ``second``."""
+    closing = other - rate
+    if closing <= ZERO:
+        return _TWO
+    return (first - second - least) / closing
+
+
+@wp.func
 def safe_share(
     kind: int,
     # points
@@ -102,32 +111,31 @@ def safe_share(
     q: wp.vec3d,
     r: wp.vec3d,
     s: wp.vec3d,
-    distance: wp.float64,
-    kept: wp.float64,
     least: wp.float64,
 ) -> wp.float64:
-    """Returns a share of the displacements up to which two elements keep a tenth of their gap, 1 for all of them.
+    """Returns a share of the displacements up to which two elements stay as far apart as ``least``, 1 for all of them.
 
-    Additive continuous collision detection (Li et al. 2021), a lower bound; ``distance`` is that of the elements, and
-    ``kept`` what is subtracted from it to get their gap.
+    They start farther apart. Conservative advancement: a plane across the closest points separates two elements until
+    a vertex of one comes as near as that to a vertex of the other along its normal; then another plane is taken.
     """
-    mean = wp.float64(0.25) * (p + q + r + s)
-    one, two, three, four = wp.length(p - mean), wp.length(q - mean), wp.length(r - mean), wp.length(s - mean)
-    way = one + wp.max(two, wp.max(three, four))
-    if kind == EDGE_EDGE:
-        way = wp.max(one, two) + wp.max(three, four)
-    gap = distance - kept - least
-    if way <= gap:
-        return ONE
-    time = gap / way
-    for _k in range(_SEARCHES):
-        _weights, now = closest_weights_and_gap(kind, a + time * p, b + time * q, c + time * r, d + time * s)
-        gap = now - kept - least
-        if gap < KEPT_GAP * least:
-            return time
-        time += _NEXT * gap / way
+    time = ZERO
+    for _k in range(_PLANES):
+        e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
+        weights, distance = closest_weights_and_gap(kind, e, f, g, h)
+        n = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / distance
+        ea, fa, ga, ha = wp.dot(n, e), wp.dot(n, f), wp.dot(n, g), wp.dot(n, h)
+        pa, qa, ra, sa = wp.dot(n, p), wp.dot(n, q), wp.dot(n, r), wp.dot(n, s)
+        ahead = wp.min(_closing_time(ea, ga, pa, ra, least), _closing_time(ea, ha, pa, sa, least))
+        if kind == EDGE_EDGE:
+            ahead = wp.min(ahead, _closing_time(fa, ga, qa, ra, least))
+            ahead = wp.min(ahead, _closing_time(fa, ha, qa, sa, least))
+        else:
+            ahead = wp.min(ahead, _closing_time(ea, fa, pa, qa, least))
+        time += _NEXT * wp.max(ahead, ZERO)
         if time >= ONE:
             return ONE
+        if ahead < _STALLED:
+            return time
     return time
 
 

@@ -527,7 +527,7 @@ def _hold_pair(
     least = barrier.least_gap(gap, reach)
     if way <= gap - least:
         return
-    time = barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, distance, kept, least)
+    time = barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least)
     if time >= ONE:
         return
     e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
@@ -646,7 +646,7 @@ def _bound(
     least = barrier.least_gap(distance - kept, wp.float64(candidates.reach[i]))
     if way <= distance - kept - least:
         return
-    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, distance, kept, least))
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least))
     if share < 1.0:
         if by_vertex:
             for j in range(4):
