@@ -448,8 +448,6 @@ def sort_entries(contacts: Contacts, u: int):
 
 # Contacts ahead
 
-_GOAL_OF_REACH, _GOAL_OF_GAP = wp.constant(wp.float64(0.6)), wp.constant(wp.float64(0.75))
-"""Gap to which a pair is held that would meet in a Newton step: of the reach of its barrier, or of its gap if less."""
 _STIFFER = wp.constant(float(10.0))
 """How much stiffer it is held than what moves it."""
 
@@ -535,7 +533,7 @@ def _hold_pair(
     if not then > ZERO:
         return
     normal = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / then
-    goal = kept + wp.min(_GOAL_OF_REACH * reach, _GOAL_OF_GAP * gap)
+    goal = kept + barrier.goal_gap(gap, reach)
     now = wp.dot(normal, weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d)
     pair = queue.pairs[i]
     key = _key(group, queue.kind, pair[0], pair[1])
@@ -605,7 +603,7 @@ def hold_at_planes(
         now, _error_now = signed_distance(end, trial.x[vertex])
         gap -= kept
         if left - kept < barrier.least_gap(gap, reach):
-            goal = kept + wp.min(_GOAL_OF_REACH * reach, _GOAL_OF_GAP * gap)
+            goal = kept + barrier.goal_gap(gap, reach)
             normal = wp.vec3d(end[0], end[1], end[2])
             weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
             key = _key(group, 7, vertex, i)
