@@ -86,6 +86,7 @@ class NewtonMethod:
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
         self._whole = wp.zeros(vertices, dtype=float, device=device)
+        self._leaves = wp.zeros(1, dtype=int, device=device)
         self._flags = wp.zeros(2, dtype=int, device=device)
         self._goes_on, self._search = self._flags[0:1], self._flags[1:2]
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
@@ -148,6 +149,7 @@ class NewtonMethod:
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self._launch(steps.begin_step, vertices, inputs, outputs)
         self.iterations.zero_()
+        self._leaves.zero_()
         self._find_candidates()
         self._bound()
         self._launch(steps.take, vertices, [motion, self._unknowns, self.progress], [self._trial])
@@ -157,6 +159,11 @@ class NewtonMethod:
         inputs = [self._trial, self._unknowns, float(dt), motion.x0]
         outputs = [motion, work.vertices, particle_q, particle_qd]
         self._launch(steps.finish, vertices, inputs, outputs)
+
+    def _renew_candidates(self):
+        inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial]
+        self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper])
+        self._find_candidates()
 
     def _find_candidates(self):
         """Finds the pairs that may come near each other within the boxes."""
@@ -204,6 +211,7 @@ class NewtonMethod:
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
         unknowns, contacts, vertices = self._unknowns, self._contacts, self._mesh.vertex_count
         dt = wp.float64(self._dt)
+        wp.capture_if(self._leaves, self._renew_candidates)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns, progress.active], [trial])
         inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
@@ -217,7 +225,8 @@ class NewtonMethod:
         for group in range(_PREDICTIONS):
             self._hold_ahead(2 + group)
         inputs = [motion, unknowns, self._vectors, self._lower, self._upper, self._settings.units]
-        self._launch(steps.displace, vertices, inputs, [trial, progress])
+        self._leaves.zero_()
+        self._launch(steps.displace, vertices, inputs, [trial, progress, self._leaves])
         self._bound(0)
         self._add_energies(False, progress.energy)
         self._add_energies(True, progress.trial)
@@ -253,6 +262,8 @@ class NewtonMethod:
         inputs = [motion, unknowns, self._vectors, active]
         self._launch(steps.write_displacements, self._mesh.vertex_count, inputs, [trial])
         self._ahead.zero_()
+        inputs = [motion, unknowns, self._vectors.solution, active, contacts]
+        work.launch_over_entries(pairs.release_held, inputs)
         inputs = [trial, unknowns, self._vectors.inverse, active, group, contacts, self._ahead]
         work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs])
         if work.max_penetrations:

@@ -448,6 +448,8 @@ def sort_entries(contacts: Contacts, u: int):
 
 # Contacts ahead
 
+_FIRST_HELD = wp.constant(wp.int64(2 << 61))
+"""Key from which contacts are held ones."""
 _STIFFER = wp.constant(float(10.0))
 """How much stiffer it is held than what moves it."""
 
@@ -493,6 +495,29 @@ def _hold(
     contacts.gradient[slot] = (stiffness * float(given - short)) * n
     contacts.hessian[slot] = stiffness * wp.outer(n, n)
     contacts.key[slot] = key
+
+
+@wp.kernel
+def release_held(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    solution: wp.array[wp.vec3],
+    active: wp.array[int],
+    # in and out
+    contacts: Contacts,
+    threads: int,
+):
+    """Lets go the pairs that are held and that the solution would pull together: they are not in the way."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        corners, weights, n = contacts.corners[i], contacts.weights[i], contacts.normal[i]
+        if contacts.key[i] >= _FIRST_HELD and active[motion.world[corners[0]]] != 0:
+            apart = wp.dot(n, contacts.gradient[i])
+            for j in range(4):
+                apart += weights[j] * wp.dot(contacts.hessian[i] * n, displacement(unknowns, corners[j], solution))
+            if apart > 0.0:
+                contacts.gradient[i] = wp.vec3()
+                contacts.hessian[i] = wp.mat33()
 
 
 @wp.func

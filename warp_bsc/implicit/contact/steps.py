@@ -259,6 +259,7 @@ def displace(
     # out
     trial: Trial,
     progress: Progress,
+    leaves: wp.array[int],
 ):
     """Writes the displacements of vertices after a solve, within the boxes in which pairs were sought."""
     v = wp.tid()
@@ -278,9 +279,35 @@ def displace(
     d = displacement(unknowns, v, vectors.solution)
     trial.displaced[v] = d
     trial.share[v] = 1.0
-    wp.atomic_min(progress.bound, world, _share_within(trial.x[v], d, lower[v], upper[v]))
+    share = _share_within(trial.x[v], d, lower[v], upper[v])
+    if share < 1.0:
+        wp.atomic_min(progress.bound, world, share)
+        leaves[0] = 1
     wp.atomic_max(progress.change, world, wp.length(d))
     add_energy(progress.slope, world, wp.float64(wp.dot(d, vectors.gradient[u])), units)
+
+
+@wp.kernel
+def renew_boxes(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    margin: wp.array[float],
+    trial: Trial,
+    # in and out
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+):
+    """Makes the boxes of vertices those around their last displacement, from where they are now."""
+    v = wp.tid()
+    x, d = trial.x[v], trial.displaced[v] + wp.vec3()
+    pad = margin[v] + float(0.0)
+    if unknowns.of_vertex[v] != -1:
+        pad += 0.5 * wp.length(d)
+    else:
+        d = motion.x1[v] - x
+    lower[v] = wp.min(x, x + d) - wp.vec3(pad)
+    upper[v] = wp.max(x, x + d) + wp.vec3(pad)
 
 
 @wp.func
