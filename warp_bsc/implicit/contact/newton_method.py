@@ -224,7 +224,7 @@ class NewtonMethod:
         self._solve_linear(progress.active)
         for group in range(_PREDICTIONS):
             self._hold_ahead(2 + group)
-        inputs = [motion, unknowns, self._vectors, self._lower, self._upper, self._settings.units]
+        inputs = [motion, unknowns, self._vectors, self._lower, self._upper]
         self._leaves.zero_()
         self._launch(steps.displace, vertices, inputs, [trial, progress, self._leaves])
         self._bound(0)

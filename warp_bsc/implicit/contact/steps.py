@@ -12,8 +12,6 @@ from .system import Contacts, Progress, Unknowns, contact_gradient, displacement
 
 wp.set_module_options({"enable_backward": False})
 
-_ARMIJO = wp.constant(wp.float64(1e-4))
-"""Share of the fall of energy along a straight line that a share of the displacements has to reach."""
 _NOISE = wp.constant(wp.float64(1e-9))
 """Rise of energy that may be rounding, as a share of it."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
@@ -255,7 +253,6 @@ def displace(
     vectors: Vectors,
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
-    units: wp.float64,
     # out
     trial: Trial,
     progress: Progress,
@@ -284,7 +281,6 @@ def displace(
         wp.atomic_min(progress.bound, world, share)
         leaves[0] = 1
     wp.atomic_max(progress.change, world, wp.length(d))
-    add_energy(progress.slope, world, wp.float64(wp.dot(d, vectors.gradient[u])), units)
 
 
 @wp.kernel
@@ -393,7 +389,6 @@ def begin_newton_step(
     w = wp.tid()
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
-    progress.slope[w] = wp.int64(0)
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
     progress.searches[w] = progress.active[w]
@@ -469,7 +464,6 @@ def decide_search(
         return
     before = wp.float64(progress.energy[w])
     allowed = before + _NOISE * wp.abs(before)
-    allowed += _ARMIJO * wp.float64(progress.scale[w]) * wp.min(wp.float64(progress.slope[w]), ZERO)
     falls = wp.float64(progress.trial[w]) <= allowed
     progress.trial[w] = wp.int64(0)
     if falls or progress.remaining[w] > 0.0:

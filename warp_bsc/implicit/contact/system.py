@@ -43,7 +43,6 @@ class Progress:
         trial: Energy at the displaced positions, in units.
         trial_cut: The same, with displacements of single vertices cut.
         cuts: 1 if those are cut.
-        slope: Derivative of the energy along the displacements, in units.
         change: Largest displacement of an unknown [m].
         remaining: Largest way of what a program moves that is left [m].
     """
@@ -57,7 +56,6 @@ class Progress:
     trial: wp.array[wp.int64]
     trial_cut: wp.array[wp.int64]
     cuts: wp.array[int]
-    slope: wp.array[wp.int64]
     change: wp.array[float]
     remaining: wp.array[float]
 
