@@ -185,6 +185,7 @@ class NewtonMethod:
             candidates = Candidates()
             candidates.queue = queue
             candidates.kept = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
+            candidates.share = wp.zeros(len(queue.pairs), dtype=float, device=device)
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
@@ -231,7 +232,7 @@ class NewtonMethod:
         self._add_energies(False, progress.energy)
         self._add_energies(True, progress.trial)
         inputs = [motion, unknowns, self._lower, self._upper]
-        self._launch(steps.begin_truncation, vertices, inputs, [trial, progress, self._whole])
+        self._launch(steps.begin_truncation, vertices, inputs, [trial, progress, self._whole, self._limit])
         self._bound(_TRUNCATIONS)
         self._add_energies(True, progress.trial_cut)
         self._launch(steps.choose_truncation, work.worlds, [self._whole], [progress])
@@ -260,15 +261,18 @@ class NewtonMethod:
         work, motion, trial, contacts = self._work, self._work.step.motion, self._trial, self._contacts
         unknowns, active = self._unknowns, self.progress.active
         inputs = [motion, unknowns, self._vectors, active]
-        self._launch(steps.write_displacements, self._mesh.vertex_count, inputs, [trial])
+        self._launch(steps.write_displacements, self._mesh.vertex_count, inputs, [trial, self._limit])
+        inputs = [motion, *self._candidates, trial, self.progress, True, self._limit]
+        work.launch_over_entries(pairs.bound_by_pairs, inputs)
         self._ahead.zero_()
         inputs = [motion, unknowns, self._vectors.solution, active, contacts]
         work.launch_over_entries(pairs.release_held, inputs)
-        inputs = [trial, unknowns, self._vectors.inverse, active, group, contacts, self._ahead]
-        work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs])
+        inputs = [trial, unknowns, self._vectors.inverse, active]
+        outputs = [group, contacts, self._ahead]
+        work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
-            self._launch(pairs.hold_at_planes, work.particle_count, inputs, [])
+            self._launch(pairs.hold_at_planes, work.particle_count, inputs, outputs)
         self._list_contacts()
         inputs = [contacts, unknowns, self._derivatives, trial, self._goal, motion.inverse_mass, wp.float64(self._dt)]
         self._launch(steps.assemble_again, self._count, [*inputs, self._ahead], [self._rows, self._vectors])

@@ -28,11 +28,13 @@ class Candidates:
         queue: The pairs.
         kept: Distance that each pair keeps in any case [m].
         reach: Gap beyond that from which its barrier pushes [m]; 0 of a pair that is excluded.
+        share: Share of the last displacements before it would meet.
     """
 
     queue: PairQueue
     kept: wp.array[wp.float64]
     reach: wp.array[float]
+    share: wp.array[float]
 
 
 @wp.struct
@@ -528,6 +530,7 @@ def _hold_pair(
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
     active: wp.array[int],
+    limit: wp.array[float],
     group: int,
     contacts: Contacts,
     ahead: wp.array[int],
@@ -541,18 +544,20 @@ def _hold_pair(
     world = motion.world[corners[0]]
     if active[world] == 0:
         return
+    share = candidates.share[i] + float(0.0)
+    if share >= 1.0:
+        return
+    is_first = bool(False)
+    for j in range(4):
+        is_first = is_first or share <= limit[corners[j]]
+    if not is_first:
+        return
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
-    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
+    time = wp.float64(share)
     kept = candidates.kept[i]
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
     gap = distance - kept
-    least = barrier.least_gap(gap, reach)
-    if way <= gap - least:
-        return
-    time = barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least)
-    if time >= ONE:
-        return
     e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
     weights, then = barrier.closest_weights_and_gap(queue.kind, e, f, g, h)
     if not then > ZERO:
@@ -576,13 +581,17 @@ def hold_pairs(
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
     active: wp.array[int],
+    limit: wp.array[float],
     group: int,
     # in and out
     contacts: Contacts,
     ahead: wp.array[int],
     threads: int,
 ):
-    """Adds contacts that hold candidates which would meet on the displacements, in active worlds."""
+    """Adds contacts that hold candidates which would meet on the displacements, in active worlds.
+
+    Only those that are the first, by ``limit``, for one of their vertices: what would come later may not come at all.
+    """
     for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
         number = int(0)
         while number < 2:
@@ -590,7 +599,7 @@ def hold_pairs(
             if number == 1:
                 of = edge_edge
             if has_pair(of.queue, i):
-                _hold_pair(motion, of, trial, unknowns, inverse, active, group, contacts, ahead, i)
+                _hold_pair(motion, of, trial, unknowns, inverse, active, limit, group, contacts, ahead, i)
             number += 1
 
 
@@ -649,6 +658,7 @@ def _bound(
     limit: wp.array[float],
     i: int,
 ):
+    candidates.share[i] = 1.0
     if candidates.reach[i] == 0.0:
         return
     queue = candidates.queue
@@ -670,6 +680,7 @@ def _bound(
     if way <= distance - kept - least:
         return
     share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least))
+    candidates.share[i] = share
     if share < 1.0:
         if by_vertex:
             for j in range(4):

@@ -217,9 +217,12 @@ def write_displacements(
     active: wp.array[int],
     # out
     trial: Trial,
+    limit: wp.array[float],
 ):
     """Writes the displacements of vertices after a solve."""
     v = wp.tid()
+    limit[v] = 1.0
+    trial.share[v] = 1.0
     if active[motion.world[v]] != 0 and unknowns.of_vertex[v] != -1:
         trial.displaced[v] = displacement(unknowns, v, vectors.solution)
 
@@ -329,9 +332,11 @@ def begin_truncation(
     trial: Trial,
     progress: Progress,
     whole: wp.array[float],
+    limit: wp.array[float],
 ):
     """Lets worlds that take less than all of their displacements try to cut those of single vertices instead."""
     v = wp.tid()
+    limit[v] = 1.0
     if v < progress.active.shape[0]:
         whole[v] = progress.scale[v]
         progress.searches[v] = 0
