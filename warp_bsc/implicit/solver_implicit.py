@@ -40,11 +40,6 @@ class SolverImplicit(SolverCCD):
         """Prepares steps of a model."""
         super().__init__(_Inertia(model), substeps=None, contact_layer=False, restitution=0.0, **options)
         self._newton = NewtonMethod(self._work, max_steps=max_newton_steps)
-        self._v0 = wp.zeros(model.particle_count, dtype=wp.vec3, device=model.device)
-
-    def _begin_step(self, state, contacts, dt):
-        wp.copy(self._v0, state.particle_qd)
-        return super()._begin_step(state, contacts, dt)
 
     def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
         end = arrays_of(state_out)
@@ -54,6 +49,6 @@ class SolverImplicit(SolverCCD):
     def _solve(self, end, dt):
         work = self._work
         begin(work)
-        self._newton.solve(self._v0, end.particle_q, end.particle_qd, dt)
+        self._newton.solve(end.particle_q, end.particle_qd, dt)
         detect_contacts(work)
         resolve_contacts(work, dt)

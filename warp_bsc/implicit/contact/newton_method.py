@@ -19,7 +19,7 @@ from .rows import add_blocks, make_rows
 from .system import Contacts, Progress, Unknowns
 
 _TRUNCATIONS = 4
-"""Passes in which the ways of single vertices are cut, before that of their world is."""
+"""Passes in which the displacements of single vertices are cut, before those of their world are."""
 _PREDICTIONS = 2
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
 _REACH_OF_EDGE = 0.1
@@ -131,11 +131,10 @@ class NewtonMethod:
             np.add.at(found, model.tet_indices.numpy().reshape(-1, 4), stiffness)
         return found
 
-    def solve(self, v0: wp.array, particle_q: wp.array, particle_qd: wp.array, dt: float) -> None:
+    def solve(self, particle_q: wp.array, particle_qd: wp.array, dt: float) -> None:
         """Finds where the particles end that the motion of the workspace predicts, and writes it there and here.
 
         Args:
-            v0: Velocities at the start [m/s].
             particle_q: Where positions at the end are written [m].
             particle_qd: Where velocities at the end are written [m/s].
             dt: Length of the step [s].
@@ -145,15 +144,12 @@ class NewtonMethod:
         self._dt = float(dt)
         self._settings.dt = dt
         self._settings.smoothing = _SMOOTHING_SPEED * dt
-        inputs = [motion, v0, float(dt), self._margin, self._unknowns]
+        inputs = [motion, self._margin, self._unknowns]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self._launch(steps.begin_step, vertices, inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
         self._find_candidates()
-        self._bound()
-        self._launch(steps.take, vertices, [motion, self._unknowns, self.progress], [self._trial])
-        self._launch(_update_planes, work.worlds, [self.progress], [self._plane_share])
         self._goes_on.fill_(1)
         wp.capture_while(self._goes_on, self._take_newton_step)
         inputs = [self._trial, self._unknowns, float(dt), motion.x0]
@@ -194,7 +190,7 @@ class NewtonMethod:
         self._ends = wp.zeros(self._count + 1, dtype=int, device=device)
         assert contacts is not None
 
-    def _bound(self, truncations=_TRUNCATIONS):
+    def _bound(self, truncations):
         """Takes the displacements down until no two elements meet on them: of single vertices, then of worlds."""
         work, motion = self._work, self._work.step.motion
         for k in range(truncations + 1):
@@ -320,13 +316,3 @@ class NewtonMethod:
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
 
-
-@wp.kernel
-def _update_planes(
-    # in
-    progress: Progress,
-    # out
-    plane_share: wp.array[float],
-):
-    """Moves planes by the share of their way that a step begins with."""
-    plane_share[wp.tid()] = progress.scale[wp.tid()]

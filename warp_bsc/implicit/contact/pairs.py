@@ -471,11 +471,13 @@ def _hold(
     """Adds a contact that holds a pair which is farther apart along the normal than it shall be, ``short`` if less."""
     compliance = float(0.0)
     given = ZERO
+    apart = ZERO
     n = to_single(normal)
     for j in range(4):
         v = corners[j]
         u = unknowns.of_vertex[v]
         w = float(weights[j])
+        apart += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
         if u == -1:
             given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
         elif u >= 0:
@@ -483,7 +485,7 @@ def _hold(
         else:
             turn = wp.cross(unknowns.arm[v], n)
             compliance += w * w * (wp.dot(n, inverse[-2 - u] * n) + wp.dot(turn, inverse[-1 - u] * turn))
-    if not compliance > 0.0:
+    if not compliance > 0.0 or apart >= short:
         return
     slot = take_slot_int(contacts.count)
     if slot >= contacts.corners.shape[0]:

@@ -50,8 +50,6 @@ def predict_positions(
 def begin_step(
     # in
     motion: Motion,
-    v0: wp.array[wp.vec3],
-    dt: float,
     margin: wp.array[float],
     unknowns: Unknowns,
     # out
@@ -62,29 +60,22 @@ def begin_step(
     progress: Progress,
     plane_share: wp.array[float],
 ):
-    """Takes the motion as predicted: where inertia alone leads, the way on which the step begins, and boxes around it.
-
-    It begins without what gravity and other forces do in the step.
-    """
+    """Takes the motion as predicted: where inertia alone leads, and boxes around the way there."""
     v = wp.tid()
     x0, x1 = motion.x0[v], motion.x1[v]
     goal[v] = x1
     trial.x[v] = x0
-    way = x1 - x0
+    trial.displaced[v] = wp.vec3()
+    trial.share[v] = 1.0
+    pad = margin[v] + float(0.0)
     u = unknowns.of_vertex[v]
     if u >= 0:
         unknowns.is_free[u] = 0
         if motion.inverse_mass[v] > 0.0 and motion.is_not_finite[v] == 0:
             unknowns.is_free[u] = 1
-            way = dt * v0[v]
-    trial.displaced[v] = way
-    trial.share[v] = 1.0
-    first, last = wp.min(x0, wp.min(x1, x0 + way)), wp.max(x0, wp.max(x1, x0 + way))
-    pad = margin[v] + 0.25 * wp.length(last - first)
-    if u < 0 or motion.inverse_mass[v] == 0.0:
-        pad = margin[v]
-    lower[v] = first - wp.vec3(pad)
-    upper[v] = last + wp.vec3(pad)
+            pad += 0.25 * wp.length(x1 - x0)
+    lower[v] = wp.min(x0, x1) - wp.vec3(pad)
+    upper[v] = wp.max(x0, x1) + wp.vec3(pad)
     if v < progress.active.shape[0]:
         progress.active[v] = 1
         progress.steps[v] = 0
