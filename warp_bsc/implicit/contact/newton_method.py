@@ -87,8 +87,9 @@ class NewtonMethod:
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
         self._whole = wp.zeros(vertices, dtype=float, device=device)
         self._leaves = wp.zeros(1, dtype=int, device=device)
-        self._flags = wp.zeros(2, dtype=int, device=device)
-        self._goes_on, self._search = self._flags[0:1], self._flags[1:2]
+        self._meets = wp.zeros(1, dtype=int, device=device)
+        self._flags = wp.zeros(3, dtype=int, device=device)
+        self._goes_on, self._search, self._cuts = (self._flags[k : k + 1] for k in range(3))
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
         self._ahead = wp.zeros(work.worlds, dtype=int, device=device)
         self._convex = wp.ones(work.worlds, dtype=int, device=device)
@@ -190,19 +191,14 @@ class NewtonMethod:
         self._ends = wp.zeros(self._count + 1, dtype=int, device=device)
         assert contacts is not None
 
-    def _bound(self, truncations):
-        """Takes the displacements down until no two elements meet on them: of single vertices, then of worlds."""
+    def _bound(self, active):
+        """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
         work, motion = self._work, self._work.step.motion
-        for k in range(truncations + 1):
-            by_vertex = k < truncations
-            inputs = [motion, *self._candidates, self._trial, self.progress, by_vertex, self._limit]
-            work.launch_over_entries(pairs.bound_by_pairs, inputs)
-            if work.max_penetrations:
-                inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, self.progress]
-                self._launch(pairs.bound_by_planes, work.particle_count, [*inputs, by_vertex], [self._limit])
-            if by_vertex:
-                self._launch(steps.truncate, self._mesh.vertex_count, [self._unknowns], [self._limit, self._trial])
-        self._launch(steps.take_bound, work.worlds, [], [self.progress])
+        inputs = [motion, *self._candidates, self._trial, active, self.progress, self._limit]
+        work.launch_over_entries(pairs.bound_by_pairs, inputs)
+        if work.max_penetrations:
+            inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
+            self._launch(pairs.bound_by_planes, work.particle_count, inputs, [self.progress, self._limit])
 
     def _take_newton_step(self):
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
@@ -210,7 +206,7 @@ class NewtonMethod:
         dt = wp.float64(self._dt)
         wp.capture_if(self._leaves, self._renew_candidates)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
-        self._launch(steps.find_remaining, vertices, [motion, unknowns, progress.active], [trial])
+        self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
         inputs = [self._derivatives, self._row_of_block, unknowns.world, progress.active]
@@ -219,27 +215,32 @@ class NewtonMethod:
         inputs = [self._derivatives, contacts, unknowns, trial, self._goal, motion.inverse_mass, dt, progress.active]
         self._launch(steps.assemble, self._count, inputs, [self._rows, self._vectors])
         self._solve_linear(progress.active)
-        for group in range(_PREDICTIONS):
-            self._hold_ahead(2 + group)
-        inputs = [motion, unknowns, self._vectors, self._lower, self._upper]
-        self._leaves.zero_()
-        self._launch(steps.displace, vertices, inputs, [trial, progress, self._leaves])
-        self._bound(0)
+        self._hold_ahead(0)
+        self._flags.zero_()
+        self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(False, progress.energy)
         self._add_energies(True, progress.trial)
-        inputs = [motion, unknowns, self._lower, self._upper]
-        self._launch(steps.begin_truncation, vertices, inputs, [trial, progress, self._whole, self._limit])
-        self._bound(_TRUNCATIONS)
-        self._add_energies(True, progress.trial_cut)
-        self._launch(steps.choose_truncation, work.worlds, [self._whole], [progress])
-        self._launch(steps.undo_truncation, vertices, [motion, progress], [trial])
-        self._search.zero_()
+        wp.capture_if(self._cuts, self._truncate)
         self._launch(steps.decide_search, work.worlds, [], [progress, self._search])
         wp.capture_while(self._search, self._try)
-        self._launch(steps.take, vertices, [motion, unknowns, progress], [trial])
-        self._goes_on.zero_()
+        self._launch(steps.take, vertices, [motion, unknowns], [progress, trial])
         inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
         self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
+
+    def _truncate(self):
+        """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
+        work, progress, vertices = self._work, self.progress, self._mesh.vertex_count
+        inputs, outputs = [self._unknowns, self._lower, self._upper], [self._trial, progress, self._whole, self._limit]
+        self._launch(steps.begin_truncation, vertices, inputs, outputs)
+        for _ in range(_TRUNCATIONS):
+            self._bound(progress.searches)
+            self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
+        self._launch(steps.begin_hold, work.worlds, [], [progress, self._ahead])  # clears bounds
+        self._bound(progress.searches)
+        self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
+        self._add_energies(True, progress.trial_cut)
+        self._launch(steps.choose_truncation, work.worlds, [self._whole], [progress])
+        self._launch(steps.undo_truncation, vertices, [work.step.motion, progress], [self._trial])
 
     def _solve_linear(self, active):
         work = self._work
@@ -252,27 +253,36 @@ class NewtonMethod:
             block_dim=BLOCK,
         )
 
-    def _hold_ahead(self, group):
-        """Holds what would meet on the displacements, and solves again."""
-        work, motion, trial, contacts = self._work, self._work.step.motion, self._trial, self._contacts
-        unknowns, active = self._unknowns, self.progress.active
-        inputs = [motion, unknowns, self._vectors, active]
-        self._launch(steps.write_displacements, self._mesh.vertex_count, inputs, [trial, self._limit])
-        inputs = [motion, *self._candidates, trial, self.progress, True, self._limit]
-        work.launch_over_entries(pairs.bound_by_pairs, inputs)
-        self._ahead.zero_()
-        inputs = [motion, unknowns, self._vectors.solution, active, contacts]
-        work.launch_over_entries(pairs.release_held, inputs)
-        inputs = [trial, unknowns, self._vectors.inverse, active]
-        outputs = [group, contacts, self._ahead]
+    def _hold_ahead(self, solves):
+        """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
+        work, trial = self._work, self._trial
+        active = self._ahead if solves else self.progress.active
+        inputs = [work.step.motion, self._unknowns, self._vectors, self._lower, self._upper, active]
+        self._leaves.zero_()
+        outputs = [trial, self.progress, self._limit, self._leaves]
+        self._launch(steps.displace, self._mesh.vertex_count, inputs, outputs)
+        self._bound(active)
+        if solves < _PREDICTIONS:
+            self._meets.zero_()
+            self._launch(steps.find_meeting, work.worlds, [self.progress], [self._meets])
+            wp.capture_if(self._meets, self._hold, solves=solves)
+
+    def _hold(self, solves):
+        work, motion, contacts = self._work, self._work.step.motion, self._contacts
+        unknowns, ahead = self._unknowns, self._ahead
+        self._launch(steps.begin_hold, work.worlds, [], [self.progress, ahead])
+        work.launch_over_entries(pairs.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
+        inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
         work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
-            self._launch(pairs.hold_at_planes, work.particle_count, inputs, outputs)
+            self._launch(pairs.hold_at_planes, work.particle_count, [*inputs, 2 + solves], [contacts])
         self._list_contacts()
-        inputs = [contacts, unknowns, self._derivatives, trial, self._goal, motion.inverse_mass, wp.float64(self._dt)]
-        self._launch(steps.assemble_again, self._count, [*inputs, self._ahead], [self._rows, self._vectors])
-        self._solve_linear(self._ahead)
+        inputs = [contacts, unknowns, self._derivatives, self._trial, self._goal, motion.inverse_mass]
+        inputs += [wp.float64(self._dt), ahead]
+        self._launch(steps.assemble_again, self._count, inputs, [self._rows, self._vectors])
+        self._solve_linear(ahead)
+        self._hold_ahead(solves + 1)
 
     def _find_contacts(self):
         """Finds what is near at the positions, and lists it by unknown."""

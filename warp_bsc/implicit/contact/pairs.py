@@ -535,7 +535,6 @@ def _hold_pair(
     limit: wp.array[float],
     group: int,
     contacts: Contacts,
-    ahead: wp.array[int],
     i: int,
 ):
     reach = wp.float64(candidates.reach[i])
@@ -570,7 +569,6 @@ def _hold_pair(
     pair = queue.pairs[i]
     key = _key(group, queue.kind, pair[0], pair[1])
     _hold(contacts, unknowns, trial, inverse, corners, weights, normal, goal - now, key)
-    ahead[world] = 1
 
 
 @wp.kernel
@@ -587,7 +585,6 @@ def hold_pairs(
     group: int,
     # in and out
     contacts: Contacts,
-    ahead: wp.array[int],
     threads: int,
 ):
     """Adds contacts that hold candidates which would meet on the displacements, in active worlds.
@@ -601,7 +598,7 @@ def hold_pairs(
             if number == 1:
                 of = edge_edge
             if has_pair(of.queue, i):
-                _hold_pair(motion, of, trial, unknowns, inverse, active, limit, group, contacts, ahead, i)
+                _hold_pair(motion, of, trial, unknowns, inverse, active, limit, group, contacts, i)
             number += 1
 
 
@@ -619,7 +616,6 @@ def hold_at_planes(
     group: int,
     # in and out
     contacts: Contacts,
-    ahead: wp.array[int],
 ):
     """Adds contacts that hold particles which would enter infinite planes, as :func:`hold_pairs`."""
     vertex = wp.tid()
@@ -644,7 +640,6 @@ def hold_at_planes(
             weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
             key = _key(group, 7, vertex, i)
             _hold(contacts, unknowns, trial, inverse, wp.vec4i(vertex), weights, normal, goal - now, key)
-            ahead[world] = 1
 
 
 # Bounds
@@ -656,7 +651,7 @@ def _bound(
     candidates: Candidates,
     trial: Trial,
     progress: Progress,
-    by_vertex: bool,
+    active: wp.array[int],
     limit: wp.array[float],
     i: int,
 ):
@@ -666,7 +661,7 @@ def _bound(
     queue = candidates.queue
     corners = vertices_of(queue, i)
     world = motion.world[corners[0]]
-    if progress.active[world] == 0:
+    if active[world] == 0:
         return
     a, b, c, d = corners_of(trial.x, corners)
     scale = progress.scale[world]
@@ -684,11 +679,9 @@ def _bound(
     share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least))
     candidates.share[i] = share
     if share < 1.0:
-        if by_vertex:
-            for j in range(4):
-                wp.atomic_min(limit, corners[j], share)
-        else:
-            wp.atomic_min(progress.bound, world, share)
+        wp.atomic_min(progress.bound, world, share)
+        for j in range(4):
+            wp.atomic_min(limit, corners[j], share)
 
 
 @wp.kernel
@@ -698,13 +691,13 @@ def bound_by_pairs(
     vertex_face: Candidates,
     edge_edge: Candidates,
     trial: Trial,
-    progress: Progress,
-    by_vertex: bool,
+    active: wp.array[int],
     # in and out
+    progress: Progress,
     limit: wp.array[float],
     threads: int,
 ):
-    """Finds the share of displacements up to which no two elements meet: by vertex, or for all of a world."""
+    """Finds the share of displacements up to which no two elements meet: by vertex, and for all of a world."""
     for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
         number = int(0)
         while number < 2:
@@ -712,7 +705,7 @@ def bound_by_pairs(
             if number == 1:
                 of = edge_edge
             if has_pair(of.queue, i):
-                _bound(motion, of, trial, progress, by_vertex, limit, i)
+                _bound(motion, of, trial, progress, active, limit, i)
             number += 1
 
 
@@ -724,15 +717,15 @@ def bound_by_planes(
     plane_share: wp.array[float],
     settings: BarrierSettings,
     trial: Trial,
-    progress: Progress,
-    by_vertex: bool,
+    active: wp.array[int],
     # in and out
+    progress: Progress,
     limit: wp.array[float],
 ):
     """Finds the share of displacements up to which no particle meets an infinite plane, as :func:`bound_by_pairs`."""
     vertex = wp.tid()
     world = motion.world[vertex]
-    if motion.inverse_mass[vertex] == 0.0 or progress.active[world] == 0:
+    if motion.inverse_mass[vertex] == 0.0 or active[world] == 0:
         return
     scale, now = progress.scale[world], plane_share[world]
     for place in range(planes.of_worlds.shape[1]):
@@ -749,10 +742,8 @@ def bound_by_planes(
         least = barrier.least_gap(gap, reach)
         if left < least:
             share = float((gap - least) / (gap - left))
-            if by_vertex:
-                wp.atomic_min(limit, vertex, share)
-            else:
-                wp.atomic_min(progress.bound, world, share)
+            wp.atomic_min(progress.bound, world, share)
+            wp.atomic_min(limit, vertex, share)
 
 
 # Energies

@@ -8,13 +8,22 @@ from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved, sort_entries
 from .rows import Rows, sum_of_corners
-from .system import Contacts, Progress, Unknowns, contact_gradient, displacement
+from .system import NOT_UNKNOWN, Contacts, Progress, Unknowns, contact_gradient, displacement
 
 wp.set_module_options({"enable_backward": False})
 
 _NOISE = wp.constant(wp.float64(1e-9))
 """Rise of energy that may be rounding, as a share of it."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
+
+
+@wp.func
+def is_given(unknowns: Unknowns, vertex: int) -> bool:
+    """Returns whether a program moves a vertex, or nothing."""
+    u = unknowns.of_vertex[vertex]
+    if u >= 0:
+        return unknowns.is_free[u] == 0
+    return u == NOT_UNKNOWN
 
 
 @wp.kernel
@@ -94,11 +103,8 @@ def truncate(
 ):
     """Takes the shares of vertices that are solved for down to their bounds, and clears these."""
     v = wp.tid()
-    if unknowns.of_vertex[v] >= 0:
-        if unknowns.is_free[unknowns.of_vertex[v]] != 0:
-            share = limit[v]
-            if share < 1.0:
-                trial.share[v] = trial.share[v] * share
+    if not is_given(unknowns, v):
+        trial.share[v] = trial.share[v] * limit[v]
     limit[v] = 1.0
 
 
@@ -106,11 +112,42 @@ def truncate(
 def take_bound(
     # in and out
     progress: Progress,
+    # out
+    cuts: wp.array[int],
 ):
-    """Takes the share of each world down to its bound."""
+    """Takes the share of each world down to its bound, and says whether one takes less than all."""
     w = wp.tid()
     progress.scale[w] = progress.scale[w] * progress.bound[w]
     progress.bound[w] = 1.0
+    if progress.active[w] != 0 and progress.scale[w] < 1.0:
+        cuts[0] = 1
+
+
+@wp.kernel
+def find_meeting(
+    # in
+    progress: Progress,
+    # out
+    meets: wp.array[int],
+):
+    """Says whether something would meet in a world."""
+    w = wp.tid()
+    if progress.active[w] != 0 and progress.bound[w] < 1.0:
+        meets[0] = 1
+
+
+@wp.kernel
+def begin_hold(
+    # in and out
+    progress: Progress,
+    ahead: wp.array[int],
+):
+    """Lets worlds in which something would meet solve once more, and clears their bounds."""
+    w = wp.tid()
+    ahead[w] = 0
+    if progress.active[w] != 0 and progress.bound[w] < 1.0:
+        ahead[w] = 1
+        progress.bound[w] = 1.0
 
 
 @wp.func
@@ -200,43 +237,23 @@ def assemble_again(
 
 
 @wp.kernel
-def write_displacements(
-    # in
-    motion: Motion,
-    unknowns: Unknowns,
-    vectors: Vectors,
-    active: wp.array[int],
-    # out
-    trial: Trial,
-    limit: wp.array[float],
-):
-    """Writes the displacements of vertices after a solve."""
-    v = wp.tid()
-    limit[v] = 1.0
-    trial.share[v] = 1.0
-    if active[motion.world[v]] != 0 and unknowns.of_vertex[v] != -1:
-        trial.displaced[v] = displacement(unknowns, v, vectors.solution)
-
-
-@wp.kernel
 def find_remaining(
     # in
     motion: Motion,
     unknowns: Unknowns,
-    active: wp.array[int],
     # out
     trial: Trial,
+    progress: Progress,
 ):
     """Writes the ways that are left of what a program moves, before a solve."""
     v = wp.tid()
-    if active[motion.world[v]] == 0:
-        return
-    u = unknowns.of_vertex[v]
-    given = u == -1
-    if u >= 0:
-        given = unknowns.is_free[u] == 0
-    if given:
-        trial.displaced[v] = motion.x1[v] - trial.x[v]
+    world = motion.world[v]
+    trial.share[v] = 1.0
+    if progress.active[world] != 0 and is_given(unknowns, v):
+        d = motion.x1[v] - trial.x[v]
+        trial.displaced[v] = d
+        if wp.length_sq(d) > 0.0:
+            wp.atomic_max(progress.remaining, world, wp.length(d))
 
 
 @wp.kernel
@@ -247,34 +264,27 @@ def displace(
     vectors: Vectors,
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
+    active: wp.array[int],
     # out
     trial: Trial,
     progress: Progress,
+    limit: wp.array[float],
     leaves: wp.array[int],
 ):
-    """Writes the displacements of vertices after a solve, within the boxes in which pairs were sought."""
+    """Writes the displacements of vertices after a solve, and how much of them stays in the boxes of the candidates."""
     v = wp.tid()
     world = motion.world[v]
-    if progress.active[world] == 0:
+    if active[world] == 0:
         return
-    u = unknowns.of_vertex[v]
-    is_free = u != -1
-    if u >= 0:
-        is_free = unknowns.is_free[u] != 0
-    if not is_free:
-        trial.share[v] = 1.0
-        way = wp.length(trial.displaced[v])
-        if way > 0.0:
-            wp.atomic_max(progress.remaining, world, way)
+    limit[v] = 1.0
+    if is_given(unknowns, v):
         return
     d = displacement(unknowns, v, vectors.solution)
     trial.displaced[v] = d
-    trial.share[v] = 1.0
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
         leaves[0] = 1
-    wp.atomic_max(progress.change, world, wp.length(d))
 
 
 @wp.kernel
@@ -315,7 +325,6 @@ def _share_within(x: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> flo
 @wp.kernel
 def begin_truncation(
     # in
-    motion: Motion,
     unknowns: Unknowns,
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
@@ -334,12 +343,9 @@ def begin_truncation(
         if progress.active[v] != 0 and progress.scale[v] < 1.0:
             progress.searches[v] = 1
         progress.scale[v] = 1.0
-    u = unknowns.of_vertex[v]
-    if u != -1:
+        progress.bound[v] = 1.0
+    if not is_given(unknowns, v):
         trial.share[v] = _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v])
-        if u >= 0:
-            if unknowns.is_free[u] == 0:
-                trial.share[v] = 1.0
 
 
 @wp.kernel
@@ -385,13 +391,13 @@ def begin_newton_step(
     w = wp.tid()
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
+    progress.cuts[w] = 0
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
     progress.searches[w] = progress.active[w]
     progress.energy[w] = wp.int64(0)
     progress.trial[w] = wp.int64(0)
     progress.trial_cut[w] = wp.int64(0)
-    progress.cuts[w] = 0
 
 
 @wp.kernel
@@ -478,8 +484,8 @@ def take(
     # in
     motion: Motion,
     unknowns: Unknowns,
-    progress: Progress,
     # in and out
+    progress: Progress,
     trial: Trial,
 ):
     """Moves vertices by the shares of their worlds; what a program moves arrives exactly."""
@@ -488,14 +494,13 @@ def take(
     if progress.active[world] == 0:
         return
     scale = progress.scale[world]
-    u = unknowns.of_vertex[v]
-    given = u == -1
-    if u >= 0:
-        given = unknowns.is_free[u] == 0
+    given = is_given(unknowns, v)
     if given and scale == 1.0:
         trial.x[v] = motion.x1[v]
     else:
         trial.x[v] = moved(trial, scale, v)
+    if not given:
+        wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))
 
 
 @wp.kernel
