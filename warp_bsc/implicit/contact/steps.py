@@ -119,8 +119,14 @@ def take_bound(
     w = wp.tid()
     progress.scale[w] = progress.scale[w] * progress.bound[w]
     progress.bound[w] = 1.0
-    if progress.active[w] != 0 and progress.scale[w] < 1.0:
+    if _may_cut(progress, w):
         cuts[0] = 1
+
+
+@wp.func
+def _may_cut(progress: Progress, w: int) -> bool:
+    """Returns whether cuts of vertices may let a world go further: not while something that a program moves comes."""
+    return progress.active[w] != 0 and progress.scale[w] < 1.0 and progress.remaining[w] == 0.0
 
 
 @wp.kernel
@@ -340,7 +346,7 @@ def begin_truncation(
     if v < progress.active.shape[0]:
         whole[v] = progress.scale[v]
         progress.searches[v] = 0
-        if progress.active[v] != 0 and progress.scale[v] < 1.0:
+        if _may_cut(progress, v):
             progress.searches[v] = 1
         progress.scale[v] = 1.0
         progress.bound[v] = 1.0
