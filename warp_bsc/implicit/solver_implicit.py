@@ -8,7 +8,6 @@ from newton import ParticleFlags
 from newton.solvers import SolverBase
 
 from ..detection.host_function import run_on_host
-from ..response.contacts import detect
 from ..response.solver_ccd import SolverCCD
 from ..response.state.motion import arrays_of
 from ..response.step import begin, detect_contacts, resolve_contacts

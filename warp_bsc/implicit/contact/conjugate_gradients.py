@@ -3,7 +3,7 @@
 import warp as wp
 
 from .rows import Rows
-from .system import Contacts, Progress, Unknowns, product
+from .system import Contacts, Unknowns, product
 
 wp.set_module_options({"enable_backward": False})
 

@@ -54,8 +54,8 @@ class NewtonMethod:
         particles, vertices = model.particle_count, mesh.vertex_count
         self._elements, of_elements = elements_of_model(model)
         world = mesh.device_world.numpy()[:particles]
-        order = np.argsort(world, kind="stable")
-        assert (order == np.arange(particles)).all()
+        if (np.diff(world) < 0).any():
+            raise ValueError("particles of a world do not follow each other in the model")
         unknown = np.arange(particles)
         self._count = particles
         unknowns = self._unknowns = Unknowns()
@@ -97,13 +97,16 @@ class NewtonMethod:
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
-        margin = np.where(np.isfinite(reach), reach, 0.0)
-        self._margin = wp.array(margin + 0.5 * margin.max(initial=0.0), dtype=float, device=device)
-        masses = model.particle_mass.numpy()[model.particle_inv_mass.numpy() > 0]
-        mass = float(masses.mean()) if len(masses) else 1.0
-        self._settings.units = 1.0 / (mass * _UNIT_SPEED**2)
+        margin, worlds = np.where(np.isfinite(reach), reach, 0.0), mesh.device_world.numpy()
+        margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
+        self._margin = wp.array(margin, dtype=float, device=device)
+        masses, moves = model.particle_mass.numpy(), model.particle_inv_mass.numpy() > 0
+        mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
+        self._settings.units = wp.array(1.0 / (mass * _UNIT_SPEED**2), dtype=wp.float64, device=device)
         self._candidates: list[Candidates] = []
         self._contacts = Contacts()
+        self._retired: list[tuple] = []
+        self._allocate(queues_of(work.detector, candidates=True))
 
     def _reach(self, mesh) -> np.ndarray:
         """Returns the gap from which each vertex pushes [m], infinite for shapes."""
@@ -113,8 +116,9 @@ class NewtonMethod:
         x[:particles] = model.particle_q.numpy()
         edges = mesh.edges[(mesh.edges < particles).all(axis=1)]
         lengths = np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
-        usual = _REACH_OF_EDGE * float(np.median(lengths)) if len(lengths) else np.inf
-        reach[:particles] = usual
+        world = mesh.device_world.numpy()
+        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, np.inf)
+        reach[:particles] = _REACH_OF_EDGE * usual[world[:particles]]
         for k in range(2):
             np.minimum.at(reach, edges[:, k], _SHORT_EDGE * lengths)
         radius = model.particle_radius.numpy()
@@ -177,6 +181,7 @@ class NewtonMethod:
         work.launch_over_entries(pairs.prepare_candidates, inputs)
 
     def _allocate(self, queues):
+        self._retired.append((self._candidates, self._contacts))  # a CUDA graph may still write to them
         device, self._candidates = self._work.device, []
         for queue in queues:
             candidates = Candidates()
@@ -186,10 +191,8 @@ class NewtonMethod:
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
-        contacts = self._contacts = allocate(Contacts, capacity, device, count=1, first=self._count + 1, entries=4 * capacity)
-        self._counts = wp.zeros(self._count + 1, dtype=int, device=device)
-        self._ends = wp.zeros(self._count + 1, dtype=int, device=device)
-        assert contacts is not None
+        sizes = {"count": 1, "listed": 1, "first": self._count, "end": self._count, "entries": 4 * capacity}
+        self._contacts = allocate(Contacts, capacity, device, **sizes)
 
     def _bound(self, active):
         """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
@@ -297,11 +300,11 @@ class NewtonMethod:
 
     def _list_contacts(self):
         work, contacts = self._work, self._contacts
-        self._counts.zero_()
-        work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns, self._counts])
-        wp.utils.array_scan(self._counts, contacts.first, inclusive=False)
-        wp.copy(self._ends, contacts.first)
-        work.launch_over_entries(pairs.list_entries, [contacts, self._unknowns, self._ends])
+        contacts.listed.zero_()
+        contacts.end.zero_()
+        work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns])
+        self._launch(pairs.place_entries, self._count, [], [contacts])
+        work.launch_over_entries(pairs.list_entries, [contacts, self._unknowns])
 
     def _try(self):
         """Computes the energy at the displaced positions, and halves the shares of worlds where it has risen."""
@@ -326,3 +329,9 @@ class NewtonMethod:
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
 
+
+def _of_worlds(function, values: np.ndarray, world: np.ndarray, worlds: int, default: float) -> np.ndarray:
+    """Returns a function of the values of each world, which is as if the world were alone; the default of none."""
+    order = np.argsort(world, kind="stable")
+    parts = np.split(values[order], np.searchsorted(world[order], np.arange(1, worlds)))
+    return np.array([function(part) if len(part) else default for part in parts], dtype=float)

@@ -11,7 +11,13 @@ from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_
 from ...response.state.structs import Motion, Step
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
-from .system import Contacts, Progress, Unknowns, contact_count, displacement, unknown_of_corner
+from .system import (
+    Contacts,
+    Progress,
+    Unknowns,
+    contact_count,
+    unknown_of_corner,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,14 +52,14 @@ class BarrierSettings:
         reach: Of each vertex: gap from which it pushes [m], infinite for shapes.
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
         smoothing: Length below which friction is smoothed [m].
-        units: Units of energy in a joule.
+        units: Units of energy in a joule, in each world.
     """
 
     dt: wp.float64
     reach: wp.array[float]
     elasticity: wp.array[float]
     smoothing: wp.float64
-    units: wp.float64
+    units: wp.array[wp.float64]
 
 
 @wp.struct
@@ -391,11 +397,9 @@ def count_entries(
     # in
     contacts: Contacts,
     unknowns: Unknowns,
-    # out
-    counts: wp.array[int],
     threads: int,
 ):
-    """Counts the contacts of each unknown that is solved for."""
+    """Counts the contacts of each unknown that is solved for, in ``end``."""
     for i in range(wp.tid(), contact_count(contacts), threads):
         for j in range(4):
             if contacts.weights[i][j] != 0.0:
@@ -403,21 +407,33 @@ def count_entries(
                 u = unknown_of_corner(unknowns, vertex)
                 if u >= 0:
                     if unknowns.is_free[u] != 0:
-                        wp.atomic_add(counts, u, 1)
+                        wp.atomic_add(contacts.end, u, 1)
                         if unknowns.of_vertex[vertex] < 0:
-                            wp.atomic_add(counts, u + 1, 1)
+                            wp.atomic_add(contacts.end, u + 1, 1)
+
+
+@wp.kernel
+def place_entries(contacts: Contacts):
+    """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them."""
+    u = wp.tid()
+    count = contacts.end[u]
+    if count > 0:
+        first = wp.atomic_add(contacts.listed, 0, count)
+        contacts.first[u] = first
+        contacts.end[u] = first
+    else:
+        contacts.first[u] = 0
 
 
 @wp.kernel
 def list_entries(
-    # in
-    contacts: Contacts,
-    unknowns: Unknowns,
     # in and out
-    ends: wp.array[int],
+    contacts: Contacts,
+    # in
+    unknowns: Unknowns,
     threads: int,
 ):
-    """Lists the contacts of each unknown, whose ``ends`` begin as the first of them."""
+    """Lists the contacts of each unknown, behind its ``end``, which moves on."""
     for i in range(wp.tid(), contact_count(contacts), threads):
         for j in range(4):
             if contacts.weights[i][j] != 0.0:
@@ -425,15 +441,15 @@ def list_entries(
                 u = unknown_of_corner(unknowns, vertex)
                 if u >= 0:
                     if unknowns.is_free[u] != 0:
-                        contacts.entries[wp.atomic_add(ends, u, 1)] = 4 * i + j
+                        contacts.entries[wp.atomic_add(contacts.end, u, 1)] = 4 * i + j
                         if unknowns.of_vertex[vertex] < 0:
-                            contacts.entries[wp.atomic_add(ends, u + 1, 1)] = 4 * i + j
+                            contacts.entries[wp.atomic_add(contacts.end, u + 1, 1)] = 4 * i + j
 
 
 @wp.func
 def sort_entries(contacts: Contacts, u: int):
     """Orders the contacts of an unknown by their pair, so that sums do not depend on the order of threads."""
-    first, end = contacts.first[u], contacts.first[u + 1]
+    first, end = contacts.first[u], contacts.end[u]
     for n in range(first + 1, end):
         entry = contacts.entries[n]
         key, place = contacts.key[entry >> 2], entry & 3
@@ -750,9 +766,9 @@ def bound_by_planes(
 
 
 @wp.func
-def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.float64):
+def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.array[wp.float64]):
     """Adds an energy [J] to that of a world, in units, so that the sum does not depend on the order of threads."""
-    scaled = wp.clamp(units * value, -_UNITS_LIMIT, _UNITS_LIMIT)
+    scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
     wp.atomic_add(energy, world, wp.int64(wp.rint(scaled)))
 
 

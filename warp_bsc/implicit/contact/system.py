@@ -76,7 +76,8 @@ class Contacts:
         gradient: [N].
         hessian: Positive semidefinite [N/m].
         key: Number of the pair, by which contacts of an unknown are ordered.
-        first: First entry of each unknown, and the end of the last.
+        listed: Number of entries, shape [1].
+        first, end: First entry of each unknown, and the end of them; unknowns are in any order.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
     """
 
@@ -89,7 +90,9 @@ class Contacts:
     gradient: wp.array[wp.vec3]
     hessian: wp.array[wp.mat33]
     key: wp.array[wp.int64]
+    listed: wp.array[int]
     first: wp.array[int]
+    end: wp.array[int]
     entries: wp.array[int]
 
 
@@ -123,7 +126,7 @@ def product(rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.ar
     total = wp.vec3()
     for k in range(rows.first[u], rows.first[u + 1]):
         total += rows.block[k] * p[rows.column[k]]
-    for n in range(contacts.first[u], contacts.first[u + 1]):
+    for n in range(contacts.first[u], contacts.end[u]):
         entry = contacts.entries[n]
         i = entry >> 2
         corners, weights = contacts.corners[i], contacts.weights[i]
@@ -147,7 +150,7 @@ def _by_corner(unknowns: Unknowns, vertex: int, u: int, force: wp.vec3) -> wp.ve
 def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int):
     """Returns the gradient of the energy of contacts by an unknown, and their block of the diagonal."""
     gradient, block = wp.vec3(), wp.mat33()
-    for n in range(contacts.first[u], contacts.first[u + 1]):
+    for n in range(contacts.first[u], contacts.end[u]):
         entry = contacts.entries[n]
         i = entry >> 2
         weight, vertex = contacts.weights[i][entry & 3], contacts.corners[i][entry & 3]
