@@ -9,11 +9,14 @@ import warp as wp
 
 from ...detection.launch import retry_until_fits
 from ...response.contacts.queue import queues_of
+from ...response.forces.structs import Centres, ContactRows, ImpulseSums, Sides
+from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import pairs, steps
 from .conjugate_gradients import BLOCK, Vectors, solve_worlds
 from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
+from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import add_blocks, make_rows
 from .system import Contacts, Progress, Unknowns
@@ -39,7 +42,13 @@ LATE_STEPS = 16
 
 
 class NewtonMethod:
-    """Solves one step after the other, with the same buffers, on the device of the model."""
+    """Solves one step after the other, with the same buffers, on the device of the model.
+
+    Attributes:
+        keeps_contacts: Whether a solve ends with the contacts at its end, to publish them.
+    """
+
+    keeps_contacts = False
 
     def __init__(self, work: Workspace, *, max_steps: int):
         """Allocates buffers.
@@ -100,6 +109,7 @@ class NewtonMethod:
         margin, worlds = np.where(np.isfinite(reach), reach, 0.0), mesh.device_world.numpy()
         margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
         self._margin = wp.array(margin, dtype=float, device=device)
+        assert model.particle_mass is not None and model.particle_inv_mass is not None
         masses, moves = model.particle_mass.numpy(), model.particle_inv_mass.numpy() > 0
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
         self._settings.units = wp.array(1.0 / (mass * _UNIT_SPEED**2), dtype=wp.float64, device=device)
@@ -144,20 +154,35 @@ class NewtonMethod:
             particle_qd: Where velocities at the end are written [m/s].
             dt: Length of the step [s].
         """
+        self._begin(dt)
+        self._find_end(particle_q, particle_qd)
+
+    def prepare(self, state: StateArrays) -> None:
+        """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
+        self._begin(1.0)
+        self.progress.active.zero_()
+        self._find_end(wp.empty_like(state.particle_q), wp.empty_like(state.particle_qd))
+
+    def _begin(self, dt):
         work, motion = self._work, self._work.step.motion
-        vertices = self._mesh.vertex_count
         self._dt = float(dt)
         self._settings.dt = dt
         self._settings.smoothing = _SMOOTHING_SPEED * dt
         inputs = [motion, self._margin, self._unknowns]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
-        self._launch(steps.begin_step, vertices, inputs, outputs)
+        self.progress.active.zero_()
+        self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
+
+    def _find_end(self, particle_q, particle_qd):
+        work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
         self._find_candidates()
         self._goes_on.fill_(1)
         wp.capture_while(self._goes_on, self._take_newton_step)
-        inputs = [self._trial, self._unknowns, float(dt), motion.x0]
+        if self.keeps_contacts:
+            self._find_near(self.progress.steps)
+        inputs = [self._trial, self._unknowns, self._dt, motion.x0]
         outputs = [motion, work.vertices, particle_q, particle_qd]
         self._launch(steps.finish, vertices, inputs, outputs)
 
@@ -287,15 +312,24 @@ class NewtonMethod:
         self._solve_linear(ahead)
         self._hold_ahead(solves + 1)
 
-    def _find_contacts(self):
-        """Finds what is near at the positions, and lists it by unknown."""
+    def publish(self, sides: Sides, centres: Centres, sums: ImpulseSums, rows: ContactRows) -> None:
+        """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
+        inputs = [self._contacts, self._settings, self._trial, self._goal, self._work.step, sides, centres, sums, rows]
+        self._work.launch_over_entries(publish_contacts, inputs)
+
+    def _find_near(self, active):
+        """Finds what is near at the positions."""
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         contacts.count.zero_()
-        inputs = [self._settings, self._trial, self._unknowns, self.progress.active, contacts]
+        inputs = [self._settings, self._trial, self._unknowns, active, contacts]
         work.launch_over_entries(pairs.find_near, [motion, *self._candidates, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
             self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
+
+    def _find_contacts(self):
+        """Finds what is near at the positions, and lists it by unknown."""
+        self._find_near(self.progress.active)
         self._list_contacts()
 
     def _list_contacts(self):

@@ -23,7 +23,8 @@ wp.set_module_options({"enable_backward": False})
 
 _LEAST_GAP = wp.constant(wp.float64(0.1))
 """Share of its distance at the start that a pair which starts within its minimum distance may give up."""
-_UNITS_LIMIT = wp.constant(wp.float64(2.0**60))
+_UNITS_LIMIT = wp.constant(wp.float64(2.0**52))
+"""Largest energy of an element or a pair, in units: a sum holds 2,048 of them."""
 
 
 @wp.struct
@@ -768,7 +769,9 @@ def bound_by_planes(
 @wp.func
 def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.array[wp.float64]):
     """Adds an energy [J] to that of a world, in units, so that the sum does not depend on the order of threads."""
-    scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
+    scaled = wp.float64(_UNITS_LIMIT)
+    if wp.isfinite(value):
+        scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
     wp.atomic_add(energy, world, wp.int64(wp.rint(scaled)))
 
 

@@ -69,8 +69,20 @@ def begin_step(
     progress: Progress,
     plane_share: wp.array[float],
 ):
-    """Takes the motion as predicted: where inertia alone leads, and boxes around the way there."""
+    """Takes the motion as predicted: where inertia alone leads, and boxes around the way there.
+
+    Worlds with unknowns become active.
+    """
     v = wp.tid()
+    if v < progress.active.shape[0]:
+        progress.steps[v] = 0
+        progress.scale[v] = 1.0
+        progress.bound[v] = 1.0
+        progress.change[v] = 0.0
+        progress.remaining[v] = 0.0
+        plane_share[v] = 0.0
+    if v >= goal.shape[0]:
+        return
     x0, x1 = motion.x0[v], motion.x1[v]
     goal[v] = x1
     trial.x[v] = x0
@@ -82,15 +94,10 @@ def begin_step(
         unknowns.is_free[u] = 0
         if motion.inverse_mass[v] > 0.0 and motion.is_not_finite[v] == 0:
             unknowns.is_free[u] = 1
+            progress.active[motion.world[v]] = 1
             pad += 0.25 * wp.length(x1 - x0)
     lower[v] = wp.min(x0, x1) - wp.vec3(pad)
     upper[v] = wp.max(x0, x1) + wp.vec3(pad)
-    if v < progress.active.shape[0]:
-        progress.active[v] = 1
-        progress.steps[v] = 0
-        progress.scale[v] = 1.0
-        progress.bound[v] = 1.0
-        plane_share[v] = 0.0
 
 
 @wp.kernel
@@ -286,6 +293,11 @@ def displace(
     if is_given(unknowns, v):
         return
     d = displacement(unknowns, v, vectors.solution)
+    if not wp.isfinite(d):  # as a start is not: its world stands
+        trial.displaced[v] = wp.vec3()
+        progress.bound[world] = 0.0
+        progress.change[world] = wp.inf
+        return
     trial.displaced[v] = d
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
@@ -344,12 +356,13 @@ def begin_truncation(
     v = wp.tid()
     limit[v] = 1.0
     if v < progress.active.shape[0]:
-        whole[v] = progress.scale[v]
         progress.searches[v] = 0
-        if _may_cut(progress, v):
-            progress.searches[v] = 1
-        progress.scale[v] = 1.0
-        progress.bound[v] = 1.0
+        if progress.active[v] != 0:
+            whole[v] = progress.scale[v]
+            if _may_cut(progress, v):
+                progress.searches[v] = 1
+            progress.scale[v] = 1.0
+            progress.bound[v] = 1.0
     if not is_given(unknowns, v):
         trial.share[v] = _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v])
 
@@ -395,12 +408,14 @@ def begin_newton_step(
 ):
     """Clears what a Newton step measures."""
     w = wp.tid()
+    progress.searches[w] = progress.active[w]
+    if progress.active[w] == 0:
+        return
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
     progress.cuts[w] = 0
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
-    progress.searches[w] = progress.active[w]
     progress.energy[w] = wp.int64(0)
     progress.trial[w] = wp.int64(0)
     progress.trial_cut[w] = wp.int64(0)

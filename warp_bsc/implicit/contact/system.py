@@ -96,6 +96,22 @@ class Contacts:
     entries: wp.array[int]
 
 
+AT_PLANE = wp.constant(8)
+"""Kind of a contact of a particle and a plane, after those of pairs of elements."""
+
+
+@wp.func
+def kind_of_key(key: wp.int64) -> int:
+    """Returns the kind of a pair."""
+    return int(key >> wp.int64(58))
+
+
+@wp.func
+def second_of_key(key: wp.int64) -> int:
+    """Returns the second element of a pair, or its plane."""
+    return int(key & wp.int64(2**29 - 1))
+
+
 @wp.func
 def unknown_of_corner(unknowns: Unknowns, vertex: int) -> int:
     """Returns the unknown of a vertex, the first of its body, or -1."""

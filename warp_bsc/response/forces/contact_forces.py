@@ -1,5 +1,7 @@
 """Buffers and launches that turn the multipliers of a step into contacts, impulses and their sums."""
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -21,7 +23,10 @@ class ContactForces:
         rows: The contacts of the last step.
         published: The sums of the last step.
         shapes_of_worlds: The shapes of each world, see :class:`.contact_report.ContactReport`.
+        more: Publishes the contacts that were in the solve, if there are some.
     """
+
+    more: Callable[[Sides, Centres, ImpulseSums, ContactRows], None] | None = None
 
     def __init__(self, work: Workspace, capacity: int, *, in_substeps: bool):
         """Allocates buffers for ``capacity`` contacts; ``in_substeps`` says whether steps may have substeps."""
@@ -129,6 +134,8 @@ class ContactForces:
         if self._slots:
             inputs = [step, work.motion.planes, self._sides, self._of_planes]
             work.launch(publish.publish_contacts_of_planes, work.vertices_at_planes, [*inputs, *outputs])
+        if self.more is not None:
+            self.more(self._sides, self._centres, self._sums, rows)
         work.launch(publish.publish_sums, self._size, [self._unpaired, self._sums], [self.published])
 
 

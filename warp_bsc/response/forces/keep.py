@@ -46,30 +46,38 @@ def end_centres(state: StateArrays, sides: Sides, mask: wp.array[wp.bool], centr
 
 
 @wp.func
-def _body_of_side(step: Step, sides: Sides, i: int, side: int) -> int:
-    """Returns the body of one side of a constraint, -1 for none."""
-    if side == 1 and step.constraints.kind[i] == ContactKind.PLANE:
-        return sides.plane_body[step.constraints.plane[i]]
-    return body_of_vertex(sides, step.constraints.vertices[i][3 * side])
+def _body_of_side(sides: Sides, corners: wp.vec4i, plane: int, side: int) -> int:
+    """Returns the body of one side of a contact, -1 for none."""
+    if side == 1 and plane >= 0:
+        return sides.plane_body[plane]
+    return body_of_vertex(sides, corners[3 * side])
 
 
 @wp.func
-def _torque_on(
-    step: Step, sides: Sides, centres: Centres, share: wp.float64, i: int, side: int, impulse: wp.vec3d
+def torque_on(
+    step: Step,
+    sides: Sides,
+    centres: Centres,
+    share: wp.float64,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    plane: int,
+    side: int,
+    impulse: wp.vec3d,
 ) -> wp.vec3d:
-    """Returns the torque of the impulse of a constraint on the body of one of its sides; ``share`` of the step is over.
+    """Returns the torque of the impulse of a contact on the body of one of its sides; ``share`` of the step is over.
 
-    The impulse is that on the first side. A plane is a side without vertices, and is touched at the vertex.
+    The impulse is that on the first side. A plane, -1 for none, is a side without vertices, and is touched at the
+    vertex.
     """
-    corners, weights = step.constraints.vertices[i], step.constraints.weights[i]
     x = step.vertices.x1
-    body = _body_of_side(step, sides, i, side)
+    body = _body_of_side(sides, corners, plane, side)
     if body < 0:
         return wp.vec3d()
     centre = (ONE - share) * centres.start[body] + share * centres.end[body]
     if can_move(step.motion, body):
         centre = step.vertices.bodies.centre[body]
-    if side == 1 and step.constraints.kind[i] == ContactKind.PLANE:
+    if side == 1 and plane >= 0:
         return wp.cross(centre - to_double(x[corners[0]]), impulse)
     arm = wp.vec3d()
     for j in range(4):
@@ -132,19 +140,19 @@ def _keep_impulse(
     place = i
     toi = constraints.toi[i]
     corners, weights, normal = constraints.vertices[i], constraints.weights[i], constraints.normal[i]
+    plane = wp.where(constraints.kind[i] == ContactKind.PLANE, constraints.plane[i], -1)
     if not _responds(step, i):
         for j in range(4):
             if corners[j] < sides.particle_count and weights[j] != ZERO:
                 add_impulse(unpaired.idle_of_particles, corners[j], 0, weights[j] * impulse, lost)
         for side in range(2):
-            body = _body_of_side(step, sides, i, side)
+            body = _body_of_side(sides, corners, plane, side)
             if can_move(motion, body):
-                torque = _torque_on(step, sides, centres, share, i, side, impulse)
+                torque = torque_on(step, sides, centres, share, corners, weights, plane, side, impulse)
                 add_impulse(unpaired.idle_of_bodies, body, 0, wp.where(side == 0, impulse, -impulse), lost)
                 add_impulse(unpaired.idle_of_bodies, body, 3, torque, lost)
         return
-    if constraints.kind[i] == ContactKind.PLANE:
-        plane = constraints.plane[i]
+    if plane >= 0:
         toi = (done + _time_at_plane(motion, planes, plane, corners[0])) / wp.float64(substeps)
         if remaining:
             kept = of_planes
@@ -157,7 +165,8 @@ def _keep_impulse(
     kept.normal[place] = normal
     if kept.torque:
         for side in range(2):
-            kept.torque[place, side] += _torque_on(step, sides, centres, share, i, side, impulse)
+            torque = torque_on(step, sides, centres, share, corners, weights, plane, side, impulse)
+            kept.torque[place, side] = kept.torque[place, side] + torque
 
 
 @wp.kernel

@@ -31,22 +31,26 @@ def _local(sides: Sides, shape: int) -> int:
 
 
 @wp.func
-def _publish(
+def publish_contact(
     # in
     step: Step,
     sides: Sides,
-    kept: KeptImpulses,
-    i: int,
     kind: int,
     corners: wp.vec4i,
     weights: wp.vec4d,
     plane: int,
+    impulse: wp.vec3d,
+    along: wp.float64,
+    normal: wp.vec3d,
+    torque_on_first: wp.vec3d,
+    torque_on_second: wp.vec3d,
+    velocity: wp.vec3,
+    toi: wp.float64,
     # out
     sums: ImpulseSums,
     rows: ContactRows,
 ):
-    """Adds the impulse of a contact to all sums, writes a row for it if it fits, and clears what was kept."""
-    impulse, along, normal = kept.impulse[i], kept.along[i], kept.normal[i]
+    """Adds the impulse of a contact to all sums, and writes a row for it if it fits."""
     shapes = wp.vec2i(shape_of(sides, corners[0]), shape_of(sides, corners[3]))
     bodies = wp.vec2i(body_of_vertex(sides, corners[0]), body_of_vertex(sides, corners[3]))
     if kind == ContactKind.PLANE:
@@ -57,12 +61,8 @@ def _publish(
         point += wp.max(weights[j], ZERO) * to_double(step.vertices.x1[corners[j]])
         if corners[j] < sides.particle_count and weights[j] != ZERO:
             add_impulse(sums.of_particles, corners[j], 0, weights[j] * impulse, rows.lost)
-    first, second = wp.vec3d(), wp.vec3d()
-    if kept.torque:
-        first = kept.torque[i, 0]
-        second = kept.torque[i, 1]
-    _add_to_side(sums, shapes[0], bodies[0], impulse, first, rows.lost)
-    _add_to_side(sums, shapes[1], bodies[1], -impulse, second, rows.lost)
+    _add_to_side(sums, shapes[0], bodies[0], impulse, torque_on_first, rows.lost)
+    _add_to_side(sums, shapes[1], bodies[1], -impulse, torque_on_second, rows.lost)
     world = step.motion.world[corners[0]]
     if float(along) > sums.largest[world]:  # rarely: all contacts of a world have this address
         wp.atomic_max(sums.largest, world, float(along))
@@ -84,12 +84,51 @@ def _publish(
         rows.shapes[row] = shapes
         rows.bodies[row] = bodies
         rows.world[row] = world
-        rows.toi[row] = float(kept.toi[i])
+        rows.toi[row] = float(toi)
         rows.point[row] = to_single(point)
         rows.normal[row] = to_single(normal)
-        rows.velocity[row] = kept.velocity[i]
+        rows.velocity[row] = velocity
         rows.normal_impulse[row] = float(along)
         rows.tangential_impulse[row] = to_single(impulse - along * normal)
+
+
+@wp.func
+def _publish(
+    # in
+    step: Step,
+    sides: Sides,
+    kept: KeptImpulses,
+    i: int,
+    kind: int,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    plane: int,
+    # out
+    sums: ImpulseSums,
+    rows: ContactRows,
+):
+    """Publishes a contact, and clears what was kept."""
+    first, second = wp.vec3d(), wp.vec3d()
+    if kept.torque:
+        first = kept.torque[i, 0]
+        second = kept.torque[i, 1]
+    publish_contact(
+        step,
+        sides,
+        kind,
+        corners,
+        weights,
+        plane,
+        kept.impulse[i],
+        kept.along[i],
+        kept.normal[i],
+        first,
+        second,
+        kept.velocity[i],
+        kept.toi[i],
+        sums,
+        rows,
+    )
     clear_kept(kept, i)
 
 
