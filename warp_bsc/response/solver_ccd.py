@@ -452,11 +452,15 @@ class SolverCCD(CollisionStage):
                     if self._substepping is not None:
                         self._substepping[0].substeps.zero_()
                     self.report.last_strain.zero_()
-                    measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
-                    wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
+                    self._measure_strain()
                 resolve_inversions(self._work, dt)
                 check_arcs(self._work)
                 self._write_end(end)
+
+    def _measure_strain(self):
+        """Measures the strain by contacts of a whole step, for the report."""
+        measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
+        wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
 
     def _write_end(self, end):
         """Writes the resolved motion to the arrays of a state, and counts the step."""

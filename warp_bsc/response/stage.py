@@ -41,6 +41,7 @@ class CollisionStage(CouplingHooks):
 
     mesh: ModelMesh
     report: SolverReport
+    _report_type: type[SolverReport] = SolverReport
     _between_steps: BetweenSteps | None = None  # of a stage whose steps carry gradients
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _mask: wp.array | None = None  # of the step in progress, if worlds take no part in it
@@ -64,7 +65,7 @@ class CollisionStage(CouplingHooks):
         self._recount_crossings()
         if not model.requires_grad:
             motion.remember(self._work.vertices.x1)
-        self.report = SolverReport(self._work, responds=responds)
+        self.report = self._report_type(self._work, responds=responds)
         self._watches_bodies = motion.moves_bodies and not model.requires_grad
         coupled: Any = innermost(self.solver)
         if isinstance(coupled, SolverCoupled):

@@ -19,6 +19,7 @@ from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
 from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import add_blocks, make_rows
+from .step_report import StepResults, write_results
 from .system import Contacts, Progress, Unknowns
 
 _TRUNCATIONS = 4
@@ -50,12 +51,14 @@ class NewtonMethod:
 
     keeps_contacts = False
 
-    def __init__(self, work: Workspace, *, max_steps: int):
+    def __init__(self, work: Workspace, *, max_steps: int, results: StepResults, unconverged_steps: wp.array[wp.int64]):
         """Allocates buffers.
 
         Args:
             work: The workspace of the steps: motion, mesh and detection.
             max_steps: Newton steps of a step at most.
+            results: Where solves write what they did.
+            unconverged_steps: Where they count steps in which a world did not converge.
         """
         self._work, self.max_steps = work, max_steps
         mesh = self._mesh = work.mesh
@@ -115,6 +118,8 @@ class NewtonMethod:
         self._settings.units = wp.array(1.0 / (mass * _UNIT_SPEED**2), dtype=wp.float64, device=device)
         self._candidates: list[Candidates] = []
         self._contacts = Contacts()
+        self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
+        self._results = [results, unconverged_steps]
         self._retired: list[tuple] = []
         self._allocate(queues_of(work.detector, candidates=True))
 
@@ -163,6 +168,11 @@ class NewtonMethod:
         self.progress.active.zero_()
         self._find_end(wp.empty_like(state.particle_q), wp.empty_like(state.particle_qd))
 
+    def read_materials(self) -> None:
+        """Reads the stiffness of tetrahedra again; not in a CUDA graph. All else is read in each step."""
+        if self._mesh.model.tet_count and not self._work.device.is_capturing:
+            self._settings.elasticity.assign(self._elasticity(self._mesh))
+
     def _begin(self, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
@@ -171,6 +181,7 @@ class NewtonMethod:
         inputs = [motion, self._margin, self._unknowns]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self.progress.active.zero_()
+        self._lacks.zero_()
         self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
@@ -185,6 +196,9 @@ class NewtonMethod:
         inputs = [self._trial, self._unknowns, self._dt, motion.x0]
         outputs = [motion, work.vertices, particle_q, particle_qd]
         self._launch(steps.finish, vertices, inputs, outputs)
+        counters, capacities = work.detector.counters.array, work.detector.capacities
+        inputs = [self.progress, counters, capacities, self._dt, _LEAST_SPEED, self._lacks]
+        self._launch(write_results, work.worlds, inputs, self._results)
 
     def _renew_candidates(self):
         inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial]
@@ -337,7 +351,7 @@ class NewtonMethod:
         contacts.listed.zero_()
         contacts.end.zero_()
         work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns])
-        self._launch(pairs.place_entries, self._count, [], [contacts])
+        self._launch(pairs.place_entries, self._count, [], [contacts, self._lacks])
         work.launch_over_entries(pairs.list_entries, [contacts, self._unknowns])
 
     def _try(self):

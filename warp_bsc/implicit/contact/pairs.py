@@ -414,9 +414,11 @@ def count_entries(
 
 
 @wp.kernel
-def place_entries(contacts: Contacts):
+def place_entries(contacts: Contacts, lacks: wp.array[int]):
     """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them."""
     u = wp.tid()
+    if u == 0 and contacts.count[0] > contacts.corners.shape[0]:
+        lacks[0] = 1
     count = contacts.end[u]
     if count > 0:
         first = wp.atomic_add(contacts.listed, 0, count)

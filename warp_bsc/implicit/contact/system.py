@@ -108,8 +108,8 @@ def kind_of_key(key: wp.int64) -> int:
 
 @wp.func
 def second_of_key(key: wp.int64) -> int:
-    """Returns the second element of a pair, or its plane."""
-    return int(key & wp.int64(2**29 - 1))
+    """Returns the second element of a pair, or its plane: the last 29 bits."""
+    return int(key & wp.int64(536870911))
 
 
 @wp.func

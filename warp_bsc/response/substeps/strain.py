@@ -225,7 +225,14 @@ class StrainMeter:
             own: Whether to measure the prediction itself, from the start of the motion on.
         """
         ends = (motion.x0, motion.x1) if own else (motion.x1, self._work.vertices.x1)
-        self._work.launch(measure_strain, len(self._edges[0]), [motion, *ends, *self._edges], [strain])
+        self._measure(motion, *ends, strain)
+
+    def measure_step(self, motion: Motion, strain: wp.array[float]) -> None:
+        """Increases ``strain`` to that from the start of a motion to positions as they are, of each world."""
+        self._measure(motion, motion.x0, self._work.vertices.x1, strain)
+
+    def _measure(self, motion, before, after, strain):
+        self._work.launch(measure_strain, len(self._edges[0]), [motion, before, after, *self._edges], [strain])
 
 
 def edges_at_rest(model: newton.Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -30,6 +30,9 @@ class Worlds:
         strain: Largest strain by contacts, float.
         inversions: Tetrahedra that the motion inverts, int; None if the stage was not asked to count them.
         inverted: Tetrahedra that were inverted at the start, int; None if the stage was not asked to count them.
+        newton_steps, last_change, converged, arrived: As of
+            :class:`warp_bsc.implicit.contact.step_report.ImplicitStepReport`, int, float and bool; None if another
+            solver steps.
     """
 
     certified: wp.array[wp.bool]
@@ -45,6 +48,10 @@ class Worlds:
     _find_inside: Callable[[], np.ndarray]
     inversions: wp.array[int] | None = None
     inverted: wp.array[int] | None = None
+    newton_steps: wp.array[int] | None = None
+    last_change: wp.array[float] | None = None
+    converged: wp.array[wp.bool] | None = None
+    arrived: wp.array[wp.bool] | None = None
     _max_impulse: wp.array[float] | None = None
 
     @property

@@ -1,0 +1,113 @@
+"""The report of steps with contact in the solve: that of the collision stage, and how far Newton's method came."""
+
+import warp as wp
+
+from ...kernels.pipeline.queues import has_overflowed
+from ...response.report import SolverReport
+from ...response.state.structs import allocate
+from ...response.state.workspace import Workspace
+from ...response.tuning import MAX_STRAIN
+from .system import Progress
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class StepResults:
+    """How far each world came in a step, shape [worlds], see :class:`ImplicitStepReport`."""
+
+    newton_steps: wp.array[int]
+    last_change: wp.array[float]
+    converged: wp.array[wp.bool]
+    arrived: wp.array[wp.bool]
+
+
+@wp.kernel
+def write_results(
+    # in
+    progress: Progress,
+    counts: wp.array[wp.int64],
+    capacities: wp.array[wp.int64],
+    dt: float,
+    least_speed: float,
+    # in and out
+    lacks: wp.array[int],
+    # out
+    results: StepResults,
+    unconverged_steps: wp.array[wp.int64],
+):
+    """Writes what each world did in a solve, and counts the step if one did not converge.
+
+    The first of ``lacks`` is 1 if contacts did not fit; the second becomes 1 once the step is counted.
+    """
+    w = wp.tid()
+    speed = progress.change[w] / dt
+    arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
+    complete = lacks[0] == 0 and not has_overflowed(counts, capacities)
+    converged = progress.steps[w] == 0 or (arrived and complete and speed <= least_speed)
+    results.newton_steps[w] = progress.steps[w]
+    results.last_change[w] = speed
+    results.arrived[w] = arrived
+    results.converged[w] = converged
+    if not converged and wp.atomic_max(lacks, 1, 1) == 0:
+        unconverged_steps[0] += wp.int64(1)
+
+
+class ImplicitStepReport(SolverReport):
+    """Results of the steps of a :class:`warp_bsc.SolverImplicit`; reading one synchronizes with the device.
+
+    ``hits`` are contacts that the solve left, and that the response behind it resolved; ``strain`` is that of a step
+    from its start to its end. With ``report_worlds``, ``worlds`` has :attr:`newton_steps`, :attr:`last_change`,
+    :attr:`converged` and :attr:`arrived` by world as well.
+    """
+
+    def __init__(self, work: Workspace, *, responds: bool = True):
+        """Reports on the steps of a workspace."""
+        super().__init__(work, responds=responds)
+        self.results = allocate(StepResults, work.worlds, work.device)
+        self.unconverged = wp.zeros(1, dtype=wp.int64, device=work.device)
+
+    @property
+    def newton_steps(self) -> int:
+        """Newton steps of the last step, the most of all worlds."""
+        return self._read(self.results.newton_steps)
+
+    @property
+    def last_change(self) -> float:
+        """Largest change of the velocity of a particle by the last Newton step of a world in the last step [m/s]."""
+        return self._read(self.results.last_change)
+
+    @property
+    def converged(self) -> bool:
+        """Whether the Newton steps of all worlds sufficed for the last step.
+
+        It is false if :attr:`last_change` is more than 1 mm/s, if :attr:`arrived` is false, and if pairs that are near
+        each other did not fit into the buffers of a CUDA graph. Such a step is free of collisions all the same, if it
+        is certified; it lags behind its forces.
+        """
+        return bool(self.results.converged.numpy().all())
+
+    @property
+    def arrived(self) -> bool:
+        """Whether all that a program moves had arrived in the solve of the last step.
+
+        Where it had not, because cloth is in its way, the response behind the solve pushes that aside, or the step is
+        not certified.
+        """
+        return bool(self.results.arrived.numpy().all())
+
+    @property
+    def unconverged_steps(self) -> int:
+        """Steps so far that were not :attr:`converged`."""
+        return self._read(self.unconverged)
+
+    def _strain_warning(self):
+        return f"a step strained an edge by more than {float(MAX_STRAIN):.0%}: {self._shorter_steps}"
+
+    @property
+    def _shorter_steps(self):
+        return "take shorter steps, or raise max_iterations if report.converged is false"
+
+    def __str__(self) -> str:
+        """Returns the line of the stage, and how many steps did not converge."""
+        return f"{super().__str__()}, {self.unconverged_steps} whose Newton steps did not converge"
