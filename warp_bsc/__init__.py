@@ -45,6 +45,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.query_points import query_points
     from .detection.rigid_motion import RigidMotion
     from .implicit.solver import SolverImplicitAdjoint
+    from .implicit.solver_implicit import SolverImplicit
     from .repair.repair import repair
     from .repair.results import RepairResult, UnresolvedContour
     from .repair.state import StateRepairResult, repair_state
@@ -89,6 +90,7 @@ _MODULES = {
     "SceneProximities": "replay.scene_proximities",
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
+    "SolverImplicit": "implicit.solver_implicit",
     "SolverImplicitAdjoint": "implicit.solver",
     "SolverReport": "response.report",
     "StateRepairResult": "repair.state",
@@ -130,6 +132,7 @@ __all__ = [
     "SceneProximities",
     "Selection",
     "SolverCCD",
+    "SolverImplicit",
     "SolverImplicitAdjoint",
     "SolverReport",
     "StateRepairResult",

@@ -563,6 +563,23 @@ def calls_of_solvers() -> dict[str, Call]:
             },
             raises=bsc.ContactLayer.__init__,
         ),
+        "SolverImplicit": Call(
+            bsc.SolverImplicit,
+            {"model": inner.model},
+            {
+                "model": OBJECTS,
+                "friction": coefficient | {"huge": 1e39},
+                "friction_table": tables,
+                "min_distance": without(DISTANCES, "None"),
+                "particle_radius": radii,
+                "collision_filter": filters,
+                "inversions": {"unknown": "counted", "flag": True, "None": None},
+                "max_iterations": NOT_COUNT | {"zero": 0},
+                "report_contacts": without(NOT_COUNT, "bool") | {"zero": 0},
+                "report_worlds": FLAGS,
+            },
+            raises=bsc.SolverImplicit.__init__,
+        ),
         "SolverImplicitAdjoint": Call(
             bsc.SolverImplicitAdjoint,
             {"solver": vbd},
@@ -599,6 +616,7 @@ def calls_of_solvers() -> dict[str, Call]:
     states = {"state_in": start, "state_out": end, "control": None, "contacts": None, "dt": 0.01}
     for name, cls in (
         ("SolverCCD", stage),
+        ("SolverImplicit", bsc.SolverImplicit(inner.model)),
         ("CollisionMonitor", bsc.CollisionMonitor(inner)),
         ("ContactLayer", bsc.ContactLayer(inner)),
         ("SolverImplicitAdjoint", bsc.SolverImplicitAdjoint(vbd)),
@@ -613,7 +631,7 @@ def calls_of_solvers() -> dict[str, Call]:
         found[f"{name}.step"] = Call(
             cls.step,
             states,
-            bad | {"world_mask": masks} if name in ("SolverCCD", "CollisionMonitor") else bad,
+            bad | {"world_mask": masks} if name in ("SolverCCD", "SolverImplicit", "CollisionMonitor") else bad,
             exempt=frozenset({"state_in", "state_out", "control", "contacts", "options"}),
         )
     return found
@@ -638,7 +656,8 @@ RESULTS = {
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 
 PASSED_ON = re.compile(
-    r"(SolverCCD|CollisionMonitor|ContactLayer|SolverImplicitAdjoint)\.(coupling_\w+|notify_model_changed|observables|reset|"
+    r"(SolverCCD|SolverImplicit|CollisionMonitor|ContactLayer|SolverImplicitAdjoint)\.(coupling_\w+|"
+    r"notify_model_changed|observables|reset|"
     r"set_collision_frequency|update_contacts|validate_observables)$"
 )
 """Methods that delegate to the inner solver, which checks their arguments."""
