@@ -1,0 +1,303 @@
+"""SolverImplicit as a solver of Newton: its report, contact forces, graphs, and what a program changes between steps."""
+
+import copy
+import threading
+import warnings
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton import ModelFlags, ParticleFlags
+from newton_scenes import SOFT, add_patch, bullet
+
+import warp_bsc as bsc
+
+DT, GRAVITY = 1.0 / 60.0, 9.81
+
+
+def ramp(device, angle=0.0, *, velocity=0.0, mu=0.3, on_plane=False):
+    """A cloth near a static box, or a plane, tilted by an angle about the y axis; z is normal to it, x points down."""
+    builder = newton.ModelBuilder(gravity=(GRAVITY * np.sin(angle), 0.0, -GRAVITY * np.cos(angle)))
+    cfg = newton.ModelBuilder.ShapeConfig(mu=mu)
+    if on_plane:
+        builder.add_ground_plane(cfg=cfg)
+    else:
+        at = wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity())
+        builder.add_shape_box(-1, hx=0.5, hy=0.2, hz=0.1, xform=at, cfg=cfg)
+    cells = {"dim_x": 4, "dim_y": 4, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.001}
+    at, speed = wp.vec3(-0.1, -0.1, 0.002), wp.vec3(velocity, 0.0, 0.0)
+    builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=speed, **cells, **SOFT)
+    return builder.finalize(device=device)
+
+
+def weight_of(model):
+    return GRAVITY * float(model.particle_mass.numpy().sum())
+
+
+def step(solver, state, end, steps=1, dt=DT):
+    """Steps from a state to another one and back; returns the one of the end."""
+    for _ in range(steps):
+        solver.step(state, end, None, None, dt)
+        state, end = end, state
+    return state
+
+
+def forces(solver, state, end, steps):
+    """Steps, and returns the force on the first shape in each step [N]."""
+    found = []
+    for _ in range(steps):
+        solver.step(state, end, None, None, DT)
+        found.append(solver.report.shape_impulse.numpy()[0] / DT)
+        state, end = end, state
+    return np.array(found)
+
+
+def positions(state):
+    return np.concatenate([state.particle_q.numpy(), state.particle_qd.numpy()])
+
+
+@pytest.mark.parametrize("on_plane", [False, True])
+def test_a_scale_under_a_cloth_shows_its_weight(on_plane, device):
+    model = ramp(device, on_plane=on_plane)
+    solver = bsc.SolverImplicit(model, report_contacts=True)
+    force, weight = forces(solver, model.state(), model.state(), 12)[-1], weight_of(model)
+    assert np.allclose(force, (0.0, 0.0, -weight), atol=1e-3 * weight)
+    report = solver.report
+    assert report.certified and report.converged and report.arrived and report.hits == 0
+    assert report.contacts.complete and report.impulses_complete
+    listed = report.contacts.numpy()
+    assert np.isin(listed["kind"], [2] if on_plane else [0, 1]).all() and (listed["shapes"] == (-1, 0)).all()
+    assert listed["normal_impulse"].sum() / DT == pytest.approx(weight, rel=1e-3)
+    assert np.allclose(listed["velocity"], (0.0, 0.0, -GRAVITY * DT), atol=1e-3)
+    assert np.allclose(report.particle_impulse.numpy().sum(axis=0) / DT, (0.0, 0.0, weight), atol=1e-3 * weight)
+    assert not report.unpaired_particle_impulse.numpy().any()
+
+
+def test_friction_on_a_ramp_is_mu_times_the_normal_force(device):
+    """Of a cloth that slides down; and it accelerates as that says."""
+    model = ramp(device, 0.5, velocity=0.5, mu=0.2)
+    solver, state = bsc.SolverImplicit(model, friction=0.2, report_contacts=True), model.state()
+    force, weight = -forces(solver, state, model.state(), 12)[-6:].mean(axis=0), weight_of(model)
+    assert force[2] == pytest.approx(weight * np.cos(0.5), rel=0.01)
+    assert force[0] == pytest.approx(-0.2 * force[2], rel=0.01)
+    velocity = state.particle_qd.numpy()[:, 0].mean()
+    assert velocity == pytest.approx(0.5 + 12 * DT * GRAVITY * (np.sin(0.5) - 0.2 * np.cos(0.5)), rel=0.02)
+
+
+def test_torques_on_a_moved_body_are_those_of_its_contacts(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -GRAVITY))
+    body = builder.add_body(xform=wp.transform(wp.vec3(0.3, 0.0, -0.1), wp.quat_identity()), is_kinematic=True)
+    builder.add_shape_box(body, hx=0.5, hy=0.2, hz=0.1)
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.002))
+    model = builder.finalize(device=device)
+    solver = bsc.SolverImplicit(model, report_contacts=True)
+    step(solver, model.state(), model.state(), 12)
+    wrench, weight = solver.report.body_impulse.numpy()[body] / DT, weight_of(model)
+    # the arm of the weight is 0.3 m to the left
+    assert np.allclose(wrench, (0.0, 0.0, -weight, 0.0, -0.3 * weight, 0.0), atol=2e-3 * weight)
+
+
+def test_a_budget_of_newton_steps_is_kept_and_said_to_have_run_out(device):
+    model, changes = ramp(device), []
+    for most in (1, 2, 50):
+        solver = bsc.SolverImplicit(model, max_iterations=most)
+        step(solver, model.state(), model.state())
+        report = solver.report
+        suffices = most == 50
+        assert report.newton_steps == most or (suffices and 2 < report.newton_steps < 50)
+        assert report.converged == suffices and (report.last_change <= 1e-3) == suffices
+        assert report.unconverged_steps == int(not suffices)
+        assert f"{report.unconverged_steps} whose Newton steps did not converge" in str(report)
+        changes.append(report.last_change)
+    assert changes[0] > changes[1] > changes[2]
+
+
+def test_what_a_program_presses_into_a_wedge_has_not_arrived(device):
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    builder.add_shape_box(-1, hx=0.2, hy=0.2, hz=0.1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()))
+    plate = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 0.105), wp.quat_identity()), is_kinematic=True)
+    builder.add_shape_box(plate, hx=0.2, hy=0.2, hz=0.1)
+    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0025))
+    model = builder.finalize(device=device)
+    solver, state, end = bsc.SolverImplicit(model, report_worlds=True), model.state(), model.state()
+    for height, arrives in ((0.105, True), (0.09, False)):
+        state.body_q.assign([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]])
+        with pytest.warns(UserWarning, match="is not certified") if not arrives else pytest.MonkeyPatch.context():
+            solver.step(state, end, None, None, DT)
+            assert solver.report.arrived == arrives and solver.report.certified == arrives
+        assert solver.report.worlds.numpy()["arrived"].tolist() == [arrives]
+        state.assign(end)
+    assert not solver.report.converged
+
+
+def test_a_step_that_strains_cloth_says_so_and_what_to_do(device):
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.1, (0.0, 0.0, 0.0))
+    builder.particle_mass = [1.0] * builder.particle_count
+    model = builder.finalize(device=device)
+    x0, state = model.particle_q.numpy(), model.state()
+    for spread, strains in ((1.0, False), (40.0, True)):
+        solver = bsc.SolverImplicit(model)
+        state.particle_q.assign(x0)
+        state.particle_qd.assign(spread * x0)
+        found = []
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            x1 = step(solver, state, model.state()).particle_q.numpy()
+            found = [str(warning.message) for warning in said]
+        a, b = solver.mesh.edges.T
+        lengths = [np.linalg.norm(x[a] - x[b], axis=1) for x in (x0, x1)]
+        assert solver.report.strain == pytest.approx((lengths[1] / lengths[0] - 1.0).max(), rel=1e-3)
+        assert (solver.report.strain > 0.2) == strains == (solver.report.totals.strained_steps == 1)
+        advice = "a step strained an edge by more than 20%: take shorter steps, or raise max_iterations"
+        assert [text.startswith(advice) for text in found] == [True] * strains
+
+
+def test_a_step_in_a_graph_is_the_step_without(device):
+    """Captured before anything has been stepped, and while buffers are small."""
+    ends = []
+    for in_graph in (True, False):
+        model = bullet(20.0, device=device)
+        solver = bsc.SolverImplicit(model, report_contacts=True)
+        state, end = model.state(), model.state()
+
+        def launch(solver=solver, state=state, end=end):
+            solver.step(state, end, None, None, DT)
+            state.assign(end)
+
+        if in_graph:
+            with wp.ScopedCapture(device) as capture:
+                launch()
+        found = []
+        for _ in range(4):
+            if in_graph:
+                wp.capture_launch(capture.graph)
+            else:
+                launch()
+            report = solver.report
+            found += [positions(state), report.particle_impulse.numpy(), report.newton_steps, report.last_change]
+        ends.append(found)
+        assert (report.totals.steps, report.totals.uncertified_steps) == (4, 0)
+    assert max(ends[0][2::4]) > 1
+    for actual, expected in zip(*ends, strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
+def test_pairs_that_do_not_fit_are_said_to_lack(device):
+    """In a graph on a GPU, where buffers cannot grow: here by the capacities that the device knows."""
+    model = ramp(device)
+    solver = bsc.SolverImplicit(model, max_iterations=50)
+    state = step(solver, model.state(), model.state(), 3)
+    assert solver.report.converged
+    pairs = solver._newton._contacts
+    kept = pairs.corners
+    pairs.corners = wp.zeros(1, dtype=wp.vec4i, device=device)  # all others are dropped
+    step(solver, state, model.state())
+    assert not solver.report.converged and solver.report.certified
+    pairs.corners = kept
+    step(solver, state, model.state())
+    assert solver.report.converged
+
+
+def test_states_may_be_one_and_contacts_are_not_used(device):
+    ends = []
+    for alone in (False, True):
+        model = ramp(device, 0.2, velocity=0.3)
+        solver, state = bsc.SolverImplicit(model), model.state()
+        end, contacts = state, None
+        if not alone:
+            end, pipeline = model.state(), newton.CollisionPipeline(model)
+            contacts = pipeline.contacts()
+            pipeline.collide(state, contacts)
+        for _ in range(4):
+            solver.step(state, end, None, contacts, DT)
+            state, end = end, state
+        ends.append(positions(state))
+    np.testing.assert_array_equal(*ends)
+
+
+def test_solvers_of_one_model_do_not_disturb_each_other(device):
+    model = ramp(device, 0.2, velocity=0.3)
+    solvers = [bsc.SolverImplicit(model) for _ in range(2)]
+    states = [[model.state(), model.state()] for _ in range(2)]
+    for k in (0, 1, 1, 0, 0, 1):
+        step(solvers[k], *states[k])
+        states[k].reverse()
+    np.testing.assert_array_equal(*(positions(pair[0]) for pair in states))
+
+
+def test_masses_gravity_and_flags_are_read_again(device):
+    model = ramp(device)
+    solver, state, end = bsc.SolverImplicit(model, report_contacts=True), model.state(), model.state()
+    weight = weight_of(model)
+    for scale in ("particle_mass", "gravity"):
+        forces(solver, state, end, 2)
+        for name, factor in (("particle_mass", 2.0), ("particle_inv_mass", 0.5), ("gravity", 2.0)):
+            if scale in name or (scale == "particle_mass" and "mass" in name):
+                getattr(model, name).assign(factor * getattr(model, name).numpy())
+        solver.notify_model_changed(ModelFlags.MODEL_PROPERTIES)
+        weight *= 2.0
+        assert forces(solver, state, end, 16)[-1][2] == pytest.approx(-weight, rel=2e-3), scale
+    flags = model.particle_flags.numpy()
+    flags[:5] &= ~int(ParticleFlags.ACTIVE)
+    model.particle_flags.assign(flags)
+    model.set_gravity((0.0, 0.0, 5.0))
+    solver.notify_model_changed(ModelFlags.MODEL_PROPERTIES)
+    before = state.particle_q.numpy()
+    after = step(solver, state, end).particle_q.numpy()
+    assert np.array_equal(before[:5], after[:5]) and (after[-5:, 2] > before[-5:, 2]).all()
+
+
+def test_a_shape_that_changes_is_followed(device):
+    model = ramp(device)
+    solver = bsc.SolverImplicit(model)
+    state = step(solver, model.state(), model.state(), 4)
+    model.shape_transform.assign([[0.0, 0.0, -0.15, 0.0, 0.0, 0.0, 1.0]])
+    solver.notify_model_changed(ModelFlags.SHAPE_PROPERTIES)
+    low = step(solver, state, model.state(), 24).particle_q.numpy()[:, 2]
+    assert ((low > -0.05) & (low < -0.045)).all() and solver.report.certified
+
+
+def test_a_reset_begins_where_the_state_is(device):
+    """Also if a program has turned time back: kinematic things do not sweep the way between."""
+    model = ramp(device)
+    solver, end = bsc.SolverImplicit(model), model.state()
+    first = positions(step(solver, model.state(), end))
+    step(solver, end, model.state(), 5)
+    state = model.state()
+    solver.reset(state)
+    np.testing.assert_array_equal(positions(step(solver, state, model.state())), first)
+
+
+def test_it_cannot_be_copied_taped_or_used_by_two_threads(device):
+    model = ramp(device)
+    solver, state, end = bsc.SolverImplicit(model), model.state(), model.state()
+    with pytest.raises(TypeError, match="a SolverImplicit cannot be copied: make a new one of the same model"):
+        copy.deepcopy(solver)
+    errors = []
+
+    def other():
+        try:
+            solver.step(state, end, None, None, DT)
+        except RuntimeError as error:
+            errors.append(str(error))
+
+    with solver._lock:
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+    assert errors == ["another thread is using this SolverImplicit: use one for each thread"]
+    builder = newton.ModelBuilder()
+    add_patch(builder, 2, 0.1, (0.0, 0.0, 1.0))
+    model = builder.finalize(device=device, requires_grad=True)
+    solver, state, end = bsc.SolverImplicit(model), model.state(), model.state()
+    with wp.Tape(), pytest.raises(NotImplementedError, match="on a tape carries no gradients yet"):
+        solver.step(state, end, None, None, DT)
+    solver.step(state, end, None, None, DT)
+    assert solver.report.certified
+
+
+def test_a_model_without_particles_is_refused(device):
+    with pytest.raises(ValueError, match="model: it has no particles"):
+        bsc.SolverImplicit(newton.ModelBuilder().finalize(device=device))
