@@ -49,7 +49,7 @@ PACKAGES = {
     "response": {"detection", "kernels", "_arguments", "_one_thread", "_private_names", "_warnings"},
     "torch": {"response", "_arguments"},
     "jax": {"response", "_arguments"},
-    "implicit": {"detection", "response", "_arguments", "_one_thread", "_private_names", "_warnings"},
+    "implicit": {"detection", "kernels", "response", "_arguments", "_one_thread", "_private_names", "_warnings"},
     "repair": {"detection", "response", "kernels", "usd", "replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread", "_sorted_keys", "_warnings"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},

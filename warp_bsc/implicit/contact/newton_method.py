@@ -141,7 +141,7 @@ class NewtonMethod:
         return reach
 
     def _elasticity(self, mesh) -> np.ndarray:
-        """Returns the stiffness of the tetrahedra around each vertex, mu V |b|^2 of each, of shape functions b [N/m]."""
+        """Returns the stiffness of tetrahedra around each vertex, mu V |b|^2 of each, of shape functions b [N/m]."""
         model, found = mesh.model, np.zeros(mesh.vertex_count)
         if model.tet_count:
             poses, materials = model.tet_poses.numpy().astype(float), model.tet_materials.numpy()

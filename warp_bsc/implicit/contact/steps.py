@@ -166,8 +166,8 @@ def begin_hold(
 @wp.func
 def _inverse(block: wp.mat33, least: float) -> wp.mat33:
     """Returns the inverse of a symmetric block; of its absolute value where that is not positive definite."""
-    a, b, c = block[0, 0], block[0, 1], block[0, 2]
-    d, e, f = block[1, 1], block[1, 2], block[2, 2]
+    a, b = block[0, 0], block[0, 1]
+    d, f = block[1, 1], block[2, 2]
     minor = a * d - b * b
     determinant = wp.determinant(block)
     size = wp.max(a, wp.max(d, f))
