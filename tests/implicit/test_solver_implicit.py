@@ -1,4 +1,4 @@
-"""SolverImplicit as a solver of Newton: its report, contact forces, graphs, and what a program changes between steps."""
+"""SolverImplicit as a solver of Newton: report, contact forces, graphs, and what a program changes between steps."""
 
 import copy
 import threading

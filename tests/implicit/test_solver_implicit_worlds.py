@@ -24,7 +24,7 @@ def random_world(seed):
         world.add_ground_plane(height=-0.05)
     plate = world.add_body(xform=wp.transform(wp.vec3(0.12, 0.0, 0.07), wp.quat_identity()), is_kinematic=True)
     world.add_shape_box(plate, hx=0.05, hy=0.2, hz=0.01)
-    add_patch(world, 4, 0.06, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, -2.0))
+    add_patch(world, 3, 0.08, (0.0, 0.0, 0.0), velocity=(0.0, 0.0, -2.0))
     q = wp.quat_rpy(*random.uniform(-0.2, 0.2, 2).tolist(), float(random.uniform(0.0, 3.0)))
     pose = wp.transform(wp.vec3(*random.uniform(-0.02, 0.02, 2), 0.16), q)
     world.particle_q = [wp.transform_point(pose, wp.vec3(*x)) for x in world.particle_q]
