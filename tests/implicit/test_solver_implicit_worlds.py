@@ -125,6 +125,23 @@ def test_a_graph_from_the_first_step_on_does_what_steps_do(together):
     assert all(map(same, run.ends, together.ends))
 
 
+def test_a_world_that_is_not_finite_stands_and_disturbs_no_other(together):
+    run = Run(range(3), together.model.device)
+    run.step()
+    x = run.states[0].particle_q.numpy()
+    hit = len(x) // 3 + 2
+    x[hit] = np.nan
+    run.states[0].particle_q.assign(x)
+    with pytest.warns(UserWarning, match="not finite"):
+        run.step()
+        run.solver.report.warn()
+    for world in (0, 2):
+        assert same(run.ends[world], together.ends[world][:2])
+    results, after = run.solver.report.worlds.numpy(), run.states[0].particle_q.numpy()
+    assert results["certified"].tolist() == [True, False, True] and not results["converged"][1]
+    assert np.flatnonzero(~np.isfinite(after).all(axis=1)).tolist() == [hit]
+
+
 def test_reset_worlds_start_anew_and_masked_ones_stand(together):
     """At random times, in worlds that take part in random steps: each goes as it went first."""
     run, random = Run(range(6), together.model.device), np.random.default_rng(1)

@@ -19,7 +19,7 @@ from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
 from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import add_blocks, make_rows
-from .step_report import StepResults, write_results
+from .step_report import StepResults, note_overflow, write_results
 from .system import Contacts, Progress, Unknowns
 
 _TRUNCATIONS = 4
@@ -98,7 +98,8 @@ class NewtonMethod:
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
         self._whole = wp.zeros(vertices, dtype=float, device=device)
-        self._leaves = wp.zeros(1, dtype=int, device=device)
+        self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
+        self._any_leaves = self._leaves[work.worlds :]
         self._meets = wp.zeros(1, dtype=int, device=device)
         self._flags = wp.zeros(3, dtype=int, device=device)
         self._goes_on, self._search, self._cuts = (self._flags[k : k + 1] for k in range(3))
@@ -196,12 +197,11 @@ class NewtonMethod:
         inputs = [self._trial, self._unknowns, self._dt, motion.x0]
         outputs = [motion, work.vertices, particle_q, particle_qd]
         self._launch(steps.finish, vertices, inputs, outputs)
-        counters, capacities = work.detector.counters.array, work.detector.capacities
-        inputs = [self.progress, counters, capacities, self._dt, _LEAST_SPEED, self._lacks]
+        inputs = [self.progress, self._dt, _LEAST_SPEED, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
     def _renew_candidates(self):
-        inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial]
+        inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
         self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper])
         self._find_candidates()
 
@@ -213,6 +213,7 @@ class NewtonMethod:
             detector.find_candidates(self._lower, self._upper, keep_separated=True)
 
         retry_until_fits(find, detector, work.device)
+        self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self._lacks])
         queues = queues_of(detector, candidates=True)
         if [len(c.kept) for c in self._candidates] != [len(q.pairs) for q in queues]:
             self._allocate(queues)
@@ -243,10 +244,10 @@ class NewtonMethod:
             self._launch(pairs.bound_by_planes, work.particle_count, inputs, [self.progress, self._limit])
 
     def _take_newton_step(self):
+        wp.capture_if(self._any_leaves, self._renew_candidates)
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
         unknowns, contacts, vertices = self._unknowns, self._contacts, self._mesh.vertex_count
         dt = wp.float64(self._dt)
-        wp.capture_if(self._leaves, self._renew_candidates)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
@@ -300,7 +301,8 @@ class NewtonMethod:
         work, trial = self._work, self._trial
         active = self._ahead if solves else self.progress.active
         inputs = [work.step.motion, self._unknowns, self._vectors, self._lower, self._upper, active]
-        self._leaves.zero_()
+        if not solves:
+            self._leaves.zero_()
         outputs = [trial, self.progress, self._limit, self._leaves]
         self._launch(steps.displace, self._mesh.vertex_count, inputs, outputs)
         self._bound(active)

@@ -11,13 +11,7 @@ from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_
 from ...response.state.structs import Motion, Step
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
-from .system import (
-    Contacts,
-    Progress,
-    Unknowns,
-    contact_count,
-    unknown_of_corner,
-)
+from .system import Contacts, Progress, Unknowns, contact_count, displacement, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
 

@@ -23,11 +23,16 @@ class StepResults:
 
 
 @wp.kernel
+def note_overflow(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], lacks: wp.array[int]):
+    """Notes whether candidates did not fit, as can be in a CUDA graph."""
+    if has_overflowed(counts, capacities):
+        lacks[0] = 1
+
+
+@wp.kernel
 def write_results(
     # in
     progress: Progress,
-    counts: wp.array[wp.int64],
-    capacities: wp.array[wp.int64],
     dt: float,
     least_speed: float,
     # in and out
@@ -38,13 +43,12 @@ def write_results(
 ):
     """Writes what each world did in a solve, and counts the step if one did not converge.
 
-    The first of ``lacks`` is 1 if contacts did not fit; the second becomes 1 once the step is counted.
+    The first of ``lacks`` is 1 if candidates or contacts did not fit; the second becomes 1 once the step is counted.
     """
     w = wp.tid()
     speed = progress.change[w] / dt
     arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
-    complete = lacks[0] == 0 and not has_overflowed(counts, capacities)
-    converged = progress.steps[w] == 0 or (arrived and complete and speed <= least_speed)
+    converged = progress.steps[w] == 0 or (arrived and lacks[0] == 0 and speed <= least_speed)
     results.newton_steps[w] = progress.steps[w]
     results.last_change[w] = speed
     results.arrived[w] = arrived

@@ -293,7 +293,8 @@ def displace(
     if is_given(unknowns, v):
         return
     d = displacement(unknowns, v, vectors.solution)
-    if not wp.isfinite(d):  # as a start is not: its world stands
+    gradient = vectors.gradient[unknown_of_corner(unknowns, v)]
+    if not (wp.isfinite(d) and wp.isfinite(gradient)):  # as a start is not: its world stands
         trial.displaced[v] = wp.vec3()
         progress.bound[world] = 0.0
         progress.change[world] = wp.inf
@@ -302,7 +303,8 @@ def displace(
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
-        leaves[0] = 1
+        leaves[world] = 1
+        leaves[leaves.shape[0] - 1] = 1
 
 
 @wp.kernel
@@ -312,12 +314,18 @@ def renew_boxes(
     unknowns: Unknowns,
     margin: wp.array[float],
     trial: Trial,
+    leaves: wp.array[int],
     # in and out
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
 ):
-    """Makes the boxes of vertices those around their last displacement, from where they are now."""
+    """Makes the boxes of vertices those around their last displacement, from where they are now.
+
+    Only in worlds in which one left its box, so that each is as if it were alone.
+    """
     v = wp.tid()
+    if leaves[motion.world[v]] == 0:
+        return
     x, d = trial.x[v], trial.displaced[v] + wp.vec3()
     pad = margin[v] + float(0.0)
     if unknowns.of_vertex[v] != -1:
