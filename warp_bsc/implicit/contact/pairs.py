@@ -765,9 +765,8 @@ def bound_by_planes(
 @wp.func
 def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.array[wp.float64]):
     """Adds an energy [J] to that of a world, in units, so that the sum does not depend on the order of threads."""
-    scaled = wp.float64(_UNITS_LIMIT)
-    if wp.isfinite(value):
-        scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
+    scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
+    scaled = wp.where(wp.isfinite(value), scaled, _UNITS_LIMIT)
     wp.atomic_add(energy, world, wp.int64(wp.rint(scaled)))
 
 

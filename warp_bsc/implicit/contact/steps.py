@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...response.state.structs import Motion, Vertices
-from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
+from ...response.state.vectors import HALF, ONE, to_double, to_single
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved, sort_entries
