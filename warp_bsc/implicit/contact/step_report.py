@@ -61,8 +61,9 @@ class ImplicitStepReport(SolverReport):
     """Results of the steps of a :class:`warp_bsc.SolverImplicit`; reading one synchronizes with the device.
 
     ``hits`` are contacts that the solve left, and that the response behind it resolved; ``strain`` is that of a step
-    from its start to its end. With ``report_worlds``, ``worlds`` has :attr:`newton_steps`, :attr:`last_change`,
-    :attr:`converged` and :attr:`arrived` by world as well.
+    from its start to its end. Impulses of barriers and friction are those at the end of the solve: with those of the
+    response they are the change of momentum, as far as the step :attr:`converged`. With ``report_worlds``, ``worlds``
+    has :attr:`newton_steps`, :attr:`last_change`, :attr:`converged` and :attr:`arrived` by world as well.
     """
 
     def __init__(self, work: Workspace, *, responds: bool = True):
