@@ -8,7 +8,15 @@ from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved, sort_entries
 from .rows import Rows, sum_of_corners
-from .system import NOT_UNKNOWN, Contacts, Progress, Unknowns, contact_gradient, displacement
+from .system import (
+    NOT_UNKNOWN,
+    Contacts,
+    Progress,
+    Unknowns,
+    contact_gradient,
+    displacement,
+    unknown_of_corner,
+)
 
 wp.set_module_options({"enable_backward": False})
 
