@@ -14,11 +14,11 @@ from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import pairs, steps
-from .conjugate_gradients import BLOCK, Vectors, solve_worlds
+from .conjugate_gradients import Vectors, block_of_world, solve_worlds
 from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
 from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
-from .rows import add_blocks, make_rows
+from .rows import make_rows
 from .step_report import StepResults, note_overflow, write_results
 from .system import Contacts, Progress, Unknowns
 
@@ -80,6 +80,7 @@ class NewtonMethod:
         unknowns.of_worlds = array(np.searchsorted(world, np.arange(work.worlds + 1)))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
+        self._block = block_of_world(int(np.bincount(world, minlength=1).max(initial=0)), device)
         self._rows = make_rows(of_elements, unknown, self._count, device)
         first = self._rows.first.numpy()
         self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(first)))
@@ -231,7 +232,8 @@ class NewtonMethod:
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
-        sizes = {"count": 1, "listed": 1, "first": self._count, "end": self._count, "entries": 4 * capacity}
+        sizes: dict = {"count": 1, "listed": 1, **dict.fromkeys(("first", "middle", "end"), self._count)}
+        sizes |= dict.fromkeys(("entries", "unsorted", "row"), 4 * capacity)
         self._contacts = allocate(Contacts, capacity, device, **sizes)
 
     def _bound(self, active):
@@ -246,17 +248,14 @@ class NewtonMethod:
     def _take_newton_step(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
-        unknowns, contacts, vertices = self._unknowns, self._contacts, self._mesh.vertex_count
+        unknowns, vertices = self._unknowns, self._mesh.vertex_count
         dt = wp.float64(self._dt)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
-        inputs = [self._derivatives, self._row_of_block, unknowns.world, progress.active]
-        self._launch(add_blocks, len(self._row_of_block), inputs, [self._rows])
-        self._find_contacts()
-        inputs = [self._derivatives, contacts, unknowns, trial, self._goal, motion.inverse_mass, dt, progress.active]
-        self._launch(steps.assemble, self._count, inputs, [self._rows, self._vectors])
+        self._find_near(progress.active)
+        self._assemble(progress.active, True)
         self._solve_linear(progress.active)
         self._hold_ahead(0)
         self._flags.zero_()
@@ -286,15 +285,21 @@ class NewtonMethod:
         self._launch(steps.undo_truncation, vertices, [work.step.motion, progress], [self._trial])
 
     def _solve_linear(self, active):
-        work = self._work
-        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS]
-        wp.launch(
-            solve_worlds,
-            work.worlds * (BLOCK if work.device.is_cuda else 1),
-            inputs=[*inputs, self._vectors, self.iterations],
-            device=work.device,
-            block_dim=BLOCK,
-        )
+        work, (threads, parts) = self._work, self._block
+        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, parts]
+        outputs = [self._vectors, self.iterations]
+        options = {"device": work.device, "block_dim": threads}
+        wp.launch(solve_worlds, work.worlds * threads, inputs=inputs, outputs=outputs, **options)
+
+    def _assemble(self, active, begins):
+        """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
+        motion, contacts, unknowns, vectors = self._work.step.motion, self._contacts, self._unknowns, self._vectors
+        self._list_contacts()
+        masses = [motion.inverse_mass, wp.float64(self._dt), active]
+        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, *masses]
+        self._launch(steps.add_blocks, len(self._row_of_block), inputs, [self._rows])
+        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows]
+        self._launch(steps.assemble, self._count, inputs, [vectors])
 
     def _hold_ahead(self, solves):
         """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
@@ -321,10 +326,7 @@ class NewtonMethod:
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
             self._launch(pairs.hold_at_planes, work.particle_count, [*inputs, 2 + solves], [contacts])
-        self._list_contacts()
-        inputs = [contacts, unknowns, self._derivatives, self._trial, self._goal, motion.inverse_mass]
-        inputs += [wp.float64(self._dt), ahead]
-        self._launch(steps.assemble_again, self._count, inputs, [self._rows, self._vectors])
+        self._assemble(ahead, False)
         self._solve_linear(ahead)
         self._hold_ahead(solves + 1)
 
@@ -343,11 +345,6 @@ class NewtonMethod:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
             self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
 
-    def _find_contacts(self):
-        """Finds what is near at the positions, and lists it by unknown."""
-        self._find_near(self.progress.active)
-        self._list_contacts()
-
     def _list_contacts(self):
         work, contacts = self._work, self._contacts
         contacts.listed.zero_()
@@ -355,6 +352,7 @@ class NewtonMethod:
         work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns])
         self._launch(pairs.place_entries, self._count, [], [contacts, self._lacks])
         work.launch_over_entries(pairs.list_entries, [contacts, self._unknowns])
+        work.launch_over_entries(pairs.sort_entries, [contacts])
 
     def _try(self):
         """Computes the energy at the displaced positions, and halves the shares of worlds where it has risen."""

@@ -177,6 +177,21 @@ def _key(group: int, kind: int, first: int, second: int) -> wp.int64:
 
 
 @wp.func
+def _couples(unknowns: Unknowns, corners: wp.vec4i, weights: wp.vec4d) -> int:
+    """Returns whether both elements of a contact are solved for, or one is of a body."""
+    first, second = int(0), int(0)
+    for j in range(4):
+        u = unknowns.of_vertex[corners[j]]
+        if u < -1:
+            return 1
+        if u >= 0 and weights[j] > ZERO:
+            first = 1
+        if u >= 0 and weights[j] < ZERO:
+            second = 1
+    return first * second
+
+
+@wp.func
 def _add_contact(
     motion: Motion,
     contacts: Contacts,
@@ -237,6 +252,7 @@ def _add_contact(
             single[row, column] = float(hessian[row, column])
     contacts.hessian[slot] = single
     contacts.key[slot] = key
+    contacts.couples[slot] = _couples(unknowns, corners, weights)
 
 
 @wp.func
@@ -420,6 +436,14 @@ def place_entries(contacts: Contacts, lacks: wp.array[int]):
         contacts.end[u] = first
     else:
         contacts.first[u] = 0
+        contacts.middle[u] = 0
+
+
+@wp.func
+def _list_entry(contacts: Contacts, u: int, entry: int):
+    n = wp.atomic_add(contacts.end, u, 1)
+    contacts.unsorted[n] = entry
+    contacts.row[n] = u
 
 
 @wp.kernel
@@ -438,27 +462,43 @@ def list_entries(
                 u = unknown_of_corner(unknowns, vertex)
                 if u >= 0:
                     if unknowns.is_free[u] != 0:
-                        contacts.entries[wp.atomic_add(contacts.end, u, 1)] = 4 * i + j
+                        _list_entry(contacts, u, 4 * i + j)
                         if unknowns.of_vertex[vertex] < 0:
-                            contacts.entries[wp.atomic_add(contacts.end, u + 1, 1)] = 4 * i + j
+                            _list_entry(contacts, u + 1, 4 * i + j)
+
+
+@wp.kernel
+def sort_entries(
+    # in and out
+    contacts: Contacts,
+    threads: int,
+):
+    """Orders the contacts of each unknown by their pair, so that sums do not depend on the order of threads.
+
+    Those that couple come last.
+    """
+    for n in range(wp.tid(), contacts.listed[0], threads):
+        u, entry = contacts.row[n], contacts.unsorted[n] + int(0)
+        first = contacts.first[u]
+        rank, single = int(0), int(0)
+        for m in range(first, contacts.end[u]):
+            other = contacts.unsorted[m] + int(0)
+            single += 1 - contacts.couples[other >> 2]
+            if _is_before(contacts, other, entry):
+                rank += 1
+        contacts.entries[first + rank] = entry
+        if rank == 0:
+            contacts.middle[u] = first + single
 
 
 @wp.func
-def sort_entries(contacts: Contacts, u: int):
-    """Orders the contacts of an unknown by their pair, so that sums do not depend on the order of threads."""
-    first, end = contacts.first[u], contacts.end[u]
-    for n in range(first + 1, end):
-        entry = contacts.entries[n]
-        key, place = contacts.key[entry >> 2], entry & 3
-        m = n - 1
-        while m >= first:
-            other = contacts.entries[m]
-            before = contacts.key[other >> 2]
-            if before < key or (before == key and (other & 3) < place):
-                break
-            contacts.entries[m + 1] = other
-            m -= 1
-        contacts.entries[m + 1] = entry
+def _is_before(contacts: Contacts, entry: int, other: int) -> bool:
+    i, j = entry >> 2, other >> 2
+    if contacts.couples[i] != contacts.couples[j]:
+        return contacts.couples[i] < contacts.couples[j]
+    if contacts.key[i] != contacts.key[j]:
+        return contacts.key[i] < contacts.key[j]
+    return entry < other
 
 
 # Contacts ahead
@@ -512,6 +552,7 @@ def _hold(
     contacts.gradient[slot] = (stiffness * float(given - short)) * n
     contacts.hessian[slot] = stiffness * wp.outer(n, n)
     contacts.key[slot] = key
+    contacts.couples[slot] = _couples(unknowns, corners, weights)
 
 
 @wp.kernel

@@ -84,26 +84,6 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
     return rows
 
 
-@wp.kernel
-def add_blocks(
-    # in
-    derivatives: Derivatives,
-    row_of_block: wp.array[int],
-    world: wp.array[int],
-    active: wp.array[int],
-    # out
-    rows: Rows,
-):
-    """Adds the blocks of elements up, in active worlds."""
-    k = wp.tid()
-    if active[world[row_of_block[k]]] == 0:
-        return
-    total = wp.mat33()
-    for n in range(rows.first_source[k], rows.first_source[k + 1]):
-        total += derivatives.block[rows.source[n]]
-    rows.block[k] = total
-
-
 @wp.func
 def sum_of_corners(rows: Rows, derivatives: Derivatives, u: int) -> wp.vec3:
     """Returns the gradient of the energy of all elements by an unknown [N]."""

@@ -6,13 +6,14 @@ from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import HALF, ONE, to_double, to_single
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
-from .pairs import BarrierSettings, Trial, add_energy, moved, sort_entries
+from .pairs import BarrierSettings, Trial, add_energy, moved
 from .rows import Rows, sum_of_corners
 from .system import (
     NOT_UNKNOWN,
     Contacts,
     Progress,
     Unknowns,
+    contact_block,
     contact_gradient,
     displacement,
     unknown_of_corner,
@@ -188,9 +189,35 @@ def _inverse(block: wp.mat33, least: float) -> wp.mat33:
 
 
 @wp.kernel
+def add_blocks(
+    # in
+    derivatives: Derivatives,
+    contacts: Contacts,
+    unknowns: Unknowns,
+    row_of_block: wp.array[int],
+    inverse_mass: wp.array[float],
+    dt: wp.float64,
+    active: wp.array[int],
+    # out
+    rows: Rows,
+):
+    """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds."""
+    k = wp.tid()
+    u, v = row_of_block[k], rows.column[k]
+    if active[unknowns.world[u]] == 0:
+        return
+    total = contact_block(contacts, unknowns, u, v)
+    for n in range(rows.first_source[k], rows.first_source[k + 1]):
+        total += derivatives.block[rows.source[n]]
+    if u == v and unknowns.is_free[u] != 0:
+        total += float(ONE / (wp.float64(inverse_mass[u]) * dt * dt)) * wp.identity(n=3, dtype=float)
+    rows.block[k] = total
+
+
+@wp.kernel
 def assemble(
     # in
-    elements_derivatives: Derivatives,
+    derivatives: Derivatives,
     contacts: Contacts,
     unknowns: Unknowns,
     trial: Trial,
@@ -198,56 +225,25 @@ def assemble(
     inverse_mass: wp.array[float],
     dt: wp.float64,
     active: wp.array[int],
-    # in and out
+    begins: bool,
     rows: Rows,
+    # in and out
     vectors: Vectors,
 ):
-    """Computes the gradient of the energy by each unknown, and what preconditions; adds inertia to the diagonal.
+    """Computes the gradient of the energy by each unknown, and what preconditions.
 
-    The displacements begin as 0, those of particles that a program moves as their ways.
+    The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
+    ways. Later ones go on from where they are.
     """
     u = wp.tid()
     if active[unknowns.world[u]] == 0:
         return
-    sort_entries(contacts, u)
     if unknowns.is_free[u] == 0:
-        vectors.gradient[u] = wp.vec3()
-        vectors.solution[u] = trial.displaced[u]
-        vectors.inverse[u] = wp.mat33()
-        vectors.direction[u] = wp.vec3()
-        return
-    inertia = ONE / (wp.float64(inverse_mass[u]) * dt * dt)
-    first = rows.first[u]
-    rows.block[first] = rows.block[first] + float(inertia) * wp.identity(n=3, dtype=float)
-    gradient, block = contact_gradient(contacts, unknowns, u)
-    gradient += sum_of_corners(rows, elements_derivatives, u)
-    gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
-    vectors.gradient[u] = gradient
-    vectors.solution[u] = wp.vec3()
-    vectors.inverse[u] = _inverse(rows.block[first] + block, float(inertia))
-
-
-@wp.kernel
-def assemble_again(
-    # in
-    contacts: Contacts,
-    unknowns: Unknowns,
-    derivatives: Derivatives,
-    trial: Trial,
-    goal: wp.array[wp.vec3],
-    inverse_mass: wp.array[float],
-    dt: wp.float64,
-    ahead: wp.array[int],
-    # in and out
-    rows: Rows,
-    vectors: Vectors,
-):
-    """Computes the gradient and what preconditions again, after contacts were added; displacements stay."""
-    u = wp.tid()
-    if ahead[unknowns.world[u]] == 0:
-        return
-    sort_entries(contacts, u)
-    if unknowns.is_free[u] == 0:
+        if begins:
+            vectors.gradient[u] = wp.vec3()
+            vectors.solution[u] = trial.displaced[u]
+            vectors.inverse[u] = wp.mat33()
+            vectors.direction[u] = wp.vec3()
         return
     inertia = ONE / (wp.float64(inverse_mass[u]) * dt * dt)
     gradient, block = contact_gradient(contacts, unknowns, u)
@@ -255,6 +251,8 @@ def assemble_again(
     gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
     vectors.gradient[u] = gradient
     vectors.inverse[u] = _inverse(rows.block[rows.first[u]] + block, float(inertia))
+    if begins:
+        vectors.solution[u] = wp.vec3()
 
 
 @wp.kernel

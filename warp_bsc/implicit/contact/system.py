@@ -76,9 +76,12 @@ class Contacts:
         gradient: [N].
         hessian: Positive semidefinite [N/m].
         key: Number of the pair, by which contacts of an unknown are ordered.
+        couples: 1 of a contact of two elements that are both solved for, or of a body. The blocks of others, between
+            vertices of one element, are parts of the rows of elements.
         listed: Number of entries, shape [1].
-        first, end: First entry of each unknown, and the end of them; unknowns are in any order.
+        first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
+        unsorted, row: The same in any order, and its unknown.
     """
 
     count: wp.array[int]
@@ -90,10 +93,14 @@ class Contacts:
     gradient: wp.array[wp.vec3]
     hessian: wp.array[wp.mat33]
     key: wp.array[wp.int64]
+    couples: wp.array[int]
     listed: wp.array[int]
     first: wp.array[int]
+    middle: wp.array[int]
     end: wp.array[int]
     entries: wp.array[int]
+    unsorted: wp.array[int]
+    row: wp.array[int]
 
 
 AT_PLANE = wp.constant(8)
@@ -137,12 +144,14 @@ def contact_count(contacts: Contacts) -> int:
 
 
 @wp.func
-def product(rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.array[wp.vec3]) -> wp.vec3:
-    """Returns the row of an unknown of the product of the Hessian with a vector."""
+def product(
+    rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.array[wp.vec3], part: int, parts: int
+) -> wp.vec3:
+    """Returns the row of an unknown of the product of the Hessian with a vector, or one of some parts of it."""
     total = wp.vec3()
-    for k in range(rows.first[u], rows.first[u + 1]):
+    for k in range(rows.first[u] + part, rows.first[u + 1], parts):
         total += rows.block[k] * p[rows.column[k]]
-    for n in range(contacts.first[u], contacts.end[u]):
+    for n in range(contacts.middle[u] + part, contacts.end[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
         corners, weights = contacts.corners[i], contacts.weights[i]
@@ -155,6 +164,23 @@ def product(rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.ar
 
 
 @wp.func
+def contact_block(contacts: Contacts, unknowns: Unknowns, u: int, v: int) -> wp.mat33:
+    """Returns the block of two unknowns of the Hessian of contacts that do not couple."""
+    block = wp.mat33()
+    for n in range(contacts.first[u], contacts.middle[u]):
+        entry = contacts.entries[n]
+        i = entry >> 2
+        corners, weights = contacts.corners[i], contacts.weights[i]
+        weight = float(0.0)
+        for j in range(4):
+            if unknowns.of_vertex[corners[j]] == v:
+                weight += weights[j]
+        if weight != 0.0:
+            block += weights[entry & 3] * weight * contacts.hessian[i]
+    return block
+
+
+@wp.func
 def _by_corner(unknowns: Unknowns, vertex: int, u: int, force: wp.vec3) -> wp.vec3:
     """Returns what a force on a vertex is to an unknown: itself, or its torque if that is the turn of a body."""
     if unknowns.of_vertex[vertex] == -1 - u:  # the unknown behind the first of the body
@@ -164,13 +190,15 @@ def _by_corner(unknowns: Unknowns, vertex: int, u: int, force: wp.vec3) -> wp.ve
 
 @wp.func
 def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int):
-    """Returns the gradient of the energy of contacts by an unknown, and their block of the diagonal."""
+    """Returns the gradient of contacts by an unknown, and the block of the diagonal of those that couple."""
     gradient, block = wp.vec3(), wp.mat33()
     for n in range(contacts.first[u], contacts.end[u]):
         entry = contacts.entries[n]
         i = entry >> 2
         weight, vertex = contacts.weights[i][entry & 3], contacts.corners[i][entry & 3]
         gradient += _by_corner(unknowns, vertex, u, weight * contacts.gradient[i])
+        if n < contacts.middle[u]:
+            continue
         if unknowns.of_vertex[vertex] == -1 - u:
             r = unknowns.arm[vertex]
             turn = wp.skew(r)
