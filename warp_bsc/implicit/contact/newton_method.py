@@ -14,7 +14,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import pairs, steps
-from .conjugate_gradients import Vectors, block_of_world, solve_worlds
+from .conjugate_gradients import Vectors, make_team, solve_worlds
 from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
 from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
@@ -80,7 +80,8 @@ class NewtonMethod:
         unknowns.of_worlds = array(np.searchsorted(world, np.arange(work.worlds + 1)))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
-        self._block = block_of_world(int(np.bincount(world, minlength=1).max(initial=0)), device)
+        largest = int(np.bincount(world, minlength=1).max(initial=0))
+        self._team, self._threads = make_team(largest, work.worlds, device)
         self._rows = make_rows(of_elements, unknown, self._count, device)
         first = self._rows.first.numpy()
         self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(first)))
@@ -285,11 +286,13 @@ class NewtonMethod:
         self._launch(steps.undo_truncation, vertices, [work.step.motion, progress], [self._trial])
 
     def _solve_linear(self, active):
-        work, (threads, parts) = self._work, self._block
-        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, parts]
+        work, team = self._work, self._team
+        if team.blocks > 1:
+            team.arrived.zero_()
+        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, team]
         outputs = [self._vectors, self.iterations]
-        options = {"device": work.device, "block_dim": threads}
-        wp.launch(solve_worlds, work.worlds * threads, inputs=inputs, outputs=outputs, **options)
+        options = {"device": work.device, "block_dim": self._threads}
+        wp.launch(solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options)
 
     def _assemble(self, active, begins):
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
