@@ -39,6 +39,15 @@ class _Inertia(SolverBase):
         wp.launch(steps.predict_positions, model.particle_count, inputs=inputs, outputs=outputs, device=model.device)
 
 
+def _radii_of_strands(model: newton.Model) -> np.ndarray | None:
+    """Returns the radii of particles without triangles and tetrahedra, 0 for others [m]; None if all are 0."""
+    radii = model.particle_radius.numpy().astype(np.float64)
+    for elements in (model.tri_indices, model.tet_indices):
+        if elements is not None:
+            radii[elements.numpy().ravel()] = 0.0
+    return radii if radii.any() else None
+
+
 class SolverImplicit(SolverCCD):
     """Steps cloth and soft bodies by one implicit solve a step, which has contact and friction in it.
 
@@ -65,6 +74,7 @@ class SolverImplicit(SolverCCD):
         max_iterations: Newton steps of a step at most.
     """
 
+    _near = 0.0  # barriers do that
     report: ImplicitStepReport
     _report_type = ImplicitStepReport
 
@@ -89,7 +99,10 @@ class SolverImplicit(SolverCCD):
             friction: Coefficient of particles, as of :class:`warp_bsc.SolverCCD`, like all that follow but for
                 ``max_iterations``. Below a speed of 1 mm/s it is proportional to the speed.
             friction_table: Coefficients by pair of materials.
-            min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it.
+            min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it. Without this and
+                ``particle_radius``, springs and particles without faces, such as ropes and grains, collide by their
+                radii, as they have no other surface; cloth and shapes keep no distance. Where those radii are 0, and
+                with ``requires_grad``, they take no part, and a warning says so.
             particle_radius: Radius of each particle [m], or one for all.
             collision_filter: Groups and masks of particles and shapes.
             inversions: What happens to tetrahedra that invert: ``"left"``, ``"reported"`` or ``"prevented"``.
@@ -111,6 +124,8 @@ class SolverImplicit(SolverCCD):
         if not model.particle_count:
             raise ValueError("model: it has no particles")
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
+        if min_distance is None and particle_radius is None and not model.requires_grad:
+            particle_radius = _radii_of_strands(model)
         super().__init__(
             _Inertia(model),
             substeps=None,
@@ -150,7 +165,7 @@ class SolverImplicit(SolverCCD):
     def _solve(self, end, dt):
         work = self._work
         begin(work)
-        self._newton.solve(end.particle_q, end.particle_qd, dt)
+        self._newton.solve(end, dt)
         detect_contacts(work)
         resolve_contacts(work, dt)
 

@@ -137,6 +137,24 @@ def first_vertex(elements: Elements, kind: int, e: int) -> int:
 
 
 @wp.func
+def _is_finite(elements: Elements, kind: int, e: int, x: wp.array[wp.vec3]) -> bool:
+    """Returns whether the particles of an element have finite positions."""
+    if kind == ElementKind.MEMBRANE:
+        v = elements.tri_indices
+        return wp.isfinite(x[v[e, 0]]) and wp.isfinite(x[v[e, 1]]) and wp.isfinite(x[v[e, 2]])
+    if kind == ElementKind.SPRING:
+        return wp.isfinite(x[elements.spring_indices[e, 0]]) and wp.isfinite(x[elements.spring_indices[e, 1]])
+    v = elements.tet_indices
+    if kind == ElementKind.BENDING:
+        v = elements.edge_indices
+    finite = bool(True)
+    for j in range(4):
+        if v[e, j] >= 0:
+            finite = finite and wp.isfinite(x[v[e, j]])
+    return finite
+
+
+@wp.func
 def _rest_stretch(mu: wp.float64, lame: wp.float64):
     """Returns the ratio of areas or volumes at which the volumetric term is at rest, alpha of Smith et al."""
     return ONE + mu / (wp.sign(lame) * wp.max(wp.abs(lame), _LEAST_LAMBDA))
@@ -556,8 +574,13 @@ def _differentiate_spring(
 def element_energy(
     elements: Elements, i: int, kind: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64
 ) -> wp.float64:
-    """Returns the energy of an element of a kind above that at rest [J], damping included."""
+    """Returns the energy of an element of a kind above that at rest [J], damping included.
+
+    It is 0 where a particle has no finite position, like the derivatives.
+    """
     e = i - elements.first[kind]
+    if not _is_finite(elements, kind, e, x):
+        return ZERO
     if kind == ElementKind.MEMBRANE:
         return _membrane_energy(elements, e, x, x0, dt)
     if kind == ElementKind.BENDING:
@@ -565,6 +588,24 @@ def element_energy(
     if kind == ElementKind.TETRAHEDRON:
         return _tetrahedron_energy(elements, e, x, x0, dt)
     return _spring_energy(elements, e, x, x0, dt)
+
+
+@wp.func
+def _clear(elements: Elements, kind: int, e: int, out: Derivatives):
+    """Writes derivatives of 0."""
+    size = 4
+    if kind == ElementKind.MEMBRANE:
+        size = 3
+    elif kind == ElementKind.SPRING:
+        size = 2
+    corner, place = (
+        elements.first[_FIRST_CORNER + kind] + size * e,
+        elements.first[_FIRST_BLOCK + kind] + size * size * e,
+    )
+    for i in range(size):
+        out.gradient[corner + i] = wp.vec3()
+    for k in range(size * size):
+        out.block[place + k] = wp.mat33()
 
 
 @wp.kernel
@@ -592,6 +633,9 @@ def differentiate(
     if active[in_world] == 0:
         return
     is_convex = convex[in_world] != 0
+    if not _is_finite(elements, kind, e, x):
+        _clear(elements, kind, e, out)
+        return
     if kind == ElementKind.MEMBRANE:
         _differentiate_membrane(elements, e, x, x0, dt, is_convex, out)
     elif kind == ElementKind.BENDING:

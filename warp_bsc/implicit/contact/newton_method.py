@@ -14,6 +14,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import pairs, steps
+from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team, solve_worlds
 from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
 from .impulses import publish_contacts
@@ -28,8 +29,12 @@ _PREDICTIONS = 2
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
+_USUAL_REACH = 1e-3
+"""Reach of particles without edges or radii [m]."""
 _SHORT_EDGE = 0.25
 """Largest reach as a share of the shortest edge at a vertex."""
+_RECOVERY_SPEED = 0.3
+"""Speed at which a barrier moves apart what is within its reach [m/s]: what is thrown rises by 5 mm."""
 _SMOOTHING_SPEED = 1e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
@@ -79,6 +84,7 @@ class NewtonMethod:
         unknowns.world = array(world)
         unknowns.of_worlds = array(np.searchsorted(world, np.arange(work.worlds + 1)))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
+        unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
         largest = int(np.bincount(world, minlength=1).max(initial=0))
         self._team, self._threads = make_team(largest, work.worlds, device)
@@ -94,12 +100,12 @@ class NewtonMethod:
         self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device)
-        self._goal, self._lower, self._upper, self._moved = (
-            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
+        self._origin, self._goal, self._lower, self._upper, self._moved = (
+            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(5)
         )
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
-        self._whole = wp.zeros(vertices, dtype=float, device=device)
+        self._whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
         self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
         self._any_leaves = self._leaves[work.worlds :]
         self._meets = wp.zeros(1, dtype=int, device=device)
@@ -116,9 +122,13 @@ class NewtonMethod:
         margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
         self._margin = wp.array(margin, dtype=float, device=device)
         assert model.particle_mass is not None and model.particle_inv_mass is not None
-        masses, moves = model.particle_mass.numpy(), model.particle_inv_mass.numpy() > 0
+        masses = model.particle_mass.numpy()
+        moves = (model.particle_inv_mass.numpy() > 0) & np.isfinite(masses)
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
         self._settings.units = wp.array(1.0 / (mass * _UNIT_SPEED**2), dtype=wp.float64, device=device)
+        self._attachments = attachments_of_model(model)
+        self._poses = None if self._attachments is None else wp.clone(model.body_q)
+        self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._candidates: list[Candidates] = []
         self._contacts = Contacts()
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
@@ -131,16 +141,17 @@ class NewtonMethod:
         model, particles = mesh.model, mesh.model.particle_count
         reach = np.full(mesh.vertex_count, np.inf)
         x = np.zeros((mesh.vertex_count, 3))
-        x[:particles] = model.particle_q.numpy()
+        x[:particles] = model.particle_q.numpy() if particles else 0.0
         edges = mesh.edges[(mesh.edges < particles).all(axis=1)]
         lengths = np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
         world = mesh.device_world.numpy()
-        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, np.inf)
+        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, _USUAL_REACH / _REACH_OF_EDGE)
         reach[:particles] = _REACH_OF_EDGE * usual[world[:particles]]
         for k in range(2):
             np.minimum.at(reach, edges[:, k], _SHORT_EDGE * lengths)
-        radius = model.particle_radius.numpy()
-        reach[:particles] = np.where(radius > 0, np.minimum(reach[:particles], radius), reach[:particles])
+        if particles:
+            radius = model.particle_radius.numpy()
+            reach[:particles] = np.where(radius > 0, np.minimum(reach[:particles], radius), reach[:particles])
         return reach
 
     def _elasticity(self, mesh) -> np.ndarray:
@@ -154,33 +165,41 @@ class NewtonMethod:
             np.add.at(found, model.tet_indices.numpy().reshape(-1, 4), stiffness)
         return found
 
-    def solve(self, particle_q: wp.array, particle_qd: wp.array, dt: float) -> None:
+    def solve(self, end: StateArrays, dt: float) -> None:
         """Finds where the particles end that the motion of the workspace predicts, and writes it there and here.
 
         Args:
-            particle_q: Where positions at the end are written [m].
-            particle_qd: Where velocities at the end are written [m/s].
+            end: The state at the end: positions and velocities of particles are written, poses of bodies read.
             dt: Length of the step [s].
         """
-        self._begin(dt)
-        self._find_end(particle_q, particle_qd)
+        self._begin(end, dt)
+        self._find_end(end)
 
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
-        self._begin(1.0)
+        end = StateArrays()
+        end.particle_q, end.particle_qd = wp.empty_like(state.particle_q), wp.empty_like(state.particle_qd)
+        end.body_q = state.body_q
+        self._begin(end, 1.0)
         self.progress.active.zero_()
-        self._find_end(wp.empty_like(state.particle_q), wp.empty_like(state.particle_qd))
+        self._find_end(end)
 
     def read_materials(self) -> None:
         """Reads the stiffness of tetrahedra again; not in a CUDA graph. All else is read in each step."""
         if self._mesh.model.tet_count and not self._work.device.is_capturing:
             self._settings.elasticity.assign(self._elasticity(self._mesh))
 
-    def _begin(self, dt):
+    def _begin(self, end, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
         self._settings.dt = dt
+        self._settings.recovery = _RECOVERY_SPEED * dt
         self._settings.smoothing = _SMOOTHING_SPEED * dt
+        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
+        if self._attachments is not None:
+            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
+            self._launch(attach, self._count, inputs, [work.vertices, end.particle_q, end.particle_qd])
+            wp.copy(self._poses, end.body_q)
         inputs = [motion, self._margin, self._unknowns]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self.progress.active.zero_()
@@ -188,16 +207,20 @@ class NewtonMethod:
         self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
+        wp.copy(self._origin, motion.x0)
+        self._touching.face.fill_(pairs.NO_FACE)
+        self._touching.any.zero_()
 
-    def _find_end(self, particle_q, particle_qd):
+    def _find_end(self, end):
         work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
         self._find_candidates()
+        wp.capture_if(self._touching.any, self._part_touching)
         self._goes_on.fill_(1)
         wp.capture_while(self._goes_on, self._take_newton_step)
         if self.keeps_contacts:
             self._find_near(self.progress.steps)
-        inputs = [self._trial, self._unknowns, self._dt, motion.x0]
-        outputs = [motion, work.vertices, particle_q, particle_qd]
+        inputs = [self._trial, self._unknowns, self._dt]
+        outputs = [motion, work.vertices, end.particle_q, end.particle_qd]
         self._launch(steps.finish, vertices, inputs, outputs)
         inputs = [self.progress, self._dt, _LEAST_SPEED, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
@@ -219,8 +242,21 @@ class NewtonMethod:
         queues = queues_of(detector, candidates=True)
         if [len(c.kept) for c in self._candidates] != [len(q.pairs) for q in queues]:
             self._allocate(queues)
-        inputs = [work.step, self._settings, work.status.crossings, *self._candidates]
-        work.launch_over_entries(pairs.prepare_candidates, inputs)
+        self._prepare_candidates()
+
+    def _prepare_candidates(self):
+        inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings]
+        self._over_candidates(pairs.prepare_candidates, inputs, [self._touching])
+
+    def _part_touching(self):
+        inputs = [self._work.step, self._settings, self._touching]
+        self._launch(pairs.part_touching, self._count, inputs, [self._trial, self._origin])
+        self._prepare_candidates()
+
+    def _over_candidates(self, kernel, before, after=()):
+        """Launches a kernel over pairs of faces and edges, and then over those of points, if there are any."""
+        for k in range(0, len(self._candidates), 2):
+            self._work.launch_over_entries(kernel, [*before, *self._candidates[k : k + 2], *after])
 
     def _allocate(self, queues):
         self._retired.append((self._candidates, self._contacts))  # a CUDA graph may still write to them
@@ -229,6 +265,7 @@ class NewtonMethod:
             candidates = Candidates()
             candidates.queue = queue
             candidates.kept = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
+            candidates.level = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
             candidates.share = wp.zeros(len(queue.pairs), dtype=float, device=device)
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
@@ -240,8 +277,7 @@ class NewtonMethod:
     def _bound(self, active):
         """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
         work, motion = self._work, self._work.step.motion
-        inputs = [motion, *self._candidates, self._trial, active, self.progress, self._limit]
-        work.launch_over_entries(pairs.bound_by_pairs, inputs)
+        self._over_candidates(pairs.bound_by_pairs, [motion], [self._trial, active, self.progress, self._limit])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
             self._launch(pairs.bound_by_planes, work.particle_count, inputs, [self.progress, self._limit])
@@ -274,7 +310,7 @@ class NewtonMethod:
         """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
         work, progress, vertices = self._work, self.progress, self._mesh.vertex_count
         inputs, outputs = [self._unknowns, self._lower, self._upper], [self._trial, progress, self._whole, self._limit]
-        self._launch(steps.begin_truncation, vertices, inputs, outputs)
+        self._launch(steps.begin_truncation, max(vertices, work.worlds), inputs, outputs)
         for _ in range(_TRUNCATIONS):
             self._bound(progress.searches)
             self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
@@ -296,12 +332,11 @@ class NewtonMethod:
 
     def _assemble(self, active, begins):
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
-        motion, contacts, unknowns, vectors = self._work.step.motion, self._contacts, self._unknowns, self._vectors
+        contacts, unknowns, vectors = self._contacts, self._unknowns, self._vectors
         self._list_contacts()
-        masses = [motion.inverse_mass, wp.float64(self._dt), active]
-        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, *masses]
+        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, active]
         self._launch(steps.add_blocks, len(self._row_of_block), inputs, [self._rows])
-        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows]
+        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, active, begins, self._rows]
         self._launch(steps.assemble, self._count, inputs, [vectors])
 
     def _hold_ahead(self, solves):
@@ -325,7 +360,7 @@ class NewtonMethod:
         self._launch(steps.begin_hold, work.worlds, [], [self.progress, ahead])
         work.launch_over_entries(pairs.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
-        work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs, self._limit, *outputs])
+        self._over_candidates(pairs.hold_pairs, [motion], [*inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
             self._launch(pairs.hold_at_planes, work.particle_count, [*inputs, 2 + solves], [contacts])
@@ -343,7 +378,7 @@ class NewtonMethod:
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         contacts.count.zero_()
         inputs = [self._settings, self._trial, self._unknowns, active, contacts]
-        work.launch_over_entries(pairs.find_near, [motion, *self._candidates, *inputs])
+        self._over_candidates(pairs.find_near, [motion], inputs)
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
             self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
@@ -371,7 +406,7 @@ class NewtonMethod:
         inputs += [progress, displaced, self._moved]
         self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
         inputs = [self._settings, trial, progress, displaced, energy]
-        work.launch_over_entries(pairs.add_pair_energies, [motion, *self._candidates, *inputs])
+        self._over_candidates(pairs.add_pair_energies, [motion], inputs)
         work.launch_over_entries(pairs.add_friction_energies, [motion, self._contacts, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]

@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...response.state.structs import Motion, Vertices
-from ...response.state.vectors import HALF, ONE, to_double, to_single
+from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved
@@ -54,7 +54,7 @@ def predict_positions(
     """Moves particles as if nothing but gravity and external forces acted on them."""
     i = wp.tid()
     x, v = x0[i] + wp.vec3(), v0[i] + wp.vec3()
-    if inverse_mass[i] > 0.0 and (flags[i] & active_flag) != 0:
+    if inverse_mass[i] > 0.0 and wp.isfinite(inverse_mass[i]) and (flags[i] & active_flag) != 0:
         acceleration = gravity[wp.max(world[i], 0) % gravity.shape[0]] + wp.vec3()
         if force:
             acceleration = acceleration + inverse_mass[i] * force[i]
@@ -62,6 +62,25 @@ def predict_positions(
         x = x + dt * v
     x1[i] = x
     v1[i] = v
+
+
+@wp.kernel
+def begin_unknowns(
+    # in
+    motion: Motion,
+    dt: wp.float64,
+    # out
+    unknowns: Unknowns,
+    goal: wp.array[wp.vec3],
+):
+    """Finds which particles are solved for, their inertia, and where inertia alone leads."""
+    u = wp.tid()
+    unknowns.is_free[u] = 0
+    unknowns.inertia[u] = ZERO
+    goal[u] = motion.x1[u]
+    if motion.inverse_mass[u] > 0.0 and motion.is_not_finite[u] == 0 and wp.isfinite(motion.x0[u]):
+        unknowns.is_free[u] = 1
+        unknowns.inertia[u] = ONE / (wp.float64(motion.inverse_mass[u]) * dt * dt)
 
 
 @wp.kernel
@@ -78,10 +97,7 @@ def begin_step(
     progress: Progress,
     plane_share: wp.array[float],
 ):
-    """Takes the motion as predicted: where inertia alone leads, and boxes around the way there.
-
-    Worlds with unknowns become active.
-    """
+    """Takes the motion as predicted, and boxes around the way there. Worlds with unknowns become active."""
     v = wp.tid()
     if v < progress.active.shape[0]:
         progress.steps[v] = 0
@@ -90,21 +106,23 @@ def begin_step(
         progress.change[v] = 0.0
         progress.remaining[v] = 0.0
         plane_share[v] = 0.0
-    if v >= goal.shape[0]:
+    if v >= trial.x.shape[0]:
         return
     x0, x1 = motion.x0[v], motion.x1[v]
-    goal[v] = x1
     trial.x[v] = x0
     trial.displaced[v] = wp.vec3()
     trial.share[v] = 1.0
+    if not wp.isfinite(x0):  # without pairs, and without forces on others
+        lower[v] = wp.vec3()
+        upper[v] = wp.vec3()
+        return
     pad = margin[v] + float(0.0)
     u = unknowns.of_vertex[v]
-    if u >= 0:
-        unknowns.is_free[u] = 0
-        if motion.inverse_mass[v] > 0.0 and motion.is_not_finite[v] == 0:
-            unknowns.is_free[u] = 1
-            progress.active[motion.world[v]] = 1
-            pad += 0.25 * wp.length(x1 - x0)
+    if u < 0:
+        goal[v] = x1
+    elif unknowns.is_free[u] != 0:
+        progress.active[motion.world[v]] = 1
+        pad += 0.25 * wp.length(x1 - x0)
     lower[v] = wp.min(x0, x1) - wp.vec3(pad)
     upper[v] = wp.max(x0, x1) + wp.vec3(pad)
 
@@ -195,8 +213,6 @@ def add_blocks(
     contacts: Contacts,
     unknowns: Unknowns,
     row_of_block: wp.array[int],
-    inverse_mass: wp.array[float],
-    dt: wp.float64,
     active: wp.array[int],
     # out
     rows: Rows,
@@ -210,7 +226,7 @@ def add_blocks(
     for n in range(rows.first_source[k], rows.first_source[k + 1]):
         total += derivatives.block[rows.source[n]]
     if u == v and unknowns.is_free[u] != 0:
-        total += float(ONE / (wp.float64(inverse_mass[u]) * dt * dt)) * wp.identity(n=3, dtype=float)
+        total += float(unknowns.inertia[u]) * wp.identity(n=3, dtype=float)
     rows.block[k] = total
 
 
@@ -222,8 +238,6 @@ def assemble(
     unknowns: Unknowns,
     trial: Trial,
     goal: wp.array[wp.vec3],
-    inverse_mass: wp.array[float],
-    dt: wp.float64,
     active: wp.array[int],
     begins: bool,
     rows: Rows,
@@ -245,7 +259,7 @@ def assemble(
             vectors.inverse[u] = wp.mat33()
             vectors.direction[u] = wp.vec3()
         return
-    inertia = ONE / (wp.float64(inverse_mass[u]) * dt * dt)
+    inertia = unknowns.inertia[u]
     gradient, block = contact_gradient(contacts, unknowns, u)
     gradient += sum_of_corners(rows, derivatives, u)
     gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
@@ -268,7 +282,7 @@ def find_remaining(
     v = wp.tid()
     world = motion.world[v]
     trial.share[v] = 1.0
-    if progress.active[world] != 0 and is_given(unknowns, v):
+    if progress.active[world] != 0 and is_given(unknowns, v) and wp.isfinite(trial.x[v]):
         d = motion.x1[v] - trial.x[v]
         trial.displaced[v] = d
         if wp.length_sq(d) > 0.0:
@@ -333,6 +347,8 @@ def renew_boxes(
     if leaves[motion.world[v]] == 0:
         return
     x, d = trial.x[v], trial.displaced[v] + wp.vec3()
+    if not wp.isfinite(x):
+        return
     pad = margin[v] + float(0.0)
     if unknowns.of_vertex[v] != -1:
         pad += 0.5 * wp.length(d)
@@ -368,7 +384,6 @@ def begin_truncation(
 ):
     """Lets worlds that take less than all of their displacements try to cut those of single vertices instead."""
     v = wp.tid()
-    limit[v] = 1.0
     if v < progress.active.shape[0]:
         progress.searches[v] = 0
         if progress.active[v] != 0:
@@ -377,6 +392,9 @@ def begin_truncation(
                 progress.searches[v] = 1
             progress.scale[v] = 1.0
             progress.bound[v] = 1.0
+    if v >= trial.x.shape[0]:
+        return
+    limit[v] = 1.0
     if not is_given(unknowns, v):
         trial.share[v] = _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v])
 
@@ -466,8 +484,7 @@ def add_energies(
     if progress.active[world] == 0 or (displaced and progress.searches[world] == 0) or unknowns.is_free[u] == 0:
         return
     off = to_double(moved_positions[u]) - to_double(goal[u])
-    inertia = HALF / (wp.float64(motion.inverse_mass[u]) * settings.dt * settings.dt)
-    add_energy(energy, world, inertia * wp.dot(off, off), settings.units)
+    add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
 
 
 @wp.kernel
@@ -577,20 +594,20 @@ def finish(
     trial: Trial,
     unknowns: Unknowns,
     dt: float,
-    x0: wp.array[wp.vec3],
     # in and out
     motion: Motion,
     vertices: Vertices,
     particle_q: wp.array[wp.vec3],
     particle_qd: wp.array[wp.vec3],
 ):
-    """Writes where the step ends, and the velocity that took vertices there."""
+    """Writes where the step ends, and the predicted velocity with what the step has added to it."""
     v = wp.tid()
     x = trial.x[v]
     u = unknowns.of_vertex[v]
     if u >= 0:
         if unknowns.is_free[u] != 0:
-            velocity = (x - x0[v]) / dt
+            # not by the way from the start, which in short steps is rounding
+            velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
             motion.x1[v] = x
             motion.velocity[v] = velocity
             vertices.x1[v] = x
