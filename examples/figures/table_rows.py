@@ -239,20 +239,24 @@ def response(found: Found, reference: Found) -> Rows:
         "plain": "Newton's contacts",
         "self-contact": "with VBD's self-contact",
         "stage": "`SolverCCD`, default",
+        "implicit": "`SolverImplicit`",
     }
     runs = {(run["scene"], run["configuration"]): run for run in found["runs"]}
     measured = {run["scene"]: run["measured"] for run in reference["runs"] if run["configuration"] == "reference"}
     columns = [name for name in titles if any(name == configuration for _, configuration in runs)]
     rows = [("scene", *(titles[name] for name in columns), f"reference, 1/{next(iter(measured.values()))['rate']} s")]
     for scene in dict.fromkeys(scene for scene, _ in runs):
-        cells = [_response_cell(runs[scene, name]["measured"]) for name in columns]
+        cells = [_response_cell(runs[scene, name]) for name in columns]
         rows.append((f"{scene}: {_SCENES_IN_CONTACT[scene]}", *cells, _stretch_and_speed(measured[scene])))
     return rows
 
 
-def _response_cell(took: Found) -> str:
+def _response_cell(run: Found) -> str:
+    took, distance = run["measured"], run.get("from_converged")
     mean = "" if took["substeps"] is None else f" ({_three(took['milliseconds']['mean'])})"
     parts = [_stretch_and_speed(took), f"{_three(took['milliseconds']['median'])}{mean} ms", *_what_passed(took)]
+    if run["configuration"] == "implicit" and distance:
+        parts.append(f"{digits(distance)} mm from the converged run")
     return "; ".join(parts)
 
 

@@ -265,6 +265,9 @@ def test_scenes_in_contact():
         f"{moves}; 8.12 (123) ms; 2 steps not certified",
         moves,
     )
+    implicit = contact_run("ball", "implicit", substeps=1.0) | {"from_converged": 2.345}
+    head, row = rows_of.response({"runs": [implicit]}, {"runs": [reference]})
+    assert head[1] == "`SolverImplicit`" and row[1] == f"{moves}; 8.12 (123) ms; 2.3 mm from the converged run"
     runs = [
         contact_run("ball", name, rate=rate) for rate in (240, 120) for name in ("plain", "stage", "stage+contacts")
     ]
