@@ -51,9 +51,9 @@ class Simulator:
         rate: Steps a second.
         settings: Its settings, and where they come from.
         claims: What it says of penetration; None if nothing.
-        solver: One of :data:`.response.SOLVERS`; None for one that is not Newton's.
+        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``; None for one that is not for Newton.
         has_self_contact: Whether VBD has contacts between particles of its own.
-        has_stage: Whether :class:`warp_bsc.SolverCCD` is behind the solver.
+        has_stage: Whether :class:`warp_bsc.SolverCCD` is behind the solver, or the solver is one itself.
     """
 
     title: str
@@ -104,6 +104,15 @@ SIMULATORS = {
     "ccd-vbd": _with_stage(_VBD),
     "ccd-style3d": _with_stage(_STYLE3D),
     "ccd-xpbd": _with_stage(_XPBD),
+    "implicit": Simulator(
+        "SolverImplicit",
+        "newton",
+        FRAME_RATE,
+        "default arguments, one step a frame, without Newton's contacts",
+        "certifies each step, or reports that it did not",
+        solver="implicit",
+        has_stage=True,
+    ),
     "mujoco-ipc": Simulator(
         "MuJoCo, ipc",
         "mujoco",

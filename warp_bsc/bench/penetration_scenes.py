@@ -124,7 +124,7 @@ def build_penetration_scene(name: str, solver: str, rate: int) -> PenetrationSce
 
     Args:
         name: A key of :data:`SCENES`.
-        solver: One of :data:`.response.SOLVERS`.
+        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``.
         rate: Steps a second.
 
     Raises:
