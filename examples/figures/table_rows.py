@@ -156,17 +156,20 @@ def touching(found: Found) -> Rows:
 
 
 def newton(*measurements: Found) -> Rows:
-    """Newton's examples, plain and with the stage."""
-    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
+    """Newton's examples, plain, with the stage, and with :class:`warp_bsc.SolverImplicit` in place of VBD."""
+    titles = {"plain": "plain: ms a frame (95th percentile); crossings", "stage": "with `SolverCCD`"}
+    if any(run["mode"] == "implicit" for found in measurements for run in found["runs"]):
+        titles["implicit"] = "with `SolverImplicit` in place of VBD"
+    rows = [("example", *titles.values(), "steps")]
     for found in measurements:
         modes: dict[str, dict[str, Found]] = {}
         for run in found["runs"]:
             modes.setdefault(run["example"], {})[run["mode"]] = run
         for name, run in modes.items():
-            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
+            cells = [_newton_cell(run[mode]) for mode in titles]
             frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
             title = f"`{name}`" + (f", {frames} frames" if frames else "")
-            rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
+            rows.append((title, *cells, _newton_steps(*(run[mode]["measured"] for mode in titles))))
     return rows
 
 
@@ -178,7 +181,7 @@ def _newton_cell(run: Found) -> str:
     return f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); {took['most_crossings']:,}"
 
 
-def _newton_steps(plain: Found | None, stage: Found | None) -> str:
+def _newton_steps(plain: Found | None, stage: Found | None, implicit: Found | None = None) -> str:
     """Returns what the stage reports, and how the example's own tests end."""
     if stage is None or stage["stage"] is None:
         return ""
@@ -189,7 +192,10 @@ def _newton_steps(plain: Found | None, stage: Found | None) -> str:
     words.append(f"{steps['truncated_steps'] or 'none'} truncated")
     if steps["frozen_steps"]:
         words.append(f"{steps['frozen_steps']} with frozen vertices")
-    tests = [_newton_tests(took) for took in (plain, stage) if took]
+    if implicit:
+        steps = implicit["stage"]
+        words.append(f"`SolverImplicit` {steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,}")
+    tests = [_newton_tests(took) for took in (plain, stage, implicit) if took]
     return f"{', '.join(words)}; tests {' / '.join(dict.fromkeys(tests))}"
 
 
