@@ -261,7 +261,7 @@ def _response_cell(run: Found) -> str:
     took, distance = run["measured"], run.get("from_converged")
     mean = "" if took["substeps"] is None else f" ({_three(took['milliseconds']['mean'])})"
     parts = [_stretch_and_speed(took), f"{_three(took['milliseconds']['median'])}{mean} ms", *_what_passed(took)]
-    if run["configuration"] == "implicit" and distance:
+    if run["configuration"] == "implicit" and distance is not None:
         parts.append(f"{digits(distance)} mm from the converged run")
     return "; ".join(parts)
 

@@ -87,7 +87,7 @@ def _print_scene(console: Console, runs: Sequence[ResponseRun]) -> None:
             )
     console.print(table)
     distances = {run.configuration: _distance_from_converged(run, runs) for run in runs}
-    shown = [f"{name} {distance:.2f}" for name, distance in distances.items() if distance]
+    shown = [f"{name} {mm:.2f}" for name, mm in distances.items() if mm is not None and name != CONVERGED]
     if shown:
         notes.append(f"Mean distance from {CONVERGED} after {EARLY_STEPS} steps [mm]: {', '.join(shown)}")
     for note in [*_describe_sizes(runs), *notes]:
