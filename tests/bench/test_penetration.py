@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.bench import penetration_libuipc, penetration_mujoco, penetration_newton
+from warp_bsc.bench import penetration, penetration_libuipc, penetration_mujoco, penetration_newton
 from warp_bsc.bench.judge import Judge
 from warp_bsc.bench.penetration import FRAME_RATE, SCENES, SIMULATORS, measure_penetration
 from warp_bsc.bench.penetration_newton import simulate_newton
@@ -116,6 +116,14 @@ def test_self_contact_limits_the_speed_of_what_flies_freely():
     limit = 0.5 * 0.85 * (built.margin + built.gap) * 600
     assert found.speed_kept == pytest.approx(limit / 20.0, rel=0.25)
     assert found.speed_kept < 0.4
+
+
+def test_a_step_that_meets_something_says_nothing_of_free_flight():
+    """The block meets the sheet 10 ms after the start."""
+    built = build_penetration_scene("soft", "vbd", 60)
+    start = positions(built.scene.model)
+    assert penetration._speed_kept(built, [start, start], 60) is None
+    assert penetration._speed_kept(built, [start, start], 120) == 0.0
 
 
 def test_what_a_solver_cannot_run_is_a_reason():

@@ -148,7 +148,7 @@ class PenetrationMeasurement:
         colliding_steps: Steps in which there are such pairs.
         inverted: Tetrahedra that are inverted, at the end of each frame.
         speed_kept: Share of its speed that a freely flying body keeps before it meets anything; None where nothing
-            flies.
+            flies for a step.
         stretch: Largest elongation of an edge beyond its length at rest, of all frame ends [%].
         uncertified_steps: Steps that were not certified; None without a stage.
         substepped_steps: Steps that the stage took in substeps, whose way is not straight; None without a stage.
@@ -285,10 +285,13 @@ def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], N
 
 
 def _speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
-    """Returns the way of the centre of what flies freely, as a share of that of a free fall at its first velocity."""
-    if not len(built.flying):
-        return None
+    """Returns the way of the centre of what flies freely, as a share of that of a free fall at its first velocity.
+
+    None without it, and where the first step goes as far as what it meets.
+    """
     steps = min(max(1, math.floor(built.seconds * rate)), len(states) - 1)
+    if not len(built.flying) or steps / rate >= 4.0 / 3.0 * built.seconds:
+        return None
     first, last = (states[i][built.flying.start : built.flying.stop].mean(axis=0, dtype=float) for i in (0, steps))
     t, flight = steps / rate, np.array(built.flight)
     gravity = built.scene.model.gravity.numpy().reshape(-1, 3)[0].astype(float)

@@ -81,7 +81,7 @@ EARLY_STEPS = 48
 _STAGES: dict[str, dict[str, Any]] = {"stage": {}, "stage+contacts": {}, REFERENCE: {"substeps": None}}
 """Arguments of the stage by configuration."""
 
-_IMPLICIT: dict[str, dict[str, Any]] = {"implicit": {}, CONVERGED: {"max_newton_steps": 200}}
+_IMPLICIT: dict[str, dict[str, Any]] = {"implicit": {}, CONVERGED: {"max_iterations": 200}}
 """Arguments of the solver with contact inside, by configuration."""
 
 
