@@ -16,7 +16,7 @@ from warp_bsc.implicit.contact.barrier import (
     friction_energy,
     friction_slope,
 )
-from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements
+from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements, make_derivatives
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.steps import add_blocks
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
@@ -77,10 +77,8 @@ class Scene:
 
     def differentiate(self, *, convex=False):
         """Returns the derivatives of all elements, on the device."""
-        out, device = Derivatives(), self.model.device
-        out.gradient = wp.zeros(sum(v.size for v in self.vertices), dtype=wp.vec3, device=device)
-        blocks = sum(len(v) * n * n for v, n in zip(self.vertices, SIZES, strict=True))
-        out.block = wp.zeros(blocks, dtype=wp.mat33, device=device)
+        device = self.model.device
+        out = make_derivatives(self.vertices, device)
         world = wp.zeros(self.model.particle_count, dtype=int, device=device)
         flags = [self.array([1], int), self.array([int(convex)], int)]
         inputs = [self.elements, self.array(self.x), self.array(self.x0), wp.float64(DT), world, *flags]
@@ -90,11 +88,17 @@ class Scene:
     def by_kind(self, out):
         """Returns gradients, shape [n, size, 3], and Hessians, shape [n, size, 3, size, 3], of each kind."""
         gradient, block, corner, place = out.gradient.numpy(), out.block.numpy(), 0, 0
-        for v, size in zip(self.vertices, SIZES, strict=True):
-            ends = corner + v.size, place + v.size * size
-            blocks = block[place : ends[1]].reshape(len(v), size, size, 3, 3)
-            yield gradient[corner : ends[0]].reshape(len(v), size, 3), blocks.transpose(0, 1, 3, 2, 4)
-            corner, place = ends
+        for kind, (v, size) in enumerate(zip(self.vertices, SIZES, strict=True)):
+            of_corners = gradient[corner : corner + v.size].reshape(len(v), size, 3)
+            corner += v.size
+            if kind == ElementKind.BENDING:
+                turn = out.turn.numpy().reshape(len(v), size, 3)
+                hessian = np.einsum("e,eia,ejb->eiajb", out.curvature.numpy(), turn, turn)
+            else:
+                blocks = block[place : place + v.size * size].reshape(len(v), size, size, 3, 3)
+                hessian = blocks.transpose(0, 1, 3, 2, 4)
+                place += v.size * size
+            yield of_corners, hessian
 
     def energies(self, x):
         out = wp.zeros(self.count, dtype=wp.float64, device=self.model.device)

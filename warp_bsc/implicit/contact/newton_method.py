@@ -16,7 +16,7 @@ from ...response.state.workspace import Workspace
 from . import pairs, steps
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team, solve_worlds
-from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
+from .elasticity import differentiate, elements_of_model, make_derivatives
 from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import make_rows
@@ -92,11 +92,7 @@ class NewtonMethod:
         first = self._rows.first.numpy()
         self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(first)))
         self._element_count = sum(map(len, of_elements))
-        self._derivatives = Derivatives()
-        corners = sum(v.size for v in of_elements)
-        blocks = sum(len(v) * n * n for v, n in zip(of_elements, SIZES, strict=True))
-        self._derivatives.gradient = wp.zeros(corners, dtype=wp.vec3, device=device)
-        self._derivatives.block = wp.zeros(blocks, dtype=wp.mat33, device=device)
+        self._derivatives = make_derivatives(of_elements, device)
         self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device)

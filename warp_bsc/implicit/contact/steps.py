@@ -7,7 +7,7 @@ from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved
-from .rows import Rows, sum_of_corners
+from .rows import Rows, sum_of_blocks, sum_of_corners
 from .system import (
     NOT_UNKNOWN,
     Contacts,
@@ -223,8 +223,7 @@ def add_blocks(
     if active[unknowns.world[u]] == 0:
         return
     total = contact_block(contacts, unknowns, u, v)
-    for n in range(rows.first_source[k], rows.first_source[k + 1]):
-        total += derivatives.block[rows.source[n]]
+    total += sum_of_blocks(rows, derivatives, k)
     if u == v and unknowns.is_free[u] != 0:
         total += float(unknowns.inertia[u]) * wp.identity(n=3, dtype=float)
     rows.block[k] = total
