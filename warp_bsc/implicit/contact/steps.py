@@ -13,9 +13,11 @@ from .system import (
     Contacts,
     Progress,
     Unknowns,
+    block_sum_of_parts,
     contact_block,
     contact_gradient,
     displacement,
+    sum_of_parts,
     unknown_of_corner,
 )
 
@@ -214,15 +216,21 @@ def add_blocks(
     unknowns: Unknowns,
     row_of_block: wp.array[int],
     active: wp.array[int],
+    parts: int,
     # out
     rows: Rows,
 ):
-    """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds."""
-    k = wp.tid()
+    """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds.
+
+    So many threads share a block, as here and there an unknown has very many contacts.
+    """
+    k, part = wp.tid() // parts, wp.tid() % parts
     u, v = row_of_block[k], rows.column[k]
     if active[unknowns.world[u]] == 0:
         return
-    total = contact_block(contacts, unknowns, u, v)
+    total = block_sum_of_parts(contact_block(contacts, unknowns, u, v, part, parts), parts)
+    if part != 0:
+        return
     total += sum_of_blocks(rows, derivatives, k)
     if u == v and unknowns.is_free[u] != 0:
         total += float(unknowns.inertia[u]) * wp.identity(n=3, dtype=float)
@@ -240,15 +248,16 @@ def assemble(
     active: wp.array[int],
     begins: bool,
     rows: Rows,
+    parts: int,
     # in and out
     vectors: Vectors,
 ):
     """Computes the gradient of the energy by each unknown, and what preconditions.
 
     The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
-    ways. Later ones go on from where they are.
+    ways. Later ones go on from where they are. So many threads share an unknown.
     """
-    u = wp.tid()
+    u, part = wp.tid() // parts, wp.tid() % parts
     if active[unknowns.world[u]] == 0:
         return
     if unknowns.is_free[u] == 0:
@@ -259,7 +268,10 @@ def assemble(
             vectors.direction[u] = wp.vec3()
         return
     inertia = unknowns.inertia[u]
-    gradient, block = contact_gradient(contacts, unknowns, u)
+    gradient, block = contact_gradient(contacts, unknowns, u, part, parts)
+    gradient, block = sum_of_parts(gradient, parts), block_sum_of_parts(block, parts)
+    if part != 0:
+        return
     gradient += sum_of_corners(rows, derivatives, u)
     gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
     vectors.gradient[u] = gradient
