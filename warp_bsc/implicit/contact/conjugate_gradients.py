@@ -5,8 +5,6 @@ import warp as wp
 from .rows import Rows
 from .system import Contacts, Unknowns, product, pull_contact, sum_of_parts
 
-wp.set_module_options({"enable_backward": False})
-
 _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
 _BLOCK, _BLOCKS = 512, 128
@@ -128,7 +126,7 @@ def _sum(value: wp.float64, team: Team, world: int, block: int, lane: int, turn:
     return total
 
 
-@wp.kernel
+@wp.kernel(module="unique", enable_backward=False, launch_bounds=_LARGEST_BLOCK)
 def solve_worlds(
     # in
     rows: Rows,
