@@ -10,10 +10,12 @@ import warp as wp
 from ...detection.launch import retry_until_fits
 from ...response.contacts.queue import queues_of
 from ...response.forces.structs import Centres, ContactRows, ImpulseSums, Sides
+from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
+from ...response.state.mesh import host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from . import pairs, steps
+from . import bodies, pairs, steps
 from .conjugate_gradients import Vectors, block_of_world, solve_worlds
 from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
 from .impulses import publish_contacts
@@ -36,6 +38,8 @@ _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step ends [m/s]."""
 _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
+_MOST_UNITS, _FAST = 2.0**56, 100.0
+"""Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
 _TOLERANCE = 1e-2
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
@@ -68,22 +72,42 @@ class NewtonMethod:
         world = mesh.device_world.numpy()[:particles]
         if (np.diff(world) < 0).any():
             raise ValueError("particles of a world do not follow each other in the model")
-        unknown = np.arange(particles)
-        self._count = particles
-        unknowns = self._unknowns = Unknowns()
 
         def array(values):
             return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
 
-        unknowns.of_vertex = array(np.append(unknown, np.full(vertices - particles, -1)))
-        unknowns.world = array(world)
-        unknowns.of_worlds = array(np.searchsorted(world, np.arange(work.worlds + 1)))
+        unknowns = self._unknowns = Unknowns()
+        solved, body_of_vertex = self._bodies_in_solve(), mesh.shape_vertices.body
+        body_world = np.zeros(0, dtype=int)
+        if len(solved):
+            body_world = np.maximum(host_array(model.body_world)[solved], 0)
+        # in each world its particles, then a shift and a turn of each of its bodies
+        owner_world = np.concatenate([world, np.repeat(body_world, 2)])
+        order = np.argsort(owner_world, kind="stable")
+        number = np.argsort(order, kind="stable")
+        unknown, of_bodies = number[:particles], np.full(model.body_count + 1, -1)
+        of_bodies[solved] = number[particles::2]
+        self._count = len(order)
+        first = of_bodies[body_of_vertex]  # that of -1 is the last
+        unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
+        unknowns.particle = array(np.where(order < particles, order, -1))
+        unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
+        unknowns.world = array(owner_world[order])
+        unknowns.of_worlds = array(np.searchsorted(owner_world[order], np.arange(work.worlds + 1)))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
-        self._block = block_of_world(int(np.bincount(world, minlength=1).max(initial=0)), device)
+        self._block = block_of_world(int(np.bincount(owner_world, minlength=1).max(initial=0)), device)
+        self._bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
+        holder = np.arange(vertices)
+        if len(solved):
+            first_vertex = np.full(model.body_count, -1)
+            of_body, first_of_body = np.unique(body_of_vertex, return_index=True)
+            first_vertex[of_body[of_body >= 0]] = particles + first_of_body[of_body >= 0]
+            self._bodies.unknown, self._bodies.first_vertex = array(of_bodies[:-1]), array(first_vertex)
+            held = np.flatnonzero(first >= 0)
+            holder[particles + held] = first_vertex[body_of_vertex[held]]
         self._rows = make_rows(of_elements, unknown, self._count, device)
-        first = self._rows.first.numpy()
-        self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(first)))
+        self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._element_count = sum(map(len, of_elements))
         self._derivatives = Derivatives()
         corners = sum(v.size for v in of_elements)
@@ -93,9 +117,8 @@ class NewtonMethod:
         self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device)
-        self._goal, self._lower, self._upper, self._moved = (
-            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
-        )
+        self._trial.holder = array(holder)
+        self._goal, self._lower, self._upper = (wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(3))
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
         self._whole = wp.zeros(vertices, dtype=float, device=device)
@@ -111,13 +134,24 @@ class NewtonMethod:
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
-        margin, worlds = np.where(np.isfinite(reach), reach, 0.0), mesh.device_world.numpy()
+        worlds = mesh.device_world.numpy()
+        of_bodies = np.full(vertices, np.inf)
+        if len(solved):
+            least = _of_worlds(np.min, reach[:particles], world, work.worlds, np.inf)[worlds]
+            of_bodies = np.minimum(bodies.reach_between_bodies(mesh), least)
+            of_bodies[:particles] = np.inf
+        self._settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
+        reach = np.minimum(reach, of_bodies)
+        margin = np.where(np.isfinite(reach), reach, 0.0)
         margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
         self._margin = wp.array(margin, dtype=float, device=device)
-        assert model.particle_mass is not None and model.particle_inv_mass is not None
-        masses, moves = model.particle_mass.numpy(), model.particle_inv_mass.numpy() > 0
+        masses, moves = host_array(model.particle_mass), host_array(model.particle_inv_mass) > 0
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
-        self._settings.units = wp.array(1.0 / (mass * _UNIT_SPEED**2), dtype=wp.float64, device=device)
+        units = 1.0 / (mass * _UNIT_SPEED**2)
+        if len(solved):
+            heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
+            units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * _FAST**2, 1e-9))
+        self._settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._candidates: list[Candidates] = []
         self._contacts = Contacts()
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
@@ -153,22 +187,33 @@ class NewtonMethod:
             np.add.at(found, model.tet_indices.numpy().reshape(-1, 4), stiffness)
         return found
 
-    def solve(self, particle_q: wp.array, particle_qd: wp.array, dt: float) -> None:
-        """Finds where the particles end that the motion of the workspace predicts, and writes it there and here.
+    def _bodies_in_solve(self) -> np.ndarray:
+        """Returns the bodies whose vertices may be solved for."""
+        mesh, worlds = self._mesh, self._work.worlds
+        if not self._work.motion.moves_bodies:
+            return np.zeros(0, dtype=int)
+        with_shapes = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+        return with_shapes[(host_array(mesh.model.body_world)[with_shapes] >= 0) | (worlds == 1)]
+
+    def solve(self, end: StateArrays, dt: float) -> None:
+        """Finds where particles and bodies end that the motion of the workspace predicts, and writes it there and here.
 
         Args:
-            particle_q: Where positions at the end are written [m].
-            particle_qd: Where velocities at the end are written [m/s].
+            end: Where positions and velocities at the end are written.
             dt: Length of the step [s].
         """
         self._begin(dt)
-        self._find_end(particle_q, particle_qd)
+        self._find_end(end)
 
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
         self._begin(1.0)
         self.progress.active.zero_()
-        self._find_end(wp.empty_like(state.particle_q), wp.empty_like(state.particle_qd))
+        end = StateArrays()
+        for name in StateArrays.vars:
+            given = getattr(state, name)
+            setattr(end, name, None if given is None else wp.clone(given))
+        self._find_end(end)
 
     def read_materials(self) -> None:
         """Reads the stiffness of tetrahedra again; not in a CUDA graph. All else is read in each step."""
@@ -180,24 +225,27 @@ class NewtonMethod:
         self._dt = float(dt)
         self._settings.dt = dt
         self._settings.smoothing = _SMOOTHING_SPEED * dt
-        inputs = [motion, self._margin, self._unknowns]
-        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self.progress.active.zero_()
+        self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
+        inputs = [motion, self._margin, self._unknowns, self._bodies]
+        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self._lacks.zero_()
         self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
 
-    def _find_end(self, particle_q, particle_qd):
+    def _find_end(self, end):
         work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
         self._find_candidates()
         self._goes_on.fill_(1)
         wp.capture_while(self._goes_on, self._take_newton_step)
         if self.keeps_contacts:
             self._find_near(self.progress.steps)
+        if len(self._bodies.unknown):
+            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
+            work.launch_over_bodies(begin_response_to_bodies)
         inputs = [self._trial, self._unknowns, self._dt, motion.x0]
-        outputs = [motion, work.vertices, particle_q, particle_qd]
-        self._launch(steps.finish, vertices, inputs, outputs)
+        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end])
         inputs = [self.progress, self._dt, _LEAST_SPEED, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
@@ -243,7 +291,7 @@ class NewtonMethod:
         work.launch_over_entries(pairs.bound_by_pairs, inputs)
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
-            self._launch(pairs.bound_by_planes, work.particle_count, inputs, [self.progress, self._limit])
+            self._launch(pairs.bound_by_planes, work.vertices_at_planes, inputs, [self.progress, self._limit])
 
     def _take_newton_step(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
@@ -265,7 +313,7 @@ class NewtonMethod:
         wp.capture_if(self._cuts, self._truncate)
         self._launch(steps.decide_search, work.worlds, [], [progress, self._search])
         wp.capture_while(self._search, self._try)
-        self._launch(steps.take, vertices, [motion, unknowns], [progress, trial])
+        self._take()
         inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
         self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
 
@@ -273,6 +321,7 @@ class NewtonMethod:
         """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
         work, progress, vertices = self._work, self.progress, self._mesh.vertex_count
         inputs, outputs = [self._unknowns, self._lower, self._upper], [self._trial, progress, self._whole, self._limit]
+        self._limit.fill_(1.0)
         self._launch(steps.begin_truncation, vertices, inputs, outputs)
         for _ in range(_TRUNCATIONS):
             self._bound(progress.searches)
@@ -295,8 +344,8 @@ class NewtonMethod:
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
         motion, contacts, unknowns, vectors = self._work.step.motion, self._contacts, self._unknowns, self._vectors
         self._list_contacts()
-        masses = [motion.inverse_mass, wp.float64(self._dt), active]
-        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, *masses]
+        masses = [motion, self._bodies, wp.float64(self._dt), active]
+        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses]
         self._launch(steps.add_blocks, len(self._row_of_block), inputs, [self._rows])
         inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows]
         self._launch(steps.assemble, self._count, inputs, [vectors])
@@ -305,7 +354,9 @@ class NewtonMethod:
         """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
         work, trial = self._work, self._trial
         active = self._ahead if solves else self.progress.active
-        inputs = [work.step.motion, self._unknowns, self._vectors, self._lower, self._upper, active]
+        motion, unknowns, vectors = work.step.motion, self._unknowns, self._vectors
+        self._launch_over_bodies(bodies.displace_bodies, [motion, unknowns, self.progress, vectors.solution])
+        inputs = [motion, unknowns, vectors, self._lower, self._upper, self._bodies, active]
         if not solves:
             self._leaves.zero_()
         outputs = [trial, self.progress, self._limit, self._leaves]
@@ -325,7 +376,7 @@ class NewtonMethod:
         work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
-            self._launch(pairs.hold_at_planes, work.particle_count, [*inputs, 2 + solves], [contacts])
+            self._launch(pairs.hold_at_planes, work.vertices_at_planes, [*inputs, 2 + solves], [contacts])
         self._assemble(ahead, False)
         self._solve_linear(ahead)
         self._hold_ahead(solves + 1)
@@ -343,7 +394,7 @@ class NewtonMethod:
         work.launch_over_entries(pairs.find_near, [motion, *self._candidates, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
+            self._launch(pairs.find_near_planes, work.vertices_at_planes, inputs[:-1], [contacts])
 
     def _list_contacts(self):
         work, contacts = self._work, self._contacts
@@ -362,20 +413,36 @@ class NewtonMethod:
 
     def _add_energies(self, displaced, energy):
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
-        outputs = [self._moved]
-        self._launch(steps.write_moved, self._mesh.vertex_count, [motion, trial, progress, displaced], outputs)
+        self._move_bodies(displaced=displaced)
+        inputs = [motion, self._unknowns, self._bodies, progress, displaced]
+        self._launch(steps.write_moved, self._mesh.vertex_count, inputs, [trial])
         inputs = [self._elements, self._element_count, motion, self._settings, trial, self._goal, self._unknowns]
-        inputs += [progress, displaced, self._moved]
+        inputs += [self._bodies, progress, displaced]
         self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
         inputs = [self._settings, trial, progress, displaced, energy]
         work.launch_over_entries(pairs.add_pair_energies, [motion, *self._candidates, *inputs])
         work.launch_over_entries(pairs.add_friction_energies, [motion, self._contacts, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(pairs.add_plane_energies, work.particle_count, inputs[:-1], [energy])
+            self._launch(pairs.add_plane_energies, work.vertices_at_planes, inputs[:-1], [energy])
+
+    def _take(self):
+        """Moves everything by what is taken of its displacements."""
+        motion, vertices = self._work.step.motion, self._mesh.vertex_count
+        self._move_bodies(takes=True)
+        inputs = [motion, self._unknowns, self._bodies]
+        self._launch(steps.take, vertices, inputs, [self.progress, self._trial])
+
+    def _move_bodies(self, *, displaced=True, takes=False):
+        inputs = [self._work.step.motion, self._unknowns, self.progress, self._trial.share, self._vectors.solution]
+        self._launch_over_bodies(bodies.move_bodies, [*inputs, displaced, takes])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
+
+    def _launch_over_bodies(self, kernel, inputs):
+        """Launches a kernel over the bodies, with those of the solve as its last argument, if there are any."""
+        self._launch(kernel, len(self._bodies.unknown), inputs, [self._bodies])
 
 
 def _of_worlds(function, values: np.ndarray, world: np.ndarray, worlds: int, default: float) -> np.ndarray:
