@@ -156,17 +156,20 @@ def touching(found: Found) -> Rows:
 
 
 def newton(*measurements: Found) -> Rows:
-    """Newton's examples, plain and with the stage."""
-    rows = [("example", "plain: ms a frame (95th percentile); crossings", "with `SolverCCD`", "steps")]
+    """Newton's examples, plain, with the stage, and with :class:`warp_bsc.SolverImplicit` in place of VBD."""
+    titles = {"plain": "plain: ms a frame (95th percentile); crossings", "stage": "with `SolverCCD`"}
+    if any(run["mode"] == "implicit" for found in measurements for run in found["runs"]):
+        titles["implicit"] = "with `SolverImplicit` in place of VBD"
+    rows = [("example", *titles.values(), "steps")]
     for found in measurements:
         modes: dict[str, dict[str, Found]] = {}
         for run in found["runs"]:
             modes.setdefault(run["example"], {})[run["mode"]] = run
         for name, run in modes.items():
-            cells = [_newton_cell(run[mode]) for mode in ("plain", "stage")]
+            cells = [_newton_cell(run[mode]) for mode in titles]
             frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
             title = f"`{name}`" + (f", {frames} frames" if frames else "")
-            rows.append((title, *cells, _newton_steps(run["plain"]["measured"], run["stage"]["measured"])))
+            rows.append((title, *cells, _newton_steps(*(run[mode]["measured"] for mode in titles))))
     return rows
 
 
@@ -178,7 +181,7 @@ def _newton_cell(run: Found) -> str:
     return f"{times['median']:,.1f} ({times['percentile_95']:,.1f}); {took['most_crossings']:,}"
 
 
-def _newton_steps(plain: Found | None, stage: Found | None) -> str:
+def _newton_steps(plain: Found | None, stage: Found | None, implicit: Found | None = None) -> str:
     """Returns what the stage reports, and how the example's own tests end."""
     if stage is None or stage["stage"] is None:
         return ""
@@ -189,7 +192,10 @@ def _newton_steps(plain: Found | None, stage: Found | None) -> str:
     words.append(f"{steps['truncated_steps'] or 'none'} truncated")
     if steps["frozen_steps"]:
         words.append(f"{steps['frozen_steps']} with frozen vertices")
-    tests = [_newton_tests(took) for took in (plain, stage) if took]
+    if implicit:
+        steps = implicit["stage"]
+        words.append(f"`SolverImplicit` {steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,}")
+    tests = [_newton_tests(took) for took in (plain, stage, implicit) if took]
     return f"{', '.join(words)}; tests {' / '.join(dict.fromkeys(tests))}"
 
 
@@ -239,20 +245,24 @@ def response(found: Found, reference: Found) -> Rows:
         "plain": "Newton's contacts",
         "self-contact": "with VBD's self-contact",
         "stage": "`SolverCCD`, default",
+        "implicit": "`SolverImplicit`",
     }
     runs = {(run["scene"], run["configuration"]): run for run in found["runs"]}
     measured = {run["scene"]: run["measured"] for run in reference["runs"] if run["configuration"] == "reference"}
     columns = [name for name in titles if any(name == configuration for _, configuration in runs)]
     rows = [("scene", *(titles[name] for name in columns), f"reference, 1/{next(iter(measured.values()))['rate']} s")]
     for scene in dict.fromkeys(scene for scene, _ in runs):
-        cells = [_response_cell(runs[scene, name]["measured"]) for name in columns]
+        cells = [_response_cell(runs[scene, name]) for name in columns]
         rows.append((f"{scene}: {_SCENES_IN_CONTACT[scene]}", *cells, _stretch_and_speed(measured[scene])))
     return rows
 
 
-def _response_cell(took: Found) -> str:
+def _response_cell(run: Found) -> str:
+    took, distance = run["measured"], run.get("from_converged")
     mean = "" if took["substeps"] is None else f" ({_three(took['milliseconds']['mean'])})"
     parts = [_stretch_and_speed(took), f"{_three(took['milliseconds']['median'])}{mean} ms", *_what_passed(took)]
+    if run["configuration"] == "implicit" and distance is not None:
+        parts.append(f"{digits(distance)} mm from the converged run")
     return "; ".join(parts)
 
 

@@ -12,6 +12,8 @@ from warp_bsc.bench.crossings import CrossingCounter
 from warp_bsc.bench.elastic_energy import ElasticEnergy
 from warp_bsc.bench.response import (
     CONFIGURATIONS,
+    CONVERGED,
+    EARLY_STEPS,
     REFERENCE,
     SCENES,
     SEMI_IMPLICIT_STEPS,
@@ -155,6 +157,9 @@ def test_the_measures_of_a_run():
     times = [1.0, 1.0, 4.0]
     found = ResponseMeasurement("cpu", 3, 1, 60, 5, 1.0, 2.0, 3.0, None, 0, 0, None, None, times)
     assert (found.median, found.mean) == (1.0, 2.0)
+    at, moved = (replace(found, early=np.array([[0.0, 0.0, z], [1.0, 0.0, 0.0]])) for z in (0.0, 0.004))
+    assert at.distance_from(moved) == pytest.approx(2.0)
+    assert at.distance_from(found) is found.distance_from(at) is at.distance_from(replace(moved, rate=120)) is None
 
 
 def test_no_scene_begins_with_a_crossing(device):
@@ -216,8 +221,8 @@ def test_each_configuration_runs(configuration, device):
     else:
         assert (found.crossings, found.uncertified_steps) == (0, 0)
         assert found.collisions == (None if configuration == REFERENCE else 0)
-        assert found.substeps == 1.0 if configuration == REFERENCE else found.substeps > 1.0
-    assert found.spread is None
+        assert found.substeps > 1.0 if configuration.startswith("stage") else found.substeps == 1.0
+    assert found.spread is None and found.early is None
 
 
 def test_a_program_moves_bodies_and_particles(device):
@@ -230,6 +235,16 @@ def test_a_program_moves_bodies_and_particles(device):
     assert passing.stretch_at_most < ball.stretch_at_most
     assert passing.collisions > 10
     assert passing.crossings == 0  # it is beyond the cloth at the end
+
+
+def test_newton_steps_are_limited_unless_the_run_is_the_converged_one(device):
+    """After as many steps as are compared, when the cloth has met the sphere."""
+    seconds = EARLY_STEPS / 60
+    limited, converged = (measure("sphere", name, device=device, seconds=seconds) for name in ("implicit", CONVERGED))
+    assert limited.steps == converged.steps == EARLY_STEPS
+    assert limited.crossings == limited.collisions == limited.uncertified_steps == 0
+    assert 1e-2 < limited.distance_from(converged) < 100.0
+    assert converged.distance_from(converged) == 0.0
 
 
 def test_worlds_are_reset(device):
@@ -264,6 +279,8 @@ def test_what_a_solver_cannot_run(device):
     assert measure_response("pile", "stage", solver="style3d", device=device).problem == "Style3D has no tetrahedra"
     run = measure_response("sphere", "self-contact", solver="xpbd", device=device)
     assert (run.measured, run.problem) == (None, "only VBD has contacts between particles of cloth")
+    run = measure_response("sphere", "implicit", solver="xpbd", device=device)
+    assert (run.measured, run.problem) == (None, "SolverImplicit takes the place of VBD")
 
 
 def test_the_explicit_solver_takes_small_steps(device):

@@ -32,10 +32,12 @@ def measurement(**others):
 RUNS = {
     ("cloth_twist", "plain"): measurement(),
     ("cloth_twist", "stage"): measurement(most_crossings=0, stage=StageTotals(60, 4, 1, 2, 3)),
+    ("cloth_twist", "implicit"): measurement(most_crossings=0, stage=StageTotals(60, 0, 0, 0, 0)),
     ("cloth_hanging --width 9", "plain"): measurement(
         test_final="particles are low [red]", test_post_step="deep", first_frame_not_finite=4
     ),
     ("cloth_hanging --width 9", "stage"): "not applicable: no solver with particles is one of SolverVBD",
+    ("cloth_hanging --width 9", "implicit"): "a reason",
 }
 
 
@@ -71,9 +73,12 @@ def test_tables(capsys, monkeypatch, measured):
     assert rows == [
         ["cloth_twist", "plain", "11.5", "1,701.8", "2,000.0", "0", "1,234", "ok"],
         ["cloth_twist", "stage", "11.5", "1,701.8", "2,000.0", "0", "0", "ok"],
+        ["cloth_twist", "implicit", "11.5", "1,701.8", "2,000.0", "0", "0", "ok"],
         ["cloth_hanging", "--width", "9", "plain", "11.5", "1,701.8", "2,000.0", "0", "1,234", "fail"],
         ["cloth_hanging", "--width", "9", "stage", "not", "run"],
+        ["cloth_hanging", "--width", "9", "implicit", "not", "run"],
         ["cloth_twist", "1,485", "2,816", "6", "60", "4", "1", "2", "3"],
+        ["cloth_twist,", "implicit", "1,485", "2,816", "6", "60", "0", "0", "0", "0"],
         ["cloth_hanging", "--width", "9", "1,485", "2,816", "6"],
     ]
     assert notes == [
@@ -81,6 +86,7 @@ def test_tables(capsys, monkeypatch, measured):
         "cloth_hanging --width 9, plain: test_final: particles are low [red]",
         "cloth_hanging --width 9, plain: positions are not finite at the end of frame 4",
         "cloth_hanging --width 9, stage: not applicable: no solver with particles is one of SolverVBD",
+        "cloth_hanging --width 9, implicit: a reason",
     ]
     assert not any("Interrupted" in line for line in lines)
 
@@ -95,7 +101,7 @@ def test_json(capsys, tmp_path, measured):
         2,
         False,
     )
-    first, second, _, last = found["runs"]
+    first, second, _, _, last, _ = found["runs"]
     milliseconds = dict(first["measured"]["milliseconds"])
     assert milliseconds.pop("frames") == [10.0, 12.0, 11.0, 2000.0]
     assert milliseconds == pytest.approx({"median": 11.5, "percentile_95": 1701.8, "worst": 2000.0})
@@ -158,7 +164,7 @@ def test_list(capsys, monkeypatch, measured):
     ("arguments", "part"),
     [
         (["cloth_twst"], "'cloth_twst': Newton has no example of this name; did you mean cloth_twist"),
-        (["--modes", "plain,both"], "must be one of plain, stage, not 'both'"),
+        (["--modes", "plain,both"], "must be one of plain, stage, implicit, not 'both'"),
         (["cloth_twist", "--frames", "2"], "frames must be more than 2"),
         (["--json", "cloth_twist"], "--json cloth_twist: this is an example; name examples before the options"),
         (["--json", "gone/found.json"], "there is no folder gone"),

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from warp_bsc.bench.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
@@ -41,6 +42,8 @@ RUNS = {
     ),
     ("sphere", "reference"): measurement(rate=1920, steps=4800, collisions=None, uncertified_steps=0, substeps=1.0),
     ("pile", "plain"): "a reason [red]",
+    ("fold", "implicit"): measurement(early=np.zeros((2, 3))),
+    ("fold", "converged"): measurement(early=np.array([[0.0, 0.0, 0.005], [0.0, 0.0, 0.0]])),
 }
 
 
@@ -86,6 +89,17 @@ def test_tables(capsys, monkeypatch, measured):
     assert "stage, moved by 1e-06 m: stretch differs by 0.25 at the end, 1.50 at most" in lines
     assert "plain: not run: a reason [red]" in lines
     assert not any("Interrupted" in line for line in lines)
+
+
+def test_distances_from_the_converged_run(capsys, measured):
+    arguments = ["sphere", "fold", "--configurations", "plain,implicit,converged"]
+    lines = run(capsys, *arguments).out.splitlines()
+    assert [line for line in lines if "Mean distance" in line] == [
+        "Mean distance from converged after 48 steps [mm]: implicit 2.50"
+    ]
+    rows = json.loads(run(capsys, *arguments, "--json").out)["runs"]
+    assert [row["from_converged"] for row in rows] == [None] * 4 + [pytest.approx(2.5), 0.0]
+    assert not any("early" in row["measured"] for row in rows)
 
 
 def test_json(capsys, tmp_path, measured):
@@ -164,7 +178,7 @@ def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measure
         (["cube"], "'cube': there is no scene of this name. The scenes are sphere, box_edge, "),
         (
             ["--configurations", "plain,both"],
-            "must be of plain, self-contact, stage, stage+contacts, reference, not 'b",
+            "must be of plain, self-contact, stage, stage+contacts, implicit, converged, reference, not 'b",
         ),
         (["--solver", "mpm"], "invalid choice: 'mpm'"),
         (["--seconds", "0"], "--seconds: must be a finite number more than 0, not 0"),

@@ -92,6 +92,12 @@ def test_newton(tmp_path, capsys):
     )
 
 
+def test_implicit(tmp_path, capsys):
+    names, output = run("newton/implicit.md", tmp_path, capsys)
+    assert output == "20 0\n"
+    assert names["state_0"].particle_q.numpy()[:, 2].max() > 0.19  # on the ball
+
+
 def test_contacts(tmp_path, capsys):
     names, _ = run("newton/contacts.md", tmp_path, capsys)
     state, end = names["inner"].model.state(), names["inner"].model.state()

@@ -168,7 +168,7 @@ def example(mode, **others):
         "test_final": "ok",
         "stage": None,
     }
-    if mode == "stage":
+    if mode != "plain":
         took["stage"] = {
             "steps": 200,
             "substepped_steps": 20,
@@ -189,6 +189,11 @@ def test_examples_of_newton():
         ("`cloth_twist`, 20 frames", "12.3 (20.0); 1,234", "12.3 (20.0); 1,234", steps),
         ("`gone`", "not run: a reason", "not run: a reason", ""),
     ]
+    runs = [example("plain"), stage, example("implicit", most_crossings=0), *lost, gone | {"mode": "implicit"}]
+    head, first, second = rows_of.newton({"runs": runs})
+    assert head[3] == "with `SolverImplicit` in place of VBD"
+    assert first[3:] == ("12.3 (20.0); 0", steps.replace(";", ", `SolverImplicit` 197 of 200;"))
+    assert second[3:] == ("not run: a reason", "")
 
 
 def penetration_run(scene, simulator, problem=None, **others):
@@ -265,6 +270,9 @@ def test_scenes_in_contact():
         f"{moves}; 8.12 (123) ms; 2 steps not certified",
         moves,
     )
+    implicit = contact_run("ball", "implicit", substeps=1.0) | {"from_converged": 2.345}
+    head, row = rows_of.response({"runs": [implicit]}, {"runs": [reference]})
+    assert head[1] == "`SolverImplicit`" and row[1] == f"{moves}; 8.12 (123) ms; 2.3 mm from the converged run"
     runs = [
         contact_run("ball", name, rate=rate) for rate in (240, 120) for name in ("plain", "stage", "stage+contacts")
     ]

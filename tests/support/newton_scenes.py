@@ -20,9 +20,11 @@ __all__ = [
     "add_crossing_sheets",
     "add_patch",
     "add_plates",
+    "add_rope",
     "bullet",
     "crossing_sheets",
     "place_plates",
+    "strands",
 ]
 
 DT = 1.0 / 240.0
@@ -92,6 +94,33 @@ def bullet(speed, *, device, worlds=1):
     builder = world
     if worlds > 1:
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+        builder.replicate(world, worlds)
+    builder.color()
+    return builder.finalize(device=device)
+
+
+def add_rope(builder, points, *, mass=0.002, velocity=(0.0, 0.0, 0.0), stiffness=1e3):
+    """Particles at some positions, and springs from each to the next."""
+    first = builder.particle_count
+    for point in np.asarray(points, dtype=float).tolist():
+        builder.add_particle(wp.vec3(*point), wp.vec3(*velocity), mass, radius=0.004)
+    for i in range(first, builder.particle_count - 1):
+        builder.add_spring(i, i + 1, stiffness, 0.01, 0.0)
+
+
+def strands(device, worlds=1):
+    """Two ropes and loose particles that fall onto each other, and onto a patch that is held at its border."""
+    world = newton.ModelBuilder()
+    add_patch(world, 5, 0.04, (0.0, 0.0, 0.0), fixed=True)
+    along = np.linspace(-0.09, 0.09, 10)
+    add_rope(world, np.stack([along, 0.01 + 0.1 * along, 0.02 + 0.0 * along], axis=1), velocity=(0.0, 0.0, -1.5))
+    add_rope(world, np.stack([0.1 * along, along, 0.04 + 0.0 * along], axis=1), velocity=(0.0, 0.0, -3.0))
+    for i, height in enumerate((0.055, 0.07, 0.085)):
+        at = wp.vec3(0.001 * i, 0.012 - 0.001 * i, height)
+        world.add_particle(at, wp.vec3(0.0, 0.0, -4.0 - i), 0.002, radius=0.004)
+    builder = world
+    if worlds > 1:
+        builder = newton.ModelBuilder()
         builder.replicate(world, worlds)
     builder.color()
     return builder.finalize(device=device)

@@ -2,7 +2,7 @@
 
 Half of them are single steps from random positions to random ones, most of them degenerate. The others are those of
 simulations: the scenes of ``substep_energy.py``, with VBD, XPBD and Style3D, in whole steps and in substeps, with
-contacts passed on and not.
+contacts passed on and not. With ``--implicit`` all steps are those of ``SolverImplicit``.
 
 ``python tests/support/stage_stress.py --steps 10000`` prints a line for each kind of scene, and the seed of each step
 that a certificate was wrong about. The exit status is then 1.
@@ -24,6 +24,7 @@ from substep_energy import KINDS, Settings
 from substep_energy import Scene as Simulation
 
 import warp_bsc as bsc
+from warp_bsc.implicit.solver_implicit import SolverImplicit
 
 __all__ = ["SCENES", "Judged", "Stress"]
 
@@ -125,8 +126,8 @@ class Stress:
         judged: Counts of steps so far.
     """
 
-    def __init__(self, scene: Scene, rng: np.random.Generator, *, worlds: int = 1, device=None):
-        self._scene, self._rng = scene, rng
+    def __init__(self, scene: Scene, rng: np.random.Generator, *, worlds: int = 1, implicit: bool = False, device=None):
+        self._scene, self._rng, self._implicit = scene, rng, implicit
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         for _world in range(worlds):
             builder.begin_world()
@@ -141,8 +142,11 @@ class Stress:
         self._worlds = worlds
         self._model = builder.finalize(device=device)
         self._inner = Given(self._model)
-        solver = bsc.SolverCCD(self._inner, min_distance=scene.min_distance, substeps=None)
         distance = scene.min_distance
+        if implicit:
+            solver = SolverImplicit(self._model, min_distance=distance)
+        else:
+            solver = bsc.SolverCCD(self._inner, min_distance=distance, substeps=None)
         self._rollout = (
             Rollout(self._model, solver) if distance is None else DistanceRollout(self._model, solver, distance)
         )
@@ -201,12 +205,14 @@ class Stress:
         self._inner.wanted = self._move(start)
         state = rollout.states[0]
         state.particle_q.assign(start)
+        if self._implicit:  # where inertia leads, which the faces of these sheets, that are at rest as they are, resist
+            state.particle_qd.assign((self._inner.wanted - start) / DT)
         rollout.solver.reset(state)
         rollout.step(DT)
         return not judged.add(rollout, getattr(rollout, "approaches", 0) - approaches)
 
 
-def simulate(seed: int, judged: dict[str, Judged], most: int, device) -> bool:
+def simulate(seed: int, judged: dict[str, Judged], most: int, device, *, implicit: bool = False) -> bool:
     """Judges the steps of a simulation, and returns whether all certificates were right.
 
     Args:
@@ -214,11 +220,15 @@ def simulate(seed: int, judged: dict[str, Judged], most: int, device) -> bool:
         judged: Counts of steps so far, by kind of scene.
         most: Most steps.
         device: Warp device.
+        implicit: Whether ``SolverImplicit`` makes the steps.
     """
     settings = Settings.draw(seed)
     simulation, counts = Simulation(settings, device), judged[settings.kind]
     with contextlib.redirect_stdout(io.StringIO()):  # Style3D prints how long it prepared
-        solver = simulation.make_solver(substeps=settings.substeps if seed % 3 else None)
+        if implicit:
+            solver = SolverImplicit(simulation.model)
+        else:
+            solver = simulation.make_solver(substeps=settings.substeps if seed % 3 else None)
     rollout, pipeline = Rollout(simulation.model, solver), newton.CollisionPipeline(simulation.model)
     contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
     wrong = 0
@@ -240,6 +250,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=1400, help="steps in all; default: 1400")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first step; default: 0")
+    parser.add_argument("--implicit", action="store_true", help="steps of SolverImplicit")
     parser.add_argument("--device", help="Warp device")
     options = parser.parse_args()
     wp.config.log_level = wp.LOG_ERROR
@@ -252,7 +263,7 @@ def main() -> int:
             if i % 100 == 0:  # another mesh
                 seed = options.seed + i
                 judged = stress.judged if stress else Judged()
-                stress = Stress(scene, np.random.default_rng(seed), device=options.device)
+                stress = Stress(scene, np.random.default_rng(seed), implicit=options.implicit, device=options.device)
                 stress.judged = judged
             if not stress.step():
                 print(f"wrong: {name}, --seed {seed}, step {i % 100}", flush=True)
@@ -261,7 +272,7 @@ def main() -> int:
     simulated = {kind: Judged() for kind in KINDS}
     seed = options.seed
     while (left := options.steps // 2 - sum(judged.steps for judged in simulated.values())) > 0:
-        if not simulate(seed, simulated, left, options.device):
+        if not simulate(seed, simulated, left, options.device, implicit=options.implicit):
             print(f"wrong: simulation, seed {seed} ({Settings.draw(seed)})", flush=True)
         seed += 1
     for kind, judged in simulated.items():

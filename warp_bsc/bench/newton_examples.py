@@ -1,4 +1,4 @@
-"""Measures Newton's own examples, unchanged, plain and with the collision stage behind their solver.
+"""Measures Newton's own examples, unchanged: plain, with the collision stage behind their solver, or another for VBD.
 
 Each run is a process of its own, see :mod:`.newton_process`, so that neither a crash nor the solver classes that it
 replaces reach another run.
@@ -41,10 +41,11 @@ __all__ = [
 FOLDERS = ("cloth", "softbody", "multiphysics")
 """The folders of Newton's examples that are measured by default."""
 
-MODES = ("plain", "stage")
-"""The modes: the example as it is, and with :class:`warp_bsc.SolverCCD` behind its solver.
+MODES = ("plain", "stage", "implicit")
+"""The modes: the example as it is, with :class:`warp_bsc.SolverCCD` behind its solver, and with
+:class:`warp_bsc.SolverImplicit` in place of VBD, with default arguments.
 
-Of a coupled solver, these are the entries that have particles, each with a stage of its own.
+Of a coupled solver, these are the entries that have particles, each with a stage or solver of its own.
 """
 
 WARM_UP = 2
@@ -133,7 +134,7 @@ class ExampleMeasurement:
             there is none.
         first_frame_not_finite: The first checked frame, counted from 0, with positions that are not finite; None if
             there is none. No later frame is checked for crossings.
-        stage: What the stage reports; None without it.
+        stage: What the stage or :class:`warp_bsc.SolverImplicit` reports; None without both.
         test_final: What the example's ``test_final`` finds: "ok" or the first line of its message; None without one.
         test_post_step: The same of ``test_post_step``, which is called after each frame until it fails.
     """

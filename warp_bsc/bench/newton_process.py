@@ -1,7 +1,8 @@
 """A process that runs one of Newton's examples and measures it: ``python -m warp_bsc.bench.newton_process REQUEST``.
 
 It runs the example as ``python -m newton.examples`` does, with a frame loop that measures in place of
-``newton.examples.run``. The collision stage takes the place of solver classes of :mod:`newton.solvers`.
+``newton.examples.run``. The collision stage takes the place of solver classes of :mod:`newton.solvers`, or
+:class:`warp_bsc.SolverImplicit` that of VBD.
 """
 
 import json
@@ -9,7 +10,7 @@ import os
 import runpy
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -71,6 +72,7 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
 
     measurements: list[ExampleMeasurement] = []
     stages: list[Any] = []
+    replaced = {"plain": (), "stage": SOLVERS, "implicit": SOLVERS[:1]}[request["mode"]]
 
     def run(example, arguments):
         own = arguments.num_frames != newton.examples.create_parser().get_default("num_frames")
@@ -78,16 +80,15 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
         if frames is None:
             frames = arguments.num_frames if own else FRAMES
             frames = min(frames, CPU_FRAMES) if wp.get_device().is_cpu else frames
-        if request["mode"] == "stage" and not stages:
-            raise _NotApplicable(f"no solver with particles is one of {', '.join(SOLVERS)}")
+        if replaced and not stages:
+            raise _NotApplicable(f"no solver with particles is one of {', '.join(replaced)}")
         measurements.append(_measure_frames(example, frames, request["check_every"], stages, progress))
 
     replace_name(newton.examples, "run", run)
     if not request["download"]:
         replace_name(newton.utils, "download_asset", _refuse_download)
         replace_name(newton.examples, "download_external_git_folder", _refuse_download)
-    if request["mode"] == "stage":
-        _stage_solvers(stages)
+    _replace_solvers(replaced, _StagedType if request["mode"] == "stage" else _ImplicitType, stages)
     options = ["--viewer", "null", "--quiet", "--device", request["device"], *request["options"]]
     if request["frames"] is not None:
         options += ["--num-frames", str(request["frames"])]
@@ -133,8 +134,24 @@ class _StagedType(type):
         return super().__instancecheck__(solver) or isinstance(solver, cls.__dict__.get("original", ()))
 
 
-def _stage_solvers(stages: list[Any]) -> None:
-    """Replaces the solvers in :mod:`newton.solvers` by staged ones, which list their stages.
+class _ImplicitType(_StagedType):
+    """The type of a class in place of VBD's whose instances are solvers with contact inside."""
+
+    def __call__(cls, *arguments, **options):
+        """Makes a solver of the model, whatever the other arguments, or VBD if it has no particles."""
+        from ..implicit.solver_implicit import SolverImplicit  # noqa: PLC0415 (imports Newton)
+
+        model = options["model"] if "model" in options else arguments[0]
+        if not model.particle_count:
+            return super().__call__(*arguments, **options)
+        solver: Any = SolverImplicit(model)
+        solver.rebuild_bvh = lambda state: None  # VBD's, which examples call
+        cls.stages.append(solver)
+        return solver
+
+
+def _replace_solvers(replaced: Sequence[str], kind: type[_StagedType], stages: list[Any]) -> None:
+    """Replaces solvers in :mod:`newton.solvers` by classes of a type, which list the stages that they make.
 
     This must come before the example is imported: it may import the classes by name.
     """
@@ -142,10 +159,10 @@ def _stage_solvers(stages: list[Any]) -> None:
 
     from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
-    for name in SOLVERS:
+    for name in replaced:
         solver = getattr(newton.solvers, name)
         names = {"__doc__": solver.__doc__, "__module__": solver.__module__, "stages": stages, "original": solver}
-        replace_name(newton.solvers, name, _StagedType(name, (solver,), names))
+        replace_name(newton.solvers, name, kind(name, (solver,), names))
 
 
 def _measure_frames(
@@ -157,7 +174,7 @@ def _measure_frames(
         example: The example, constructed.
         frames: Number of frames.
         check_every: Number of frames after which crossings are counted again; those of the last frame are as well.
-        stages: The stages behind its solvers.
+        stages: The stages behind or in place of its solvers.
         progress: Called with the number of frames done and the number of all.
     """
     crossings = _Crossings(example)

@@ -51,9 +51,9 @@ class Simulator:
         rate: Steps a second.
         settings: Its settings, and where they come from.
         claims: What it says of penetration; None if nothing.
-        solver: One of :data:`.response.SOLVERS`; None for one that is not Newton's.
+        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``; None for one that is not for Newton.
         has_self_contact: Whether VBD has contacts between particles of its own.
-        has_stage: Whether :class:`warp_bsc.SolverCCD` is behind the solver.
+        has_stage: Whether :class:`warp_bsc.SolverCCD` is behind the solver, or the solver is one itself.
     """
 
     title: str
@@ -104,6 +104,15 @@ SIMULATORS = {
     "ccd-vbd": _with_stage(_VBD),
     "ccd-style3d": _with_stage(_STYLE3D),
     "ccd-xpbd": _with_stage(_XPBD),
+    "implicit": Simulator(
+        "SolverImplicit",
+        "newton",
+        FRAME_RATE,
+        "default arguments, one step a frame, without Newton's contacts",
+        "certifies each step, or reports that it did not",
+        solver="implicit",
+        has_stage=True,
+    ),
     "mujoco-ipc": Simulator(
         "MuJoCo, ipc",
         "mujoco",
@@ -139,7 +148,7 @@ class PenetrationMeasurement:
         colliding_steps: Steps in which there are such pairs.
         inverted: Tetrahedra that are inverted, at the end of each frame.
         speed_kept: Share of its speed that a freely flying body keeps before it meets anything; None where nothing
-            flies.
+            flies for a step.
         stretch: Largest elongation of an edge beyond its length at rest, of all frame ends [%].
         uncertified_steps: Steps that were not certified; None without a stage.
         substepped_steps: Steps that the stage took in substeps, whose way is not straight; None without a stage.
@@ -276,10 +285,13 @@ def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], N
 
 
 def _speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
-    """Returns the way of the centre of what flies freely, as a share of that of a free fall at its first velocity."""
-    if not len(built.flying):
-        return None
+    """Returns the way of the centre of what flies freely, as a share of that of a free fall at its first velocity.
+
+    None without it, and where the first step goes as far as what it meets.
+    """
     steps = min(max(1, math.floor(built.seconds * rate)), len(states) - 1)
+    if not len(built.flying) or steps / rate >= 4.0 / 3.0 * built.seconds:
+        return None
     first, last = (states[i][built.flying.start : built.flying.stop].mean(axis=0, dtype=float) for i in (0, steps))
     t, flight = steps / rate, np.array(built.flight)
     gravity = built.scene.model.gravity.numpy().reshape(-1, 3)[0].astype(float)

@@ -63,13 +63,13 @@ def simulate_newton(
 
     Args:
         built: The scene.
-        solver: One of :data:`.response.SOLVERS`.
+        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``.
         rate: Steps a second.
         seconds: Simulated time [s].
         progress: Called with the number of steps done and the number of all.
         has_self_contact: Whether VBD has contacts between particles of its own.
-        has_stage: Whether :class:`warp_bsc.SolverCCD` with default arguments is behind the solver, without contacts of
-            Newton; without it the solver has these.
+        has_stage: Whether :class:`warp_bsc.SolverCCD` with default arguments is behind the solver, or the solver is
+            one itself, without contacts of Newton; without it the solver has these.
 
     Raises:
         NotFinite: If positions are not finite, or the scene bursts.
@@ -81,7 +81,7 @@ def simulate_newton(
         rate,
         has_contacts=not has_stage,
         stage_options={} if has_stage else None,
-        inner=_make_solver(built, solver, has_self_contact=has_self_contact),
+        inner=None if solver == "implicit" else _make_solver(built, solver, has_self_contact=has_self_contact),
         samples=states,
     )
     simulation.run(seconds, progress)

@@ -16,6 +16,8 @@ from .response_scenes import Motion, Scene, SceneBuilder, build_scene
 __all__ = ["SCENES", "PenetrationScene", "build_penetration_scene"]
 
 _STIFFNESS = 1e3  # N/m of the membranes that are hit
+_FREE = 0.75
+"""Share of the way to what it meets over which the speed of what flies is measured."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class PenetrationScene:
         margin, gap: Distances of VBD's self-contact [m], those of the example of Newton that is nearest to the scene.
         flying: Particles that fly freely at first, whose speed is measured; empty if there are none.
         flight: Velocity at which they begin [m/s], shape [3].
-        seconds: Time for which they would fly freely at that velocity [s].
+        seconds: Time after which that speed is measured [s]; from 4/3 of it on they meet something.
     """
 
     scene: Scene
@@ -57,7 +59,7 @@ def _build_bullet(builder: SceneBuilder) -> PenetrationScene:
     model = builder.finish()
     _throw(model, patch, velocity)
     scene = Scene(model, 0.5)
-    return PenetrationScene(scene, flying=patch, flight=velocity, seconds=0.75 * distance / speed)
+    return PenetrationScene(scene, flying=patch, flight=velocity, seconds=_FREE * distance / speed)
 
 
 def _build_drape(builder: SceneBuilder) -> PenetrationScene:
@@ -106,7 +108,7 @@ def _build_soft(builder: SceneBuilder) -> PenetrationScene:
     block = range(sheet, builder.to.particle_count)
     model = builder.finish()
     _throw(model, block, velocity)
-    return PenetrationScene(Scene(model, 0.5), flying=block, flight=velocity, seconds=0.5 * distance / 4.0)
+    return PenetrationScene(Scene(model, 0.5), flying=block, flight=velocity, seconds=_FREE * distance / 4.0)
 
 
 SCENES: dict[str, Callable[[SceneBuilder], PenetrationScene]] = {
@@ -124,7 +126,7 @@ def build_penetration_scene(name: str, solver: str, rate: int) -> PenetrationSce
 
     Args:
         name: A key of :data:`SCENES`.
-        solver: One of :data:`.response.SOLVERS`.
+        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``.
         rate: Steps a second.
 
     Raises:

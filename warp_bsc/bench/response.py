@@ -8,7 +8,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ import warp as wp
 
 __all__ = [
     "CONFIGURATIONS",
+    "CONVERGED",
+    "EARLY_STEPS",
     "REFERENCE",
     "REFERENCE_RATE",
     "SCENES",
@@ -47,12 +49,17 @@ SCENES = (
 REFERENCE = "reference"
 """The configuration with a small step."""
 
-CONFIGURATIONS = ("plain", "self-contact", "stage", "stage+contacts", REFERENCE)
+CONVERGED = "converged"
+"""The configuration whose Newton steps are not limited."""
+
+CONFIGURATIONS = ("plain", "self-contact", "stage", "stage+contacts", "implicit", CONVERGED, REFERENCE)
 """The configurations.
 
 ``plain``: the solver with Newton's contacts. ``self-contact``: the same with VBD's own contacts between particles.
 ``stage``: :class:`warp_bsc.SolverCCD` with default arguments, without contacts of Newton. ``stage+contacts``: the same
-with them. ``reference``: :class:`warp_bsc.SolverCCD` without substeps, without contacts of Newton, at a small step.
+with them. ``implicit``: :class:`warp_bsc.SolverImplicit` with default arguments, in place of VBD, whose energies it
+has. ``converged``: the same with as many Newton steps as a step needs. ``reference``: :class:`warp_bsc.SolverCCD`
+without substeps, without contacts of Newton, at a small step.
 """
 
 SOLVERS = ("vbd", "xpbd", "style3d", "semi-implicit")
@@ -68,8 +75,14 @@ SEMI_IMPLICIT_STEPS = 32
 WARM_UP = 2
 """Steps at the start whose times are left out: kernels are compiled and buffers grow in them."""
 
+EARLY_STEPS = 48
+"""Steps after which positions are compared with those of :data:`CONVERGED`."""
+
 _STAGES: dict[str, dict[str, Any]] = {"stage": {}, "stage+contacts": {}, REFERENCE: {"substeps": None}}
 """Arguments of the stage by configuration."""
+
+_IMPLICIT: dict[str, dict[str, Any]] = {"implicit": {}, CONVERGED: {"max_iterations": 200}}
+"""Arguments of the solver with contact inside, by configuration."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +124,7 @@ class ResponseMeasurement:
         substeps: Mean number of substeps of a step, 1 for a step that was not taken in substeps; None without a stage.
         milliseconds: Time of each step but the first :data:`WARM_UP` [ms], with Newton's contacts; two steps are timed
             together.
+        early: Positions after :data:`EARLY_STEPS` steps [m], shape [particle_count, 3]; None if there are fewer steps.
         spread: What a small offset of the start changes; None if it was not measured.
     """
 
@@ -128,7 +142,14 @@ class ResponseMeasurement:
     uncertified_steps: int | None
     substeps: float | None
     milliseconds: list[float]
+    early: np.ndarray | None = field(default=None, repr=False)
     spread: Spread | None = None
+
+    def distance_from(self, other: "ResponseMeasurement") -> float | None:
+        """Mean distance of the particles from those of a run with equal steps, after as many [mm]; None without it."""
+        if self.early is None or other.early is None or self.rate != other.rate:
+            return None
+        return 1e3 * float(np.linalg.norm(self.early - other.early, axis=1).mean())
 
     @property
     def median(self) -> float:
@@ -212,6 +233,8 @@ def measure_response(
 
     if configuration == "self-contact" and solver != "vbd":
         return ResponseRun(scene, solver, configuration, problem="only VBD has contacts between particles of cloth")
+    if configuration in _IMPLICIT and solver != "vbd":
+        return ResponseRun(scene, solver, configuration, problem="SolverImplicit takes the place of VBD")
     passes = 2 if perturb is not None and configuration == "stage" else 1
 
     def run(number: int, offset: float) -> ResponseMeasurement:
@@ -259,13 +282,14 @@ def _measure(
         rate = max(reference_rate, own_rate) if is_explicit else reference_rate
     elif rate is None:
         rate = own_rate
+    is_implicit = configuration in _IMPLICIT
     simulation = Simulation(
         built,
-        solver,
+        "implicit" if is_implicit else solver,
         rate,
         has_self_contact=configuration == "self-contact",
-        has_contacts=configuration not in ("stage", REFERENCE),
-        stage_options=_STAGES.get(configuration),
+        has_contacts=configuration in ("plain", "self-contact", "stage+contacts"),
+        stage_options=(_STAGES | _IMPLICIT).get(configuration),
         offset=offset,
         counts_collisions=configuration != REFERENCE,
     )
@@ -287,4 +311,5 @@ def _measure(
         uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
         substeps=float(np.mean(simulation.substeps)) if stage else None,
         milliseconds=simulation.milliseconds[WARM_UP:],
+        early=samples.early,
     )

@@ -10,11 +10,13 @@ import newton
 import numpy as np
 import warp as wp
 
+from ..implicit.solver_implicit import SolverImplicit
 from ..response.solver_ccd import SolverCCD
 from ..response.state.mesh import host_array
 from ..response.substeps.strain import edges_at_rest
 from .crossings import CrossingCounter
 from .elastic_energy import ElasticEnergy
+from .response import EARLY_STEPS
 from .response_scenes import Scene
 
 __all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "total_energy"]
@@ -124,7 +126,7 @@ class Simulation:
     """A scene with its solver, which is stepped in pairs of steps: a graph ends with the states that it began with.
 
     Attributes:
-        stage: The stage; None without one.
+        stage: The stage, which :class:`.SolverImplicit` is itself; None without one.
         samples: What was measured of each state.
         milliseconds: Time of each step [ms]; two steps are timed together.
         substeps: Substeps of each step, 1 for a step that was not taken in substeps.
@@ -150,11 +152,12 @@ class Simulation:
 
         Args:
             scene: The scene.
-            solver: One of :data:`.response.SOLVERS`.
+            solver: One of :data:`.response.SOLVERS`, or ``"implicit"`` for :class:`.SolverImplicit`.
             rate: Steps a second.
             has_self_contact: Whether VBD has contacts between particles of its own.
             has_contacts: Whether the solver gets Newton's contacts.
-            stage_options: Arguments of the stage, beside those that the scene needs; None for no stage.
+            stage_options: Arguments of the stage or of :class:`.SolverImplicit`, beside those that the scene needs;
+                None for no stage.
             offset: How far all particles are moved along x [m].
             inner: The solver that is stepped, behind the stage if there is one; default: that of the bench of contact.
             samples: What the states are given to, with a method ``add`` as that of :class:`Samples`; default:
@@ -168,10 +171,13 @@ class Simulation:
             moved = host_array(model.particle_q).astype(np.float64)
             moved[:, 0] += offset
             model.particle_q.assign(moved.astype(np.float32))
-        inner = inner or _make_solver(scene, solver, has_self_contact=has_self_contact)
-        if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
-            inner.collision = None  # its own contacts, which need those of Newton
-        self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
+        if solver == "implicit":
+            self.stage = SolverImplicit(model, **scene.stage_options, **(stage_options or {}))
+        else:
+            inner = inner or _make_solver(scene, solver, has_self_contact=has_self_contact)
+            if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
+                inner.collision = None  # its own contacts, which need those of Newton
+            self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
         self._solver: Any = inner if self.stage is None else self.stage
         self._pipeline = newton.CollisionPipeline(model) if has_contacts else None
         self._contacts = self._pipeline.contacts() if self._pipeline else None
@@ -277,6 +283,7 @@ class Samples:
         speed: The mean speed of movable particles [m/s].
         energy: The kinetic, gravitational and elastic energy of each world [J], see :class:`.ElasticEnergy`.
         restarts: Indices of ``energy`` and worlds, where the energy of a world begins anew.
+        early: Positions after :data:`.response.EARLY_STEPS` steps [m]; None before.
     """
 
     def __init__(self, model: newton.Model):
@@ -303,12 +310,15 @@ class Samples:
         self.speed: list[float] = []
         self.energy: list[np.ndarray] = []
         self.restarts: list[tuple[int, int]] = []
+        self.early: np.ndarray | None = None
 
     def add(self, state: newton.State) -> bool:
         """Measures a state; returns whether its positions and velocities are finite."""
         x, v = host_array(state.particle_q), host_array(state.particle_qd)
         if not (np.isfinite(x).all() and np.isfinite(v).all()):
             return False
+        if len(self.stretch) == EARLY_STEPS:  # the first state is that before all steps
+            self.early = x.astype(np.float64)
         self.stretch.append(largest_stretch(x, self._edges, self._lengths))
         self.speed.append(float(np.linalg.norm(v[self._movable], axis=1).mean()))
         self.energy.append(self._energy_of(state))

@@ -1,4 +1,4 @@
-"""The command ``warp-bsc bench newton``: measures Newton's own examples, plain and with the collision stage."""
+"""The command ``warp-bsc bench newton``: measures Newton's own examples, plain, with the stage and another solver."""
 
 import argparse
 from collections.abc import Generator
@@ -17,18 +17,18 @@ from .tables import Console
 __all__ = ["add_to"]
 
 _DESCRIPTION = """\
-Run Newton's own examples, unchanged, and measure them: plain, and with
-SolverCCD put behind their solver, or behind each entry of a coupled solver that
-has particles. Each run is a process of its own, in which the example captures
-its own CUDA graph and runs its own tests. A row has the times of frames,
-without drawing and without the first two; the edges of cloth or soft bodies
-that cross faces at the start, and the most at frame ends, found in exact
-arithmetic; the steps that the stage did not certify; and whether the example's
-own tests pass. Default: the examples of newton.examples.cloth, softbody and
-multiphysics that have cloth or soft bodies. Any other example of Newton can be
-named. Options of the example itself follow its name, in quotes. A run that
-fails is a row, and a line below the table says why. Tests that expect a state
-at rest fail in short runs, in both modes."""
+Run Newton's own examples, unchanged, and measure them: plain, with SolverCCD
+put behind their solver, or behind each entry of a coupled solver that has
+particles, and with SolverImplicit in place of VBD. Each run is a process of its
+own, in which the example captures its own CUDA graph and runs its own tests. A
+row has the times of frames, without drawing and without the first two; the
+edges of cloth or soft bodies that cross faces at the start, and the most at
+frame ends, found in exact arithmetic; the steps that were not certified; and
+whether the example's own tests pass. Default: the examples of
+newton.examples.cloth, softbody and multiphysics that have cloth or soft bodies.
+Any other example of Newton can be named. Options of the example itself follow
+its name, in quotes. A run that fails is a row, and a line below the table says
+why. Tests that expect a state at rest fail in short runs, in all modes."""
 
 _EPILOG = f"""\
 examples:
@@ -58,7 +58,8 @@ def add_to(commands: Commands, summary: str) -> None:
         type=_modes,
         default=MODES,
         metavar="MODE,...",
-        help="plain: the example as it is; stage: with SolverCCD behind its solver (default: plain,stage)",
+        help="plain: the example as it is; stage: with SolverCCD behind its solver; implicit: with SolverImplicit in "
+        "place of VBD (default: all)",
     )
     command.add_argument(
         "--check-every",

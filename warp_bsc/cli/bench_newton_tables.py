@@ -31,7 +31,7 @@ def print_examples(console: Console, examples: list[NewtonExample]) -> None:
 
 
 def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.Device, partial: bool) -> None:
-    """Prints the times, the crossings and the tests of examples, a row a run, and the reports of the stage.
+    """Prints the times, the crossings and the tests of examples, a row a run, and the reports of stages.
 
     Args:
         console: The terminal or file to print to.
@@ -62,12 +62,15 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
     for note in notes:
         say(console, note)
 
-    sizes = {run.example: run.measured for run in runs if run.measured}
-    sizes |= {run.example: run.measured for run in runs if run.measured and run.measured.stage}
+    sizes: dict[str, ExampleMeasurement] = {}
+    for run in runs:
+        name = f"{run.example}, implicit" if run.mode == "implicit" else run.example
+        if run.measured and (run.measured.stage or name not in sizes):
+            sizes[name] = run.measured
     if sizes:
         console.print()
         stage = ("Steps", "In sub-\nsteps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
-        caption = "Steps of the stage: all, in substeps, not certified, with paths truncated, with vertices frozen."
+        caption = "Steps: all, in substeps, not certified, with paths truncated, with vertices frozen."
         table = make_table("Example", "Partic-\nles", "Trian-\ngles", "Frames", *stage, caption=caption)
         for name, took in sizes.items():
             counts = [took.particles, took.triangles, took.frames, *(asdict(took.stage).values() if took.stage else ())]

@@ -28,8 +28,8 @@ keeps before it meets anything, the largest stretch of an edge, and the time of
 a step. MuJoCo runs on the CPU, libuipc on a GPU, Newton's solvers on --device.
 The simulators:
 {_LINES}
-SolverCCD has its default arguments. A simulator that is not installed or cannot
-run a scene is a row, and a line below says why."""
+SolverCCD and SolverImplicit have their default arguments. A simulator that is
+not installed or cannot run a scene is a row, and a line below says why."""
 
 _EPILOG = f"""\
 scenes:

@@ -9,6 +9,7 @@ import warp as wp
 
 from ..bench.response import (
     CONFIGURATIONS,
+    CONVERGED,
     REFERENCE,
     REFERENCE_RATE,
     SCENES,
@@ -40,6 +41,8 @@ The configurations:
   self-contact    the same with VBD's own contacts between particles
   stage           SolverCCD with default arguments, without Newton's contacts
   stage+contacts  the same with Newton's contacts
+  implicit        SolverImplicit with default arguments, in place of VBD
+  converged       the same with as many Newton steps as a step needs
   reference       SolverCCD without substeps, at a small step: slow
 Ropes have particle_radius, without which nothing collides with springs. The
 semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations, unless
@@ -78,7 +81,7 @@ def add_to(commands: Commands, summary: str) -> None:
         "--configurations",
         type=_configurations,
         metavar="NAME,...",
-        help="the configurations to run (default: all, with self-contact only for vbd)",
+        help="the configurations to run (default: all, self-contact, implicit and converged only for vbd)",
     )
     command.add_argument(
         "--reference",
@@ -147,7 +150,7 @@ def _choose_configurations(arguments: argparse.Namespace) -> tuple[str, ...]:
     """Returns the configurations to run: those that are named, otherwise all that the solver and options allow."""
     if arguments.configurations is not None:
         return arguments.configurations
-    omitted = set() if arguments.solver == "vbd" else {"self-contact"}
+    omitted = set() if arguments.solver == "vbd" else {"self-contact", "implicit", CONVERGED}
     omitted |= set() if arguments.reference else {REFERENCE}
     return tuple(name for name in CONFIGURATIONS if name not in omitted)
 

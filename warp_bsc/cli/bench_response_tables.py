@@ -8,7 +8,7 @@ import warp as wp
 from rich.console import Console
 from rich.text import Text
 
-from ..bench.response import WARM_UP, ResponseMeasurement, ResponseRun
+from ..bench.response import CONVERGED, EARLY_STEPS, WARM_UP, ResponseMeasurement, ResponseRun
 from .tables import count, make_table, say
 
 __all__ = ["print_response_runs", "response_runs_to_dict"]
@@ -59,6 +59,7 @@ def response_runs_to_dict(runs: Sequence[ResponseRun], *, device: wp.Device, par
                 "configuration": run.configuration,
                 "problem": run.problem,
                 "measured": None if run.measured is None else _measurement_to_dict(run.measured),
+                "from_converged": _distance_from_converged(run, runs),
             }
             for run in runs
         ],
@@ -85,6 +86,10 @@ def _print_scene(console: Console, runs: Sequence[ResponseRun]) -> None:
                 f"{spread.stretch_at_end:.2f} at the end, {spread.stretch_at_most:.2f} at most"
             )
     console.print(table)
+    distances = {run.configuration: _distance_from_converged(run, runs) for run in runs}
+    shown = [f"{name} {mm:.2f}" for name, mm in distances.items() if mm is not None and name != CONVERGED]
+    if shown:
+        notes.append(f"Mean distance from {CONVERGED} after {EARLY_STEPS} steps [mm]: {', '.join(shown)}")
     for note in [*_describe_sizes(runs), *notes]:
         say(console, note)
 
@@ -123,5 +128,13 @@ def _describe_sizes(runs: Sequence[ResponseRun]) -> list[str]:
     return [", ".join([*sizes, " or ".join(steps)])]
 
 
+def _distance_from_converged(run: ResponseRun, runs: Sequence[ResponseRun]) -> float | None:
+    """Returns how far particles are from those of the converged run of the scene in the mean [mm]; None without it."""
+    converged = next((o.measured for o in runs if (o.scene, o.configuration) == (run.scene, CONVERGED)), None)
+    return run.measured.distance_from(converged) if run.measured and converged else None
+
+
 def _measurement_to_dict(took: ResponseMeasurement) -> dict[str, Any]:
-    return asdict(took) | {"milliseconds": {"median": took.median, "mean": took.mean, "worst": max(took.milliseconds)}}
+    values = asdict(took)
+    del values["early"]
+    return values | {"milliseconds": {"median": took.median, "mean": took.mean, "worst": max(took.milliseconds)}}

@@ -74,6 +74,15 @@ class _Inertia(SolverBase):
         wp.launch(steps.predict_positions, model.particle_count, inputs=inputs, outputs=outputs, device=model.device)
 
 
+def _radii_of_strands(model: newton.Model) -> np.ndarray | None:
+    """Returns the radii of particles without triangles and tetrahedra, 0 for others [m]; None if all are 0."""
+    radii = model.particle_radius.numpy().astype(np.float64)
+    for elements in (model.tri_indices, model.tet_indices):
+        if elements is not None:
+            radii[elements.numpy().ravel()] = 0.0
+    return radii if radii.any() else None
+
+
 class SolverImplicit(SolverCCD):
     """Steps cloth and soft bodies by one implicit solve a step, which has contact and friction in it.
 
@@ -103,6 +112,7 @@ class SolverImplicit(SolverCCD):
         max_iterations: Newton steps of a step at most.
     """
 
+    _near = 0.0  # barriers do that
     report: ImplicitStepReport
     _report_type = ImplicitStepReport
 
@@ -130,7 +140,10 @@ class SolverImplicit(SolverCCD):
             friction_table: Coefficients by pair of materials.
             bodies: Whether the solver moves free dynamic bodies, or leaves all of them where a program, or another
                 solver, puts them.
-            min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it.
+            min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it. Without this and
+                ``particle_radius``, springs and particles without faces, such as ropes and grains, collide by their
+                radii, as they have no other surface; cloth and shapes keep no distance. Where those radii are 0, and
+                with ``requires_grad``, they take no part, and a warning says so.
             particle_radius: Radius of each particle [m], or one for all.
             collision_filter: Groups and masks of particles and shapes.
             inversions: What happens to tetrahedra that invert: ``"left"``, ``"reported"`` or ``"prevented"``.
@@ -147,7 +160,7 @@ class SolverImplicit(SolverCCD):
                 model has neither particles nor bodies, if a joint holds a body that the solver is to move, or if the
                 particles of a world do not follow each other in it.
             NotImplementedError: If the model has shapes that are not supported, see
-                :class:`.response.state.mesh.ModelMesh`.
+                :class:`.response.state.mesh.ModelMesh`, or attaches particles to a body that the solver is to move.
         """
         check_instance(model, "model", (newton.Model, ModelView), "a newton.Model")
         if not model.particle_count and not model.body_count:
@@ -160,7 +173,15 @@ class SolverImplicit(SolverCCD):
                 "bodies only: put it into a coupled solver (newton.solvers.experimental.coupled), in which another "
                 "solver moves the bodies, or pass bodies='left' if something else writes their poses"
             )
+        if moves and model.attachment_particle_body_count:
+            if _dynamic_bodies(model)[host_array(model.attachment_particle_body_body)].any():
+                raise NotImplementedError(
+                    "model: it attaches particles to a body that SolverImplicit would move; make the body kinematic, "
+                    "or pass bodies='left' if something else writes its pose"
+                )
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
+        if model.particle_count and min_distance is None and particle_radius is None and not model.requires_grad:
+            particle_radius = _radii_of_strands(model)
         super().__init__(
             _Inertia(model, moves_bodies=moves),
             substeps=None,

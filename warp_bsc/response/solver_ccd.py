@@ -103,6 +103,8 @@ class SolverCCD(CollisionStage):
         max_iterations: Iterations of detect and project.
     """
 
+    _near = 1.0  # share of the separation within which pairs near their distance are moved apart like contacts
+
     def __init__(
         self,
         solver: SolverBase,
@@ -228,7 +230,7 @@ class SolverCCD(CollisionStage):
         self._warn_of_unseen(mesh, options.distances)
         self.separation = default_separation(mesh) if options.separation is None else options.separation
         if keeps_distances:
-            mesh.distances = mesh.min_distances(options.distances, reach=self.separation)
+            mesh.distances = mesh.min_distances(options.distances, reach=self._near * self.separation)
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         integrator = innermost(solver)
         moves = options.moves_bodies(mesh, integrator)

@@ -92,6 +92,27 @@ def closest_weights_and_gap(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d:
 
 
 @wp.func
+def least_distance(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
+    """Returns a lower bound of the distance of two elements, 0 where they may touch."""
+    if kind == EDGE_EDGE:
+        _at, distance, error = closest_points(EDGE_EDGE, b - a, d - c, c - a)
+        return wp.max(distance - _TWO * error, ZERO)
+    _there, found, rounding = closest_points(VERTEX_FACE, c - b, d - b, a - b)
+    return wp.max(found - _TWO * rounding, ZERO)
+
+
+@wp.func
+def distance_of_boxes(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
+    """Returns the distance of the boxes around two elements, at most that of the elements, and faster to find."""
+    lower, upper = wp.min(wp.min(b, c), d), wp.max(wp.max(b, c), d)
+    first, last = a, a
+    if kind == EDGE_EDGE:
+        lower, upper = wp.min(c, d), wp.max(c, d)
+        first, last = wp.min(a, b), wp.max(a, b)
+    return wp.length(wp.max(wp.max(lower - last, first - upper), wp.vec3d()))
+
+
+@wp.func
 def _closing_time(first: wp.float64, second: wp.float64, rate: wp.float64, other: wp.float64, least: wp.float64):
     """Returns when a point at ``first``, along a direction, comes as near as ``least`` to one at ``second``."""
     closing = other - rate
@@ -114,12 +135,14 @@ def safe_share(
     r: wp.vec3d,
     s: wp.vec3d,
     least: wp.float64,
+    most: wp.float64,
     bends: wp.vec2d,
 ) -> wp.float64:
     """Returns a share of the displacements up to which two elements stay as far apart as ``least``, 1 for all of them.
 
     They start farther apart. Conservative advancement: a plane across the closest points separates two elements until
     a vertex of one comes as near as that to a vertex of the other along its normal; then another plane is taken.
+    Shares of more than ``most`` are of no use, and are 1.
     Displacements are chords: at a share t, elements may be nearer by t (b - t c), where ``bends`` are b and c.
     """
     time = ZERO
@@ -138,7 +161,7 @@ def safe_share(
         else:
             ahead = wp.min(ahead, _closing_time(ea, fa, pa, qa + more, near))
         time += _NEXT * wp.max(ahead, ZERO)
-        if time >= ONE:
+        if time >= ONE or time > most:
             return ONE
         if ahead < _STALLED:
             return time

@@ -7,18 +7,44 @@ from .system import Contacts, Unknowns, product
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_BLOCK = 1024
-"""Most threads of a block on a GPU."""
+_LARGEST_BLOCK = 1024
+"""Threads of the only block of a world, at most."""
+_BLOCK, _BLOCKS = 512, 128
+"""Threads of each block of a larger world, and blocks of all worlds at most: a GPU runs them together."""
 
 
-def block_of_world(unknowns: int, device: wp.Device) -> tuple[int, int]:
-    """Returns how many threads solve for a world of so many unknowns, and how many of these share a row."""
-    if device.is_cpu:
-        return 1, 1
-    parts = 4
-    while parts > 1 and parts * unknowns > MAX_BLOCK:
-        parts //= 2
-    return min(MAX_BLOCK, max(64, -(-parts * unknowns // 32) * 32)), parts
+@wp.struct
+class Team:
+    """The threads that solve for a world: one block, or several that wait for each other.
+
+    Attributes:
+        blocks: Number of blocks.
+        parts: Threads that share a row, a power of 2.
+        arrived: How often blocks have waited for the others, shape [worlds].
+        sums: Of the blocks of each world, of two sums in turn, shape [worlds, 2 blocks].
+    """
+
+    blocks: int
+    parts: int
+    arrived: wp.array[int]
+    sums: wp.array2d[wp.float64]
+
+
+def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]:
+    """Returns the team for worlds of so many unknowns at most, and the number of threads in its blocks."""
+    team, threads = Team(), 1
+    team.blocks = team.parts = 1
+    if device.is_cuda:
+        team.parts = 4
+        while team.parts > 1 and team.parts * unknowns > _LARGEST_BLOCK:
+            team.parts //= 2
+        threads = min(_LARGEST_BLOCK, max(64, -(-team.parts * unknowns // 32) * 32))
+        if unknowns > _LARGEST_BLOCK and worlds <= _BLOCKS // 2:
+            team.parts, threads = 4, _BLOCK
+            team.blocks = min(_BLOCKS // worlds, -(-team.parts * unknowns // _BLOCK))
+    team.arrived = wp.zeros(worlds, dtype=int, device=device)
+    team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=wp.float64, device=device)
+    return team, threads
 
 
 @wp.struct
@@ -44,11 +70,40 @@ class Vectors:
     snippet="""
 #if defined(__CUDA_ARCH__)
     __syncthreads();
+    if (blocks > 1) {
+        if (threadIdx.x == 0) {
+            __threadfence();
+            atomicAdd(&arrived.data[world], 1);
+            while (*(volatile int*)&arrived.data[world] < turn * blocks) {}
+            __threadfence();
+        }
+        __syncthreads();
+    }
 #endif
 """
 )
-def _wait_for_block():
-    """Waits for all threads of the block; each then sees what the others wrote."""
+def _wait(world: int, blocks: int, turn: int, arrived: wp.array[int]):
+    """Waits for all threads of a world, for the ``turn``-th time; each then sees what the others wrote."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ double sums[32];
+    const int lane = threadIdx.x & 31;
+    for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
+    if (lane == 0) sums[threadIdx.x >> 5] = value;
+    __syncthreads();
+    value = lane < (blockDim.x >> 5) ? sums[lane] : 0.0;
+    for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
+    __syncthreads();
+#endif
+    return value;
+"""
+)
+def _sum_of_block(value: wp.float64) -> wp.float64:
+    """Returns the sum over the threads of a block, in each."""
     ...
 
 
@@ -74,9 +129,19 @@ def _dot(a: wp.vec3, b: wp.vec3) -> wp.float64:
 
 
 @wp.func
-def _sum(value: wp.float64) -> wp.float64:
-    """Returns the sum over the threads of a block, in each."""
-    return wp.tile_sum(wp.tile(value))[0]
+def _sum(value: wp.float64, team: Team, world: int, block: int, lane: int, turn: int) -> wp.float64:
+    """Returns the sum over the threads of a world, in each, which have waited ``turn`` times then."""
+    total = _sum_of_block(value)
+    if team.blocks == 1:
+        return total
+    first = (turn % 2) * team.blocks
+    if lane == 0:
+        team.sums[world, first + block] = total
+    _wait(world, team.blocks, turn, team.arrived)
+    total = wp.float64(0.0)
+    for other in range(team.blocks):
+        total += team.sums[world, first + other]
+    return total
 
 
 @wp.kernel
@@ -88,7 +153,7 @@ def solve_worlds(
     active: wp.array[int],
     tolerance: wp.float64,
     max_iterations: int,
-    parts: int,
+    team: Team,
     # in and out
     vectors: Vectors,
     # out
@@ -99,36 +164,41 @@ def solve_worlds(
     Where the matrix is found not to be positive definite, the solution so far ends the solve, or the preconditioned
     negative gradient if there is none: both are directions in which the energy falls. What is given stays given.
     """
-    world, lane = wp.tid() // wp.block_dim(), wp.tid() % wp.block_dim()
+    thread = wp.tid()
+    number, lane = thread // wp.block_dim(), thread % wp.block_dim()
+    world, block = number // team.blocks, number % team.blocks
     if active[world] == 0:
         return
-    begin, end = unknowns.of_worlds[world] + lane // parts, unknowns.of_worlds[world + 1]
-    stride, share = wp.block_dim() // parts, lane % parts
-    part = wp.float64(0.0)
+    row, part = (block * wp.block_dim() + lane) // team.parts, lane % team.parts
+    begin, end = unknowns.of_worlds[world] + row, unknowns.of_worlds[world + 1]
+    stride = team.blocks * wp.block_dim() // team.parts
+    turn = int(1)
+    own = wp.float64(0.0)
     for u in range(begin, end, stride):
         r = wp.vec3()
         if unknowns.is_free[u] != 0:
-            p = product(rows, contacts, unknowns, u, vectors.solution, share, parts)
-            r = -vectors.gradient[u] - _sum_of_parts(p, parts)
-        if share == 0:
+            p = product(rows, contacts, unknowns, u, vectors.solution, part, team.parts)
+            r = -vectors.gradient[u] - _sum_of_parts(p, team.parts)
+        if part == 0:
             z = vectors.inverse[u] * r
             vectors.residual[u] = r
             vectors.direction[u] = z
-            part += _dot(r, z)
-    squared = _sum(part)
-    _wait_for_block()
+            own += _dot(r, z)
+    squared = _sum(own, team, world, block, lane, turn)
     limit = tolerance * tolerance * squared
     count = int(0)
     goes_on = squared > wp.float64(0.0)
     while goes_on:
-        part = wp.float64(0.0)
+        own = wp.float64(0.0)
         for u in range(begin, end, stride):
             if unknowns.is_free[u] != 0:
-                p = _sum_of_parts(product(rows, contacts, unknowns, u, vectors.direction, share, parts), parts)
-                if share == 0:
+                p = product(rows, contacts, unknowns, u, vectors.direction, part, team.parts)
+                p = _sum_of_parts(p, team.parts)
+                if part == 0:
                     vectors.along[u] = p
-                    part += _dot(vectors.direction[u], p)
-        curvature = _sum(part)
+                    own += _dot(vectors.direction[u], p)
+        turn += 1
+        curvature = _sum(own, team, world, block, lane, turn)
         is_convex = curvature > wp.float64(0.0)
         step = float(0.0)
         if is_convex:
@@ -136,21 +206,23 @@ def solve_worlds(
         elif count == 0:
             step = float(squared / wp.max(-curvature, wp.float64(1e-30) + wp.float64(0.01) * squared))
         count += 1
-        part = wp.float64(0.0)
+        own = wp.float64(0.0)
         for u in range(begin, end, stride):
-            if unknowns.is_free[u] != 0 and share == 0:
+            if unknowns.is_free[u] != 0 and part == 0:
                 vectors.solution[u] = vectors.solution[u] + step * vectors.direction[u]
                 r = vectors.residual[u] - step * vectors.along[u]
                 vectors.residual[u] = r
-                part += _dot(r, vectors.inverse[u] * r)
-        after = _sum(part)
+                own += _dot(r, vectors.inverse[u] * r)
+        turn += 1
+        after = _sum(own, team, world, block, lane, turn)
         goes_on = is_convex and after > limit and count < max_iterations
         momentum = float(after / squared)
         squared = after
         if goes_on:
             for u in range(begin, end, stride):
-                if unknowns.is_free[u] != 0 and share == 0:
+                if unknowns.is_free[u] != 0 and part == 0:
                     vectors.direction[u] = vectors.inverse[u] * vectors.residual[u] + momentum * vectors.direction[u]
-        _wait_for_block()
-    if lane == 0:
+            turn += 1
+            _wait(world, team.blocks, turn, team.arrived)
+    if block == 0 and lane == 0:
         iterations[world] = iterations[world] + count

@@ -79,11 +79,15 @@ class Derivatives:
 
     Attributes:
         gradient: Of each corner of each element [N], shape [corners].
-        block: Hessians of each two corners of each element, row by row [N/m], shape [blocks].
+        block: Hessians of each two corners of each element but those of bending, row by row [N/m], shape [blocks].
+        turn: Derivatives of the angle of each element of bending by its corners [1/m], shape [4 count].
+        curvature: Second derivative of its energy by the angle [J], shape [count].
     """
 
     gradient: wp.array[wp.vec3]
     block: wp.array[wp.mat33]
+    turn: wp.array[wp.vec3]
+    curvature: wp.array[float]
 
 
 def elements_of_model(model: newton.Model) -> tuple[Elements, list[np.ndarray]]:
@@ -109,9 +113,22 @@ def elements_of_model(model: newton.Model) -> tuple[Elements, list[np.ndarray]]:
     elements.spring_damping = model.spring_damping
     counts = np.array([len(v) for v in vertices])
     sizes = np.array(SIZES)
-    first = [np.cumsum(np.append(0, counts * n)[:-1]) for n in (1, sizes, sizes * sizes)]
+    blocks = counts * sizes * sizes
+    blocks[ElementKind.BENDING] = 0
+    first = [np.cumsum(np.append(0, n)[:-1]) for n in (counts, counts * sizes, blocks)]
     elements.first = wp.array(np.concatenate(first).astype(np.int32), dtype=int, device=model.device)
     return elements, vertices
+
+
+def make_derivatives(vertices: list[np.ndarray], device: wp.Device) -> Derivatives:
+    """Returns buffers for the derivatives of elements with the particles that :func:`elements_of_model` returns."""
+    derivatives, bends = Derivatives(), len(vertices[ElementKind.BENDING])
+    blocks = sum(v.size * v.shape[1] for kind, v in enumerate(vertices) if kind != ElementKind.BENDING)
+    derivatives.gradient = wp.zeros(sum(v.size for v in vertices), dtype=wp.vec3, device=device)
+    derivatives.block = wp.zeros(blocks, dtype=wp.mat33, device=device)
+    derivatives.turn = wp.zeros(4 * bends, dtype=wp.vec3, device=device)
+    derivatives.curvature = wp.zeros(bends, dtype=float, device=device)
+    return derivatives
 
 
 @wp.func
@@ -134,6 +151,24 @@ def first_vertex(elements: Elements, kind: int, e: int) -> int:
     if kind == ElementKind.TETRAHEDRON:
         return elements.tet_indices[e, 0]
     return elements.spring_indices[e, 0]
+
+
+@wp.func
+def _is_finite(elements: Elements, kind: int, e: int, x: wp.array[wp.vec3]) -> bool:
+    """Returns whether the particles of an element have finite positions."""
+    if kind == ElementKind.MEMBRANE:
+        v = elements.tri_indices
+        return wp.isfinite(x[v[e, 0]]) and wp.isfinite(x[v[e, 1]]) and wp.isfinite(x[v[e, 2]])
+    if kind == ElementKind.SPRING:
+        return wp.isfinite(x[elements.spring_indices[e, 0]]) and wp.isfinite(x[elements.spring_indices[e, 1]])
+    v = elements.tet_indices
+    if kind == ElementKind.BENDING:
+        v = elements.edge_indices
+    finite = bool(True)
+    for j in range(4):
+        if v[e, j] >= 0:
+            finite = finite and wp.isfinite(x[v[e, j]])
+    return finite
 
 
 @wp.func
@@ -345,7 +380,7 @@ def _bending_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.arr
 def _differentiate_bending(
     elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
 ):
-    corner, place = elements.first[_FIRST_CORNER + 1] + 4 * e, elements.first[_FIRST_BLOCK + 1] + 16 * e
+    corner = elements.first[_FIRST_CORNER + 1] + 4 * e
     flat = not _bends(elements, e)
     a, b, c, d = wp.vec3d(), wp.vec3d(), wp.vec3d(), wp.vec3d()
     if not flat:
@@ -354,8 +389,7 @@ def _differentiate_bending(
     if flat:
         for i in range(4):
             out.gradient[corner + i] = wp.vec3()
-        for k in range(16):
-            out.block[place + k] = wp.mat33()
+        out.curvature[e] = 0.0
         return
     n1, n2, edge = wp.cross(c - a, d - a), wp.cross(d - b, c - b), d - c
     length = wp.length(edge)
@@ -366,7 +400,7 @@ def _differentiate_bending(
     rest = wp.float64(elements.edge_rest_length[e])
     stiffness = wp.float64(elements.edge_properties[e, 0])
     moment = rest * (stiffness * (angle - wp.float64(elements.edge_rest_angle[e])) + damping / dt * change)
-    curvature = rest * (stiffness + damping / dt)
+    out.curvature[e] = float(rest * (stiffness + damping / dt))
     by = wp.matrix_from_rows(
         -length * m1,
         -length * m2,
@@ -375,8 +409,7 @@ def _differentiate_bending(
     )
     for i in range(4):
         out.gradient[corner + i] = to_single(moment * by[i])
-        for j in range(4):
-            out.block[place + 4 * i + j] = _single(curvature * wp.outer(by[i], by[j]))
+        out.turn[4 * e + i] = to_single(by[i])
 
 
 # Tetrahedra
@@ -556,8 +589,13 @@ def _differentiate_spring(
 def element_energy(
     elements: Elements, i: int, kind: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64
 ) -> wp.float64:
-    """Returns the energy of an element of a kind above that at rest [J], damping included."""
+    """Returns the energy of an element of a kind above that at rest [J], damping included.
+
+    It is 0 where a particle has no finite position, like the derivatives.
+    """
     e = i - elements.first[kind]
+    if not _is_finite(elements, kind, e, x):
+        return ZERO
     if kind == ElementKind.MEMBRANE:
         return _membrane_energy(elements, e, x, x0, dt)
     if kind == ElementKind.BENDING:
@@ -565,6 +603,24 @@ def element_energy(
     if kind == ElementKind.TETRAHEDRON:
         return _tetrahedron_energy(elements, e, x, x0, dt)
     return _spring_energy(elements, e, x, x0, dt)
+
+
+@wp.func
+def _clear(elements: Elements, kind: int, e: int, out: Derivatives):
+    """Writes derivatives of 0."""
+    size = 4
+    if kind == ElementKind.MEMBRANE:
+        size = 3
+    elif kind == ElementKind.SPRING:
+        size = 2
+    corner, place = (
+        elements.first[_FIRST_CORNER + kind] + size * e,
+        elements.first[_FIRST_BLOCK + kind] + size * size * e,
+    )
+    for i in range(size):
+        out.gradient[corner + i] = wp.vec3()
+    for k in range(size * size):
+        out.block[place + k] = wp.mat33()
 
 
 @wp.kernel
@@ -592,6 +648,9 @@ def differentiate(
     if active[in_world] == 0:
         return
     is_convex = convex[in_world] != 0
+    if not _is_finite(elements, kind, e, x):
+        _clear(elements, kind, e, out)
+        return
     if kind == ElementKind.MEMBRANE:
         _differentiate_membrane(elements, e, x, x0, dt, is_convex, out)
     elif kind == ElementKind.BENDING:

@@ -16,8 +16,9 @@ from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import bodies, pairs, steps
-from .conjugate_gradients import Vectors, block_of_world, solve_worlds
-from .elasticity import SIZES, Derivatives, differentiate, elements_of_model
+from .attachments import attach, attachments_of_model
+from .conjugate_gradients import Vectors, make_team, solve_worlds
+from .elasticity import differentiate, elements_of_model, make_derivatives
 from .impulses import publish_contacts
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import make_rows
@@ -30,8 +31,12 @@ _PREDICTIONS = 2
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
+_USUAL_REACH = 1e-3
+"""Reach of particles without edges or radii [m]."""
 _SHORT_EDGE = 0.25
 """Largest reach as a share of the shortest edge at a vertex."""
+_RECOVERY_SPEED = 0.3
+"""Speed at which a barrier moves apart what is within its reach [m/s]: what is thrown rises by 5 mm."""
 _SMOOTHING_SPEED = 1e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
@@ -95,8 +100,10 @@ class NewtonMethod:
         unknowns.world = array(owner_world[order])
         unknowns.of_worlds = array(np.searchsorted(owner_world[order], np.arange(work.worlds + 1)))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
+        unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
-        self._block = block_of_world(int(np.bincount(owner_world, minlength=1).max(initial=0)), device)
+        largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
+        self._team, self._threads = make_team(largest, work.worlds, device)
         self._bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
         holder = np.arange(vertices)
         if len(solved):
@@ -109,19 +116,17 @@ class NewtonMethod:
         self._rows = make_rows(of_elements, unknown, self._count, device)
         self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._element_count = sum(map(len, of_elements))
-        self._derivatives = Derivatives()
-        corners = sum(v.size for v in of_elements)
-        blocks = sum(len(v) * n * n for v, n in zip(of_elements, SIZES, strict=True))
-        self._derivatives.gradient = wp.zeros(corners, dtype=wp.vec3, device=device)
-        self._derivatives.block = wp.zeros(blocks, dtype=wp.mat33, device=device)
+        self._derivatives = make_derivatives(of_elements, device)
         self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device)
         self._trial.holder = array(holder)
-        self._goal, self._lower, self._upper = (wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(3))
+        self._origin, self._goal, self._lower, self._upper = (
+            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
+        )
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
-        self._whole = wp.zeros(vertices, dtype=float, device=device)
+        self._whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
         self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
         self._any_leaves = self._leaves[work.worlds :]
         self._meets = wp.zeros(1, dtype=int, device=device)
@@ -145,13 +150,17 @@ class NewtonMethod:
         margin = np.where(np.isfinite(reach), reach, 0.0)
         margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
         self._margin = wp.array(margin, dtype=float, device=device)
-        masses, moves = host_array(model.particle_mass), host_array(model.particle_inv_mass) > 0
+        masses = host_array(model.particle_mass)
+        moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
         units = 1.0 / (mass * _UNIT_SPEED**2)
         if len(solved):
             heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * _FAST**2, 1e-9))
         self._settings.units = wp.array(units, dtype=wp.float64, device=device)
+        self._attachments = attachments_of_model(model)
+        self._poses = None if self._attachments is None else wp.clone(model.body_q)
+        self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._candidates: list[Candidates] = []
         self._contacts = Contacts()
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
@@ -164,16 +173,17 @@ class NewtonMethod:
         model, particles = mesh.model, mesh.model.particle_count
         reach = np.full(mesh.vertex_count, np.inf)
         x = np.zeros((mesh.vertex_count, 3))
-        x[:particles] = model.particle_q.numpy()
+        x[:particles] = model.particle_q.numpy() if particles else 0.0
         edges = mesh.edges[(mesh.edges < particles).all(axis=1)]
         lengths = np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
         world = mesh.device_world.numpy()
-        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, np.inf)
+        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, _USUAL_REACH / _REACH_OF_EDGE)
         reach[:particles] = _REACH_OF_EDGE * usual[world[:particles]]
         for k in range(2):
             np.minimum.at(reach, edges[:, k], _SHORT_EDGE * lengths)
-        radius = model.particle_radius.numpy()
-        reach[:particles] = np.where(radius > 0, np.minimum(reach[:particles], radius), reach[:particles])
+        if particles:
+            radius = model.particle_radius.numpy()
+            reach[:particles] = np.where(radius > 0, np.minimum(reach[:particles], radius), reach[:particles])
         return reach
 
     def _elasticity(self, mesh) -> np.ndarray:
@@ -199,20 +209,20 @@ class NewtonMethod:
         """Finds where particles and bodies end that the motion of the workspace predicts, and writes it there and here.
 
         Args:
-            end: Where positions and velocities at the end are written.
+            end: The state at the end, with the poses of bodies as predicted; what is solved for is written.
             dt: Length of the step [s].
         """
-        self._begin(dt)
+        self._begin(end, dt)
         self._find_end(end)
 
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
-        self._begin(1.0)
-        self.progress.active.zero_()
         end = StateArrays()
         for name in StateArrays.vars:
             given = getattr(state, name)
             setattr(end, name, None if given is None else wp.clone(given))
+        self._begin(end, 1.0)
+        self.progress.active.zero_()
         self._find_end(end)
 
     def read_materials(self) -> None:
@@ -220,11 +230,18 @@ class NewtonMethod:
         if self._mesh.model.tet_count and not self._work.device.is_capturing:
             self._settings.elasticity.assign(self._elasticity(self._mesh))
 
-    def _begin(self, dt):
+    def _begin(self, end, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
         self._settings.dt = dt
+        self._settings.recovery = _RECOVERY_SPEED * dt
         self._settings.smoothing = _SMOOTHING_SPEED * dt
+        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
+        if self._attachments is not None:
+            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
+            outputs = [work.vertices, end.particle_q, end.particle_qd]
+            self._launch(attach, self._mesh.model.particle_count, inputs, outputs)
+            wp.copy(self._poses, end.body_q)
         self.progress.active.zero_()
         self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
         inputs = [motion, self._margin, self._unknowns, self._bodies]
@@ -233,10 +250,14 @@ class NewtonMethod:
         self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
+        wp.copy(self._origin, motion.x0)
+        self._touching.face.fill_(pairs.NO_FACE)
+        self._touching.any.zero_()
 
     def _find_end(self, end):
         work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
         self._find_candidates()
+        wp.capture_if(self._touching.any, self._part_touching)
         self._goes_on.fill_(1)
         wp.capture_while(self._goes_on, self._take_newton_step)
         if self.keeps_contacts:
@@ -244,7 +265,7 @@ class NewtonMethod:
         if len(self._bodies.unknown):
             self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
-        inputs = [self._trial, self._unknowns, self._dt, motion.x0]
+        inputs = [self._trial, self._unknowns, self._dt]
         self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end])
         inputs = [self.progress, self._dt, _LEAST_SPEED, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
@@ -266,8 +287,21 @@ class NewtonMethod:
         queues = queues_of(detector, candidates=True)
         if [len(c.kept) for c in self._candidates] != [len(q.pairs) for q in queues]:
             self._allocate(queues)
-        inputs = [work.step, self._settings, work.status.crossings, *self._candidates]
-        work.launch_over_entries(pairs.prepare_candidates, inputs)
+        self._prepare_candidates()
+
+    def _prepare_candidates(self):
+        inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings]
+        self._over_candidates(pairs.prepare_candidates, inputs, [self._touching])
+
+    def _part_touching(self):
+        inputs = [self._work.step, self._settings, self._touching]
+        self._launch(pairs.part_touching, self._mesh.model.particle_count, inputs, [self._trial, self._origin])
+        self._prepare_candidates()
+
+    def _over_candidates(self, kernel, before, after=()):
+        """Launches a kernel over pairs of faces and edges, and then over those of points, if there are any."""
+        for k in range(0, len(self._candidates), 2):
+            self._work.launch_over_entries(kernel, [*before, *self._candidates[k : k + 2], *after])
 
     def _allocate(self, queues):
         self._retired.append((self._candidates, self._contacts))  # a CUDA graph may still write to them
@@ -276,6 +310,7 @@ class NewtonMethod:
             candidates = Candidates()
             candidates.queue = queue
             candidates.kept = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
+            candidates.level = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
             candidates.share = wp.zeros(len(queue.pairs), dtype=float, device=device)
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
@@ -287,8 +322,7 @@ class NewtonMethod:
     def _bound(self, active):
         """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
         work, motion = self._work, self._work.step.motion
-        inputs = [motion, *self._candidates, self._trial, active, self.progress, self._limit]
-        work.launch_over_entries(pairs.bound_by_pairs, inputs)
+        self._over_candidates(pairs.bound_by_pairs, [motion], [self._trial, active, self.progress, self._limit])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
             self._launch(pairs.bound_by_planes, work.vertices_at_planes, inputs, [self.progress, self._limit])
@@ -321,8 +355,7 @@ class NewtonMethod:
         """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
         work, progress, vertices = self._work, self.progress, self._mesh.vertex_count
         inputs, outputs = [self._unknowns, self._lower, self._upper], [self._trial, progress, self._whole, self._limit]
-        self._limit.fill_(1.0)
-        self._launch(steps.begin_truncation, vertices, inputs, outputs)
+        self._launch(steps.begin_truncation, max(vertices, work.worlds), inputs, outputs)
         for _ in range(_TRUNCATIONS):
             self._bound(progress.searches)
             self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
@@ -334,11 +367,13 @@ class NewtonMethod:
         self._launch(steps.undo_truncation, vertices, [work.step.motion, progress], [self._trial])
 
     def _solve_linear(self, active):
-        work, (threads, parts) = self._work, self._block
-        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, parts]
+        work, team = self._work, self._team
+        if team.blocks > 1:
+            team.arrived.zero_()
+        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, team]
         outputs = [self._vectors, self.iterations]
-        options = {"device": work.device, "block_dim": threads}
-        wp.launch(solve_worlds, work.worlds * threads, inputs=inputs, outputs=outputs, **options)
+        options = {"device": work.device, "block_dim": self._threads}
+        wp.launch(solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options)
 
     def _assemble(self, active, begins):
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
@@ -373,7 +408,7 @@ class NewtonMethod:
         self._launch(steps.begin_hold, work.worlds, [], [self.progress, ahead])
         work.launch_over_entries(pairs.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
-        work.launch_over_entries(pairs.hold_pairs, [motion, *self._candidates, *inputs, self._limit, *outputs])
+        self._over_candidates(pairs.hold_pairs, [motion], [*inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
             self._launch(pairs.hold_at_planes, work.vertices_at_planes, [*inputs, 2 + solves], [contacts])
@@ -391,7 +426,7 @@ class NewtonMethod:
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         contacts.count.zero_()
         inputs = [self._settings, self._trial, self._unknowns, active, contacts]
-        work.launch_over_entries(pairs.find_near, [motion, *self._candidates, *inputs])
+        self._over_candidates(pairs.find_near, [motion], inputs)
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
             self._launch(pairs.find_near_planes, work.vertices_at_planes, inputs[:-1], [contacts])
@@ -420,7 +455,7 @@ class NewtonMethod:
         inputs += [self._bodies, progress, displaced]
         self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
         inputs = [self._settings, trial, progress, displaced, energy]
-        work.launch_over_entries(pairs.add_pair_energies, [motion, *self._candidates, *inputs])
+        self._over_candidates(pairs.add_pair_energies, [motion], inputs)
         work.launch_over_entries(pairs.add_friction_energies, [motion, self._contacts, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]

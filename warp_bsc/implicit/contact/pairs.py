@@ -4,6 +4,7 @@ import warp as wp
 
 from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.queues import take_slot_int
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.constraints import friction_on_plane, pair_friction
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
@@ -16,10 +17,16 @@ from .system import Contacts, Progress, Unknowns, contact_count, displacement, i
 
 wp.set_module_options({"enable_backward": False})
 
-_LEAST_GAP = wp.constant(wp.float64(0.1))
-"""Share of its distance at the start that a pair which starts within its minimum distance may give up."""
+_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
+"""Share of its distance at the start that a pair keeps which starts within its minimum distance."""
+_LEAST_GAP = wp.constant(wp.float64(1e-6))
+"""Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
+_PARTED = wp.constant(1e-3)
+"""How far what touches a shape is moved off it, as a share of its reach."""
+_PARTED_ROUNDED = wp.constant(2.0**-20)
+"""The same at least, as a share of its largest coordinate."""
 _UNITS_LIMIT = wp.constant(wp.float64(2.0**52))
-"""Largest energy of an element or a pair, in units: a sum holds 2,048 of them."""
+"""Most units of one energy: a thousand of them fit into a sum, and a speed of 900 m/s into one."""
 
 
 @wp.struct
@@ -29,12 +36,14 @@ class Candidates:
     Attributes:
         queue: The pairs.
         kept: Distance that each pair keeps in any case [m].
-        reach: Gap beyond that from which its barrier pushes [m]; 0 of a pair that is excluded.
+        level: Distance at which its barrier is infinite [m], no more than that.
+        reach: Gap beyond the level from which its barrier pushes [m]; 0 of a pair that is excluded.
         share: Share of the last displacements before it would meet.
     """
 
     queue: PairQueue
     kept: wp.array[wp.float64]
+    level: wp.array[wp.float64]
     reach: wp.array[float]
     share: wp.array[float]
 
@@ -47,6 +56,7 @@ class BarrierSettings:
         dt: Length of the step [s].
         reach: Of each vertex: gap from which it pushes [m], infinite for shapes.
         reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
+        recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
         smoothing: Length below which friction is smoothed [m].
         units: Units of energy in a joule, in each world.
@@ -55,6 +65,7 @@ class BarrierSettings:
     dt: wp.float64
     reach: wp.array[float]
     reach_of_bodies: wp.array[float]
+    recovery: wp.float64
     elasticity: wp.array[float]
     smoothing: wp.float64
     units: wp.array[wp.float64]
@@ -149,28 +160,71 @@ def _stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int) 
 
 
 @wp.func
-def _prepare(step: Step, candidates: Candidates, settings: BarrierSettings, crossings: wp.array[int], i: int):
+def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, reach: float):
+    """Returns the level and the reach of the barrier of a pair, by its distance at the start and that to keep.
+
+    The reach of what starts within it ends a little above its gap: a barrier otherwise throws apart, at up to its reach
+    a step, what a program puts there or what fell there in the step before.
+    """
+    whole = wp.float64(reach)
+    level = wp.min(kept, start - _LEAST_GAP * whole)
+    return level, wp.min(whole, start - level + settings.recovery)
+
+
+@wp.struct
+class Touching:
+    """Particles that touch a face of a shape, to part them.
+
+    Attributes:
+        face: The first such face of each vertex; :data:`NO_FACE` for none.
+        any: 1 if there is one, shape [1].
+    """
+
+    face: wp.array[int]
+    any: wp.array[int]
+
+
+NO_FACE = wp.constant(2**31 - 1)
+
+
+@wp.func
+def _prepare(
+    step: Step,
+    candidates: Candidates,
+    settings: BarrierSettings,
+    origin: wp.array[wp.vec3],
+    crossings: wp.array[int],
+    touching: Touching,
+    i: int,
+):
     motion, queue = step.motion, candidates.queue
     corners = vertices_of(queue, i)
     candidates.reach[i] = 0.0
     candidates.kept[i] = ZERO
     if owner_of(motion, corners) != ContactClass.OURS:
         return
-    a, b, c, d = corners_of(motion.x0, corners)
+    a, b, c, d = corners_of(origin, corners)
+    if not wp.isfinite(a + b + c + d):
+        return
     start = ZERO
     if motion.distances.radius:
         found, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
         start = found
-        candidates.kept[i] = wp.min(kept, (ONE - _LEAST_GAP) * found)
+        candidates.kept[i] = kept
     else:
-        _weights, found = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-        start = found
+        start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
+        if start == ZERO and queue.kind == VERTEX_FACE and settings.reach[corners[1]] == wp.inf:
+            if motion.inverse_mass[corners[0]] > 0.0:
+                wp.atomic_min(touching.face, corners[0], queue.pairs[i][1])
+                touching.any[0] = 1
         return
     if crossings[motion.world[corners[0]]] > 0:
         if crossed_at_start(step, queue.kind, queue.pairs[i]):
             return
-    candidates.reach[i] = _reach_of(settings, corners)
+    level, reach = _barrier_of(settings, start, candidates.kept[i], _reach_of(settings, corners))
+    candidates.level[i] = level
+    candidates.reach[i] = float(reach)
 
 
 @wp.kernel
@@ -178,22 +232,59 @@ def prepare_candidates(
     # in
     step: Step,
     settings: BarrierSettings,
+    origin: wp.array[wp.vec3],
     crossings: wp.array[int],
     # in and out
-    vertex_face: Candidates,
-    edge_edge: Candidates,
+    first: Candidates,
+    second: Candidates,
+    # out
+    touching: Touching,
     threads: int,
 ):
     """Writes distances that candidates keep, and excludes those that touch or cross at the start of the step."""
-    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
         number = int(0)
         while number < 2:
-            of = vertex_face
+            of = first
             if number == 1:
-                of = edge_edge
+                of = second
             if has_pair(of.queue, i):
-                _prepare(step, of, settings, crossings, i)
+                _prepare(step, of, settings, origin, crossings, touching, i)
             number += 1
+
+
+@wp.kernel
+def part_touching(
+    # in
+    step: Step,
+    settings: BarrierSettings,
+    touching: Touching,
+    # in and out
+    trial: Trial,
+    origin: wp.array[wp.vec3],
+):
+    """Moves particles that touch a face of a shape off it a little, to the side to which it faces."""
+    v = wp.tid()
+    face = touching.face[v]
+    if face == NO_FACE:
+        return
+    x, mesh = trial.x[v] + wp.vec3(), step.mesh
+    a, b, c = trial.x[mesh.faces[face, 0]], trial.x[mesh.faces[face, 1]], trial.x[mesh.faces[face, 2]]
+    off = wp.max(_PARTED * settings.reach[v], _PARTED_ROUNDED * wp.max(wp.abs(x)))
+    parted = x + off * wp.normalize(wp.cross(b - a, c - a))
+    trial.x[v] = parted
+    origin[v] = parted
+
+
+@wp.func
+def _merged(corners: wp.vec4i, weights: wp.vec4d) -> wp.vec4d:
+    """Returns weights with those of corners that are one vertex, as points have them, at the first of these."""
+    merged = weights
+    for j in range(3, 1, -1):
+        if corners[j] == corners[j - 1]:
+            merged[j - 1] = merged[j - 1] + merged[j]
+            merged[j] = ZERO
+    return merged
 
 
 @wp.func
@@ -300,12 +391,14 @@ def _find_near(
     if active[motion.world[corners[0]]] == 0:
         return
     a, b, c, d = corners_of(trial.x, corners)
+    if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
+        return
     weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-    gap = distance - candidates.kept[i]
+    gap = distance - candidates.level[i]
     if gap >= reach or not gap > ZERO:
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    stiffness = _stiffness(motion, settings, corners, queue.kind == 1)
+    stiffness = _stiffness(motion, settings, corners, queue.kind == EDGE_EDGE)
     pair = queue.pairs[i]
     key = _key(0, queue.kind, pair[0], pair[1])
     friction = pair_friction(motion, corners)
@@ -316,7 +409,7 @@ def _find_near(
         trial,
         unknowns,
         corners,
-        weights,
+        _merged(corners, weights),
         normal,
         wp.vec3d(),
         ZERO,
@@ -332,8 +425,8 @@ def _find_near(
 def find_near(
     # in
     motion: Motion,
-    vertex_face: Candidates,
-    edge_edge: Candidates,
+    first: Candidates,
+    second: Candidates,
     settings: BarrierSettings,
     trial: Trial,
     unknowns: Unknowns,
@@ -343,12 +436,12 @@ def find_near(
     threads: int,
 ):
     """Adds contacts for the candidates that are near each other, in active worlds."""
-    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
         number = int(0)
         while number < 2:
-            of = vertex_face
+            of = first
             if number == 1:
-                of = edge_edge
+                of = second
             if has_pair(of.queue, i):
                 _find_near(motion, of, settings, trial, unknowns, active, contacts, i)
             number += 1
@@ -356,18 +449,21 @@ def find_near(
 
 @wp.func
 def _plane_gap(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int):
-    """Returns the distance that a particle keeps from a plane, and the reach of its barrier, 0 if it is excluded."""
-    body = body_of(motion, vertex)
+    """Returns the distance that a vertex keeps from a plane, and the level and the reach of its barrier.
+
+    The reach is 0 if it is excluded.
+    """
     if is_filtered_by_plane(motion, planes, i, vertex) or not is_stopped_by_plane(motion, planes, i, vertex):
-        return ZERO, ZERO
+        return ZERO, ZERO, ZERO
     start, error = signed_distance(planes.start[i], motion.x0[vertex])
-    start -= error
-    if not start > ZERO:
-        return ZERO, ZERO
-    kept = ZERO
-    if motion.distances.radius:
-        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], (ONE - _LEAST_GAP) * start)
-    return kept, wp.float64(wp.where(body < 0, settings.reach[vertex], settings.reach_of_bodies[vertex]))
+    if not start >= -error:
+        return ZERO, ZERO, ZERO
+    kept = wp.min(start - error, ZERO)
+    if motion.distances.radius and start > error:
+        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (start - error))
+    whole = wp.where(body_of(motion, vertex) < 0, settings.reach[vertex], settings.reach_of_bodies[vertex])
+    level, reach = _barrier_of(settings, start, kept, whole)
+    return kept, level, reach
 
 
 @wp.func
@@ -402,8 +498,8 @@ def find_near_planes(
             return
         plane = _plane_at(planes, i, plane_share[world])
         distance, _error = signed_distance(plane, trial.x[vertex])
-        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
-        gap = distance - kept
+        _kept, level, reach = _plane_gap(motion, planes, settings, i, vertex)
+        gap = distance - level
         if gap >= reach or not gap > ZERO:
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
@@ -656,8 +752,8 @@ def _hold_pair(
 def hold_pairs(
     # in
     motion: Motion,
-    vertex_face: Candidates,
-    edge_edge: Candidates,
+    first: Candidates,
+    second: Candidates,
     trial: Trial,
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
@@ -672,12 +768,12 @@ def hold_pairs(
 
     Only those that are the first, by ``limit``, for one of their vertices: what would come later may not come at all.
     """
-    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
         number = int(0)
         while number < 2:
-            of = vertex_face
+            of = first
             if number == 1:
-                of = edge_edge
+                of = second
             if has_pair(of.queue, i):
                 _hold_pair(motion, of, trial, unknowns, inverse, active, limit, group, contacts, i)
             number += 1
@@ -707,7 +803,7 @@ def hold_at_planes(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        kept, _level, reach = _plane_gap(motion, planes, settings, i, vertex)
         if reach == ZERO:
             continue
         gap, _error = signed_distance(_plane_at(planes, i, plane_share[world]), trial.x[vertex])
@@ -753,12 +849,18 @@ def _bound(
     # far apart for their ways: no need to find the closest points
     way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     kept = candidates.kept[i]
-    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-    least = barrier.least_gap(distance - kept, wp.float64(candidates.reach[i]))
+    reach = wp.float64(candidates.reach[i])
+    apart = barrier.distance_of_boxes(queue.kind, a, b, c, d) - kept
     bends = _bends(trial, scale, corners)
+    if way + bends[0] <= apart - barrier.least_gap(apart, reach):
+        return
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    least = barrier.least_gap(distance - kept, reach)
     if way + bends[0] <= distance - kept - least:
         return
-    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, bends))
+    # what other pairs allow: more than that changes nothing
+    most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, wp.float64(most), bends))
     candidates.share[i] = share
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
@@ -772,8 +874,8 @@ def _bound(
 def bound_by_pairs(
     # in
     motion: Motion,
-    vertex_face: Candidates,
-    edge_edge: Candidates,
+    first: Candidates,
+    second: Candidates,
     trial: Trial,
     active: wp.array[int],
     # in and out
@@ -782,12 +884,12 @@ def bound_by_pairs(
     threads: int,
 ):
     """Finds the share of displacements up to which no two elements meet: by vertex, and for all of a world."""
-    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
         number = int(0)
         while number < 2:
-            of = vertex_face
+            of = first
             if number == 1:
-                of = edge_edge
+                of = second
             if has_pair(of.queue, i):
                 _bound(motion, of, trial, progress, active, limit, i)
             number += 1
@@ -816,7 +918,7 @@ def bound_by_planes(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        kept, _level, reach = _plane_gap(motion, planes, settings, i, vertex)
         if reach == ZERO:
             continue
         before, _error = signed_distance(_plane_at(planes, i, now), trial.x[vertex])
@@ -866,12 +968,14 @@ def _pair_energy(
     if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
         return
     a, b, c, d = corners_of(trial.moved, corners)
+    if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
+        return
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-    gap = distance - candidates.kept[i]
+    gap = distance - candidates.level[i]
     if gap < reach:
         value = wp.float64(1.0e30)
         if gap > ZERO:
-            stiffness = _stiffness(motion, settings, corners, queue.kind == 1)
+            stiffness = _stiffness(motion, settings, corners, queue.kind == EDGE_EDGE)
             value = stiffness * barrier.barrier_energy(gap, reach)
         add_energy(energy, world, value, settings.units)
 
@@ -880,8 +984,8 @@ def _pair_energy(
 def add_pair_energies(
     # in
     motion: Motion,
-    vertex_face: Candidates,
-    edge_edge: Candidates,
+    first: Candidates,
+    second: Candidates,
     settings: BarrierSettings,
     trial: Trial,
     progress: Progress,
@@ -891,12 +995,12 @@ def add_pair_energies(
     threads: int,
 ):
     """Adds the energies of barriers between elements, at positions or at the displaced ones."""
-    for i in range(wp.tid(), wp.max(pair_count(vertex_face.queue), pair_count(edge_edge.queue)), threads):
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
         number = int(0)
         while number < 2:
-            of = vertex_face
+            of = first
             if number == 1:
-                of = edge_edge
+                of = second
             if has_pair(of.queue, i):
                 _pair_energy(motion, of, settings, trial, progress, displaced, energy, i)
             number += 1
@@ -955,10 +1059,10 @@ def add_plane_energies(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, reach = _plane_gap(motion, planes, settings, i, vertex)
+        _kept, level, reach = _plane_gap(motion, planes, settings, i, vertex)
         plane = _plane_at(planes, i, now + (1.0 - now) * scale)
         distance, _error = signed_distance(plane, trial.moved[vertex])
-        gap = distance - kept
+        gap = distance - level
         if gap < reach:
             value = wp.float64(1.0e30)
             if gap > ZERO:

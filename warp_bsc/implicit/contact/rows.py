@@ -3,9 +3,12 @@
 import numpy as np
 import warp as wp
 
-from .elasticity import SIZES, Derivatives
+from .elasticity import SIZES, Derivatives, ElementKind
 
 wp.set_module_options({"enable_backward": False})
+
+
+_OF_NONE = np.iinfo(np.int64).min
 
 
 @wp.struct
@@ -17,7 +20,7 @@ class Rows:
         column: Unknown of each block; the first of a row is that of the diagonal.
         block: The blocks [N/m].
         first_source: First block of elements in each block of a row, and the end of the last.
-        source: Blocks of elements.
+        source: Blocks of elements; of bending, -1 less 16 times the element plus 4 times one corner plus the other.
         first_corner: First corner of elements in each unknown, and the end of the last.
         corner: Corners of elements.
     """
@@ -41,19 +44,20 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
         device: Where to put them.
     """
     diagonal = np.arange(count, dtype=np.int64)
-    keys, sources = [diagonal * (count + 1)], [np.full(count, -1, dtype=np.int64)]
+    keys, sources = [diagonal * (count + 1)], [np.full(count, _OF_NONE)]
     corner_rows, corners, first_corner, first_block = [], [], 0, 0
-    for v, size in zip(vertices, SIZES, strict=True):
+    for kind, (v, size) in enumerate(zip(vertices, SIZES, strict=True)):
         u = np.where(v >= 0, unknown[np.maximum(v, 0)] if len(unknown) else -1, -1)
         exists = (u[:, :, None] >= 0) & (u[:, None, :] >= 0)
-        numbers = first_block + np.arange(len(v) * size * size).reshape(len(v), size, size)
+        numbers = np.arange(len(v) * size * size).reshape(len(v), size, size)
+        numbers = -1 - numbers if kind == ElementKind.BENDING else first_block + numbers
         keys.append((u[:, :, None] * count + u[:, None, :])[exists])
         sources.append(numbers[exists])
         of_corners = first_corner + np.arange(len(v) * size).reshape(len(v), size)
         corner_rows.append(u[u >= 0])
         corners.append(of_corners[u >= 0])
         first_corner += len(v) * size
-        first_block += len(v) * size * size
+        first_block += 0 if kind == ElementKind.BENDING else len(v) * size * size
     key, source = np.concatenate(keys), np.concatenate(sources)
     order = np.argsort(key, kind="stable")
     key, source = key[order], source[order]
@@ -66,7 +70,7 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
     first_source = np.append(0, np.cumsum(counts))
     at = np.repeat(starts[order] - first_source[:-1], counts) + np.arange(len(key))
     source = source[at]
-    kept = source >= 0  # the diagonal has an entry of its own, which is none of an element
+    kept = source != _OF_NONE  # the diagonal has an entry of its own, which is none of an element
     kept_before = np.append(0, np.cumsum(kept))
     corner_row, corner = np.concatenate(corner_rows), np.concatenate(corners)
     by_row = np.argsort(corner_row, kind="stable")
@@ -82,6 +86,21 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
     rows.first_corner = array(np.searchsorted(corner_row[by_row], np.arange(count + 1)))
     rows.corner = array(corner[by_row])
     return rows
+
+
+@wp.func
+def sum_of_blocks(rows: Rows, derivatives: Derivatives, k: int) -> wp.mat33:
+    """Returns a block of the Hessian of all elements [N/m]."""
+    total = wp.mat33()
+    for n in range(rows.first_source[k], rows.first_source[k + 1]):
+        source = rows.source[n] + int(0)
+        if source >= 0:
+            total += derivatives.block[source]
+        else:
+            e = (-1 - source) >> 4
+            i, j = ((-1 - source) >> 2) & 3, (-1 - source) & 3
+            total += derivatives.curvature[e] * wp.outer(derivatives.turn[4 * e + i], derivatives.turn[4 * e + j])
+    return total
 
 
 @wp.func

@@ -4,12 +4,12 @@ import warp as wp
 
 from ...response.state.motion import StateArrays, predicted_velocity
 from ...response.state.structs import Motion, Vertices
-from ...response.state.vectors import HALF, ONE, to_double, to_single
+from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, inertia_of_body, inertial_energy, rounding_energy
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved
-from .rows import Rows, sum_of_corners
+from .rows import Rows, sum_of_blocks, sum_of_corners
 from .system import (
     Contacts,
     Progress,
@@ -53,7 +53,7 @@ def predict_positions(
     """Moves particles as if nothing but gravity and external forces acted on them."""
     i = wp.tid()
     x, v = x0[i] + wp.vec3(), v0[i] + wp.vec3()
-    if inverse_mass[i] > 0.0 and (flags[i] & active_flag) != 0:
+    if inverse_mass[i] > 0.0 and wp.isfinite(inverse_mass[i]) and (flags[i] & active_flag) != 0:
         acceleration = gravity[wp.max(world[i], 0) % gravity.shape[0]] + wp.vec3()
         if force:
             acceleration = acceleration + inverse_mass[i] * force[i]
@@ -61,6 +61,28 @@ def predict_positions(
         x = x + dt * v
     x1[i] = x
     v1[i] = v
+
+
+@wp.kernel
+def begin_unknowns(
+    # in
+    motion: Motion,
+    dt: wp.float64,
+    # out
+    unknowns: Unknowns,
+    goal: wp.array[wp.vec3],
+):
+    """Finds which particles are solved for, their inertia, and where inertia alone leads."""
+    u = wp.tid()
+    p = unknowns.particle[u]
+    if p < 0:
+        return
+    unknowns.is_free[u] = 0
+    unknowns.inertia[u] = ZERO
+    goal[p] = motion.x1[p]
+    if motion.inverse_mass[p] > 0.0 and motion.is_not_finite[p] == 0 and wp.isfinite(motion.x0[p]):
+        unknowns.is_free[u] = 1
+        unknowns.inertia[u] = ONE / (wp.float64(motion.inverse_mass[p]) * dt * dt)
 
 
 @wp.kernel
@@ -78,10 +100,7 @@ def begin_step(
     progress: Progress,
     plane_share: wp.array[float],
 ):
-    """Takes the motion as predicted: where inertia alone leads, and boxes around the way there.
-
-    Worlds with unknowns become active.
-    """
+    """Takes the motion as predicted, and boxes around the way there. Worlds with unknowns become active."""
     v = wp.tid()
     if v < progress.active.shape[0]:
         progress.steps[v] = 0
@@ -90,21 +109,23 @@ def begin_step(
         progress.change[v] = 0.0
         progress.remaining[v] = 0.0
         plane_share[v] = 0.0
-    if v >= goal.shape[0]:
+    if v >= trial.x.shape[0]:
         return
     x0, x1 = motion.x0[v], motion.x1[v]
-    goal[v] = x1
     trial.x[v] = x0
     trial.displaced[v] = wp.vec3()
     trial.share[v] = 1.0
+    trial.bend[v] = 0.0
+    if not wp.isfinite(x0):  # without pairs, and without forces on others
+        lower[v] = wp.vec3()
+        upper[v] = wp.vec3()
+        return
     pad = margin[v] + float(0.0)
     u = unknowns.of_vertex[v]
-    if u >= 0:
-        unknowns.is_free[u] = 0
-        if motion.inverse_mass[v] > 0.0 and motion.is_not_finite[v] == 0:
-            unknowns.is_free[u] = 1
-            progress.active[motion.world[v]] = 1
-    trial.bend[v] = 0.0
+    if u < 0:
+        goal[v] = x1
+    elif unknowns.is_free[u] != 0:
+        progress.active[motion.world[v]] = 1
     if is_solved(unknowns, v):
         pad += 0.25 * wp.length(x1 - x0)
         if u < 0:
@@ -206,7 +227,7 @@ def _inertia(
     p = unknowns.particle[u]
     if p < 0:
         return inertia_of_body(bodies, motion, unknowns.body[u], u, dt)
-    inertia = ONE / (wp.float64(motion.inverse_mass[p]) * dt * dt)
+    inertia = unknowns.inertia[u]
     pull = to_single(inertia * (to_double(trial.x[p]) - to_double(goal[p])))
     return pull, float(inertia) * wp.identity(n=3, dtype=float)
 
@@ -233,8 +254,7 @@ def add_blocks(
     if active[unknowns.world[u]] == 0:
         return
     total = contact_block(contacts, unknowns, u, v)
-    for n in range(rows.first_source[k], rows.first_source[k + 1]):
-        total += derivatives.block[rows.source[n]]
+    total += sum_of_blocks(rows, derivatives, k)
     if u == v and unknowns.is_free[u] != 0:
         _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
         total += inertia
@@ -296,7 +316,7 @@ def find_remaining(
     v = wp.tid()
     world = motion.world[v]
     trial.share[v] = 1.0
-    if progress.active[world] != 0 and is_given(unknowns, v):
+    if progress.active[world] != 0 and is_given(unknowns, v) and wp.isfinite(trial.x[v]):
         d = motion.x1[v] - trial.x[v]
         trial.displaced[v] = d
         if wp.length_sq(d) > 0.0:
@@ -366,6 +386,8 @@ def renew_boxes(
     if leaves[motion.world[v]] == 0:
         return
     x, d = trial.x[v], trial.displaced[v] + wp.vec3()
+    if not wp.isfinite(x):
+        return
     pad = margin[v] + float(0.0)
     if unknowns.of_vertex[v] != -1:
         pad += 0.5 * wp.length(d)
@@ -409,8 +431,11 @@ def begin_truncation(
                 progress.searches[v] = 1
             progress.scale[v] = 1.0
             progress.bound[v] = 1.0
+    if v >= trial.x.shape[0]:
+        return
+    limit[v] = 1.0
     if not is_given(unknowns, v):
-        wp.atomic_min(limit, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
+        wp.atomic_min(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
 
 
 @wp.kernel
@@ -507,8 +532,7 @@ def add_energies(
                 add_energy(progress.noise, world, rounding_energy(bodies, motion, body, settings.dt), settings.units)
         return
     off = to_double(trial.moved[p]) - to_double(goal[p])
-    inertia = HALF / (wp.float64(motion.inverse_mass[p]) * settings.dt * settings.dt)
-    add_energy(energy, world, inertia * wp.dot(off, off), settings.units)
+    add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
 
 
 @wp.kernel
@@ -626,18 +650,18 @@ def finish(
     trial: Trial,
     unknowns: Unknowns,
     dt: float,
-    x0: wp.array[wp.vec3],
     # in and out
     motion: Motion,
     vertices: Vertices,
     end: StateArrays,
 ):
-    """Writes where the step ends, and the velocity that took vertices there."""
+    """Writes where the step ends, and the predicted velocity with what the step has added to it."""
     v = wp.tid()
     x = trial.x[v]
     if not is_solved(unknowns, v):
         return
-    velocity = (x - x0[v]) / dt
+    # not by the way from the start, which in short steps is rounding
+    velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
     if unknowns.of_vertex[v] < 0:
         velocity = predicted_velocity(motion, v, x)
     else:

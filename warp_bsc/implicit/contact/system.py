@@ -21,6 +21,7 @@ class Unknowns:
         world: World of each unknown.
         of_worlds: First unknown of each world, and the end of the last.
         is_free: 1 for each unknown that is solved for; the others are given.
+        inertia: Mass over the square of the length of the step, and attachments, of each particle [N/m].
         arm: Of each vertex of a body that is solved for, from its centre of mass [m].
     """
 
@@ -30,6 +31,7 @@ class Unknowns:
     world: wp.array[int]
     of_worlds: wp.array[int]
     is_free: wp.array[int]
+    inertia: wp.array[wp.float64]
     arm: wp.array[wp.vec3]
 
 

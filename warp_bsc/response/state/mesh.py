@@ -251,7 +251,8 @@ class ModelMesh(CollisionMesh):
     def refresh_inverse_masses(self) -> None:
         """Reads the inverse masses and flags of the model's particles again. Can be captured in a CUDA graph.
 
-        The response cannot move vertices with inverse mass 0: kinematic and inactive particles, and shapes.
+        The response cannot move vertices with inverse mass 0: kinematic and inactive particles, and shapes; nor those
+        whose inverse mass is not finite.
         """
         model = self.model
         inputs, outputs = [model.particle_inv_mass, model.particle_flags], [self.inverse_masses]
@@ -304,7 +305,8 @@ def _write_inverse_masses(
 ):
     particle = wp.tid()
     is_active = particle_flags[particle] & ParticleFlags.ACTIVE != 0
-    inverse_masses[particle] = wp.where(is_active, particle_inv_mass[particle], 0.0)
+    moves = is_active and wp.isfinite(particle_inv_mass[particle])
+    inverse_masses[particle] = wp.where(moves, particle_inv_mass[particle], 0.0)
 
 
 def host_array(array: wp.array | None) -> np.ndarray:

@@ -1,0 +1,222 @@
+"""Energies of SolverImplicit and their derivatives: against what Warp differentiates, and against differences."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton_scenes import DT
+
+from warp_bsc.implicit.contact import elasticity
+from warp_bsc.implicit.contact.barrier import (
+    CURVATURE_AT_HALF,
+    barrier_curvature,
+    barrier_energy,
+    barrier_slope,
+    friction_curvature,
+    friction_energy,
+    friction_slope,
+)
+from warp_bsc.implicit.contact.bodies import SolvedBodies
+from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements, make_derivatives
+from warp_bsc.implicit.contact.pairs import Trial
+from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
+from warp_bsc.implicit.contact.steps import add_blocks
+from warp_bsc.implicit.contact.system import Contacts, Unknowns
+from warp_bsc.implicit.equations import _elastic_elements
+from warp_bsc.response.state.structs import Motion, allocate
+
+
+@wp.kernel
+def _energies(
+    elements: Elements, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, energy: wp.array[wp.float64]
+):
+    i = wp.tid()
+    energy[i] = elasticity.element_energy(elements, i, elasticity.kind_of(elements, i), x, x0, dt)
+
+
+@wp.kernel
+def _evaluate_barrier(gap: wp.array[wp.float64], reach: wp.float64, values: wp.array2d[wp.float64]):
+    i = wp.tid()
+    values[i, 0] = barrier_energy(gap[i], reach)
+    values[i, 1] = barrier_slope(gap[i], reach)
+    values[i, 2] = barrier_curvature(gap[i], reach)
+    values[i, 3] = friction_energy(gap[i], reach)
+    values[i, 4] = friction_slope(gap[i], reach) * gap[i]
+    values[i, 5] = friction_curvature(gap[i], reach)
+
+
+@wp.kernel
+def _sum_corners(rows: Rows, derivatives: Derivatives, gradient: wp.array[wp.vec3]):
+    gradient[wp.tid()] = sum_of_corners(rows, derivatives, wp.tid())
+
+
+class Scene:
+    """A cloth, a block, a rope and a spring across, crumpled at random, with all kinds of elements and of damping."""
+
+    def __init__(self, device, seed=0):
+        rng = np.random.default_rng(seed)
+        builder = newton.ModelBuilder()
+        still = {"rot": wp.quat_identity(), "vel": wp.vec3()}
+        builder.add_cloth_grid(
+            pos=wp.vec3(), dim_x=3, dim_y=2, cell_x=0.1, cell_y=0.1, mass=0.01, tri_ke=100.0, tri_ka=120.0,
+            tri_kd=0.02, edge_ke=0.5, edge_kd=0.01, **still,
+        )  # fmt: skip
+        builder.add_soft_grid(
+            pos=wp.vec3(1.0, 0.0, 0.0), dim_x=1, dim_y=1, dim_z=1, cell_x=0.1, cell_y=0.1, cell_z=0.1, density=100.0,
+            k_mu=1e3, k_lambda=2e3, k_damp=0.3, **still,
+        )  # fmt: skip
+        for a, b in ((0, 12), (3, 17), (5, 6)):
+            builder.add_spring(a, b, 10.0, 0.1, 0)
+        self.model = builder.finalize(device=device)
+        self.elements, self.vertices = elasticity.elements_of_model(self.model)
+        self.count = sum(map(len, self.vertices))
+        q = self.model.particle_q.numpy()
+        self.x0 = (q + rng.normal(0.0, 0.02, q.shape)).astype(np.float32)
+        self.x = (self.x0 + rng.normal(0.0, 0.02, q.shape)).astype(np.float32)
+
+    def array(self, values, dtype=wp.vec3):
+        return wp.array(values, dtype=dtype, device=self.model.device)
+
+    def differentiate(self, *, convex=False):
+        """Returns the derivatives of all elements, on the device."""
+        device = self.model.device
+        out = make_derivatives(self.vertices, device)
+        world = wp.zeros(self.model.particle_count, dtype=int, device=device)
+        flags = [self.array([1], int), self.array([int(convex)], int)]
+        inputs = [self.elements, self.array(self.x), self.array(self.x0), wp.float64(DT), world, *flags]
+        wp.launch(elasticity.differentiate, self.count, inputs=inputs, outputs=[out], device=device)
+        return out
+
+    def by_kind(self, out):
+        """Returns gradients, shape [n, size, 3], and Hessians, shape [n, size, 3, size, 3], of each kind."""
+        gradient, block, corner, place = out.gradient.numpy(), out.block.numpy(), 0, 0
+        for kind, (v, size) in enumerate(zip(self.vertices, SIZES, strict=True)):
+            of_corners = gradient[corner : corner + v.size].reshape(len(v), size, 3)
+            corner += v.size
+            if kind == ElementKind.BENDING:
+                turn = out.turn.numpy().reshape(len(v), size, 3)
+                hessian = np.einsum("e,eia,ejb->eiajb", out.curvature.numpy(), turn, turn)
+            else:
+                blocks = block[place : place + v.size * size].reshape(len(v), size, size, 3, 3)
+                hessian = blocks.transpose(0, 1, 3, 2, 4)
+                place += v.size * size
+            yield of_corners, hessian
+
+    def energies(self, x):
+        out = wp.zeros(self.count, dtype=wp.float64, device=self.model.device)
+        inputs = [self.elements, self.array(x.astype(np.float32)), self.array(self.x0), wp.float64(DT)]
+        wp.launch(_energies, self.count, inputs=inputs, outputs=[out], device=self.model.device)
+        return np.split(out.numpy(), np.cumsum([len(v) for v in self.vertices])[:-1])
+
+
+@pytest.fixture(scope="module")
+def scene(device):
+    return Scene(device)
+
+
+def test_derivatives_are_those_that_warp_computes(device, scene):
+    flat = Scene(device)
+    flat.x = flat.model.particle_q.numpy()
+    flat.x[:, :2] += np.random.default_rng(3).normal(0.0, 0.01, (len(flat.x), 2))
+    flat.x0 = flat.x
+    check_derivatives(flat, [ElementKind.BENDING])  # without moments: there the approximation of its Hessian is exact
+    check_derivatives(scene, [kind for kind in ElementKind if kind != ElementKind.BENDING])
+
+
+def check_derivatives(scene, kinds_of_hessians):
+    """Compares gradients of all elements, and Hessians of some kinds."""
+    found = scene.by_kind(scene.differentiate())
+    x, x0 = (wp.array(a.astype(float), dtype=wp.vec3d, device=scene.model.device) for a in (scene.x, scene.x0))
+    all_elements = zip(ElementKind, _elastic_elements(scene.model), found, strict=True)
+    for kind, elements, (gradient, hessian) in all_elements:
+        elements.load(x, x0)
+        elements.add_forces(DT, wp.zeros(scene.model.particle_count, dtype=wp.vec3d, device=scene.model.device))
+        elements.differentiate(DT)
+        expected = -elements._forces.numpy()[:, 0]
+        np.testing.assert_allclose(gradient, expected, atol=1e-5 * max(1.0, np.abs(expected).max()))
+        if kind not in kinds_of_hessians:
+            continue
+        expected = -elements.jacobian.numpy().reshape(hessian.shape)
+        np.testing.assert_allclose(hessian, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_gradients_are_those_of_the_energies(scene):
+    found = [gradient for gradient, _ in scene.by_kind(scene.differentiate())]
+    way = 1e-4 * np.random.default_rng(1).normal(size=scene.x.shape)
+    ends = (scene.x + way).astype(np.float32), (scene.x - way).astype(np.float32)
+    between = ends[0].astype(float) - ends[1]
+    above, below = map(scene.energies, ends)
+    for gradient, v, more, less in zip(found, scene.vertices, above, below, strict=True):
+        taken = np.where(v[..., None] >= 0, between[v], 0.0)
+        expected = (gradient * taken).sum(axis=(1, 2))
+        np.testing.assert_allclose(more - less, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_convex_hessians_have_no_negative_eigenvalue(scene):
+    def least(hessian):
+        n = 3 * hessian.shape[1]
+        values = np.linalg.eigvalsh(hessian.reshape(-1, n, n).astype(float))
+        return (values[:, 0] / np.abs(values).max(axis=1).clip(1e-30)).min()
+
+    whole = [least(hessian) for _, hessian in scene.by_kind(scene.differentiate())]
+    convex = [least(hessian) for _, hessian in scene.by_kind(scene.differentiate(convex=True))]
+    assert min(whole) < -1e-3
+    assert convex[ElementKind.MEMBRANE] > -1e-5
+    assert convex[ElementKind.SPRING] > -1e-5
+    assert convex[ElementKind.TETRAHEDRON] >= whole[ElementKind.TETRAHEDRON]
+
+
+def test_rows_are_the_sums_of_elements(scene):
+    derivatives, count, device = scene.differentiate(), scene.model.particle_count, scene.model.device
+    unknown = np.random.default_rng(2).permutation(count)
+    rows = make_rows(scene.vertices, unknown, count, device)
+    first, column = rows.first.numpy(), rows.column.numpy()
+    row = np.repeat(np.arange(count), np.diff(first))
+    unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
+    without_inertia = [Trial(), scene.array(scene.x), Motion(), SolvedBodies(), wp.float64(DT)]
+    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int)]
+    wp.launch(add_blocks, len(row), inputs=inputs, outputs=[rows], device=device)
+    gradient = wp.zeros(count, dtype=wp.vec3, device=device)
+    wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)
+    matrix, vector = np.zeros((count, 3, count, 3)), np.zeros((count, 3))
+    for (of_corners, blocks), v in zip(scene.by_kind(derivatives), scene.vertices, strict=True):
+        for e, i in zip(*np.nonzero(v >= 0), strict=True):
+            u = unknown[v[e, i]]
+            vector[u] += of_corners[e, i]
+            for j in np.flatnonzero(v[e] >= 0):
+                matrix[u, :, unknown[v[e, j]]] += blocks[e, i, :, j]
+    found = np.zeros_like(matrix)
+    found[row, :, column] = rows.block.numpy()
+    np.testing.assert_allclose(found, matrix, atol=1e-5 * np.abs(matrix).max())
+    np.testing.assert_allclose(gradient.numpy(), vector, atol=1e-5 * np.abs(vector).max())
+    assert (column[first[:-1]] == np.arange(count)).all()  # the diagonal is the first of its row
+
+
+def test_elements_without_finite_positions_have_no_forces(device):
+    scene = Scene(device)
+    scene.x[4] = np.nan
+    for v, (gradient, hessian), energy in zip(
+        scene.vertices, scene.by_kind(scene.differentiate()), scene.energies(scene.x), strict=True
+    ):
+        hurt = (v == 4).any(axis=1)
+        assert not gradient[hurt].any()
+        assert not hessian[hurt].any()
+        assert not energy[hurt].any()
+        assert np.isfinite(energy).all()
+        assert np.isfinite(gradient).all()
+
+
+def test_derivatives_of_barriers_and_of_friction(device):
+    reach, step = 0.002, 1e-9
+    gap = np.array([1e-5, 3e-4, 1e-3, 1.9e-3])
+    gaps = np.concatenate([gap - step, gap, gap + step])
+    values = wp.zeros((len(gaps), 6), dtype=wp.float64, device=device)
+    inputs = [wp.array(gaps, dtype=wp.float64, device=device), wp.float64(reach)]
+    wp.launch(_evaluate_barrier, len(gaps), inputs=inputs, outputs=[values], device=device)
+    before, here, after = values.numpy().reshape(3, len(gap), 6)
+    slopes = (after - before) / (2.0 * step)
+    for first in (0, 3):  # of the barrier, then of friction
+        for column in (first, first + 1):
+            np.testing.assert_allclose(here[:, column + 1], slopes[:, column], rtol=1e-5)
+    assert here[2, 2] == pytest.approx(CURVATURE_AT_HALF, rel=1e-12)
+    assert (np.diff(here[:, 0]) < 0.0).all()  # it pushes apart
