@@ -135,14 +135,14 @@ def safe_share(
     r: wp.vec3d,
     s: wp.vec3d,
     least: wp.float64,
-    most: wp.float64,
+    most: float,
     bends: wp.vec2d,
 ) -> wp.float64:
     """Returns a share of the displacements up to which two elements stay as far apart as ``least``, 1 for all of them.
 
     They start farther apart. Conservative advancement: a plane across the closest points separates two elements until
     a vertex of one comes as near as that to a vertex of the other along its normal; then another plane is taken.
-    Shares of more than ``most`` are of no use, and are 1.
+    Shares of more than ``most``, rounded as they are kept, are of no use, and are 1.
     Displacements are chords: at a share t, elements may be nearer by t (b - t c), where ``bends`` are b and c.
     """
     time = ZERO
@@ -161,7 +161,7 @@ def safe_share(
         else:
             ahead = wp.min(ahead, _closing_time(ea, fa, pa, qa + more, near))
         time += _NEXT * wp.max(ahead, ZERO)
-        if time >= ONE or time > most:
+        if time >= ONE or float(time) > most:
             return ONE
         if ahead < _STALLED:
             return time

@@ -860,7 +860,7 @@ def _bound(
         return
     # what other pairs allow: more than that changes nothing
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
-    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, wp.float64(most), bends))
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
     candidates.share[i] = share
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
