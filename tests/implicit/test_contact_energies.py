@@ -174,7 +174,7 @@ def test_rows_are_the_sums_of_elements(scene):
     row = np.repeat(np.arange(count), np.diff(first))
     unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
     without_inertia = [Trial(), scene.array(scene.x), Motion(), SolvedBodies(), wp.float64(DT)]
-    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int)]
+    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int), 1]
     wp.launch(add_blocks, len(row), inputs=inputs, outputs=[rows], device=device)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)

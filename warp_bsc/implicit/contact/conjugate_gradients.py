@@ -3,7 +3,7 @@
 import warp as wp
 
 from .rows import Rows
-from .system import Contacts, Unknowns, product
+from .system import Contacts, Unknowns, product, pull_contact, sum_of_parts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -107,22 +107,6 @@ def _sum_of_block(value: wp.float64) -> wp.float64:
     ...
 
 
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    const unsigned mask = ((1u << parts) - 1u) << (threadIdx.x & 31u & ~(unsigned)(parts - 1));
-    for (int offset = parts / 2; offset > 0; offset /= 2)
-        for (int c = 0; c < 3; ++c)
-            value[c] += __shfl_xor_sync(mask, value[c], offset);
-#endif
-    return value;
-"""
-)
-def _sum_of_parts(value: wp.vec3, parts: int) -> wp.vec3:
-    """Returns the sum of the values of ``parts`` threads that follow each other, a power of 2 below 32, in each."""
-    ...
-
-
 @wp.func
 def _dot(a: wp.vec3, b: wp.vec3) -> wp.float64:
     return wp.float64(wp.dot(a, b))
@@ -174,11 +158,18 @@ def solve_worlds(
     stride = team.blocks * wp.block_dim() // team.parts
     turn = int(1)
     own = wp.float64(0.0)
+    first = contacts.coupled_first[world] + block * wp.block_dim() + lane
+    couples = contacts.coupled_end[world] > contacts.coupled_first[world]
+    for n in range(first, contacts.coupled_end[world], team.blocks * wp.block_dim()):
+        pull_contact(contacts, unknowns, contacts.coupled[n], vectors.solution)
+    if couples:
+        _wait(world, team.blocks, turn, team.arrived)
+        turn += 1
     for u in range(begin, end, stride):
         r = wp.vec3()
         if unknowns.is_free[u] != 0:
             p = product(rows, contacts, unknowns, u, vectors.solution, part, team.parts)
-            r = -vectors.gradient[u] - _sum_of_parts(p, team.parts)
+            r = -vectors.gradient[u] - sum_of_parts(p, team.parts)
         if part == 0:
             z = vectors.inverse[u] * r
             vectors.residual[u] = r
@@ -190,10 +181,15 @@ def solve_worlds(
     goes_on = squared > wp.float64(0.0)
     while goes_on:
         own = wp.float64(0.0)
+        if couples:
+            for n in range(first, contacts.coupled_end[world], team.blocks * wp.block_dim()):
+                pull_contact(contacts, unknowns, contacts.coupled[n], vectors.direction)
+            turn += 1
+            _wait(world, team.blocks, turn, team.arrived)
         for u in range(begin, end, stride):
             if unknowns.is_free[u] != 0:
                 p = product(rows, contacts, unknowns, u, vectors.direction, part, team.parts)
-                p = _sum_of_parts(p, team.parts)
+                p = sum_of_parts(p, team.parts)
                 if part == 0:
                     vectors.along[u] = p
                     own += _dot(vectors.direction[u], p)

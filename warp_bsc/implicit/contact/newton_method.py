@@ -29,6 +29,8 @@ _TRUNCATIONS = 4
 """Passes in which the displacements of single vertices are cut, before those of their world are."""
 _PREDICTIONS = 2
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
+_PARTS = 8
+"""Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
 _USUAL_REACH = 1e-3
@@ -315,8 +317,9 @@ class NewtonMethod:
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
-        sizes: dict = {"count": 1, "listed": 1, **dict.fromkeys(("first", "middle", "end"), self._count)}
-        sizes |= dict.fromkeys(("entries", "unsorted", "row"), 4 * capacity)
+        sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
+        sizes |= dict.fromkeys(("entries", "unsorted", "row", "order"), 4 * capacity)
+        sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = allocate(Contacts, capacity, device, **sizes)
 
     def _bound(self, active):
@@ -379,11 +382,12 @@ class NewtonMethod:
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
         motion, contacts, unknowns, vectors = self._work.step.motion, self._contacts, self._unknowns, self._vectors
         self._list_contacts()
+        parts = _PARTS if self._work.device.is_cuda else 1
         masses = [motion, self._bodies, wp.float64(self._dt), active]
-        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses]
-        self._launch(steps.add_blocks, len(self._row_of_block), inputs, [self._rows])
-        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows]
-        self._launch(steps.assemble, self._count, inputs, [vectors])
+        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses, parts]
+        self._launch(steps.add_blocks, parts * len(self._row_of_block), inputs, [self._rows])
+        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows, parts]
+        self._launch(steps.assemble, parts * self._count, inputs, [vectors])
 
     def _hold_ahead(self, solves):
         """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
@@ -435,9 +439,11 @@ class NewtonMethod:
         work, contacts = self._work, self._contacts
         contacts.listed.zero_()
         contacts.end.zero_()
-        work.launch_over_entries(pairs.count_entries, [contacts, self._unknowns])
-        self._launch(pairs.place_entries, self._count, [], [contacts, self._lacks])
-        work.launch_over_entries(pairs.list_entries, [contacts, self._unknowns])
+        contacts.coupled_end.zero_()
+        inputs = [contacts, self._unknowns, self._mesh.device_world]
+        work.launch_over_entries(pairs.count_entries, inputs)
+        self._launch(pairs.place_entries, max(self._count, work.worlds), [], [contacts, self._lacks])
+        work.launch_over_entries(pairs.list_entries, inputs)
         work.launch_over_entries(pairs.sort_entries, [contacts])
 
     def _try(self):

@@ -25,6 +25,8 @@ _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
 """The same at least, as a share of its largest coordinate."""
+_COUPLES = wp.constant(wp.int64(1 << 61))
+"""What is added to the number of a contact that couples, so that it comes last."""
 _UNITS_LIMIT = wp.constant(wp.float64(2.0**52))
 """Most units of one energy: a thousand of them fit into a sum, and a speed of 900 m/s into one."""
 
@@ -290,7 +292,7 @@ def _merged(corners: wp.vec4i, weights: wp.vec4d) -> wp.vec4d:
 @wp.func
 def _key(group: int, kind: int, first: int, second: int) -> wp.int64:
     """Returns a number of a pair, different for each pair of a kind, and for each group of contacts."""
-    return (wp.int64(8 * group + kind) << wp.int64(58)) | (wp.int64(first) << wp.int64(29)) | wp.int64(second)
+    return (wp.int64(8 * group + kind) << wp.int64(56)) | (wp.int64(first) << wp.int64(28)) | wp.int64(second)
 
 
 @wp.func
@@ -531,9 +533,10 @@ def count_entries(
     # in
     contacts: Contacts,
     unknowns: Unknowns,
+    world: wp.array[int],
     threads: int,
 ):
-    """Counts the contacts of each unknown that is solved for, in ``end``."""
+    """Counts the contacts of each unknown that is solved for, in ``end``, and those of each world that couple."""
     for i in range(wp.tid(), contact_count(contacts), threads):
         for j in range(4):
             if contacts.weights[i][j] != 0.0:
@@ -544,14 +547,22 @@ def count_entries(
                         wp.atomic_add(contacts.end, u, 1)
                         if unknowns.of_vertex[vertex] < 0:
                             wp.atomic_add(contacts.end, u + 1, 1)
+        if contacts.couples[i] != 0:
+            wp.atomic_add(contacts.coupled_end, world[contacts.corners[i][0]], 1)
 
 
 @wp.kernel
 def place_entries(contacts: Contacts, lacks: wp.array[int]):
-    """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them."""
+    """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them. So for each world."""
     u = wp.tid()
     if u == 0 and contacts.count[0] > contacts.corners.shape[0]:
         lacks[0] = 1
+    if u < contacts.coupled_first.shape[0]:
+        start = wp.atomic_add(contacts.listed, 1, contacts.coupled_end[u])
+        contacts.coupled_first[u] = start
+        contacts.coupled_end[u] = start
+    if u >= contacts.first.shape[0]:
+        return
     count = contacts.end[u]
     if count > 0:
         first = wp.atomic_add(contacts.listed, 0, count)
@@ -567,6 +578,7 @@ def _list_entry(contacts: Contacts, u: int, entry: int):
     n = wp.atomic_add(contacts.end, u, 1)
     contacts.unsorted[n] = entry
     contacts.row[n] = u
+    contacts.order[n] = wp.int64(contacts.couples[entry >> 2]) * _COUPLES + contacts.key[entry >> 2]
 
 
 @wp.kernel
@@ -575,10 +587,13 @@ def list_entries(
     contacts: Contacts,
     # in
     unknowns: Unknowns,
+    world: wp.array[int],
     threads: int,
 ):
-    """Lists the contacts of each unknown, behind its ``end``, which moves on."""
+    """Lists the contacts of each unknown, behind its ``end``, which moves on, and those of each world that couple."""
     for i in range(wp.tid(), contact_count(contacts), threads):
+        if contacts.couples[i] != 0:
+            contacts.coupled[wp.atomic_add(contacts.coupled_end, world[contacts.corners[i][0]], 1)] = i
         for j in range(4):
             if contacts.weights[i][j] != 0.0:
                 vertex = contacts.corners[i][j]
@@ -601,32 +616,22 @@ def sort_entries(
     Those that couple come last.
     """
     for n in range(wp.tid(), contacts.listed[0], threads):
-        u, entry = contacts.row[n], contacts.unsorted[n] + int(0)
+        u, own, entry = contacts.row[n], contacts.order[n] + wp.int64(0), contacts.unsorted[n] + int(0)
         first = contacts.first[u]
         rank, single = int(0), int(0)
         for m in range(first, contacts.end[u]):
-            other = contacts.unsorted[m] + int(0)
-            single += 1 - contacts.couples[other >> 2]
-            if _is_before(contacts, other, entry):
+            other = contacts.order[m] + wp.int64(0)
+            single += wp.where(other < _COUPLES, 1, 0)
+            if other < own or (other == own and contacts.unsorted[m] < entry):
                 rank += 1
         contacts.entries[first + rank] = entry
         if rank == 0:
             contacts.middle[u] = first + single
 
 
-@wp.func
-def _is_before(contacts: Contacts, entry: int, other: int) -> bool:
-    i, j = entry >> 2, other >> 2
-    if contacts.couples[i] != contacts.couples[j]:
-        return contacts.couples[i] < contacts.couples[j]
-    if contacts.key[i] != contacts.key[j]:
-        return contacts.key[i] < contacts.key[j]
-    return entry < other
-
-
 # Contacts ahead
 
-_FIRST_HELD = wp.constant(wp.int64(2 << 61))
+_FIRST_HELD = wp.constant(wp.int64(16 << 56))
 """Key from which contacts are held ones."""
 _STIFFER = wp.constant(float(10.0))
 """How much stiffer it is held than what moves it."""

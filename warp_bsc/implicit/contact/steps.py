@@ -14,10 +14,12 @@ from .system import (
     Contacts,
     Progress,
     Unknowns,
+    block_sum_of_parts,
     contact_block,
     contact_gradient,
     displacement,
     is_solved,
+    sum_of_parts,
     unknown_of_corner,
 )
 
@@ -245,15 +247,21 @@ def add_blocks(
     bodies: SolvedBodies,
     dt: wp.float64,
     active: wp.array[int],
+    parts: int,
     # out
     rows: Rows,
 ):
-    """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds."""
-    k = wp.tid()
+    """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds.
+
+    So many threads share a block, as here and there an unknown has very many contacts.
+    """
+    k, part = wp.tid() // parts, wp.tid() % parts
     u, v = row_of_block[k], rows.column[k]
     if active[unknowns.world[u]] == 0:
         return
-    total = contact_block(contacts, unknowns, u, v)
+    total = block_sum_of_parts(contact_block(contacts, unknowns, u, v, part, parts), parts)
+    if part != 0:
+        return
     total += sum_of_blocks(rows, derivatives, k)
     if u == v and unknowns.is_free[u] != 0:
         _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
@@ -275,15 +283,16 @@ def assemble(
     active: wp.array[int],
     begins: bool,
     rows: Rows,
+    parts: int,
     # in and out
     vectors: Vectors,
 ):
     """Computes the gradient of the energy by each unknown, and what preconditions.
 
     The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
-    ways. Later ones go on from where they are.
+    ways. Later ones go on from where they are. So many threads share an unknown.
     """
-    u = wp.tid()
+    u, part = wp.tid() // parts, wp.tid() % parts
     if active[unknowns.world[u]] == 0:
         return
     if unknowns.is_free[u] == 0:
@@ -295,8 +304,11 @@ def assemble(
             vectors.inverse[u] = wp.mat33()
             vectors.direction[u] = wp.vec3()
         return
+    gradient, block = contact_gradient(contacts, unknowns, u, part, parts)
+    gradient, block = sum_of_parts(gradient, parts), block_sum_of_parts(block, parts)
+    if part != 0:
+        return
     pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
-    gradient, block = contact_gradient(contacts, unknowns, u)
     vectors.gradient[u] = gradient + sum_of_corners(rows, derivatives, u) + pull
     vectors.inverse[u] = _inverse(rows.block[rows.first[u]] + block, wp.min(wp.get_diag(inertia)))
     if begins:

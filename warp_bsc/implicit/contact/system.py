@@ -89,7 +89,9 @@ class Contacts:
         listed: Number of entries, shape [1].
         first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
-        unsorted, row: The same in any order, and its unknown.
+        unsorted, row, order: The same in any order, its unknown, and the number by which it is ordered.
+        coupled: Contacts that couple, those of a world from ``coupled_first`` to ``coupled_end``.
+        pull: Product of the Hessian of each of them with a displacement [N].
     """
 
     count: wp.array[int]
@@ -109,6 +111,11 @@ class Contacts:
     entries: wp.array[int]
     unsorted: wp.array[int]
     row: wp.array[int]
+    order: wp.array[wp.int64]
+    coupled: wp.array[int]
+    coupled_first: wp.array[int]
+    coupled_end: wp.array[int]
+    pull: wp.array[wp.vec3]
 
 
 AT_PLANE = wp.constant(8)
@@ -118,13 +125,37 @@ AT_PLANE = wp.constant(8)
 @wp.func
 def kind_of_key(key: wp.int64) -> int:
     """Returns the kind of a pair."""
-    return int(key >> wp.int64(58))
+    return int(key >> wp.int64(56))
 
 
 @wp.func
 def second_of_key(key: wp.int64) -> int:
-    """Returns the second element of a pair, or its plane: the last 29 bits."""
-    return int(key & wp.int64(536870911))
+    """Returns the second element of a pair, or its plane: the last 28 bits."""
+    return int(key & wp.int64(268435455))
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const unsigned mask = (parts == 32 ? ~0u : (1u << parts) - 1u) << (threadIdx.x & 31u & ~(unsigned)(parts - 1));
+    for (int offset = parts / 2; offset > 0; offset /= 2)
+        for (int c = 0; c < 3; ++c)
+            value[c] += __shfl_xor_sync(mask, value[c], offset);
+#endif
+    return value;
+"""
+)
+def sum_of_parts(value: wp.vec3, parts: int) -> wp.vec3:
+    """Returns the sum of the values of ``parts`` threads that follow each other, a power of 2, in each; 1 on a CPU."""
+    ...
+
+
+@wp.func
+def block_sum_of_parts(block: wp.mat33, parts: int) -> wp.mat33:
+    """Returns the sum of blocks, as :func:`sum_of_parts` does."""
+    return wp.matrix_from_rows(
+        sum_of_parts(block[0], parts), sum_of_parts(block[1], parts), sum_of_parts(block[2], parts)
+    )
 
 
 @wp.func
@@ -164,27 +195,36 @@ def contact_count(contacts: Contacts) -> int:
 def product(
     rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.array[wp.vec3], part: int, parts: int
 ) -> wp.vec3:
-    """Returns the row of an unknown of the product of the Hessian with a vector, or one of some parts of it."""
+    """Returns the row of an unknown of the product of the Hessian with a vector, or one of some parts of it.
+
+    Of contacts that couple, it reads what :func:`pull_contact` wrote.
+    """
     total = wp.vec3()
     for k in range(rows.first[u] + part, rows.first[u + 1], parts):
         total += rows.block[k] * p[rows.column[k]]
     for n in range(contacts.middle[u] + part, contacts.end[u], parts):
         entry = contacts.entries[n]
-        i = entry >> 2
-        corners, weights = contacts.corners[i], contacts.weights[i]
-        between = wp.vec3()
-        for j in range(4):
-            if weights[j] != 0.0:
-                between += weights[j] * displacement(unknowns, corners[j], p)
-        total += _by_corner(unknowns, corners[entry & 3], u, weights[entry & 3] * (contacts.hessian[i] * between))
+        i, place = entry >> 2, entry & 3
+        total += _by_corner(unknowns, contacts.corners[i][place], u, contacts.weights[i][place] * contacts.pull[i])
     return total
 
 
 @wp.func
-def contact_block(contacts: Contacts, unknowns: Unknowns, u: int, v: int) -> wp.mat33:
-    """Returns the block of two unknowns of the Hessian of contacts that do not couple."""
+def pull_contact(contacts: Contacts, unknowns: Unknowns, i: int, p: wp.array[wp.vec3]):
+    """Writes the product of the Hessian of a contact with a vector, which :func:`product` reads."""
+    corners, weights = contacts.corners[i], contacts.weights[i]
+    between = wp.vec3()
+    for j in range(4):
+        if weights[j] != 0.0:
+            between += weights[j] * displacement(unknowns, corners[j], p)
+    contacts.pull[i] = contacts.hessian[i] * between
+
+
+@wp.func
+def contact_block(contacts: Contacts, unknowns: Unknowns, u: int, v: int, part: int, parts: int) -> wp.mat33:
+    """Returns the block of two unknowns of the Hessian of contacts that do not couple, or one of some parts of it."""
     block = wp.mat33()
-    for n in range(contacts.first[u], contacts.middle[u]):
+    for n in range(contacts.first[u] + part, contacts.middle[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
         corners, weights = contacts.corners[i], contacts.weights[i]
@@ -206,10 +246,10 @@ def _by_corner(unknowns: Unknowns, vertex: int, u: int, force: wp.vec3) -> wp.ve
 
 
 @wp.func
-def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int):
-    """Returns the gradient of contacts by an unknown, and the block of the diagonal of those that couple."""
+def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int, part: int, parts: int):
+    """Returns the gradient of contacts by an unknown, and the block of the diagonal of those that couple, or a part."""
     gradient, block = wp.vec3(), wp.mat33()
-    for n in range(contacts.first[u], contacts.end[u]):
+    for n in range(contacts.first[u] + part, contacts.end[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
         weight, vertex = contacts.weights[i][entry & 3], contacts.corners[i][entry & 3]
