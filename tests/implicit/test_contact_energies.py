@@ -16,12 +16,14 @@ from warp_bsc.implicit.contact.barrier import (
     friction_energy,
     friction_slope,
 )
+from warp_bsc.implicit.contact.bodies import SolvedBodies
 from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements, make_derivatives
+from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.steps import add_blocks
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
 from warp_bsc.implicit.equations import _elastic_elements
-from warp_bsc.response.state.structs import allocate
+from warp_bsc.response.state.structs import Motion, allocate
 
 
 @wp.kernel
@@ -171,7 +173,8 @@ def test_rows_are_the_sums_of_elements(scene):
     first, column = rows.first.numpy(), rows.column.numpy()
     row = np.repeat(np.arange(count), np.diff(first))
     unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
-    inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array([1], int), 1]
+    without_inertia = [Trial(), scene.array(scene.x), Motion(), SolvedBodies(), wp.float64(DT)]
+    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int), 1]
     wp.launch(add_blocks, len(row), inputs=inputs, outputs=[rows], device=device)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)

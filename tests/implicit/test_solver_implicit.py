@@ -299,5 +299,5 @@ def test_it_cannot_be_copied_taped_or_used_by_two_threads(device):
 
 
 def test_a_model_without_particles_is_refused(device):
-    with pytest.raises(ValueError, match="model: it has no particles"):
+    with pytest.raises(ValueError, match="model: it has neither particles nor bodies"):
         bsc.SolverImplicit(newton.ModelBuilder().finalize(device=device))

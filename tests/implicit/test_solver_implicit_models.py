@@ -397,7 +397,7 @@ def test_what_is_crushed_is_named(device):
 def test_a_model_without_particles_is_refused(device):
     builder = newton.ModelBuilder()
     add_table(builder)
-    with pytest.raises(ValueError, match="no particles"):
+    with pytest.raises(ValueError, match="neither particles nor bodies"):
         SolverImplicit(builder.finalize(device=device))
 
 

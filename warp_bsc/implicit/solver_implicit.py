@@ -6,17 +6,21 @@ from typing import Literal
 import newton
 import numpy as np
 import warp as wp
-from newton import ParticleFlags
+from newton import BodyFlags, ParticleFlags
 from newton.solvers import SolverBase
+from newton.solvers.experimental.coupled import ModelView
 
-from .._arguments import check_instance, checked_integer
+from .._arguments import check_instance, checked_choice, checked_integer
 from ..detection.host_function import run_on_host
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
+from ..response.state.mesh import host_array
 from ..response.state.motion import arrays_of
+from ..response.state.structs import Bodies
 from ..response.step import begin, detect_contacts, resolve_contacts
 from .contact import steps
+from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.step_report import ImplicitStepReport, StepResults
 
@@ -24,13 +28,44 @@ MAX_STEPS = 4
 """Newton steps of a step: after 48 steps at 60 a second, cloth on a sphere is 3 mm from where more would have it."""
 
 
+def _dynamic_bodies(model: newton.Model) -> np.ndarray:
+    """Returns which bodies are neither kinematic nor without mass, shape [body_count]."""
+    if not model.body_count:
+        return np.zeros(0, dtype=bool)
+    is_kinematic = (host_array(model.body_flags) & BodyFlags.KINEMATIC) != 0
+    return (host_array(model.body_inv_mass) > 0.0) & ~is_kinematic
+
+
+def _find_jointed_body(model: newton.Model) -> int | None:
+    """Returns a dynamic body that a joint holds, None if there is none."""
+    if not model.joint_count:
+        return None
+    holds = host_array(model.joint_enabled) & (host_array(model.joint_type) != newton.JointType.FREE)
+    ends = np.concatenate([host_array(model.joint_child)[holds], host_array(model.joint_parent)[holds]])
+    jointed = ends[ends >= 0][_dynamic_bodies(model)[ends[ends >= 0]]]
+    return int(jointed[0]) if len(jointed) else None
+
+
 class _Inertia(SolverBase):
-    """Moves particles as if nothing but gravity and external forces acted on them; bodies stay where they are."""
+    """Moves particles and bodies as if nothing but gravity and external forces acted on them."""
+
+    def __init__(self, model: newton.Model, *, moves_bodies: bool):
+        super().__init__(model)
+        self._bodies = Bodies() if moves_bodies and model.body_count else None
+        if self._bodies is not None:
+            self._bodies.com, self._bodies.world = model.body_com, model.body_world
+            self._bodies.inertia, self._bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
+            self._bodies.inverse_mass = model.body_inv_mass
 
     def step(self, state_in, state_out, control, contacts, dt):
         """Writes the positions and velocities that inertia leads to."""
         model = self.model
-        if state_in.body_q is not None and state_in is not state_out:
+        if self._bodies is not None:
+            inputs = [state_in.body_q, state_in.body_qd, state_in.body_f, model.body_flags, model.gravity]
+            outputs = [state_out.body_q, state_out.body_qd]
+            inputs = [*inputs, self._bodies, float(dt)]
+            wp.launch(predict_bodies, model.body_count, inputs=inputs, outputs=outputs, device=model.device)
+        elif state_in.body_q is not None and state_in is not state_out:
             wp.copy(state_out.body_q, state_in.body_q)
             wp.copy(state_out.body_qd, state_in.body_qd)
         inputs = [state_in.particle_q, state_in.particle_qd, state_in.particle_f, model.particle_inv_mass]
@@ -57,6 +92,9 @@ class SolverImplicit(SolverCCD):
     solver by :class:`warp_bsc.SolverCCD`, whose certificate, kinematic particles and bodies, and report this solver
     has; what is left to collide is resolved as there.
 
+    Free bodies are solved for: they rest on each other, on cloth, on static shapes and on infinite planes, as their
+    flags, groups and filters of collision say. Kinematic bodies and those without mass are where the program puts them.
+
     Stiffness and reach of barriers follow from masses, edges, radii and elasticity; no option needs tuning. Contacts
     that are passed to :meth:`step` are not needed, and not used.
 
@@ -64,8 +102,8 @@ class SolverImplicit(SolverCCD):
     are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
 
     Limitations:
-        Restitution does not exist: contacts are without bounce, and implicit steps damp. Bodies do not move. A step on
-        a tape raises NotImplementedError if the model requires gradients.
+        Restitution does not exist: contacts are without bounce, and implicit steps damp. A step on a tape raises
+        NotImplementedError if the model requires gradients.
 
     Attributes:
         mesh: The triangles that collide, :class:`.response.state.mesh.ModelMesh`.
@@ -84,6 +122,7 @@ class SolverImplicit(SolverCCD):
         *,
         friction: float | wp.array[float] | None = None,
         friction_table: FrictionTable | None = None,
+        bodies: Literal["solved", "left"] = "solved",
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
@@ -95,10 +134,12 @@ class SolverImplicit(SolverCCD):
         """Prepares steps of a model.
 
         Args:
-            model: A model with particles.
+            model: A model with particles or free bodies.
             friction: Coefficient of particles, as of :class:`warp_bsc.SolverCCD`, like all that follow but for
                 ``max_iterations``. Below a speed of 1 mm/s it is proportional to the speed.
             friction_table: Coefficients by pair of materials.
+            bodies: Whether the solver moves free dynamic bodies, or leaves all of them where a program, or another
+                solver, puts them.
             min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it. Without this and
                 ``particle_radius``, springs and particles without faces, such as ropes and grains, collide by their
                 radii, as they have no other surface; cloth and shapes keep no distance. Where those radii are 0, and
@@ -116,19 +157,35 @@ class SolverImplicit(SolverCCD):
         Raises:
             TypeError: If an argument has another type.
             ValueError: If a number, or the friction of a shape that collides with particles, is out of range, if the
-                model has no particles, or if the particles of a world do not follow each other in it.
+                model has neither particles nor bodies, if a joint holds a body that the solver is to move, or if the
+                particles of a world do not follow each other in it.
             NotImplementedError: If the model has shapes that are not supported, see
-                :class:`.response.state.mesh.ModelMesh`.
+                :class:`.response.state.mesh.ModelMesh`, or attaches particles to a body that the solver is to move.
         """
-        check_instance(model, "model", newton.Model, "a newton.Model")
-        if not model.particle_count:
-            raise ValueError("model: it has no particles")
+        check_instance(model, "model", (newton.Model, ModelView), "a newton.Model")
+        if not model.particle_count and not model.body_count:
+            raise ValueError("model: it has neither particles nor bodies")
+        moves = checked_choice(bodies, "bodies", ("solved", "left")) == "solved"
+        jointed = _find_jointed_body(model) if moves else None
+        if jointed is not None:
+            raise ValueError(
+                f"a joint holds body {jointed} ({model.body_label[jointed]!r}), and SolverImplicit solves for free "
+                "bodies only: put it into a coupled solver (newton.solvers.experimental.coupled), in which another "
+                "solver moves the bodies, or pass bodies='left' if something else writes their poses"
+            )
+        if moves and model.attachment_particle_body_count:
+            if _dynamic_bodies(model)[host_array(model.attachment_particle_body_body)].any():
+                raise NotImplementedError(
+                    "model: it attaches particles to a body that SolverImplicit would move; make the body kinematic, "
+                    "or pass bodies='left' if something else writes its pose"
+                )
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
-        if min_distance is None and particle_radius is None and not model.requires_grad:
+        if model.particle_count and min_distance is None and particle_radius is None and not model.requires_grad:
             particle_radius = _radii_of_strands(model)
         super().__init__(
-            _Inertia(model),
+            _Inertia(model, moves_bodies=moves),
             substeps=None,
+            bodies="separated" if moves and _dynamic_bodies(model).any() else "left",
             contact_layer=False,
             restitution=0.0,
             friction=friction,

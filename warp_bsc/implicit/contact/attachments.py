@@ -87,12 +87,13 @@ def attach(
     particle_qd: wp.array[wp.vec3],
 ):
     """Adds attachments to the inertia of particles; what is held by one goes to its point, and is no unknown."""
-    u = wp.tid()
+    p = wp.tid()
+    u = unknowns.of_vertex[p]
     if unknowns.is_free[u] == 0:
         return
     weight, shifted = unknowns.inertia[u] + ZERO, wp.vec3d()
-    origin = to_double(goal[u])
-    for n in range(attachments.first[u], attachments.first[u + 1]):
+    origin = to_double(goal[p])
+    for n in range(attachments.first[p], attachments.first[p + 1]):
         i = attachments.items[n]
         body, point = attachments.body[i], attachments.body_point[i]
         if not attachments.enabled[i] or not _is_finite(ends[body]):
@@ -101,13 +102,13 @@ def attach(
         stiffness = attachments.stiffness[i]
         if wp.isinf(stiffness):
             unknowns.is_free[u] = 0
-            x, velocity = to_single(end), to_single((end - to_double(motion.x0[u])) / dt)
-            motion.x1[u] = x
-            motion.velocity[u] = velocity
-            vertices.x1[u] = x
-            vertices.velocity[u] = velocity
-            particle_q[u] = x
-            particle_qd[u] = velocity
+            x, velocity = to_single(end), to_single((end - to_double(motion.x0[p])) / dt)
+            motion.x1[p] = x
+            motion.velocity[p] = velocity
+            vertices.x1[p] = x
+            vertices.velocity[p] = velocity
+            particle_q[p] = x
+            particle_qd[p] = velocity
             return
         spring = wp.max(wp.float64(stiffness), ZERO)
         shifted += spring * (end - origin)
@@ -115,9 +116,9 @@ def attach(
         if attachments.damping[i] > 0.0:
             damping = wp.float64(attachments.damping[i]) / dt
             moved = wp.vec3d()
-            if continues(motion, motion.world[u]) and _is_finite(starts[body]):
+            if continues(motion, motion.world[p]) and _is_finite(starts[body]):
                 moved = end - _point(starts[body], point)
-            shifted += damping * (to_double(motion.x0[u]) + moved - origin)
+            shifted += damping * (to_double(motion.x0[p]) + moved - origin)
             weight += damping
     unknowns.inertia[u] = weight
-    goal[u] = to_single(origin + shifted / weight)
+    goal[p] = to_single(origin + shifted / weight)

@@ -135,13 +135,15 @@ def safe_share(
     r: wp.vec3d,
     s: wp.vec3d,
     least: wp.float64,
-    most: wp.float64,
+    most: float,
+    bends: wp.vec2d,
 ) -> wp.float64:
     """Returns a share of the displacements up to which two elements stay as far apart as ``least``, 1 for all of them.
 
     They start farther apart. Conservative advancement: a plane across the closest points separates two elements until
     a vertex of one comes as near as that to a vertex of the other along its normal; then another plane is taken.
-    Shares of more than ``most`` are of no use, and are 1.
+    Shares of more than ``most``, rounded as they are kept, are of no use, and are 1.
+    Displacements are chords: at a share t, elements may be nearer by t (b - t c), where ``bends`` are b and c.
     """
     time = ZERO
     for _k in range(_PLANES):
@@ -149,15 +151,17 @@ def safe_share(
         weights, distance = closest_weights_and_gap(kind, e, f, g, h)
         n = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / distance
         ea, fa, ga, ha = wp.dot(n, e), wp.dot(n, f), wp.dot(n, g), wp.dot(n, h)
+        near = least + time * (bends[0] - time * bends[1])
+        more = wp.max(bends[0] - _TWO * time * bends[1], ZERO)
         pa, qa, ra, sa = wp.dot(n, p), wp.dot(n, q), wp.dot(n, r), wp.dot(n, s)
-        ahead = wp.min(_closing_time(ea, ga, pa, ra, least), _closing_time(ea, ha, pa, sa, least))
+        ahead = wp.min(_closing_time(ea, ga, pa, ra + more, near), _closing_time(ea, ha, pa, sa + more, near))
         if kind == EDGE_EDGE:
-            ahead = wp.min(ahead, _closing_time(fa, ga, qa, ra, least))
-            ahead = wp.min(ahead, _closing_time(fa, ha, qa, sa, least))
+            ahead = wp.min(ahead, _closing_time(fa, ga, qa, ra + more, near))
+            ahead = wp.min(ahead, _closing_time(fa, ha, qa, sa + more, near))
         else:
-            ahead = wp.min(ahead, _closing_time(ea, fa, pa, qa, least))
+            ahead = wp.min(ahead, _closing_time(ea, fa, pa, qa + more, near))
         time += _NEXT * wp.max(ahead, ZERO)
-        if time >= ONE or time > most:
+        if time >= ONE or float(time) > most:
             return ONE
         if ahead < _STALLED:
             return time

@@ -619,6 +619,9 @@ def _clear(elements: Elements, kind: int, e: int, out: Derivatives):
     )
     for i in range(size):
         out.gradient[corner + i] = wp.vec3()
+    if kind == ElementKind.BENDING:  # has no blocks
+        out.curvature[e] = 0.0
+        return
     for k in range(size * size):
         out.block[place + k] = wp.mat33()
 

@@ -10,10 +10,12 @@ import warp as wp
 from ...detection.launch import retry_until_fits
 from ...response.contacts.queue import queues_of
 from ...response.forces.structs import Centres, ContactRows, ImpulseSums, Sides
+from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
+from ...response.state.mesh import host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from . import pairs, steps
+from . import bodies, pairs, steps
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team, solve_worlds
 from .elasticity import differentiate, elements_of_model, make_derivatives
@@ -43,6 +45,8 @@ _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step ends [m/s]."""
 _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
+_MOST_UNITS, _FAST = 2.0**56, 100.0
+"""Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
 _TOLERANCE = 1e-2
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
@@ -75,31 +79,52 @@ class NewtonMethod:
         world = mesh.device_world.numpy()[:particles]
         if (np.diff(world) < 0).any():
             raise ValueError("particles of a world do not follow each other in the model")
-        unknown = np.arange(particles)
-        self._count = particles
-        unknowns = self._unknowns = Unknowns()
 
         def array(values):
             return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
 
-        unknowns.of_vertex = array(np.append(unknown, np.full(vertices - particles, -1)))
-        unknowns.world = array(world)
-        unknowns.of_worlds = array(np.searchsorted(world, np.arange(work.worlds + 1)))
+        unknowns = self._unknowns = Unknowns()
+        solved, body_of_vertex = self._bodies_in_solve(), mesh.shape_vertices.body
+        body_world = np.zeros(0, dtype=int)
+        if len(solved):
+            body_world = np.maximum(host_array(model.body_world)[solved], 0)
+        # in each world its particles, then a shift and a turn of each of its bodies
+        owner_world = np.concatenate([world, np.repeat(body_world, 2)])
+        order = np.argsort(owner_world, kind="stable")
+        number = np.argsort(order, kind="stable")
+        unknown, of_bodies = number[:particles], np.full(model.body_count + 1, -1)
+        of_bodies[solved] = number[particles::2]
+        self._count = len(order)
+        first = of_bodies[body_of_vertex]  # that of -1 is the last
+        unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
+        unknowns.particle = array(np.where(order < particles, order, -1))
+        unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
+        unknowns.world = array(owner_world[order])
+        unknowns.of_worlds = array(np.searchsorted(owner_world[order], np.arange(work.worlds + 1)))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
         unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
-        largest = int(np.bincount(world, minlength=1).max(initial=0))
+        largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
         self._team, self._threads = make_team(largest, work.worlds, device)
+        self._bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
+        holder = np.arange(vertices)
+        if len(solved):
+            first_vertex = np.full(model.body_count, -1)
+            of_body, first_of_body = np.unique(body_of_vertex, return_index=True)
+            first_vertex[of_body[of_body >= 0]] = particles + first_of_body[of_body >= 0]
+            self._bodies.unknown, self._bodies.first_vertex = array(of_bodies[:-1]), array(first_vertex)
+            held = np.flatnonzero(first >= 0)
+            holder[particles + held] = first_vertex[body_of_vertex[held]]
         self._rows = make_rows(of_elements, unknown, self._count, device)
-        first = self._rows.first.numpy()
-        self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(first)))
+        self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._element_count = sum(map(len, of_elements))
         self._derivatives = make_derivatives(of_elements, device)
         self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device)
-        self._origin, self._goal, self._lower, self._upper, self._moved = (
-            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(5)
+        self._trial.holder = array(holder)
+        self._origin, self._goal, self._lower, self._upper = (
+            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
         )
         self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
@@ -116,14 +141,25 @@ class NewtonMethod:
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
-        margin, worlds = np.where(np.isfinite(reach), reach, 0.0), mesh.device_world.numpy()
+        worlds = mesh.device_world.numpy()
+        of_bodies = np.full(vertices, np.inf)
+        if len(solved):
+            least = _of_worlds(np.min, reach[:particles], world, work.worlds, np.inf)[worlds]
+            of_bodies = np.minimum(bodies.reach_between_bodies(mesh), least)
+            of_bodies[:particles] = np.inf
+        self._settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
+        reach = np.minimum(reach, of_bodies)
+        margin = np.where(np.isfinite(reach), reach, 0.0)
         margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
         self._margin = wp.array(margin, dtype=float, device=device)
-        assert model.particle_mass is not None and model.particle_inv_mass is not None
-        masses = model.particle_mass.numpy()
-        moves = (model.particle_inv_mass.numpy() > 0) & np.isfinite(masses)
+        masses = host_array(model.particle_mass)
+        moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
-        self._settings.units = wp.array(1.0 / (mass * _UNIT_SPEED**2), dtype=wp.float64, device=device)
+        units = 1.0 / (mass * _UNIT_SPEED**2)
+        if len(solved):
+            heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
+            units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * _FAST**2, 1e-9))
+        self._settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._attachments = attachments_of_model(model)
         self._poses = None if self._attachments is None else wp.clone(model.body_q)
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
@@ -163,11 +199,19 @@ class NewtonMethod:
             np.add.at(found, model.tet_indices.numpy().reshape(-1, 4), stiffness)
         return found
 
+    def _bodies_in_solve(self) -> np.ndarray:
+        """Returns the bodies whose vertices may be solved for."""
+        mesh, worlds = self._mesh, self._work.worlds
+        if not self._work.motion.moves_bodies:
+            return np.zeros(0, dtype=int)
+        with_shapes = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+        return with_shapes[(host_array(mesh.model.body_world)[with_shapes] >= 0) | (worlds == 1)]
+
     def solve(self, end: StateArrays, dt: float) -> None:
-        """Finds where the particles end that the motion of the workspace predicts, and writes it there and here.
+        """Finds where particles and bodies end that the motion of the workspace predicts, and writes it there and here.
 
         Args:
-            end: The state at the end: positions and velocities of particles are written, poses of bodies read.
+            end: The state at the end, with the poses of bodies as predicted; what is solved for is written.
             dt: Length of the step [s].
         """
         self._begin(end, dt)
@@ -176,8 +220,9 @@ class NewtonMethod:
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
         end = StateArrays()
-        end.particle_q, end.particle_qd = wp.empty_like(state.particle_q), wp.empty_like(state.particle_qd)
-        end.body_q = state.body_q
+        for name in StateArrays.vars:
+            given = getattr(state, name)
+            setattr(end, name, None if given is None else wp.clone(given))
         self._begin(end, 1.0)
         self.progress.active.zero_()
         self._find_end(end)
@@ -196,11 +241,13 @@ class NewtonMethod:
         self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
         if self._attachments is not None:
             inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
-            self._launch(attach, self._count, inputs, [work.vertices, end.particle_q, end.particle_qd])
+            outputs = [work.vertices, end.particle_q, end.particle_qd]
+            self._launch(attach, self._mesh.model.particle_count, inputs, outputs)
             wp.copy(self._poses, end.body_q)
-        inputs = [motion, self._margin, self._unknowns]
-        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self.progress.active.zero_()
+        self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
+        inputs = [motion, self._margin, self._unknowns, self._bodies]
+        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self._lacks.zero_()
         self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
@@ -217,9 +264,11 @@ class NewtonMethod:
         wp.capture_while(self._goes_on, self._take_newton_step)
         if self.keeps_contacts:
             self._find_near(self.progress.steps)
+        if len(self._bodies.unknown):
+            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
+            work.launch_over_bodies(begin_response_to_bodies)
         inputs = [self._trial, self._unknowns, self._dt]
-        outputs = [motion, work.vertices, end.particle_q, end.particle_qd]
-        self._launch(steps.finish, vertices, inputs, outputs)
+        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end])
         inputs = [self.progress, self._dt, _LEAST_SPEED, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
@@ -248,7 +297,7 @@ class NewtonMethod:
 
     def _part_touching(self):
         inputs = [self._work.step, self._settings, self._touching]
-        self._launch(pairs.part_touching, self._count, inputs, [self._trial, self._origin])
+        self._launch(pairs.part_touching, self._mesh.model.particle_count, inputs, [self._trial, self._origin])
         self._prepare_candidates()
 
     def _over_candidates(self, kernel, before, after=()):
@@ -279,7 +328,7 @@ class NewtonMethod:
         self._over_candidates(pairs.bound_by_pairs, [motion], [self._trial, active, self.progress, self._limit])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
-            self._launch(pairs.bound_by_planes, work.particle_count, inputs, [self.progress, self._limit])
+            self._launch(pairs.bound_by_planes, work.vertices_at_planes, inputs, [self.progress, self._limit])
 
     def _take_newton_step(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
@@ -301,7 +350,7 @@ class NewtonMethod:
         wp.capture_if(self._cuts, self._truncate)
         self._launch(steps.decide_search, work.worlds, [], [progress, self._search])
         wp.capture_while(self._search, self._try)
-        self._launch(steps.take, vertices, [motion, unknowns], [progress, trial])
+        self._take()
         inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
         self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
 
@@ -331,19 +380,22 @@ class NewtonMethod:
 
     def _assemble(self, active, begins):
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
-        contacts, unknowns, vectors = self._contacts, self._unknowns, self._vectors
+        motion, contacts, unknowns, vectors = self._work.step.motion, self._contacts, self._unknowns, self._vectors
         self._list_contacts()
         parts = _PARTS if self._work.device.is_cuda else 1
-        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, active, parts]
+        masses = [motion, self._bodies, wp.float64(self._dt), active]
+        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses, parts]
         self._launch(steps.add_blocks, parts * len(self._row_of_block), inputs, [self._rows])
-        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, active, begins, self._rows, parts]
+        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows, parts]
         self._launch(steps.assemble, parts * self._count, inputs, [vectors])
 
     def _hold_ahead(self, solves):
         """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
         work, trial = self._work, self._trial
         active = self._ahead if solves else self.progress.active
-        inputs = [work.step.motion, self._unknowns, self._vectors, self._lower, self._upper, active]
+        motion, unknowns, vectors = work.step.motion, self._unknowns, self._vectors
+        self._launch_over_bodies(bodies.displace_bodies, [motion, unknowns, self.progress, vectors.solution])
+        inputs = [motion, unknowns, vectors, self._lower, self._upper, self._bodies, active]
         if not solves:
             self._leaves.zero_()
         outputs = [trial, self.progress, self._limit, self._leaves]
@@ -363,7 +415,7 @@ class NewtonMethod:
         self._over_candidates(pairs.hold_pairs, [motion], [*inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
-            self._launch(pairs.hold_at_planes, work.particle_count, [*inputs, 2 + solves], [contacts])
+            self._launch(pairs.hold_at_planes, work.vertices_at_planes, [*inputs, 2 + solves], [contacts])
         self._assemble(ahead, False)
         self._solve_linear(ahead)
         self._hold_ahead(solves + 1)
@@ -381,7 +433,7 @@ class NewtonMethod:
         self._over_candidates(pairs.find_near, [motion], inputs)
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(pairs.find_near_planes, work.particle_count, inputs[:-1], [contacts])
+            self._launch(pairs.find_near_planes, work.vertices_at_planes, inputs[:-1], [contacts])
 
     def _list_contacts(self):
         work, contacts = self._work, self._contacts
@@ -402,20 +454,36 @@ class NewtonMethod:
 
     def _add_energies(self, displaced, energy):
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
-        outputs = [self._moved]
-        self._launch(steps.write_moved, self._mesh.vertex_count, [motion, trial, progress, displaced], outputs)
+        self._move_bodies(displaced=displaced)
+        inputs = [motion, self._unknowns, self._bodies, progress, displaced]
+        self._launch(steps.write_moved, self._mesh.vertex_count, inputs, [trial])
         inputs = [self._elements, self._element_count, motion, self._settings, trial, self._goal, self._unknowns]
-        inputs += [progress, displaced, self._moved]
+        inputs += [self._bodies, progress, displaced]
         self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
         inputs = [self._settings, trial, progress, displaced, energy]
         self._over_candidates(pairs.add_pair_energies, [motion], inputs)
         work.launch_over_entries(pairs.add_friction_energies, [motion, self._contacts, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(pairs.add_plane_energies, work.particle_count, inputs[:-1], [energy])
+            self._launch(pairs.add_plane_energies, work.vertices_at_planes, inputs[:-1], [energy])
+
+    def _take(self):
+        """Moves everything by what is taken of its displacements."""
+        motion, vertices = self._work.step.motion, self._mesh.vertex_count
+        self._move_bodies(takes=True)
+        inputs = [motion, self._unknowns, self._bodies]
+        self._launch(steps.take, vertices, inputs, [self.progress, self._trial])
+
+    def _move_bodies(self, *, displaced=True, takes=False):
+        inputs = [self._work.step.motion, self._unknowns, self.progress, self._trial.share, self._vectors.solution]
+        self._launch_over_bodies(bodies.move_bodies, [*inputs, displaced, takes])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
+
+    def _launch_over_bodies(self, kernel, inputs):
+        """Launches a kernel over the bodies, with those of the solve as its last argument, if there are any."""
+        self._launch(kernel, len(self._bodies.unknown), inputs, [self._bodies])
 
 
 def _of_worlds(function, values: np.ndarray, world: np.ndarray, worlds: int, default: float) -> np.ndarray:

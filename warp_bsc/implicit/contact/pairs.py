@@ -5,14 +5,15 @@ import warp as wp
 from ...detection.approach_phase import distances_of_pair
 from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.constraints import friction_on_plane, pair_friction
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
-from ...response.contacts.rules import ContactClass, crossed_at_start, owner_of
+from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_mass_of, owner_of
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
-from ...response.state.structs import Motion, Step
+from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
-from .system import Contacts, Progress, Unknowns, contact_count, displacement, unknown_of_corner
+from .system import Contacts, Progress, Unknowns, contact_count, displacement, is_solved, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,6 +57,7 @@ class BarrierSettings:
     Attributes:
         dt: Length of the step [s].
         reach: Of each vertex: gap from which it pushes [m], infinite for shapes.
+        reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
         recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
         smoothing: Length below which friction is smoothed [m].
@@ -64,6 +66,7 @@ class BarrierSettings:
 
     dt: wp.float64
     reach: wp.array[float]
+    reach_of_bodies: wp.array[float]
     recovery: wp.float64
     elasticity: wp.array[float]
     smoothing: wp.float64
@@ -78,25 +81,48 @@ class Trial:
         x: Positions of vertices [m].
         displaced: Displacements [m].
         share: Share of its displacement that a vertex takes of what its world takes.
+        holder: Vertex whose share each vertex takes: itself, or the first of its body.
+        bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
+        moved: Positions after displacements.
     """
 
     x: wp.array[wp.vec3]
     displaced: wp.array[wp.vec3]
     share: wp.array[float]
+    holder: wp.array[int]
+    bend: wp.array[float]
+    moved: wp.array[wp.vec3]
 
 
 @wp.func
 def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3:
     """Returns the position of a vertex after a share of its displacement, rounded as it is stored."""
-    return trial.x[vertex] + (scale * trial.share[vertex]) * trial.displaced[vertex]
+    return trial.x[vertex] + (scale * trial.share[trial.holder[vertex]]) * trial.displaced[vertex]
+
+
+@wp.func
+def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
+    """Returns how far shares of displacements may be off, as :func:`.barrier.safe_share` takes it."""
+    first, second = float(0.0), float(0.0)
+    for k in range(2):  # corners 0 and 3 are of different elements
+        of_first = trial.holder[corners[k]] == trial.holder[corners[0]]
+        first = wp.max(first, wp.where(of_first, trial.bend[corners[k]], 0.0))
+    for k in range(1, 4):
+        of_second = trial.holder[corners[k]] == trial.holder[corners[3]]
+        second = wp.max(second, wp.where(of_second, trial.bend[corners[k]], 0.0))
+    share = scale * trial.share[trial.holder[corners[0]]]
+    other = scale * trial.share[trial.holder[corners[3]]]
+    first, second = share * first, other * second
+    return wp.vec2d(wp.float64(first + second), wp.float64(share * first + other * second))
 
 
 @wp.func
 def _reach_of(settings: BarrierSettings, corners: wp.vec4i) -> float:
-    reach = settings.reach[corners[0]]
-    for j in range(1, 4):
+    reach, of_bodies = float(wp.inf), float(wp.inf)
+    for j in range(4):
         reach = wp.min(reach, settings.reach[corners[j]])
-    return reach
+        of_bodies = wp.min(of_bodies, settings.reach_of_bodies[corners[j]])
+    return wp.where(reach < wp.inf, reach, of_bodies)
 
 
 @wp.func
@@ -316,7 +342,7 @@ def _add_contact(
     for j in range(4):
         v = corners[j]
         slid += weights[j] * (to_double(trial.x[v]) - to_double(motion.x0[v]))
-        if unknowns.of_vertex[v] == -1:
+        if unknowns.of_vertex[v] < 0 and not is_solved(unknowns, v):
             given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
     slid -= wp.dot(slid, normal) * normal
     gradient = (-load + curvature * (given - approach)) * normal
@@ -425,11 +451,11 @@ def find_near(
 
 @wp.func
 def _plane_gap(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int):
-    """Returns the distance that a particle keeps from a plane, and the level and the reach of its barrier.
+    """Returns the distance that a vertex keeps from a plane, and the level and the reach of its barrier.
 
     The reach is 0 if it is excluded.
     """
-    if is_filtered_by_plane(motion, planes, i, vertex):
+    if is_filtered_by_plane(motion, planes, i, vertex) or not is_stopped_by_plane(motion, planes, i, vertex):
         return ZERO, ZERO, ZERO
     start, error = signed_distance(planes.start[i], motion.x0[vertex])
     if not start >= -error:
@@ -437,7 +463,8 @@ def _plane_gap(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, 
     kept = wp.min(start - error, ZERO)
     if motion.distances.radius and start > error:
         kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (start - error))
-    level, reach = _barrier_of(settings, start, kept, settings.reach[vertex])
+    whole = wp.where(body_of(motion, vertex) < 0, settings.reach[vertex], settings.reach_of_bodies[vertex])
+    level, reach = _barrier_of(settings, start, kept, whole)
     return kept, level, reach
 
 
@@ -465,7 +492,7 @@ def find_near_planes(
     """Adds contacts for the particles that are near infinite planes, in active worlds."""
     vertex = wp.tid()
     world = motion.world[vertex]
-    if motion.inverse_mass[vertex] == 0.0 or active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
         return
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]
@@ -632,7 +659,7 @@ def _hold(
         u = unknowns.of_vertex[v]
         w = float(weights[j])
         apart += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
-        if u == -1:
+        if u < 0 and not is_solved(unknowns, v):
             given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
         elif u >= 0:
             compliance += w * w * wp.dot(n, inverse[u] * n)
@@ -775,7 +802,7 @@ def hold_at_planes(
     """Adds contacts that hold particles which would enter infinite planes, as :func:`hold_pairs`."""
     vertex = wp.tid()
     world = motion.world[vertex]
-    if motion.inverse_mass[vertex] == 0.0 or active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
         return
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]
@@ -829,20 +856,23 @@ def _bound(
     kept = candidates.kept[i]
     reach = wp.float64(candidates.reach[i])
     apart = barrier.distance_of_boxes(queue.kind, a, b, c, d) - kept
-    if way <= apart - barrier.least_gap(apart, reach):
+    bends = _bends(trial, scale, corners)
+    if way + bends[0] <= apart - barrier.least_gap(apart, reach):
         return
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
     least = barrier.least_gap(distance - kept, reach)
-    if way <= distance - kept - least:
+    if way + bends[0] <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
-    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, wp.float64(most)))
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
     candidates.share[i] = share
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
         for j in range(4):
             wp.atomic_min(limit, corners[j], share)
+            if trial.holder[corners[j]] != corners[j]:
+                wp.atomic_min(limit, trial.holder[corners[j]], share)
 
 
 @wp.kernel
@@ -886,7 +916,7 @@ def bound_by_planes(
     """Finds the share of displacements up to which no particle meets an infinite plane, as :func:`bound_by_pairs`."""
     vertex = wp.tid()
     world = motion.world[vertex]
-    if motion.inverse_mass[vertex] == 0.0 or active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
         return
     scale, now = progress.scale[world], plane_share[world]
     for place in range(planes.of_worlds.shape[1]):
@@ -901,10 +931,15 @@ def bound_by_planes(
         after, _error_after = signed_distance(_plane_at(planes, i, then), moved(trial, scale, vertex))
         gap, left = before - kept, after - kept
         least = barrier.least_gap(gap, reach)
-        if left < least:
-            share = float((gap - least) / (gap - left))
+        taken = scale * trial.share[trial.holder[vertex]]
+        bend = wp.float64(taken * trial.bend[vertex])
+        flat = wp.float64(taken) * bend
+        rate, low = gap - left + bend, gap - least
+        square = rate * rate - wp.float64(4.0) * flat * low
+        if low - rate + flat < ZERO or (square > ZERO and rate > ZERO and rate < wp.float64(2.0) * flat):
+            share = float(wp.float64(2.0) * low / (rate + wp.sqrt(wp.max(square, ZERO))))
             wp.atomic_min(progress.bound, world, share)
-            wp.atomic_min(limit, vertex, share)
+            wp.atomic_min(limit, trial.holder[vertex], share)
 
 
 # Energies
@@ -937,9 +972,7 @@ def _pair_energy(
     world = motion.world[corners[0]]
     if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
         return
-    scale = wp.where(displaced, progress.scale[world], 0.0)
-    a, b = to_double(moved(trial, scale, corners[0])), to_double(moved(trial, scale, corners[1]))
-    c, d = to_double(moved(trial, scale, corners[2])), to_double(moved(trial, scale, corners[3]))
+    a, b, c, d = corners_of(trial.moved, corners)
     if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
         return
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
@@ -997,11 +1030,10 @@ def add_friction_energies(
         world = motion.world[corners[0]]
         limit = contacts.friction[i] * contacts.load[i]
         if limit > 0.0 and not (displaced and progress.searches[world] == 0):
-            scale = wp.where(displaced, progress.scale[world], 0.0)
             slid, normal = wp.vec3d(), to_double(contacts.normal[i])
             for j in range(4):
                 v = corners[j]
-                slid += wp.float64(weights[j]) * (to_double(moved(trial, scale, v)) - to_double(motion.x0[v]))
+                slid += wp.float64(weights[j]) * (to_double(trial.moved[v]) - to_double(motion.x0[v]))
             slid -= wp.dot(slid, normal) * normal
             value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
             add_energy(energy, world, value, settings.units)
@@ -1023,7 +1055,7 @@ def add_plane_energies(
     """Adds the energies of barriers at infinite planes."""
     vertex = wp.tid()
     world = motion.world[vertex]
-    if motion.inverse_mass[vertex] == 0.0 or progress.active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or progress.active[world] == 0:
         return
     if displaced and progress.searches[world] == 0:
         return
@@ -1034,7 +1066,7 @@ def add_plane_energies(
             return
         _kept, level, reach = _plane_gap(motion, planes, settings, i, vertex)
         plane = _plane_at(planes, i, now + (1.0 - now) * scale)
-        distance, _error = signed_distance(plane, moved(trial, scale, vertex))
+        distance, _error = signed_distance(plane, trial.moved[vertex])
         gap = distance - level
         if gap < reach:
             value = wp.float64(1.0e30)

@@ -2,14 +2,15 @@
 
 import warp as wp
 
+from ...response.state.motion import StateArrays, predicted_velocity
 from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
+from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, inertia_of_body, inertial_energy, rounding_energy
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .pairs import BarrierSettings, Trial, add_energy, moved
 from .rows import Rows, sum_of_blocks, sum_of_corners
 from .system import (
-    NOT_UNKNOWN,
     Contacts,
     Progress,
     Unknowns,
@@ -17,6 +18,7 @@ from .system import (
     contact_block,
     contact_gradient,
     displacement,
+    is_solved,
     sum_of_parts,
     unknown_of_corner,
 )
@@ -31,10 +33,7 @@ _LEAST_SCALE = wp.constant(float(2.0**-12))
 @wp.func
 def is_given(unknowns: Unknowns, vertex: int) -> bool:
     """Returns whether a program moves a vertex, or nothing."""
-    u = unknowns.of_vertex[vertex]
-    if u >= 0:
-        return unknowns.is_free[u] == 0
-    return u == NOT_UNKNOWN
+    return not is_solved(unknowns, vertex)
 
 
 @wp.kernel
@@ -77,12 +76,15 @@ def begin_unknowns(
 ):
     """Finds which particles are solved for, their inertia, and where inertia alone leads."""
     u = wp.tid()
+    p = unknowns.particle[u]
+    if p < 0:
+        return
     unknowns.is_free[u] = 0
     unknowns.inertia[u] = ZERO
-    goal[u] = motion.x1[u]
-    if motion.inverse_mass[u] > 0.0 and motion.is_not_finite[u] == 0 and wp.isfinite(motion.x0[u]):
+    goal[p] = motion.x1[p]
+    if motion.inverse_mass[p] > 0.0 and motion.is_not_finite[p] == 0 and wp.isfinite(motion.x0[p]):
         unknowns.is_free[u] = 1
-        unknowns.inertia[u] = ONE / (wp.float64(motion.inverse_mass[u]) * dt * dt)
+        unknowns.inertia[u] = ONE / (wp.float64(motion.inverse_mass[p]) * dt * dt)
 
 
 @wp.kernel
@@ -91,6 +93,7 @@ def begin_step(
     motion: Motion,
     margin: wp.array[float],
     unknowns: Unknowns,
+    bodies: SolvedBodies,
     # out
     goal: wp.array[wp.vec3],
     lower: wp.array[wp.vec3],
@@ -114,6 +117,7 @@ def begin_step(
     trial.x[v] = x0
     trial.displaced[v] = wp.vec3()
     trial.share[v] = 1.0
+    trial.bend[v] = 0.0
     if not wp.isfinite(x0):  # without pairs, and without forces on others
         lower[v] = wp.vec3()
         upper[v] = wp.vec3()
@@ -124,7 +128,10 @@ def begin_step(
         goal[v] = x1
     elif unknowns.is_free[u] != 0:
         progress.active[motion.world[v]] = 1
+    if is_solved(unknowns, v):
         pad += 0.25 * wp.length(x1 - x0)
+        if u < 0:
+            unknowns.arm[v] = arm_on_body(bodies, motion, v, x0)
     lower[v] = wp.min(x0, x1) - wp.vec3(pad)
     upper[v] = wp.max(x0, x1) + wp.vec3(pad)
 
@@ -139,7 +146,7 @@ def truncate(
 ):
     """Takes the shares of vertices that are solved for down to their bounds, and clears these."""
     v = wp.tid()
-    if not is_given(unknowns, v):
+    if trial.holder[v] == v and not is_given(unknowns, v):
         trial.share[v] = trial.share[v] * limit[v]
     limit[v] = 1.0
 
@@ -208,6 +215,25 @@ def _inverse(block: wp.mat33, least: float) -> wp.mat33:
     return q * wp.diag(values) * wp.transpose(q)
 
 
+@wp.func
+def _inertia(
+    unknowns: Unknowns,
+    trial: Trial,
+    goal: wp.array[wp.vec3],
+    motion: Motion,
+    bodies: SolvedBodies,
+    dt: wp.float64,
+    u: int,
+):
+    """Returns the gradient of the inertia by an unknown, and its block of the diagonal."""
+    p = unknowns.particle[u]
+    if p < 0:
+        return inertia_of_body(bodies, motion, unknowns.body[u], u, dt)
+    inertia = unknowns.inertia[u]
+    pull = to_single(inertia * (to_double(trial.x[p]) - to_double(goal[p])))
+    return pull, float(inertia) * wp.identity(n=3, dtype=float)
+
+
 @wp.kernel
 def add_blocks(
     # in
@@ -215,6 +241,11 @@ def add_blocks(
     contacts: Contacts,
     unknowns: Unknowns,
     row_of_block: wp.array[int],
+    trial: Trial,
+    goal: wp.array[wp.vec3],
+    motion: Motion,
+    bodies: SolvedBodies,
+    dt: wp.float64,
     active: wp.array[int],
     parts: int,
     # out
@@ -233,7 +264,8 @@ def add_blocks(
         return
     total += sum_of_blocks(rows, derivatives, k)
     if u == v and unknowns.is_free[u] != 0:
-        total += float(unknowns.inertia[u]) * wp.identity(n=3, dtype=float)
+        _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
+        total += inertia
     rows.block[k] = total
 
 
@@ -245,6 +277,9 @@ def assemble(
     unknowns: Unknowns,
     trial: Trial,
     goal: wp.array[wp.vec3],
+    motion: Motion,
+    bodies: SolvedBodies,
+    dt: wp.float64,
     active: wp.array[int],
     begins: bool,
     rows: Rows,
@@ -263,19 +298,19 @@ def assemble(
     if unknowns.is_free[u] == 0:
         if begins:
             vectors.gradient[u] = wp.vec3()
-            vectors.solution[u] = trial.displaced[u]
+            vectors.solution[u] = wp.vec3()
+            if unknowns.particle[u] >= 0:
+                vectors.solution[u] = trial.displaced[unknowns.particle[u]]
             vectors.inverse[u] = wp.mat33()
             vectors.direction[u] = wp.vec3()
         return
-    inertia = unknowns.inertia[u]
     gradient, block = contact_gradient(contacts, unknowns, u, part, parts)
     gradient, block = sum_of_parts(gradient, parts), block_sum_of_parts(block, parts)
     if part != 0:
         return
-    gradient += sum_of_corners(rows, derivatives, u)
-    gradient += to_single(inertia * (to_double(trial.x[u]) - to_double(goal[u])))
-    vectors.gradient[u] = gradient
-    vectors.inverse[u] = _inverse(rows.block[rows.first[u]] + block, float(inertia))
+    pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
+    vectors.gradient[u] = gradient + sum_of_corners(rows, derivatives, u) + pull
+    vectors.inverse[u] = _inverse(rows.block[rows.first[u]] + block, wp.min(wp.get_diag(inertia)))
     if begins:
         vectors.solution[u] = wp.vec3()
 
@@ -308,6 +343,7 @@ def displace(
     vectors: Vectors,
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
+    bodies: SolvedBodies,
     active: wp.array[int],
     # out
     trial: Trial,
@@ -315,7 +351,7 @@ def displace(
     limit: wp.array[float],
     leaves: wp.array[int],
 ):
-    """Writes the displacements of vertices after a solve, and how much of them stays in the boxes of the candidates."""
+    """Writes the displacements of vertices after a solve, and whether some leave the boxes of the candidates."""
     v = wp.tid()
     world = motion.world[v]
     if active[world] == 0:
@@ -325,6 +361,10 @@ def displace(
         return
     d = displacement(unknowns, v, vectors.solution)
     gradient = vectors.gradient[unknown_of_corner(unknowns, v)]
+    u = unknowns.of_vertex[v]
+    if u < 0:
+        d = body_vertex(bodies.moved, motion, v) - trial.x[v]
+        trial.bend[v] = bend_of(unknowns.arm[v], vectors.solution[-1 - u])
     if not (wp.isfinite(d) and wp.isfinite(gradient)):  # as a start is not: its world stands
         trial.displaced[v] = wp.vec3()
         progress.bound[world] = 0.0
@@ -407,7 +447,7 @@ def begin_truncation(
         return
     limit[v] = 1.0
     if not is_given(unknowns, v):
-        trial.share[v] = _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v])
+        wp.atomic_min(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
 
 
 @wp.kernel
@@ -456,6 +496,7 @@ def begin_newton_step(
         return
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
+    progress.noise[w] = wp.int64(0)
     progress.cuts[w] = 0
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
@@ -474,9 +515,9 @@ def add_energies(
     trial: Trial,
     goal: wp.array[wp.vec3],
     unknowns: Unknowns,
+    bodies: SolvedBodies,
     progress: Progress,
     displaced: bool,
-    moved_positions: wp.array[wp.vec3],
     # in and out
     energy: wp.array[wp.int64],
 ):
@@ -487,14 +528,22 @@ def add_energies(
         world = motion.world[first_vertex(elements, kind, i - elements.first[kind])]
         if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
             return
-        value = element_energy(elements, i, kind, moved_positions, motion.x0, settings.dt)
+        value = element_energy(elements, i, kind, trial.moved, motion.x0, settings.dt)
         add_energy(energy, world, value, settings.units)
         return
     u = i - element_count
     world = unknowns.world[u]
     if progress.active[world] == 0 or (displaced and progress.searches[world] == 0) or unknowns.is_free[u] == 0:
         return
-    off = to_double(moved_positions[u]) - to_double(goal[u])
+    p = unknowns.particle[u]
+    if p < 0:
+        body = unknowns.body[u]
+        if u == bodies.unknown[body]:
+            add_energy(energy, world, inertial_energy(bodies, motion, body, settings.dt), settings.units)
+            if not displaced:
+                add_energy(progress.noise, world, rounding_energy(bodies, motion, body, settings.dt), settings.units)
+        return
+    off = to_double(trial.moved[p]) - to_double(goal[p])
     add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
 
 
@@ -502,17 +551,21 @@ def add_energies(
 def write_moved(
     # in
     motion: Motion,
-    trial: Trial,
+    unknowns: Unknowns,
+    bodies: SolvedBodies,
     progress: Progress,
     displaced: bool,
     # out
-    moved_positions: wp.array[wp.vec3],
+    trial: Trial,
 ):
     """Writes positions, or the displaced ones."""
     v = wp.tid()
     world = motion.world[v]
     if progress.active[world] != 0:
-        moved_positions[v] = moved(trial, wp.where(displaced, progress.scale[world], 0.0), v)
+        x = moved(trial, wp.where(displaced, progress.scale[world], 0.0), v)
+        if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
+            x = body_vertex(bodies.moved, motion, v)
+        trial.moved[v] = x
 
 
 @wp.kernel
@@ -528,7 +581,7 @@ def decide_search(
         progress.trial[w] = wp.int64(0)
         return
     before = wp.float64(progress.energy[w])
-    allowed = before + _NOISE * wp.abs(before)
+    allowed = before + _NOISE * wp.abs(before) + wp.float64(progress.noise[w])
     falls = wp.float64(progress.trial[w]) <= allowed
     progress.trial[w] = wp.int64(0)
     if falls or progress.remaining[w] > 0.0:
@@ -547,6 +600,7 @@ def take(
     # in
     motion: Motion,
     unknowns: Unknowns,
+    bodies: SolvedBodies,
     # in and out
     progress: Progress,
     trial: Trial,
@@ -560,8 +614,11 @@ def take(
     given = is_given(unknowns, v)
     if given and scale == 1.0:
         trial.x[v] = motion.x1[v]
-    else:
+    elif given or unknowns.of_vertex[v] >= 0:
         trial.x[v] = moved(trial, scale, v)
+    else:
+        trial.x[v] = body_vertex(bodies.pose, motion, v)
+        unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
     if not given:
         wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))
 
@@ -608,20 +665,21 @@ def finish(
     # in and out
     motion: Motion,
     vertices: Vertices,
-    particle_q: wp.array[wp.vec3],
-    particle_qd: wp.array[wp.vec3],
+    end: StateArrays,
 ):
     """Writes where the step ends, and the predicted velocity with what the step has added to it."""
     v = wp.tid()
     x = trial.x[v]
-    u = unknowns.of_vertex[v]
-    if u >= 0:
-        if unknowns.is_free[u] != 0:
-            # not by the way from the start, which in short steps is rounding
-            velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
-            motion.x1[v] = x
-            motion.velocity[v] = velocity
-            vertices.x1[v] = x
-            vertices.velocity[v] = velocity
-            particle_q[v] = x
-            particle_qd[v] = velocity
+    if not is_solved(unknowns, v):
+        return
+    # not by the way from the start, which in short steps is rounding
+    velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
+    if unknowns.of_vertex[v] < 0:
+        velocity = predicted_velocity(motion, v, x)
+    else:
+        end.particle_q[v] = x
+        end.particle_qd[v] = velocity
+    motion.x1[v] = x
+    motion.velocity[v] = velocity
+    vertices.x1[v] = x
+    vertices.velocity[v] = velocity

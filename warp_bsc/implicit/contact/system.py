@@ -16,6 +16,8 @@ class Unknowns:
 
     Attributes:
         of_vertex: Unknown of each vertex of the mesh; :data:`NOT_UNKNOWN`, or -2 less the first unknown of its body.
+        particle: Particle of each unknown, -1 of those of bodies.
+        body: Body of each unknown, -1 of those of particles.
         world: World of each unknown.
         of_worlds: First unknown of each world, and the end of the last.
         is_free: 1 for each unknown that is solved for; the others are given.
@@ -24,6 +26,8 @@ class Unknowns:
     """
 
     of_vertex: wp.array[int]
+    particle: wp.array[int]
+    body: wp.array[int]
     world: wp.array[int]
     of_worlds: wp.array[int]
     is_free: wp.array[int]
@@ -45,6 +49,7 @@ class Progress:
         trial: Energy at the displaced positions, in units.
         trial_cut: The same, with displacements of single vertices cut.
         cuts: 1 if those are cut.
+        noise: How far the energy of what touches bodies may be off, as their vertices are rounded, in units.
         change: Largest displacement of an unknown [m].
         remaining: Largest way of what a program moves that is left [m].
     """
@@ -58,6 +63,7 @@ class Progress:
     trial: wp.array[wp.int64]
     trial_cut: wp.array[wp.int64]
     cuts: wp.array[int]
+    noise: wp.array[wp.int64]
     change: wp.array[float]
     remaining: wp.array[float]
 
@@ -157,6 +163,15 @@ def unknown_of_corner(unknowns: Unknowns, vertex: int) -> int:
     """Returns the unknown of a vertex, the first of its body, or -1."""
     u = unknowns.of_vertex[vertex]
     return wp.where(u < -1, -2 - u, u)
+
+
+@wp.func
+def is_solved(unknowns: Unknowns, vertex: int) -> bool:
+    """Returns whether a vertex is solved for, by itself or with its body."""
+    u = unknown_of_corner(unknowns, vertex)
+    if u < 0:
+        return False
+    return unknowns.is_free[u] != 0
 
 
 @wp.func

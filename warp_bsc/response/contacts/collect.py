@@ -69,7 +69,7 @@ def count_new_crossings(of_edges: wp.array[int], before: wp.array[int], status: 
 
 
 @wp.func
-def _stops(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
+def is_stopped_by_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> bool:
     """Returns whether a plane stops a vertex: not one of its own body, or of a shape that it does not collide with."""
     body = body_of(motion, vertex)
     if body < 0:
@@ -149,7 +149,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
             if not ahead:
                 count_filtered(status, world)
             continue
-        if not _stops(motion, planes, i, vertex):
+        if not is_stopped_by_plane(motion, planes, i, vertex):
             continue
         before, error_before = signed_distance(planes.start[i], motion.x0[vertex])
         before -= kept

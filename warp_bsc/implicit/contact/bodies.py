@@ -1,0 +1,281 @@
+"""Rigid bodies in the solve: each has two unknowns, the shift of its centre of mass, and its turn about that.
+
+The inertia of a turn is that of the rotation vector from the pose to which inertia leads, with the moments there.
+Vertices go on arcs: they are where their body is, and a bound on their chords takes off how far arcs leave these.
+"""
+
+import numpy as np
+import warp as wp
+from newton import BodyFlags
+
+from ...response.state.mesh import ModelMesh
+from ...response.state.motion import StateArrays
+from ...response.state.poses import centre_of, in_world, turn_between, turned_pose
+from ...response.state.structs import Bodies, Motion
+from ...response.state.vectors import HALF, ONE, to_double, to_single
+from .system import Progress, Unknowns
+
+wp.set_module_options({"enable_backward": False})
+
+_ITERATIONS = wp.constant(4)
+"""Iterations for the spin that keeps an angular momentum in the middle of a step."""
+_SMALL_ANGLE = wp.constant(wp.float64(1e-3))
+_TWELFTH = wp.constant(wp.float64(1.0 / 12.0))
+_ROUNDING = wp.constant(wp.float64(2.0**-23))
+_REACH = 0.01
+"""Reach of barriers between bodies as a share of the size of the smaller one."""
+
+
+@wp.struct
+class SolvedBodies:
+    """The bodies in a solve; empty if none is solved for.
+
+    Attributes:
+        unknown: First unknown of each body, -1 for none.
+        first_vertex: First vertex of each.
+        goal: Pose to which inertia leads.
+        pose: Pose now.
+        moved: Pose after a share of its displacement.
+        inertia: Moments in the goal, in the frame of the world [kg m^2].
+    """
+
+    unknown: wp.array[int]
+    first_vertex: wp.array[int]
+    goal: wp.array[wp.transform]
+    pose: wp.array[wp.transform]
+    moved: wp.array[wp.transform]
+    inertia: wp.array[wp.mat33d]
+
+
+def reach_between_bodies(mesh: ModelMesh) -> np.ndarray:
+    """Returns the gap from which vertices of bodies push other bodies and static shapes [m]; infinite for others."""
+    reach, first = np.full(mesh.vertex_count, np.inf), mesh.model.particle_count
+    for body in np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0]):
+        of_body = mesh.shape_vertices.body == body
+        positions = mesh.shape_vertices.position[of_body]
+        reach[first:][of_body] = _REACH * np.linalg.norm(positions.max(axis=0) - positions.min(axis=0))
+    return reach
+
+
+@wp.kernel
+def predict_bodies(
+    # in
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    force: wp.array[wp.spatial_vector],
+    flags: wp.array[int],
+    gravity: wp.array[wp.vec3],
+    bodies: Bodies,
+    dt: float,
+    # out
+    end_q: wp.array[wp.transform],
+    end_qd: wp.array[wp.spatial_vector],
+):
+    """Moves bodies as if nothing but gravity and external forces acted on them.
+
+    Their angular momentum stays what it is, and turns them by their spin in the middle of the step. Kinematic bodies
+    and bodies without mass stay.
+    """
+    body = wp.tid()
+    pose, velocity = body_q[body], body_qd[body]
+    end_q[body] = pose
+    end_qd[body] = velocity
+    inverse_mass = bodies.inverse_mass[body]
+    if inverse_mass == 0.0 or (flags[body] & BodyFlags.KINEMATIC) != 0:
+        return
+    linear, spin = wp.spatial_top(velocity), to_double(wp.spatial_bottom(velocity))
+    linear += dt * gravity[wp.max(bodies.world[body], 0) % gravity.shape[0]]
+    momentum = in_world(bodies.inertia[body], pose) * spin
+    if force:
+        linear += dt * inverse_mass * wp.spatial_top(force[body])
+        momentum += wp.float64(dt) * to_double(wp.spatial_bottom(force[body]))
+    shift, h = wp.float64(dt) * to_double(linear), wp.float64(dt)
+    turns = wp.trace(bodies.inverse_inertia[body]) > 0.0
+    for _k in range(_ITERATIONS):
+        halfway = turned_pose(bodies, body, pose, shift, HALF * h * spin)
+        if turns:
+            spin = in_world(bodies.inverse_inertia[body], halfway) * momentum
+    end = turned_pose(bodies, body, pose, shift, h * spin)
+    if turns:
+        spin = in_world(bodies.inverse_inertia[body], end) * momentum
+    end_q[body] = end
+    end_qd[body] = wp.spatial_vector(linear, to_single(spin))
+
+
+@wp.kernel
+def begin_bodies(
+    # in
+    motion: Motion,
+    # out
+    unknowns: Unknowns,
+    active: wp.array[int],
+    bodies: SolvedBodies,
+):
+    """Takes the poses of bodies from the motion as predicted."""
+    body = wp.tid()
+    u = bodies.unknown[body]
+    if u < 0:
+        return
+    of_motion = motion.bodies
+    is_free = int(of_motion.inverse_mass[body] > 0.0)
+    unknowns.is_free[u] = is_free
+    unknowns.is_free[u + 1] = wp.where(wp.trace(of_motion.inverse_inertia[body]) > 0.0, is_free, 0)
+    if is_free == 0:
+        return
+    active[unknowns.world[u]] = 1
+    start, goal = of_motion.start[body], of_motion.end[body]
+    bodies.goal[body] = goal
+    bodies.inertia[body] = in_world(of_motion.inertia[body], goal)
+    bodies.pose[body] = start
+
+
+@wp.func
+def body_vertex(poses: wp.array[wp.transform], motion: Motion, vertex: int) -> wp.vec3:
+    """Returns where a vertex of a body is in a pose of that [m]."""
+    return wp.transform_point(
+        poses[motion.bodies.of_vertex[vertex]], motion.bodies.position[vertex - motion.bodies.particle_count]
+    )
+
+
+@wp.func
+def arm_on_body(bodies: SolvedBodies, motion: Motion, vertex: int, x: wp.vec3) -> wp.vec3:
+    """Returns the vector to a vertex at ``x`` from the centre of mass of its body [m]."""
+    body = motion.bodies.of_vertex[vertex]
+    return to_single(to_double(x) - centre_of(motion.bodies, body, bodies.pose[body]))
+
+
+@wp.func
+def bend_of(arm: wp.vec3, turn: wp.vec3) -> float:
+    """Returns how far an arc leaves its chord at most, by t (1 - t) at a share t of it [m]."""
+    return 0.5 * wp.length(arm) * wp.length_sq(turn)
+
+
+@wp.func
+def _off_goal(bodies: SolvedBodies, motion: Motion, body: int, pose: wp.transform):
+    """Returns how far a pose is from the goal: its centre [m], and its rotation vector [rad]."""
+    goal = bodies.goal[body]
+    off = centre_of(motion.bodies, body, pose) - centre_of(motion.bodies, body, goal)
+    return off, turn_between(goal, pose)
+
+
+@wp.func
+def inertia_of_body(bodies: SolvedBodies, motion: Motion, body: int, u: int, dt: wp.float64):
+    """Returns the gradient of the inertia of a body by one of its unknowns, and the block of the diagonal."""
+    off, turned = _off_goal(bodies, motion, body, bodies.pose[body])
+    block = (ONE / wp.float64(motion.bodies.inverse_mass[body])) * wp.identity(n=3, dtype=wp.float64)
+    gradient = block * off
+    if u != bodies.unknown[body]:
+        block = bodies.inertia[body]
+        gradient = block * turned
+        # what a turn changes of the rotation vector
+        angle = wp.length(turned)
+        factor = _TWELFTH
+        if angle > _SMALL_ANGLE:
+            factor = ONE / (angle * angle) - HALF / (angle * wp.tan(HALF * angle))
+        once = wp.cross(turned, gradient)
+        gradient += HALF * once + factor * wp.cross(turned, once)
+    single = wp.mat33()
+    for i in range(3):
+        for j in range(3):
+            single[i, j] = float(block[i, j] / (dt * dt))
+    return to_single(gradient / (dt * dt)), single
+
+
+@wp.func
+def inertial_energy(bodies: SolvedBodies, motion: Motion, body: int, dt: wp.float64) -> wp.float64:
+    """Returns the energy of the inertia of a body after a share of its displacement [J]."""
+    off, turned = _off_goal(bodies, motion, body, bodies.moved[body])
+    value = wp.dot(off, off) / wp.float64(motion.bodies.inverse_mass[body])
+    return HALF * (value + wp.dot(turned, bodies.inertia[body] * turned)) / (dt * dt)
+
+
+@wp.func
+def rounding_energy(bodies: SolvedBodies, motion: Motion, body: int, dt: wp.float64) -> wp.float64:
+    """Returns how far the work of all that pushes a body may be off, as positions are rounded [J]."""
+    off, turned = _off_goal(bodies, motion, body, bodies.pose[body])
+    force = wp.length(off) / (wp.float64(motion.bodies.inverse_mass[body]) * dt * dt)
+    torque = wp.length(bodies.inertia[body] * turned) / (dt * dt)
+    x = motion.x0[bodies.first_vertex[body]]
+    return _ROUNDING * (force * wp.float64(wp.max(wp.abs(x))) + torque)
+
+
+@wp.func
+def _is_active(bodies: SolvedBodies, unknowns: Unknowns, progress: Progress, body: int) -> bool:
+    """Returns whether a body is solved for in this Newton step."""
+    u = bodies.unknown[body]
+    if u < 0:
+        return False
+    return unknowns.is_free[u] != 0 and progress.active[unknowns.world[u]] != 0
+
+
+@wp.kernel
+def move_bodies(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    progress: Progress,
+    share: wp.array[float],
+    solution: wp.array[wp.vec3],
+    displaced: bool,
+    takes: bool,
+    # in and out
+    bodies: SolvedBodies,
+):
+    """Moves bodies by what they and their worlds take of their displacements, if ``displaced``; ``takes`` for good."""
+    body = wp.tid()
+    if not _is_active(bodies, unknowns, progress, body):
+        return
+    u = bodies.unknown[body]
+    taken = progress.scale[unknowns.world[u]] * share[bodies.first_vertex[body]]
+    pose = bodies.pose[body]
+    if displaced and taken > 0.0:
+        shift, turn = taken * solution[u], taken * solution[u + 1]
+        pose = turned_pose(motion.bodies, body, pose, to_double(shift), to_double(turn))
+    bodies.moved[body] = pose
+    if takes:
+        bodies.pose[body] = pose
+
+
+@wp.kernel
+def displace_bodies(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    progress: Progress,
+    solution: wp.array[wp.vec3],
+    # out
+    bodies: SolvedBodies,
+):
+    """Moves bodies by all of their displacements."""
+    body = wp.tid()
+    if _is_active(bodies, unknowns, progress, body):
+        u = bodies.unknown[body]
+        shift, turn = to_double(solution[u]), to_double(solution[u + 1])
+        bodies.moved[body] = turned_pose(motion.bodies, body, bodies.pose[body], shift, turn)
+
+
+@wp.kernel
+def finish_bodies(
+    # in
+    bodies: SolvedBodies,
+    unknowns: Unknowns,
+    dt: float,
+    # in and out
+    motion: Motion,
+    end: StateArrays,
+):
+    """Writes where bodies end, and their velocities: what inertia leads to, and what took them off that."""
+    body = wp.tid()
+    u = bodies.unknown[body]
+    if u < 0:
+        return
+    if unknowns.is_free[u] != 0:
+        pose, before = bodies.pose[body], motion.bodies.velocity[body]
+        off, turned = _off_goal(bodies, motion, body, pose)
+        linear = to_double(wp.spatial_top(before)) + off / wp.float64(dt)
+        angular = to_double(wp.spatial_bottom(before)) + turned / wp.float64(dt)
+        velocity = wp.spatial_vector(to_single(linear), to_single(angular))
+        motion.bodies.end[body] = pose
+        motion.bodies.velocity[body] = velocity
+        end.body_q[body] = pose
+        end.body_qd[body] = velocity
