@@ -59,6 +59,7 @@ PACKAGES = {
         "usd",
         "checker",
         "response",
+        "implicit",
         "repair",
         "_arguments",
         "_atomic_file",

@@ -292,6 +292,7 @@ def _measure(
         stage_options=(_STAGES | _IMPLICIT).get(configuration),
         offset=offset,
         counts_collisions=configuration != REFERENCE,
+        early_steps=EARLY_STEPS,
     )
     steps = simulation.run(built.seconds if seconds is None else seconds, progress)
     stage, samples, last = simulation.stage, simulation.samples, max(1, steps // 10)

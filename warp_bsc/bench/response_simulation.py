@@ -16,7 +16,6 @@ from ..response.state.mesh import host_array
 from ..response.substeps.strain import edges_at_rest
 from .crossings import CrossingCounter
 from .elastic_energy import ElasticEnergy
-from .response import EARLY_STEPS
 from .response_scenes import Scene
 
 __all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "total_energy"]
@@ -147,6 +146,7 @@ class Simulation:
         inner: Any = None,
         samples: Any = None,
         counts_collisions: bool = False,
+        early_steps: int = 0,
     ):
         """Makes the solver and the states.
 
@@ -163,6 +163,7 @@ class Simulation:
             samples: What the states are given to, with a method ``add`` as that of :class:`Samples`; default:
                 :class:`Samples`.
             counts_collisions: Whether collisions of each step are counted; it takes a detection, which is not timed.
+            early_steps: Steps after which :class:`Samples` keep positions.
         """
         model = scene.model
         self._scene, self._model, self._rate, self._offset = scene, model, rate, offset
@@ -186,7 +187,7 @@ class Simulation:
         self._poses_in_both = solver != "vbd"
         self._ends = [(model.state(), wp.zeros(1, dtype=int)) for _ in self._states]  # copies of both ends of a pair
         self._graph: wp.Graph | None = None
-        self.samples, self.milliseconds, self.substeps = samples or Samples(model), [], []
+        self.samples, self.milliseconds, self.substeps = samples or Samples(model, early_steps), [], []
         self._counts_collisions, self.collisions = counts_collisions, []
 
     def run(self, seconds: float, progress: Callable[[int, int], None]) -> int:
@@ -283,11 +284,12 @@ class Samples:
         speed: The mean speed of movable particles [m/s].
         energy: The kinetic, gravitational and elastic energy of each world [J], see :class:`.ElasticEnergy`.
         restarts: Indices of ``energy`` and worlds, where the energy of a world begins anew.
-        early: Positions after :data:`.response.EARLY_STEPS` steps [m]; None before.
+        early: Positions after the given number of steps [m]; None before.
     """
 
-    def __init__(self, model: newton.Model):
-        """Reads masses and lengths at rest."""
+    def __init__(self, model: newton.Model, early_steps: int = 0):
+        """Reads masses and lengths at rest; positions after ``early_steps`` are kept."""
+        self._early_steps = early_steps
         self._worlds = max(1, model.world_count)
         self._movable = host_array(model.particle_inv_mass) > 0.0
         edges, lengths, _ = edges_at_rest(model)
@@ -317,7 +319,7 @@ class Samples:
         x, v = host_array(state.particle_q), host_array(state.particle_qd)
         if not (np.isfinite(x).all() and np.isfinite(v).all()):
             return False
-        if len(self.stretch) == EARLY_STEPS:  # the first state is that before all steps
+        if len(self.stretch) == self._early_steps:  # the first state is that before all steps
             self.early = x.astype(np.float64)
         self.stretch.append(largest_stretch(x, self._edges, self._lengths))
         self.speed.append(float(np.linalg.norm(v[self._movable], axis=1).mean()))
