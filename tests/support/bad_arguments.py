@@ -573,6 +573,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
                 "collision_filter": filters,
+                "bodies": {"unknown": "moved", "flag": True, "None": None},
                 "inversions": {"unknown": "counted", "flag": True, "None": None},
                 "max_iterations": NOT_COUNT | {"zero": 0},
                 "report_contacts": without(NOT_COUNT, "bool") | {"zero": 0},
