@@ -88,8 +88,9 @@ class SolverImplicit(SolverCCD):
 
     The end of a step minimizes inertia, the elastic energies that Newton's VBD has, barriers between elements that are
     near each other, and friction. Newton's method finds it, with conjugate gradients for each world and bounds that let
-    no two elements meet. The motion is then detected and certified as that of any solver by :class:`warp_bsc.SolverCCD`,
-    whose certificate, kinematic particles and bodies, and report this solver has; what is left to collide is resolved as there.
+    no two elements meet. The motion is then detected and certified as that of any solver by
+    :class:`warp_bsc.SolverCCD`, whose certificate, kinematic particles and bodies, and report this solver has; what is
+    left to collide is resolved as there.
 
     Free bodies are solved for: they rest on each other, on cloth, on static shapes and on infinite planes, as their
     flags, groups and filters of collision say. Kinematic bodies and those without mass are where the program puts them.
