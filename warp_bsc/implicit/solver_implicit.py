@@ -76,7 +76,7 @@ class _Inertia(SolverBase):
 
 def _radii_of_strands(model: newton.Model) -> np.ndarray | None:
     """Returns the radii of particles without triangles and tetrahedra, 0 for others [m]; None if all are 0."""
-    radii = model.particle_radius.numpy().astype(np.float64)
+    radii = host_array(model.particle_radius).astype(np.float64)
     for elements in (model.tri_indices, model.tet_indices):
         if elements is not None:
             radii[elements.numpy().ravel()] = 0.0
