@@ -13,7 +13,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.poses import centre_of, in_world, turn_between, turned_pose
 from ...response.state.structs import Bodies, Motion
 from ...response.state.vectors import HALF, ONE, to_double, to_single
-from .system import Progress, Unknowns
+from .system import Progress, Unknowns, to_single_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -174,11 +174,7 @@ def inertia_of_body(bodies: SolvedBodies, motion: Motion, body: int, u: int, dt:
             factor = ONE / (angle * angle) - HALF / (angle * wp.tan(HALF * angle))
         once = wp.cross(turned, gradient)
         gradient += HALF * once + factor * wp.cross(turned, once)
-    single = wp.mat33()
-    for i in range(3):
-        for j in range(3):
-            single[i, j] = float(block[i, j] / (dt * dt))
-    return to_single(gradient / (dt * dt)), single
+    return to_single(gradient / (dt * dt)), to_single_block(block / (dt * dt))
 
 
 @wp.func

@@ -185,17 +185,7 @@ def _cross_matrix(a: wp.vec3d) -> wp.mat33d:
 
 @wp.func
 def _single(m: wp.mat33d) -> wp.mat33:
-    return wp.mat33(
-        float(m[0, 0]),
-        float(m[0, 1]),
-        float(m[0, 2]),
-        float(m[1, 0]),
-        float(m[1, 1]),
-        float(m[1, 2]),
-        float(m[2, 0]),
-        float(m[2, 1]),
-        float(m[2, 2]),
-    )
+    return wp.matrix_from_rows(to_single(m[0]), to_single(m[1]), to_single(m[2]))
 
 
 @wp.func

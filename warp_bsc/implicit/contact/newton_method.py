@@ -15,7 +15,7 @@ from ...response.state.mesh import host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from . import bodies, pairs, steps
+from . import bodies, bounds, contact_lists, held, merit, near, pairs, steps
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team, solve_worlds
 from .elasticity import differentiate, elements_of_model, make_derivatives
@@ -325,10 +325,10 @@ class NewtonMethod:
     def _bound(self, active):
         """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
         work, motion = self._work, self._work.step.motion
-        self._over_candidates(pairs.bound_by_pairs, [motion], [self._trial, active, self.progress, self._limit])
+        self._over_candidates(bounds.bound_by_pairs, [motion], [self._trial, active, self.progress, self._limit])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
-            self._launch(pairs.bound_by_planes, work.vertices_at_planes, inputs, [self.progress, self._limit])
+            self._launch(bounds.bound_by_planes, work.vertices_at_planes, inputs, [self.progress, self._limit])
 
     def _take_newton_step(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
@@ -410,12 +410,12 @@ class NewtonMethod:
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         unknowns, ahead = self._unknowns, self._ahead
         self._launch(steps.begin_hold, work.worlds, [], [self.progress, ahead])
-        work.launch_over_entries(pairs.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
+        work.launch_over_entries(held.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
-        self._over_candidates(pairs.hold_pairs, [motion], [*inputs, self._limit, *outputs])
+        self._over_candidates(held.hold_pairs, [motion], [*inputs, self._limit, *outputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
-            self._launch(pairs.hold_at_planes, work.vertices_at_planes, [*inputs, 2 + solves], [contacts])
+            self._launch(held.hold_at_planes, work.vertices_at_planes, [*inputs, 2 + solves], [contacts])
         self._assemble(ahead, False)
         self._solve_linear(ahead)
         self._hold_ahead(solves + 1)
@@ -430,10 +430,10 @@ class NewtonMethod:
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         contacts.count.zero_()
         inputs = [self._settings, self._trial, self._unknowns, active, contacts]
-        self._over_candidates(pairs.find_near, [motion], inputs)
+        self._over_candidates(near.find_near, [motion], inputs)
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(pairs.find_near_planes, work.vertices_at_planes, inputs[:-1], [contacts])
+            self._launch(near.find_near_planes, work.vertices_at_planes, inputs[:-1], [contacts])
 
     def _list_contacts(self):
         work, contacts = self._work, self._contacts
@@ -441,10 +441,10 @@ class NewtonMethod:
         contacts.end.zero_()
         contacts.coupled_end.zero_()
         inputs = [contacts, self._unknowns, self._mesh.device_world]
-        work.launch_over_entries(pairs.count_entries, inputs)
-        self._launch(pairs.place_entries, max(self._count, work.worlds), [], [contacts, self._lacks])
-        work.launch_over_entries(pairs.list_entries, inputs)
-        work.launch_over_entries(pairs.sort_entries, [contacts])
+        work.launch_over_entries(contact_lists.count_entries, inputs)
+        self._launch(contact_lists.place_entries, max(self._count, work.worlds), [], [contacts, self._lacks])
+        work.launch_over_entries(contact_lists.list_entries, inputs)
+        work.launch_over_entries(contact_lists.sort_entries, [contacts])
 
     def _try(self):
         """Computes the energy at the displaced positions, and halves the shares of worlds where it has risen."""
@@ -461,11 +461,11 @@ class NewtonMethod:
         inputs += [self._bodies, progress, displaced]
         self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
         inputs = [self._settings, trial, progress, displaced, energy]
-        self._over_candidates(pairs.add_pair_energies, [motion], inputs)
-        work.launch_over_entries(pairs.add_friction_energies, [motion, self._contacts, *inputs])
+        self._over_candidates(merit.add_pair_energies, [motion], inputs)
+        work.launch_over_entries(merit.add_friction_energies, [motion, self._contacts, *inputs])
         if work.max_penetrations:
             inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(pairs.add_plane_energies, work.vertices_at_planes, inputs[:-1], [energy])
+            self._launch(merit.add_plane_energies, work.vertices_at_planes, inputs[:-1], [energy])
 
     def _take(self):
         """Moves everything by what is taken of its displacements."""

@@ -8,7 +8,8 @@ from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, inertia_of_body, inertial_energy, rounding_energy
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
-from .pairs import BarrierSettings, Trial, add_energy, moved
+from .merit import add_energy
+from .pairs import BarrierSettings, Trial, moved
 from .rows import Rows, sum_of_blocks, sum_of_corners
 from .system import (
     Contacts,
@@ -28,12 +29,6 @@ wp.set_module_options({"enable_backward": False})
 _NOISE = wp.constant(wp.float64(1e-9))
 """Rise of energy that may be rounding, as a share of it."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
-
-
-@wp.func
-def is_given(unknowns: Unknowns, vertex: int) -> bool:
-    """Returns whether a program moves a vertex, or nothing."""
-    return not is_solved(unknowns, vertex)
 
 
 @wp.kernel
@@ -146,7 +141,7 @@ def truncate(
 ):
     """Takes the shares of vertices that are solved for down to their bounds, and clears these."""
     v = wp.tid()
-    if trial.holder[v] == v and not is_given(unknowns, v):
+    if trial.holder[v] == v and is_solved(unknowns, v):
         trial.share[v] = trial.share[v] * limit[v]
     limit[v] = 1.0
 
@@ -328,7 +323,7 @@ def find_remaining(
     v = wp.tid()
     world = motion.world[v]
     trial.share[v] = 1.0
-    if progress.active[world] != 0 and is_given(unknowns, v) and wp.isfinite(trial.x[v]):
+    if progress.active[world] != 0 and not is_solved(unknowns, v) and wp.isfinite(trial.x[v]):
         d = motion.x1[v] - trial.x[v]
         trial.displaced[v] = d
         if wp.length_sq(d) > 0.0:
@@ -357,7 +352,7 @@ def displace(
     if active[world] == 0:
         return
     limit[v] = 1.0
-    if is_given(unknowns, v):
+    if not is_solved(unknowns, v):
         return
     d = displacement(unknowns, v, vectors.solution)
     gradient = vectors.gradient[unknown_of_corner(unknowns, v)]
@@ -446,7 +441,7 @@ def begin_truncation(
     if v >= trial.x.shape[0]:
         return
     limit[v] = 1.0
-    if not is_given(unknowns, v):
+    if is_solved(unknowns, v):
         wp.atomic_min(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
 
 
@@ -611,7 +606,7 @@ def take(
     if progress.active[world] == 0:
         return
     scale = progress.scale[world]
-    given = is_given(unknowns, v)
+    given = not is_solved(unknowns, v)
     if given and scale == 1.0:
         trial.x[v] = motion.x1[v]
     elif given or unknowns.of_vertex[v] >= 0:

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...response.state.vectors import ZERO, to_single
 from .rows import Rows
 
 wp.set_module_options({"enable_backward": False})
@@ -263,3 +264,30 @@ def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int, part: int, 
         else:
             block += weight * weight * contacts.hessian[i]
     return gradient, block
+
+
+@wp.func
+def key_of_pair(group: int, kind: int, first: int, second: int) -> wp.int64:
+    """Returns a number of a pair, different for each pair of a kind, and for each group of contacts."""
+    return (wp.int64(8 * group + kind) << wp.int64(56)) | (wp.int64(first) << wp.int64(28)) | wp.int64(second)
+
+
+@wp.func
+def couples(unknowns: Unknowns, corners: wp.vec4i, weights: wp.vec4d) -> int:
+    """Returns whether both elements of a contact are solved for, or one is of a body."""
+    first, second = int(0), int(0)
+    for j in range(4):
+        u = unknowns.of_vertex[corners[j]]
+        if u < -1:
+            return 1
+        if u >= 0 and weights[j] > ZERO:
+            first = 1
+        if u >= 0 and weights[j] < ZERO:
+            second = 1
+    return first * second
+
+
+@wp.func
+def to_single_block(m: wp.mat33d) -> wp.mat33:
+    """Returns the nearest block in single precision."""
+    return wp.matrix_from_rows(to_single(m[0]), to_single(m[1]), to_single(m[2]))
