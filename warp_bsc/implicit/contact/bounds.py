@@ -1,0 +1,145 @@
+"""Bounds on the displacements of a Newton step: the share of them before two elements meet."""
+
+import warp as wp
+
+from ...response.contacts.queue import has_pair, pair_count, vertices_of
+from ...response.contacts.rules import inverse_mass_of
+from ...response.state.planes import MovingPlanes, signed_distance
+from ...response.state.structs import Motion
+from ...response.state.vectors import ZERO, corners_of, to_double
+from . import barrier
+from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
+from .system import Progress
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
+    """Returns how far shares of displacements may be off, as :func:`.barrier.safe_share` takes it."""
+    first, second = float(0.0), float(0.0)
+    for k in range(2):  # corners 0 and 3 are of different elements
+        of_first = trial.holder[corners[k]] == trial.holder[corners[0]]
+        first = wp.max(first, wp.where(of_first, trial.bend[corners[k]], 0.0))
+    for k in range(1, 4):
+        of_second = trial.holder[corners[k]] == trial.holder[corners[3]]
+        second = wp.max(second, wp.where(of_second, trial.bend[corners[k]], 0.0))
+    share = scale * trial.share[trial.holder[corners[0]]]
+    other = scale * trial.share[trial.holder[corners[3]]]
+    first, second = share * first, other * second
+    return wp.vec2d(wp.float64(first + second), wp.float64(share * first + other * second))
+
+
+@wp.func
+def _bound(
+    motion: Motion,
+    candidates: Candidates,
+    trial: Trial,
+    progress: Progress,
+    active: wp.array[int],
+    limit: wp.array[float],
+    i: int,
+):
+    candidates.share[i] = 1.0
+    if candidates.reach[i] == 0.0:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    world = motion.world[corners[0]]
+    if active[world] == 0:
+        return
+    a, b, c, d = corners_of(trial.x, corners)
+    scale = progress.scale[world]
+    p = to_double(moved(trial, scale, corners[0])) - a
+    q = to_double(moved(trial, scale, corners[1])) - b
+    r = to_double(moved(trial, scale, corners[2])) - c
+    s = to_double(moved(trial, scale, corners[3])) - d
+    # far apart for their ways: no need to find the closest points
+    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
+    kept = candidates.kept[i]
+    reach = wp.float64(candidates.reach[i])
+    apart = barrier.distance_of_boxes(queue.kind, a, b, c, d) - kept
+    bends = _bends(trial, scale, corners)
+    if way + bends[0] <= apart - barrier.least_gap(apart, reach):
+        return
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    least = barrier.least_gap(distance - kept, reach)
+    if way + bends[0] <= distance - kept - least:
+        return
+    # what other pairs allow: more than that changes nothing
+    most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
+    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
+    candidates.share[i] = share
+    if share < 1.0:
+        wp.atomic_min(progress.bound, world, share)
+        for j in range(4):
+            wp.atomic_min(limit, corners[j], share)
+            if trial.holder[corners[j]] != corners[j]:
+                wp.atomic_min(limit, trial.holder[corners[j]], share)
+
+
+@wp.kernel
+def bound_by_pairs(
+    # in
+    motion: Motion,
+    first: Candidates,
+    second: Candidates,
+    trial: Trial,
+    active: wp.array[int],
+    # in and out
+    progress: Progress,
+    limit: wp.array[float],
+    threads: int,
+):
+    """Finds the share of displacements up to which no two elements meet: by vertex, and for all of a world."""
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = first
+            if number == 1:
+                of = second
+            if has_pair(of.queue, i):
+                _bound(motion, of, trial, progress, active, limit, i)
+            number += 1
+
+
+@wp.kernel
+def bound_by_planes(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    active: wp.array[int],
+    # in and out
+    progress: Progress,
+    limit: wp.array[float],
+):
+    """Finds the share of displacements up to which no particle meets an infinite plane, as :func:`bound_by_pairs`."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
+        return
+    scale, now = progress.scale[world], plane_share[world]
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        kept, _level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        if reach == ZERO:
+            continue
+        before, _error = signed_distance(plane_at(planes, i, now), trial.x[vertex])
+        then = now + (1.0 - now) * scale
+        after, _error_after = signed_distance(plane_at(planes, i, then), moved(trial, scale, vertex))
+        gap, left = before - kept, after - kept
+        least = barrier.least_gap(gap, reach)
+        taken = scale * trial.share[trial.holder[vertex]]
+        bend = wp.float64(taken * trial.bend[vertex])
+        flat = wp.float64(taken) * bend
+        rate, low = gap - left + bend, gap - least
+        square = rate * rate - wp.float64(4.0) * flat * low
+        if low - rate + flat < ZERO or (square > ZERO and rate > ZERO and rate < wp.float64(2.0) * flat):
+            share = float(wp.float64(2.0) * low / (rate + wp.sqrt(wp.max(square, ZERO))))
+            wp.atomic_min(progress.bound, world, share)
+            wp.atomic_min(limit, trial.holder[vertex], share)

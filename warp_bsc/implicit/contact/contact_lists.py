@@ -1,0 +1,111 @@
+"""The contacts of each unknown, in an order that does not depend on threads, and those of each world that couple."""
+
+import warp as wp
+
+from .system import Contacts, Unknowns, contact_count, unknown_of_corner
+
+wp.set_module_options({"enable_backward": False})
+
+_COUPLES = wp.constant(wp.int64(1 << 61))
+"""What is added to the number of a contact that couples, so that it comes last."""
+
+
+@wp.kernel
+def count_entries(
+    # in
+    contacts: Contacts,
+    unknowns: Unknowns,
+    world: wp.array[int],
+    threads: int,
+):
+    """Counts the contacts of each unknown that is solved for, in ``end``, and those of each world that couple."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        for j in range(4):
+            if contacts.weights[i][j] != 0.0:
+                vertex = contacts.corners[i][j]
+                u = unknown_of_corner(unknowns, vertex)
+                if u >= 0:
+                    if unknowns.is_free[u] != 0:
+                        wp.atomic_add(contacts.end, u, 1)
+                        if unknowns.of_vertex[vertex] < 0:
+                            wp.atomic_add(contacts.end, u + 1, 1)
+        if contacts.couples[i] != 0:
+            wp.atomic_add(contacts.coupled_end, world[contacts.corners[i][0]], 1)
+
+
+@wp.kernel
+def place_entries(contacts: Contacts, lacks: wp.array[int]):
+    """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them. So for each world."""
+    u = wp.tid()
+    if u == 0 and contacts.count[0] > contacts.corners.shape[0]:
+        lacks[0] = 1
+    if u < contacts.coupled_first.shape[0]:
+        start = wp.atomic_add(contacts.listed, 1, contacts.coupled_end[u])
+        contacts.coupled_first[u] = start
+        contacts.coupled_end[u] = start
+    if u >= contacts.first.shape[0]:
+        return
+    count = contacts.end[u]
+    if count > 0:
+        first = wp.atomic_add(contacts.listed, 0, count)
+        contacts.first[u] = first
+        contacts.end[u] = first
+    else:
+        contacts.first[u] = 0
+        contacts.middle[u] = 0
+
+
+@wp.func
+def _list_entry(contacts: Contacts, u: int, entry: int):
+    n = wp.atomic_add(contacts.end, u, 1)
+    contacts.unsorted[n] = entry
+    contacts.row[n] = u
+    contacts.order[n] = wp.int64(contacts.couples[entry >> 2]) * _COUPLES + contacts.key[entry >> 2]
+
+
+@wp.kernel
+def list_entries(
+    # in and out
+    contacts: Contacts,
+    # in
+    unknowns: Unknowns,
+    world: wp.array[int],
+    threads: int,
+):
+    """Lists the contacts of each unknown, behind its ``end``, which moves on, and those of each world that couple."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        if contacts.couples[i] != 0:
+            contacts.coupled[wp.atomic_add(contacts.coupled_end, world[contacts.corners[i][0]], 1)] = i
+        for j in range(4):
+            if contacts.weights[i][j] != 0.0:
+                vertex = contacts.corners[i][j]
+                u = unknown_of_corner(unknowns, vertex)
+                if u >= 0:
+                    if unknowns.is_free[u] != 0:
+                        _list_entry(contacts, u, 4 * i + j)
+                        if unknowns.of_vertex[vertex] < 0:
+                            _list_entry(contacts, u + 1, 4 * i + j)
+
+
+@wp.kernel
+def sort_entries(
+    # in and out
+    contacts: Contacts,
+    threads: int,
+):
+    """Orders the contacts of each unknown by their pair, so that sums do not depend on the order of threads.
+
+    Those that couple come last.
+    """
+    for n in range(wp.tid(), contacts.listed[0], threads):
+        u, own, entry = contacts.row[n], contacts.order[n] + wp.int64(0), contacts.unsorted[n] + int(0)
+        first = contacts.first[u]
+        rank, single = int(0), int(0)
+        for m in range(first, contacts.end[u]):
+            other = contacts.order[m] + wp.int64(0)
+            single += wp.where(other < _COUPLES, 1, 0)
+            if other < own or (other == own and contacts.unsorted[m] < entry):
+                rank += 1
+        contacts.entries[first + rank] = entry
+        if rank == 0:
+            contacts.middle[u] = first + single

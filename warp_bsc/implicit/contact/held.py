@@ -1,0 +1,207 @@
+"""Contacts that hold pairs which would meet on the displacements of a Newton step, before it is taken."""
+
+import warp as wp
+
+from ...kernels.pipeline.queues import take_slot_int
+from ...response.contacts.queue import has_pair, pair_count, vertices_of
+from ...response.contacts.rules import inverse_mass_of
+from ...response.state.planes import MovingPlanes, signed_distance
+from ...response.state.structs import Motion
+from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
+from . import barrier
+from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at
+from .system import Contacts, Unknowns, contact_count, couples, displacement, is_solved, key_of_pair
+
+wp.set_module_options({"enable_backward": False})
+
+_FIRST_HELD = wp.constant(wp.int64(16 << 56))
+"""Key from which contacts are held ones."""
+_STIFFER = wp.constant(float(10.0))
+"""How much stiffer it is held than what moves it."""
+
+
+@wp.func
+def _hold(
+    contacts: Contacts,
+    unknowns: Unknowns,
+    trial: Trial,
+    inverse: wp.array[wp.mat33],
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    short: wp.float64,
+    key: wp.int64,
+):
+    """Adds a contact that holds a pair which is farther apart along the normal than it shall be, ``short`` if less."""
+    compliance = float(0.0)
+    given = ZERO
+    apart = ZERO
+    n = to_single(normal)
+    for j in range(4):
+        v = corners[j]
+        u = unknowns.of_vertex[v]
+        w = float(weights[j])
+        apart += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
+        if u < 0 and not is_solved(unknowns, v):
+            given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
+        elif u >= 0:
+            compliance += w * w * wp.dot(n, inverse[u] * n)
+        else:
+            turn = wp.cross(unknowns.arm[v], n)
+            compliance += w * w * (wp.dot(n, inverse[-2 - u] * n) + wp.dot(turn, inverse[-1 - u] * turn))
+    if not compliance > 0.0 or apart >= short:
+        return
+    slot = take_slot_int(contacts.count)
+    if slot >= contacts.corners.shape[0]:
+        return
+    stiffness = _STIFFER / compliance
+    contacts.corners[slot] = corners
+    contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
+    contacts.normal[slot] = n
+    contacts.load[slot] = 0.0
+    contacts.friction[slot] = 0.0
+    contacts.gradient[slot] = (stiffness * float(given - short)) * n
+    contacts.hessian[slot] = stiffness * wp.outer(n, n)
+    contacts.key[slot] = key
+    contacts.couples[slot] = couples(unknowns, corners, weights)
+
+
+@wp.kernel
+def release_held(
+    # in
+    motion: Motion,
+    unknowns: Unknowns,
+    solution: wp.array[wp.vec3],
+    active: wp.array[int],
+    # in and out
+    contacts: Contacts,
+    threads: int,
+):
+    """Lets go the pairs that are held and that the solution would pull together: they are not in the way."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        corners, weights, n = contacts.corners[i], contacts.weights[i], contacts.normal[i]
+        if contacts.key[i] >= _FIRST_HELD and active[motion.world[corners[0]]] != 0:
+            apart = wp.dot(n, contacts.gradient[i])
+            for j in range(4):
+                apart += weights[j] * wp.dot(contacts.hessian[i] * n, displacement(unknowns, corners[j], solution))
+            if apart > 0.0:
+                contacts.gradient[i] = wp.vec3()
+                contacts.hessian[i] = wp.mat33()
+
+
+@wp.func
+def _hold_pair(
+    motion: Motion,
+    candidates: Candidates,
+    trial: Trial,
+    unknowns: Unknowns,
+    inverse: wp.array[wp.mat33],
+    active: wp.array[int],
+    limit: wp.array[float],
+    group: int,
+    contacts: Contacts,
+    i: int,
+):
+    reach = wp.float64(candidates.reach[i])
+    if reach == ZERO:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    world = motion.world[corners[0]]
+    if active[world] == 0:
+        return
+    share = candidates.share[i] + float(0.0)
+    if share >= 1.0:
+        return
+    is_first = bool(False)
+    for j in range(4):
+        is_first = is_first or share <= limit[corners[j]]
+    if not is_first:
+        return
+    a, b, c, d = corners_of(trial.x, corners)
+    p, q, r, s = corners_of(trial.displaced, corners)
+    time = wp.float64(share)
+    kept = candidates.kept[i]
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    gap = distance - kept
+    e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
+    weights, then = barrier.closest_weights_and_gap(queue.kind, e, f, g, h)
+    if not then > ZERO:
+        return
+    normal = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / then
+    goal = kept + barrier.goal_gap(gap, reach)
+    now = wp.dot(normal, weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d)
+    pair = queue.pairs[i]
+    key = key_of_pair(group, queue.kind, pair[0], pair[1])
+    _hold(contacts, unknowns, trial, inverse, corners, weights, normal, goal - now, key)
+
+
+@wp.kernel
+def hold_pairs(
+    # in
+    motion: Motion,
+    first: Candidates,
+    second: Candidates,
+    trial: Trial,
+    unknowns: Unknowns,
+    inverse: wp.array[wp.mat33],
+    active: wp.array[int],
+    limit: wp.array[float],
+    group: int,
+    # in and out
+    contacts: Contacts,
+    threads: int,
+):
+    """Adds contacts that hold candidates which would meet on the displacements, in active worlds.
+
+    Only those that are the first, by ``limit``, for one of their vertices: what would come later may not come at all.
+    """
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = first
+            if number == 1:
+                of = second
+            if has_pair(of.queue, i):
+                _hold_pair(motion, of, trial, unknowns, inverse, active, limit, group, contacts, i)
+            number += 1
+
+
+@wp.kernel
+def hold_at_planes(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    inverse: wp.array[wp.mat33],
+    active: wp.array[int],
+    group: int,
+    # in and out
+    contacts: Contacts,
+):
+    """Adds contacts that hold particles which would enter infinite planes, as :func:`hold_pairs`."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
+        return
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        kept, _level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        if reach == ZERO:
+            continue
+        gap, _error = signed_distance(plane_at(planes, i, plane_share[world]), trial.x[vertex])
+        end = plane_at(planes, i, 1.0)
+        left, _error_after = signed_distance(end, trial.x[vertex] + trial.displaced[vertex])
+        now, _error_now = signed_distance(end, trial.x[vertex])
+        gap -= kept
+        if left - kept < barrier.least_gap(gap, reach):
+            goal = kept + barrier.goal_gap(gap, reach)
+            normal = wp.vec3d(end[0], end[1], end[2])
+            weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
+            key = key_of_pair(group, 7, vertex, i)
+            _hold(contacts, unknowns, trial, inverse, wp.vec4i(vertex), weights, normal, goal - now, key)

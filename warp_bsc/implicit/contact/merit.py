@@ -1,0 +1,148 @@
+"""Energies of contacts, by which a Newton step is judged, in fixed point."""
+
+import warp as wp
+
+from ...kernels.polynomials import EDGE_EDGE
+from ...response.contacts.queue import has_pair, pair_count, vertices_of
+from ...response.contacts.rules import inverse_mass_of
+from ...response.state.planes import MovingPlanes, signed_distance
+from ...response.state.structs import Motion
+from ...response.state.vectors import ZERO, corners_of, to_double
+from . import barrier
+from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
+from .system import Contacts, Progress, contact_count
+
+wp.set_module_options({"enable_backward": False})
+
+_UNITS_LIMIT = wp.constant(wp.float64(2.0**52))
+"""Most units of one energy: a thousand of them fit into a sum, and a speed of 900 m/s into one."""
+
+
+@wp.func
+def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units: wp.array[wp.float64]):
+    """Adds an energy [J] to that of a world, in units, so that the sum does not depend on the order of threads."""
+    scaled = wp.clamp(units[world] * value, -_UNITS_LIMIT, _UNITS_LIMIT)
+    scaled = wp.where(wp.isfinite(value), scaled, _UNITS_LIMIT)
+    wp.atomic_add(energy, world, wp.int64(wp.rint(scaled)))
+
+
+@wp.func
+def _pair_energy(
+    motion: Motion,
+    candidates: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    energy: wp.array[wp.int64],
+    i: int,
+):
+    reach = wp.float64(candidates.reach[i])
+    if reach == ZERO:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    world = motion.world[corners[0]]
+    if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
+        return
+    a, b, c, d = corners_of(trial.moved, corners)
+    if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
+        return
+    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    gap = distance - candidates.level[i]
+    if gap < reach:
+        value = wp.float64(1.0e30)
+        if gap > ZERO:
+            stiffness = stiffness_of_pair(motion, settings, corners, queue.kind == EDGE_EDGE)
+            value = stiffness * barrier.barrier_energy(gap, reach)
+        add_energy(energy, world, value, settings.units)
+
+
+@wp.kernel
+def add_pair_energies(
+    # in
+    motion: Motion,
+    first: Candidates,
+    second: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # in and out
+    energy: wp.array[wp.int64],
+    threads: int,
+):
+    """Adds the energies of barriers between elements, at positions or at the displaced ones."""
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = first
+            if number == 1:
+                of = second
+            if has_pair(of.queue, i):
+                _pair_energy(motion, of, settings, trial, progress, displaced, energy, i)
+            number += 1
+
+
+@wp.kernel
+def add_friction_energies(
+    # in
+    motion: Motion,
+    contacts: Contacts,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # in and out
+    energy: wp.array[wp.int64],
+    threads: int,
+):
+    """Adds the work of friction, under the loads and along the planes of the contacts."""
+    for i in range(wp.tid(), contact_count(contacts), threads):
+        corners, weights = contacts.corners[i], contacts.weights[i]
+        world = motion.world[corners[0]]
+        limit = contacts.friction[i] * contacts.load[i]
+        if limit > 0.0 and not (displaced and progress.searches[world] == 0):
+            slid, normal = wp.vec3d(), to_double(contacts.normal[i])
+            for j in range(4):
+                v = corners[j]
+                slid += wp.float64(weights[j]) * (to_double(trial.moved[v]) - to_double(motion.x0[v]))
+            slid -= wp.dot(slid, normal) * normal
+            value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
+            add_energy(energy, world, value, settings.units)
+
+
+@wp.kernel
+def add_plane_energies(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    displaced: bool,
+    # in and out
+    energy: wp.array[wp.int64],
+):
+    """Adds the energies of barriers at infinite planes."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if inverse_mass_of(motion, vertex) == 0.0 or progress.active[world] == 0:
+        return
+    if displaced and progress.searches[world] == 0:
+        return
+    scale, now = wp.where(displaced, progress.scale[world], 0.0), plane_share[world]
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        _kept, level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        plane = plane_at(planes, i, now + (1.0 - now) * scale)
+        distance, _error = signed_distance(plane, trial.moved[vertex])
+        gap = distance - level
+        if gap < reach:
+            value = wp.float64(1.0e30)
+            if gap > ZERO:
+                value = stiffness_at_plane(motion, settings, vertex) * barrier.barrier_energy(gap, reach)
+            add_energy(energy, world, value, settings.units)

@@ -1,0 +1,215 @@
+"""Contacts of a Newton step: pairs of elements that are near each other, and what is near infinite planes."""
+
+import warp as wp
+
+from ...kernels.pipeline.queues import take_slot_int
+from ...kernels.polynomials import EDGE_EDGE
+from ...response.contacts.constraints import friction_on_plane, pair_friction
+from ...response.contacts.queue import has_pair, pair_count, vertices_of
+from ...response.contacts.rules import inverse_mass_of
+from ...response.state.planes import MovingPlanes, signed_distance
+from ...response.state.structs import Motion
+from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
+from . import barrier
+from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
+from .system import Contacts, Unknowns, couples, is_solved, key_of_pair, to_single_block
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def _merged(corners: wp.vec4i, weights: wp.vec4d) -> wp.vec4d:
+    """Returns weights with those of corners that are one vertex, as points have them, at the first of these."""
+    merged = weights
+    for j in range(3, 1, -1):
+        if corners[j] == corners[j - 1]:
+            merged[j - 1] = merged[j - 1] + merged[j]
+            merged[j] = ZERO
+    return merged
+
+
+@wp.func
+def _add_contact(
+    motion: Motion,
+    contacts: Contacts,
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3d,
+    shifted: wp.vec3d,
+    approach: wp.float64,
+    gap: wp.float64,
+    reach: wp.float64,
+    stiffness: wp.float64,
+    friction: float,
+    key: wp.int64,
+):
+    """Adds a contact, with the derivatives of its barrier and friction.
+
+    ``shifted`` is how far the second point has moved since the start beside its corners, ``approach`` how far what a
+    program moves goes along the normal in this Newton step.
+    """
+    slot = take_slot_int(contacts.count)
+    if slot >= contacts.corners.shape[0]:
+        return
+    load = -stiffness * barrier.barrier_slope(gap, reach)
+    curvature = stiffness * barrier.barrier_curvature(gap, reach)
+    slid, given = -shifted, ZERO
+    for j in range(4):
+        v = corners[j]
+        slid += weights[j] * (to_double(trial.x[v]) - to_double(motion.x0[v]))
+        if unknowns.of_vertex[v] < 0 and not is_solved(unknowns, v):
+            given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
+    slid -= wp.dot(slid, normal) * normal
+    gradient = (-load + curvature * (given - approach)) * normal
+    hessian = curvature * wp.outer(normal, normal)
+    if friction > 0.0 and load > ZERO:
+        length, limit = wp.length(slid), wp.float64(friction) * load
+        slope = limit * barrier.friction_slope(length, settings.smoothing)
+        gradient += slope * slid
+        across = wp.identity(n=3, dtype=wp.float64) - wp.outer(normal, normal)
+        if length > ZERO:
+            along = slid / length
+            more = limit * barrier.friction_curvature(length, settings.smoothing) - slope
+            across = slope * across + more * wp.outer(along, along)
+        else:
+            across = slope * across
+        hessian += across
+    contacts.corners[slot] = corners
+    contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
+    contacts.normal[slot] = to_single(normal)
+    contacts.load[slot] = float(load)
+    contacts.friction[slot] = friction
+    contacts.gradient[slot] = to_single(gradient)
+    contacts.hessian[slot] = to_single_block(hessian)
+    contacts.key[slot] = key
+    contacts.couples[slot] = couples(unknowns, corners, weights)
+
+
+@wp.func
+def _find_near(
+    motion: Motion,
+    candidates: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    contacts: Contacts,
+    i: int,
+):
+    reach = wp.float64(candidates.reach[i])
+    if reach == ZERO:
+        return
+    queue = candidates.queue
+    corners = vertices_of(queue, i)
+    if active[motion.world[corners[0]]] == 0:
+        return
+    a, b, c, d = corners_of(trial.x, corners)
+    if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
+        return
+    weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    gap = distance - candidates.level[i]
+    if gap >= reach or not gap > ZERO:
+        return
+    normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
+    stiffness = stiffness_of_pair(motion, settings, corners, queue.kind == EDGE_EDGE)
+    pair = queue.pairs[i]
+    key = key_of_pair(0, queue.kind, pair[0], pair[1])
+    friction = pair_friction(motion, corners)
+    _add_contact(
+        motion,
+        contacts,
+        settings,
+        trial,
+        unknowns,
+        corners,
+        _merged(corners, weights),
+        normal,
+        wp.vec3d(),
+        ZERO,
+        gap,
+        reach,
+        stiffness,
+        friction,
+        key,
+    )
+
+
+@wp.kernel
+def find_near(
+    # in
+    motion: Motion,
+    first: Candidates,
+    second: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    # out
+    contacts: Contacts,
+    threads: int,
+):
+    """Adds contacts for the candidates that are near each other, in active worlds."""
+    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
+        number = int(0)
+        while number < 2:
+            of = first
+            if number == 1:
+                of = second
+            if has_pair(of.queue, i):
+                _find_near(motion, of, settings, trial, unknowns, active, contacts, i)
+            number += 1
+
+
+@wp.kernel
+def find_near_planes(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    plane_share: wp.array[float],
+    settings: BarrierSettings,
+    trial: Trial,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    # out
+    contacts: Contacts,
+):
+    """Adds contacts for the particles that are near infinite planes, in active worlds."""
+    vertex = wp.tid()
+    world = motion.world[vertex]
+    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
+        return
+    for place in range(planes.of_worlds.shape[1]):
+        i = planes.of_worlds[world, place]
+        if i < 0:
+            return
+        plane = plane_at(planes, i, plane_share[world])
+        distance, _error = signed_distance(plane, trial.x[vertex])
+        _kept, level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        gap = distance - level
+        if gap >= reach or not gap > ZERO:
+            continue
+        normal = wp.vec3d(plane[0], plane[1], plane[2])
+        stiffness = stiffness_at_plane(motion, settings, vertex)
+        key = key_of_pair(1, 0, vertex, i)
+        there, _error_there = signed_distance(planes.end[i], trial.x[vertex])
+        since, _since_error = signed_distance(planes.start[i], trial.x[vertex])
+        _add_contact(
+            motion,
+            contacts,
+            settings,
+            trial,
+            unknowns,
+            wp.vec4i(vertex),
+            wp.vec4d(ONE, ZERO, ZERO, ZERO),
+            normal,
+            (since - distance) * normal,
+            distance - there,
+            gap,
+            reach,
+            stiffness,
+            friction_on_plane(motion, planes, i, vertex),
+            key,
+        )
