@@ -12,6 +12,7 @@ from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
 from ..detection.host_function import run_on_host
+from ..response.schedule import Loop
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
@@ -25,7 +26,7 @@ from .contact.newton_method import NewtonMethod
 from .contact.step_report import ImplicitStepReport, StepResults
 
 MAX_STEPS = 4
-"""Newton steps of a step: after 48 steps at 60 a second, cloth on a sphere is 3 mm from where more would have it."""
+"""Newton steps of a step: after 48 steps, cloth across the edge of a box is 3.7 mm from where more would have it."""
 
 
 def _dynamic_bodies(model: newton.Model) -> np.ndarray:
@@ -98,8 +99,8 @@ class SolverImplicit(SolverCCD):
     Stiffness and reach of barriers follow from masses, edges, radii and elasticity; no option needs tuning. Contacts
     that are passed to :meth:`step` are not needed, and not used.
 
-    Each world is stepped as if it were alone, bit for bit, but for the distance by which contacts that the solve leaves
-    are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
+    Each world is stepped as if it were alone, bit for bit as measured on CPUs, but for the distance by which contacts
+    that the solve leaves are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
 
     Limitations:
         Restitution does not exist: contacts are without bounce, and implicit steps damp. A step on a tape raises
@@ -224,7 +225,13 @@ class SolverImplicit(SolverCCD):
         begin(work)
         self._newton.solve(end, dt)
         detect_contacts(work)
+        wp.capture_if(work.loop[Loop.UNFINISHED], self._retreat, end=end)
         resolve_contacts(work, dt)
+
+    def _retreat(self, end):
+        self._newton.retreat(end)
+        begin(self._work)
+        detect_contacts(self._work)
 
     def _measure_strain(self):
         self._meter.measure_step(self._motion.vertices, self.report.last_strain)

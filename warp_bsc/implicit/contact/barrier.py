@@ -8,7 +8,7 @@ References:
     M. Li, Z. Ferguson, T. Schneider, T. Langlois, D. Zorin, D. Panozzo, C. Jiang and D. M. Kaufman, Incremental
     Potential Contact, ACM Transactions on Graphics 39(4), 2020, doi:10.1145/3386569.3392425.
     M. Li, D. M. Kaufman and C. Jiang, Codimensional Incremental Potential Contact, ACM Transactions on Graphics 40(4),
-    2021, doi:10.1145/3450626.3459767 (additive continuous collision detection).
+    2021, doi:10.1145/3450626.3459767 (thickness).
 """
 
 import warp as wp

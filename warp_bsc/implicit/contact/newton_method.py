@@ -217,6 +217,13 @@ class NewtonMethod:
         self._begin(end, dt)
         self._find_end(end)
 
+    def retreat(self, end: StateArrays) -> None:
+        """Ends the step earlier in worlds in which the workspace found contacts, see :func:`.steps.retreat`."""
+        work = self._work
+        inputs = [self._trial, self._unknowns, self._dt, work.status.contact_iteration]
+        outputs = [work.step.motion, end, self._results[0].converged]
+        self._launch(steps.retreat, self._mesh.vertex_count, inputs, outputs)
+
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
         end = StateArrays()

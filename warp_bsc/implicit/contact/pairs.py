@@ -77,6 +77,7 @@ class Trial:
         holder: Vertex whose share each vertex takes: itself, or the first of its body.
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
         moved: Positions after displacements.
+        first: Positions after the first Newton step of the step, to which the straight way is free.
     """
 
     x: wp.array[wp.vec3]
@@ -85,6 +86,7 @@ class Trial:
     holder: wp.array[int]
     bend: wp.array[float]
     moved: wp.array[wp.vec3]
+    first: wp.array[wp.vec3]
 
 
 @wp.func

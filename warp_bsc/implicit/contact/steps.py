@@ -614,6 +614,8 @@ def take(
     else:
         trial.x[v] = body_vertex(bodies.pose, motion, v)
         unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
+    if progress.steps[world] == 0:
+        trial.first[v] = trial.x[v]
     if not given:
         wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))
 
@@ -678,3 +680,32 @@ def finish(
     motion.velocity[v] = velocity
     vertices.x1[v] = x
     vertices.velocity[v] = velocity
+
+
+@wp.kernel
+def retreat(
+    # in
+    trial: Trial,
+    unknowns: Unknowns,
+    dt: float,
+    contact_iteration: wp.array[int],
+    # in and out
+    motion: Motion,
+    end: StateArrays,
+    converged: wp.array[wp.bool],
+):
+    """Ends the step of worlds whose straight way has contacts where their first Newton step led, straight and free.
+
+    It is not converged. A push out of a contact that the solve knows nothing of would give vertices much energy.
+    """
+    v = wp.tid()
+    world = motion.world[v]
+    if contact_iteration[world] < 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
+        return
+    converged[world] = False
+    x = trial.first[v]
+    velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
+    end.particle_q[v] = x
+    end.particle_qd[v] = velocity
+    motion.x1[v] = x
+    motion.velocity[v] = velocity
