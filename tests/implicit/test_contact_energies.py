@@ -18,6 +18,7 @@ from warp_bsc.implicit.contact.barrier import (
 )
 from warp_bsc.implicit.contact.bodies import SolvedBodies
 from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements, make_derivatives
+from warp_bsc.implicit.contact.matrix import make_matrix
 from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.steps import add_blocks
@@ -174,8 +175,9 @@ def test_rows_are_the_sums_of_elements(scene):
     row = np.repeat(np.arange(count), np.diff(first))
     unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
     without_inertia = [Trial(), scene.array(scene.x), Motion(), SolvedBodies(), wp.float64(DT)]
-    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int), 1]
-    wp.launch(add_blocks, len(row), inputs=inputs, outputs=[rows], device=device)
+    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int), rows, 1]
+    blocks_of = make_matrix(rows, np.array([0, count]), parts=2, device=device)
+    wp.launch(add_blocks, len(row), inputs=inputs, outputs=[blocks_of], device=device)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)
     matrix, vector = np.zeros((count, 3, count, 3)), np.zeros((count, 3))
@@ -186,7 +188,8 @@ def test_rows_are_the_sums_of_elements(scene):
             for j in np.flatnonzero(v[e] >= 0):
                 matrix[u, :, unknown[v[e, j]]] += blocks[e, i, :, j]
     found = np.zeros_like(matrix)
-    found[row, :, column] = rows.block.numpy()
+    place = blocks_of.place.numpy()[:, None] + blocks_of.width * np.arange(9)
+    found[row, :, column] = blocks_of.value.numpy()[place].reshape(-1, 3, 3)
     np.testing.assert_allclose(found, matrix, atol=1e-5 * np.abs(matrix).max())
     np.testing.assert_allclose(gradient.numpy(), vector, atol=1e-5 * np.abs(vector).max())
     assert (column[first[:-1]] == np.arange(count)).all()  # the diagonal is the first of its row

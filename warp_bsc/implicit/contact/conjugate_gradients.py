@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from .rows import Rows
-from .system import Contacts, Unknowns, product, pull_contact, sum_of_parts
+from .matrix import Matrix, block_at
+from .system import Contacts, Unknowns, coupled_product, pull_contact, sum_of_parts
 
 _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
@@ -18,12 +18,14 @@ class Team:
     Attributes:
         blocks: Number of blocks.
         parts: Threads that share a row, a power of 2.
+        shares: Whether the direction of a solve is in shared memory, where the threads of a block read it.
         arrived: How often blocks have waited for the others, shape [worlds].
         sums: Of the blocks of each world, of two sums in turn, shape [worlds, 2 blocks].
     """
 
     blocks: int
     parts: int
+    shares: bool
     arrived: wp.array[int]
     sums: wp.array2d[wp.float64]
 
@@ -40,6 +42,7 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]
         if unknowns > _LARGEST_BLOCK and worlds <= _BLOCKS // 2:
             team.parts, threads = 4, _BLOCK
             team.blocks = min(_BLOCKS // worlds, -(-team.parts * unknowns // _BLOCK))
+    team.shares = device.is_cuda and unknowns <= _LARGEST_BLOCK
     team.arrived = wp.zeros(worlds, dtype=int, device=device)
     team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=wp.float64, device=device)
     return team, threads
@@ -53,7 +56,8 @@ class Vectors:
         gradient: Of the energy [N].
         inverse: Inverted blocks of the diagonal, which precondition, shape [unknown_count].
         solution: The displacements [m]; those that are given, before.
-        residual, direction, along: Of the iteration; the last is the product with the direction.
+        residual, direction, along: Of the iteration; the last is the product with the direction, then the residual as
+            preconditioned.
     """
 
     gradient: wp.array[wp.vec3]
@@ -88,21 +92,66 @@ def _wait(world: int, blocks: int, turn: int, arrived: wp.array[int]):
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
-    __shared__ double sums[32];
+    __shared__ double all_sums[64];
+    double* sums = all_sums + 32 * (turn & 1);
     const int lane = threadIdx.x & 31;
     for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
     if (lane == 0) sums[threadIdx.x >> 5] = value;
     __syncthreads();
     value = lane < (blockDim.x >> 5) ? sums[lane] : 0.0;
     for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
-    __syncthreads();
 #endif
     return value;
 """
 )
-def _sum_of_block(value: wp.float64) -> wp.float64:
-    """Returns the sum over the threads of a block, in each."""
+def _sum_of_block(value: wp.float64, turn: int) -> wp.float64:
+    """Returns the sum over the threads of a block, in each; in every other turn by the same memory."""
     ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ float shared[3 * 1024];
+    if (shares) {
+        float* at = shared + 3 * row;
+        if (!writes) return wp::vec3(at[0], at[1], at[2]);
+        at[0] = value[0];
+        at[1] = value[1];
+        at[2] = value[2];
+    }
+#endif
+    if (writes) p.data[first + row] = value;
+    return p.data[first + row];
+"""
+)
+def _element(p: wp.array[wp.vec3], first: int, row: int, value: wp.vec3, writes: bool, shares: bool) -> wp.vec3:
+    """Reads or writes an element of a vector, which is also in shared memory if the team ``shares``."""
+    ...
+
+
+@wp.func
+def _product(
+    matrix: Matrix,
+    contacts: Contacts,
+    unknowns: Unknowns,
+    p: wp.array[wp.vec3],
+    shares: bool,
+    world: int,
+    first: int,
+    row: int,
+    part: int,
+):
+    """Returns a row of a world of the product of the Hessian with a vector, summed over the threads that share it."""
+    thread = row * matrix.parts + part
+    group, lane = matrix.group[world] + thread // matrix.width, thread % matrix.width
+    total = coupled_product(contacts, unknowns, first + row, part, matrix.parts)
+    for entry in range(matrix.first[group], matrix.first[group + 1]):
+        column = matrix.column[entry * matrix.width + lane]
+        if column >= 0:
+            block = block_at(matrix, 9 * entry * matrix.width + lane)
+            total += block * _element(p, first, column - first, wp.vec3(), False, shares)
+    return sum_of_parts(total, matrix.parts)
 
 
 @wp.func
@@ -113,7 +162,7 @@ def _dot(a: wp.vec3, b: wp.vec3) -> wp.float64:
 @wp.func
 def _sum(value: wp.float64, team: Team, world: int, block: int, lane: int, turn: int) -> wp.float64:
     """Returns the sum over the threads of a world, in each, which have waited ``turn`` times then."""
-    total = _sum_of_block(value)
+    total = _sum_of_block(value, turn)
     if team.blocks == 1:
         return total
     first = (turn % 2) * team.blocks
@@ -129,7 +178,7 @@ def _sum(value: wp.float64, team: Team, world: int, block: int, lane: int, turn:
 @wp.kernel(module="unique", enable_backward=False, launch_bounds=_LARGEST_BLOCK)
 def solve_worlds(
     # in
-    rows: Rows,
+    matrix: Matrix,
     contacts: Contacts,
     unknowns: Unknowns,
     active: wp.array[int],
@@ -151,27 +200,29 @@ def solve_worlds(
     world, block = number // team.blocks, number % team.blocks
     if active[world] == 0:
         return
-    row, part = (block * wp.block_dim() + lane) // team.parts, lane % team.parts
-    begin, end = unknowns.of_worlds[world] + row, unknowns.of_worlds[world + 1]
-    stride = team.blocks * wp.block_dim() // team.parts
+    part = lane % team.parts
+    begin, stride = (block * wp.block_dim() + lane) // team.parts, team.blocks * wp.block_dim() // team.parts
+    first = unknowns.of_worlds[world]
+    end = unknowns.of_worlds[world + 1] - first
     turn = int(1)
     own = wp.float64(0.0)
-    first = contacts.coupled_first[world] + block * wp.block_dim() + lane
+    first_coupled = contacts.coupled_first[world] + block * wp.block_dim() + lane
     couples = contacts.coupled_end[world] > contacts.coupled_first[world]
-    for n in range(first, contacts.coupled_end[world], team.blocks * wp.block_dim()):
+    for n in range(first_coupled, contacts.coupled_end[world], team.blocks * wp.block_dim()):
         pull_contact(contacts, unknowns, contacts.coupled[n], vectors.solution)
     if couples:
         _wait(world, team.blocks, turn, team.arrived)
         turn += 1
-    for u in range(begin, end, stride):
+    for row in range(begin, end, stride):
+        u = first + row
         r = wp.vec3()
         if unknowns.is_free[u] != 0:
-            p = product(rows, contacts, unknowns, u, vectors.solution, part, team.parts)
-            r = -vectors.gradient[u] - sum_of_parts(p, team.parts)
+            p = _product(matrix, contacts, unknowns, vectors.solution, False, world, first, row, part)
+            r = -vectors.gradient[u] - p
         if part == 0:
             z = vectors.inverse[u] * r
             vectors.residual[u] = r
-            vectors.direction[u] = z
+            _element(vectors.direction, first, row, z, True, team.shares)
             own += _dot(r, z)
     squared = _sum(own, team, world, block, lane, turn)
     limit = tolerance * tolerance * squared
@@ -180,17 +231,17 @@ def solve_worlds(
     while goes_on:
         own = wp.float64(0.0)
         if couples:
-            for n in range(first, contacts.coupled_end[world], team.blocks * wp.block_dim()):
+            for n in range(first_coupled, contacts.coupled_end[world], team.blocks * wp.block_dim()):
                 pull_contact(contacts, unknowns, contacts.coupled[n], vectors.direction)
             turn += 1
             _wait(world, team.blocks, turn, team.arrived)
-        for u in range(begin, end, stride):
+        for row in range(begin, end, stride):
+            u = first + row
             if unknowns.is_free[u] != 0:
-                p = product(rows, contacts, unknowns, u, vectors.direction, part, team.parts)
-                p = sum_of_parts(p, team.parts)
+                p = _product(matrix, contacts, unknowns, vectors.direction, team.shares, world, first, row, part)
                 if part == 0:
                     vectors.along[u] = p
-                    own += _dot(vectors.direction[u], p)
+                    own += _dot(_element(vectors.direction, first, row, p, False, team.shares), p)
         turn += 1
         curvature = _sum(own, team, world, block, lane, turn)
         is_convex = curvature > wp.float64(0.0)
@@ -201,21 +252,27 @@ def solve_worlds(
             step = float(squared / wp.max(-curvature, wp.float64(1e-30) + wp.float64(0.01) * squared))
         count += 1
         own = wp.float64(0.0)
-        for u in range(begin, end, stride):
+        for row in range(begin, end, stride):
+            u = first + row
             if unknowns.is_free[u] != 0 and part == 0:
-                vectors.solution[u] = vectors.solution[u] + step * vectors.direction[u]
+                d = _element(vectors.direction, first, row, wp.vec3(), False, team.shares)
+                vectors.solution[u] = vectors.solution[u] + step * d
                 r = vectors.residual[u] - step * vectors.along[u]
+                z = vectors.inverse[u] * r
                 vectors.residual[u] = r
-                own += _dot(r, vectors.inverse[u] * r)
+                vectors.along[u] = z
+                own += _dot(r, z)
         turn += 1
         after = _sum(own, team, world, block, lane, turn)
         goes_on = is_convex and after > limit and count < max_iterations
         momentum = float(after / squared)
         squared = after
         if goes_on:
-            for u in range(begin, end, stride):
+            for row in range(begin, end, stride):
+                u = first + row
                 if unknowns.is_free[u] != 0 and part == 0:
-                    vectors.direction[u] = vectors.inverse[u] * vectors.residual[u] + momentum * vectors.direction[u]
+                    d = _element(vectors.direction, first, row, wp.vec3(), False, team.shares)
+                    _element(vectors.direction, first, row, vectors.along[u] + momentum * d, True, team.shares)
             turn += 1
             _wait(world, team.blocks, turn, team.arrived)
     if block == 0 and lane == 0:

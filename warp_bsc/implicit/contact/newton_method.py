@@ -20,6 +20,7 @@ from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team, solve_worlds
 from .elasticity import differentiate, elements_of_model, make_derivatives
 from .impulses import publish_contacts
+from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import make_rows
 from .step_report import StepResults, note_overflow, write_results
@@ -100,7 +101,8 @@ class NewtonMethod:
         unknowns.particle = array(np.where(order < particles, order, -1))
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
         unknowns.world = array(owner_world[order])
-        unknowns.of_worlds = array(np.searchsorted(owner_world[order], np.arange(work.worlds + 1)))
+        of_worlds = np.searchsorted(owner_world[order], np.arange(work.worlds + 1))
+        unknowns.of_worlds = array(of_worlds)
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
         unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
@@ -117,6 +119,7 @@ class NewtonMethod:
             holder[particles + held] = first_vertex[body_of_vertex[held]]
         self._rows = make_rows(of_elements, unknown, self._count, device)
         self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
+        self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
         self._element_count = sum(map(len, of_elements))
         self._derivatives = make_derivatives(of_elements, device)
         self._vectors = allocate(Vectors, self._count, device)
@@ -380,7 +383,7 @@ class NewtonMethod:
         work, team = self._work, self._team
         if team.blocks > 1:
             team.arrived.zero_()
-        inputs = [self._rows, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, team]
+        inputs = [self._matrix, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, team]
         outputs = [self._vectors, self.iterations]
         options = {"device": work.device, "block_dim": self._threads}
         wp.launch(solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options)
@@ -391,9 +394,11 @@ class NewtonMethod:
         self._list_contacts()
         parts = _PARTS if self._work.device.is_cuda else 1
         masses = [motion, self._bodies, wp.float64(self._dt), active]
-        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses, parts]
-        self._launch(steps.add_blocks, parts * len(self._row_of_block), inputs, [self._rows])
-        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins, self._rows, parts]
+        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses]
+        inputs += [self._rows, parts]
+        self._launch(steps.add_blocks, parts * len(self._row_of_block), inputs, [self._matrix])
+        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins]
+        inputs += [self._rows, self._matrix, parts]
         self._launch(steps.assemble, parts * self._count, inputs, [vectors])
 
     def _hold_ahead(self, solves):

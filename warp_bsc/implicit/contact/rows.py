@@ -1,4 +1,4 @@
-"""The Hessian of a step without contacts: sparse rows of 3 x 3 blocks, whose places do not change."""
+"""The places of a Hessian without contacts, which do not change: sparse rows of 3 x 3 blocks, sums over elements."""
 
 import numpy as np
 import warp as wp
@@ -18,7 +18,6 @@ class Rows:
     Attributes:
         first: First block of each row, and the end of the last, shape [unknown_count + 1].
         column: Unknown of each block; the first of a row is that of the diagonal.
-        block: The blocks [N/m].
         first_source: First block of elements in each block of a row, and the end of the last.
         source: Blocks of elements; of bending, -1 less 16 times the element plus 4 times one corner plus the other.
         first_corner: First corner of elements in each unknown, and the end of the last.
@@ -27,7 +26,6 @@ class Rows:
 
     first: wp.array[int]
     column: wp.array[int]
-    block: wp.array[wp.mat33]
     first_source: wp.array[int]
     source: wp.array[int]
     first_corner: wp.array[int]
@@ -81,7 +79,6 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
     rows = Rows()
     rows.first = array(np.searchsorted(row[order], np.arange(count + 1)))
     rows.column = array(column[order])
-    rows.block = wp.zeros(len(order), dtype=wp.mat33, device=device)
     rows.first_source, rows.source = array(kept_before[first_source]), array(source[kept])
     rows.first_corner = array(np.searchsorted(corner_row[by_row], np.arange(count + 1)))
     rows.corner = array(corner[by_row])

@@ -8,6 +8,7 @@ from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, inertia_of_body, inertial_energy, rounding_energy
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
+from .matrix import Matrix, block_of, set_block
 from .merit import add_energy
 from .pairs import BarrierSettings, Trial, moved
 from .rows import Rows, sum_of_blocks, sum_of_corners
@@ -242,9 +243,10 @@ def add_blocks(
     bodies: SolvedBodies,
     dt: wp.float64,
     active: wp.array[int],
+    rows: Rows,
     parts: int,
     # out
-    rows: Rows,
+    matrix: Matrix,
 ):
     """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds.
 
@@ -261,7 +263,7 @@ def add_blocks(
     if u == v and unknowns.is_free[u] != 0:
         _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
         total += inertia
-    rows.block[k] = total
+    set_block(matrix, k, total)
 
 
 @wp.kernel
@@ -278,6 +280,7 @@ def assemble(
     active: wp.array[int],
     begins: bool,
     rows: Rows,
+    matrix: Matrix,
     parts: int,
     # in and out
     vectors: Vectors,
@@ -305,7 +308,7 @@ def assemble(
         return
     pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
     vectors.gradient[u] = gradient + sum_of_corners(rows, derivatives, u) + pull
-    vectors.inverse[u] = _inverse(rows.block[rows.first[u]] + block, wp.min(wp.get_diag(inertia)))
+    vectors.inverse[u] = _inverse(block_of(matrix, rows.first[u]) + block, wp.min(wp.get_diag(inertia)))
     if begins:
         vectors.solution[u] = wp.vec3()
 

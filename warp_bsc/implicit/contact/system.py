@@ -3,7 +3,6 @@
 import warp as wp
 
 from ...response.state.vectors import ZERO, to_single
-from .rows import Rows
 
 wp.set_module_options({"enable_backward": False})
 
@@ -193,16 +192,12 @@ def contact_count(contacts: Contacts) -> int:
 
 
 @wp.func
-def product(
-    rows: Rows, contacts: Contacts, unknowns: Unknowns, u: int, p: wp.array[wp.vec3], part: int, parts: int
-) -> wp.vec3:
-    """Returns the row of an unknown of the product of the Hessian with a vector, or one of some parts of it.
+def coupled_product(contacts: Contacts, unknowns: Unknowns, u: int, part: int, parts: int) -> wp.vec3:
+    """Returns the row of an unknown, or one of some parts of it, of the product of contacts that couple with a vector.
 
-    Of contacts that couple, it reads what :func:`pull_contact` wrote.
+    It reads what :func:`pull_contact` wrote.
     """
     total = wp.vec3()
-    for k in range(rows.first[u] + part, rows.first[u + 1], parts):
-        total += rows.block[k] * p[rows.column[k]]
     for n in range(contacts.middle[u] + part, contacts.end[u], parts):
         entry = contacts.entries[n]
         i, place = entry >> 2, entry & 3
@@ -212,7 +207,7 @@ def product(
 
 @wp.func
 def pull_contact(contacts: Contacts, unknowns: Unknowns, i: int, p: wp.array[wp.vec3]):
-    """Writes the product of the Hessian of a contact with a vector, which :func:`product` reads."""
+    """Writes the product of the Hessian of a contact with a vector, which :func:`coupled_product` reads."""
     corners, weights = contacts.corners[i], contacts.weights[i]
     between = wp.vec3()
     for j in range(4):
