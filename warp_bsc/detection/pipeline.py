@@ -30,7 +30,7 @@ from .stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
 
-MIN_CAPACITY = 4096
+MIN_CAPACITY = 2**17
 """Smallest capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
 
 _LARGEST_RADIUS = 2.0**1000

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from .matrix import Matrix, block_at
-from .system import Contacts, Unknowns, coupled_product, pull_contact, sum_of_parts
+from .matrix import Matrix
+from .system import Contacts, Unknowns
 
 _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
@@ -56,8 +56,8 @@ class Vectors:
         gradient: Of the energy [N].
         inverse: Inverted blocks of the diagonal, which precondition, shape [unknown_count].
         solution: The displacements [m]; those that are given, before.
-        residual, direction, along: Of the iteration; the last is the product with the direction, then the residual as
-            preconditioned.
+        residual, direction, along: Of the iteration; the last is the product with the direction, and then the residual
+            as it is preconditioned.
     """
 
     gradient: wp.array[wp.vec3]
@@ -70,109 +70,211 @@ class Vectors:
 
 @wp.func_native(
     snippet="""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-    if (blocks > 1) {
-        if (threadIdx.x == 0) {
-            __threadfence();
-            atomicAdd(&arrived.data[world], 1);
-            while (*(volatile int*)&arrived.data[world] < turn * blocks) {}
-            __threadfence();
-        }
-        __syncthreads();
-    }
-#endif
-"""
-)
-def _wait(world: int, blocks: int, turn: int, arrived: wp.array[int]):
-    """Waits for all threads of a world, for the ``turn``-th time; each then sees what the others wrote."""
-    ...
-
-
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    __shared__ double all_sums[64];
-    double* sums = all_sums + 32 * (turn & 1);
-    const int lane = threadIdx.x & 31;
-    for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
-    if (lane == 0) sums[threadIdx.x >> 5] = value;
-    __syncthreads();
-    value = lane < (blockDim.x >> 5) ? sums[lane] : 0.0;
-    for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
-#endif
-    return value;
-"""
-)
-def _sum_of_block(value: wp.float64, turn: int) -> wp.float64:
-    """Returns the sum over the threads of a block, in each; in every other turn by the same memory."""
-    ...
-
-
-@wp.func_native(
-    snippet="""
+    const int parts = matrix.parts, width = matrix.width, blocks = team.blocks;
+    const int first = unknowns.of_worlds.data[world], rows = unknowns.of_worlds.data[world + 1] - first;
+    const int* is_free = unknowns.is_free.data + first;
+    const wp::mat33* inverse = vectors.inverse.data + first;
+    float* solution = (float*)(vectors.solution.data + first);
+    float* residual = (float*)(vectors.residual.data + first);
+    float* along = (float*)(vectors.along.data + first);
+    const int first_coupled = contacts.coupled_first.data[world], end_coupled = contacts.coupled_end.data[world];
+    const bool couples = end_coupled > first_coupled;
+    int turn = 0;
 #if defined(__CUDA_ARCH__)
     __shared__ float shared[3 * 1024];
-    if (shares) {
-        float* at = shared + 3 * row;
-        if (!writes) return wp::vec3(at[0], at[1], at[2]);
-        at[0] = value[0];
-        at[1] = value[1];
-        at[2] = value[2];
-    }
+    __shared__ double sums_of_warps[2][32];
+    const int lane = threadIdx.x, threads = blockDim.x;
+    float* direction = team.shares ? shared : (float*)(vectors.direction.data + first);
+    auto wait = [&]() {
+        ++turn;
+        __syncthreads();
+        if (blocks > 1) {
+            if (lane == 0) {
+                __threadfence();
+                atomicAdd(&team.arrived.data[world], 1);
+                while (*(volatile int*)&team.arrived.data[world] < turn * blocks) {}
+                __threadfence();
+            }
+            __syncthreads();
+        }
+    };
+    auto sum_of_block = [&](double value) {
+        double* sums = sums_of_warps[turn & 1];
+        for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
+        if ((lane & 31) == 0) sums[lane >> 5] = value;
+        __syncthreads();
+        value = (lane & 31) < (threads >> 5) ? sums[lane & 31] : 0.0;
+        for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
+        return value;
+    };
+    auto sum = [&](double value) {
+        if (blocks == 1) {
+            ++turn;
+            return sum_of_block(value);
+        }
+        value = sum_of_block(value);
+        double* sums = team.sums.data + (2 * world + ((turn + 1) & 1)) * blocks;
+        if (lane == 0) sums[block] = value;
+        wait();
+        value = 0.0;
+        for (int other = 0; other < blocks; ++other) value += sums[other];
+        return value;
+    };
+    const unsigned sharers = (parts == 32 ? ~0u : (1u << parts) - 1u) << (lane & 31 & ~(parts - 1));
+    auto sum_of_parts = [&](float value) {
+        for (int offset = parts / 2; offset; offset >>= 1) value += __shfl_xor_sync(sharers, value, offset);
+        return value;
+    };
+#else
+    const int lane = 0, threads = 1;
+    float* direction = (float*)(vectors.direction.data + first);
+    auto wait = []() {};
+    auto sum = [](double value) { return value; };
+    auto sum_of_parts = [](float value) { return value; };
 #endif
-    if (writes) p.data[first + row] = value;
-    return p.data[first + row];
+    const int part = lane % parts, stride = blocks * threads / parts, begin = (block * threads + lane) / parts;
+    auto pull = [&](const float* p) {  // products of contacts that couple with a vector
+        if (!couples) return;
+        for (int n = first_coupled + block * threads + lane; n < end_coupled; n += blocks * threads) {
+            const int i = contacts.coupled.data[n];
+            const wp::vec4i corners = contacts.corners.data[i];
+            const wp::vec4 weights = contacts.weights.data[i];
+            float x = 0.0f, y = 0.0f, z = 0.0f;
+            for (int j = 0; j < 4; ++j) {
+                const int u = unknowns.of_vertex.data[corners[j]];
+                if (weights[j] == 0.0f || u == -1) continue;
+                const float* d = p + 3 * ((u >= 0 ? u : -2 - u) - first);
+                x += weights[j] * d[0];
+                y += weights[j] * d[1];
+                z += weights[j] * d[2];
+                if (u < -1) {  // of a body: its turn follows its shift
+                    const wp::vec3 arm = unknowns.arm.data[corners[j]];
+                    x += weights[j] * (d[4] * arm[2] - d[5] * arm[1]);
+                    y += weights[j] * (d[5] * arm[0] - d[3] * arm[2]);
+                    z += weights[j] * (d[3] * arm[1] - d[4] * arm[0]);
+                }
+            }
+            contacts.pull.data[i] = wp::mul(contacts.hessian.data[i], wp::vec3(x, y, z));
+        }
+        wait();
+    };
+    auto multiply = [&](int row, const float* p, float* result) {
+        const int thread = row * parts + part, u = first + row;
+        const int group = matrix.group.data[world] + thread / width, end = matrix.first.data[group + 1];
+        int entry = matrix.first.data[group];
+        const float* v = matrix.value.data + 9 * entry * width + thread % width;
+        const int* column = matrix.column.data + entry * width + thread % width;
+        float x = 0.0f, y = 0.0f, z = 0.0f;
+#if defined(__CUDA_ARCH__)
+#pragma unroll 4
+#endif
+        for (; entry < end; ++entry, v += 9 * width, column += width) {
+            const int c = *column;
+            if (c < 0) continue;
+            const float* d = p + 3 * (c - first);
+            x += v[0] * d[0] + v[width] * d[1] + v[2 * width] * d[2];
+            y += v[3 * width] * d[0] + v[4 * width] * d[1] + v[5 * width] * d[2];
+            z += v[6 * width] * d[0] + v[7 * width] * d[1] + v[8 * width] * d[2];
+        }
+        if (couples) {
+            const bool of_body = unknowns.particle.data[u] < 0;
+            for (int n = contacts.middle.data[u] + part; n < contacts.end.data[u]; n += parts) {
+                const int i = contacts.entries.data[n] >> 2, place = contacts.entries.data[n] & 3;
+                wp::vec3 force = contacts.weights.data[i][place] * contacts.pull.data[i];
+                const int vertex = of_body ? contacts.corners.data[i][place] : 0;
+                if (of_body && unknowns.of_vertex.data[vertex] == -1 - u)
+                    force = wp::cross(unknowns.arm.data[vertex], force);
+                x += force[0];
+                y += force[1];
+                z += force[2];
+            }
+        }
+        result[0] = sum_of_parts(x);
+        result[1] = sum_of_parts(y);
+        result[2] = sum_of_parts(z);
+    };
+    pull(solution);
+    double own = 0.0;
+    for (int row = begin; row < rows; row += stride) {
+        wp::vec3 r, p;
+        if (is_free[row]) {
+            multiply(row, solution, &p[0]);
+            r = -vectors.gradient.data[first + row] - p;
+        }
+        if (part == 0) {
+            const wp::vec3 z = wp::mul(inverse[row], r);
+            for (int c = 0; c < 3; ++c) {
+                residual[3 * row + c] = r[c];
+                direction[3 * row + c] = z[c];
+            }
+            own += wp::dot(r, z);
+        }
+    }
+    double squared = sum(own);
+    const double limit = tolerance * tolerance * squared;
+    int count = 0;
+    bool goes_on = squared > 0.0;
+    while (goes_on) {
+        pull(direction);
+        own = 0.0;
+        for (int row = begin; row < rows; row += stride) {
+            if (!is_free[row]) continue;
+            wp::vec3 p;
+            multiply(row, direction, &p[0]);
+            if (part != 0) continue;
+            for (int c = 0; c < 3; ++c) along[3 * row + c] = p[c];
+            const float* d = direction + 3 * row;
+            own += d[0] * p[0] + d[1] * p[1] + d[2] * p[2];
+        }
+        const double curvature = sum(own);
+        const bool is_convex = curvature > 0.0;
+        float step = 0.0f;
+        if (is_convex) step = (float)(squared / curvature);
+        else if (count == 0) step = (float)(squared / wp::max(-curvature, 1e-30 + 0.01 * squared));
+        ++count;
+        own = 0.0;
+        for (int row = begin; row < rows; row += stride) {
+            if (!is_free[row] || part != 0) continue;
+            wp::vec3 r;
+            for (int c = 0; c < 3; ++c) {
+                solution[3 * row + c] += step * direction[3 * row + c];
+                residual[3 * row + c] = r[c] = residual[3 * row + c] - step * along[3 * row + c];
+            }
+            const wp::vec3 z = wp::mul(inverse[row], r);
+            for (int c = 0; c < 3; ++c) along[3 * row + c] = z[c];
+            own += wp::dot(r, z);
+        }
+        const double after = sum(own);
+        goes_on = is_convex && after > limit && count < max_iterations;
+        const float momentum = (float)(after / squared);
+        squared = after;
+        if (!goes_on) break;
+        for (int row = begin; row < rows; row += stride) {
+            if (!is_free[row] || part != 0) continue;
+            for (int c = 0; c < 3; ++c)
+                direction[3 * row + c] = along[3 * row + c] + momentum * direction[3 * row + c];
+        }
+        wait();
+    }
+    return count;
 """
 )
-def _element(p: wp.array[wp.vec3], first: int, row: int, value: wp.vec3, writes: bool, shares: bool) -> wp.vec3:
-    """Reads or writes an element of a vector, which is also in shared memory if the team ``shares``."""
-    ...
-
-
-@wp.func
-def _product(
+def _solve(
     matrix: Matrix,
     contacts: Contacts,
     unknowns: Unknowns,
-    p: wp.array[wp.vec3],
-    shares: bool,
+    tolerance: wp.float64,
+    max_iterations: int,
+    team: Team,
+    vectors: Vectors,
     world: int,
-    first: int,
-    row: int,
-    part: int,
-):
-    """Returns a row of a world of the product of the Hessian with a vector, summed over the threads that share it."""
-    thread = row * matrix.parts + part
-    group, lane = matrix.group[world] + thread // matrix.width, thread % matrix.width
-    total = coupled_product(contacts, unknowns, first + row, part, matrix.parts)
-    for entry in range(matrix.first[group], matrix.first[group + 1]):
-        column = matrix.column[entry * matrix.width + lane]
-        if column >= 0:
-            block = block_at(matrix, 9 * entry * matrix.width + lane)
-            total += block * _element(p, first, column - first, wp.vec3(), False, shares)
-    return sum_of_parts(total, matrix.parts)
+    block: int,
+) -> int:
+    """Solves for a world by the threads of one block, or several, and returns the number of iterations.
 
-
-@wp.func
-def _dot(a: wp.vec3, b: wp.vec3) -> wp.float64:
-    return wp.float64(wp.dot(a, b))
-
-
-@wp.func
-def _sum(value: wp.float64, team: Team, world: int, block: int, lane: int, turn: int) -> wp.float64:
-    """Returns the sum over the threads of a world, in each, which have waited ``turn`` times then."""
-    total = _sum_of_block(value, turn)
-    if team.blocks == 1:
-        return total
-    first = (turn % 2) * team.blocks
-    if lane == 0:
-        team.sums[world, first + block] = total
-    _wait(world, team.blocks, turn, team.arrived)
-    total = wp.float64(0.0)
-    for other in range(team.blocks):
-        total += team.sums[world, first + other]
-    return total
+    By hand, with plain pointers: most of an iteration would otherwise be the arithmetic of addresses.
+    """
+    ...
 
 
 @wp.kernel(module="unique", enable_backward=False, launch_bounds=_LARGEST_BLOCK)
@@ -200,80 +302,6 @@ def solve_worlds(
     world, block = number // team.blocks, number % team.blocks
     if active[world] == 0:
         return
-    part = lane % team.parts
-    begin, stride = (block * wp.block_dim() + lane) // team.parts, team.blocks * wp.block_dim() // team.parts
-    first = unknowns.of_worlds[world]
-    end = unknowns.of_worlds[world + 1] - first
-    turn = int(1)
-    own = wp.float64(0.0)
-    first_coupled = contacts.coupled_first[world] + block * wp.block_dim() + lane
-    couples = contacts.coupled_end[world] > contacts.coupled_first[world]
-    for n in range(first_coupled, contacts.coupled_end[world], team.blocks * wp.block_dim()):
-        pull_contact(contacts, unknowns, contacts.coupled[n], vectors.solution)
-    if couples:
-        _wait(world, team.blocks, turn, team.arrived)
-        turn += 1
-    for row in range(begin, end, stride):
-        u = first + row
-        r = wp.vec3()
-        if unknowns.is_free[u] != 0:
-            p = _product(matrix, contacts, unknowns, vectors.solution, False, world, first, row, part)
-            r = -vectors.gradient[u] - p
-        if part == 0:
-            z = vectors.inverse[u] * r
-            vectors.residual[u] = r
-            _element(vectors.direction, first, row, z, True, team.shares)
-            own += _dot(r, z)
-    squared = _sum(own, team, world, block, lane, turn)
-    limit = tolerance * tolerance * squared
-    count = int(0)
-    goes_on = squared > wp.float64(0.0)
-    while goes_on:
-        own = wp.float64(0.0)
-        if couples:
-            for n in range(first_coupled, contacts.coupled_end[world], team.blocks * wp.block_dim()):
-                pull_contact(contacts, unknowns, contacts.coupled[n], vectors.direction)
-            turn += 1
-            _wait(world, team.blocks, turn, team.arrived)
-        for row in range(begin, end, stride):
-            u = first + row
-            if unknowns.is_free[u] != 0:
-                p = _product(matrix, contacts, unknowns, vectors.direction, team.shares, world, first, row, part)
-                if part == 0:
-                    vectors.along[u] = p
-                    own += _dot(_element(vectors.direction, first, row, p, False, team.shares), p)
-        turn += 1
-        curvature = _sum(own, team, world, block, lane, turn)
-        is_convex = curvature > wp.float64(0.0)
-        step = float(0.0)
-        if is_convex:
-            step = float(squared / curvature)
-        elif count == 0:
-            step = float(squared / wp.max(-curvature, wp.float64(1e-30) + wp.float64(0.01) * squared))
-        count += 1
-        own = wp.float64(0.0)
-        for row in range(begin, end, stride):
-            u = first + row
-            if unknowns.is_free[u] != 0 and part == 0:
-                d = _element(vectors.direction, first, row, wp.vec3(), False, team.shares)
-                vectors.solution[u] = vectors.solution[u] + step * d
-                r = vectors.residual[u] - step * vectors.along[u]
-                z = vectors.inverse[u] * r
-                vectors.residual[u] = r
-                vectors.along[u] = z
-                own += _dot(r, z)
-        turn += 1
-        after = _sum(own, team, world, block, lane, turn)
-        goes_on = is_convex and after > limit and count < max_iterations
-        momentum = float(after / squared)
-        squared = after
-        if goes_on:
-            for row in range(begin, end, stride):
-                u = first + row
-                if unknowns.is_free[u] != 0 and part == 0:
-                    d = _element(vectors.direction, first, row, wp.vec3(), False, team.shares)
-                    _element(vectors.direction, first, row, vectors.along[u] + momentum * d, True, team.shares)
-            turn += 1
-            _wait(world, team.blocks, turn, team.arrived)
+    count = _solve(matrix, contacts, unknowns, tolerance, max_iterations, team, vectors, world, block)
     if block == 0 and lane == 0:
         iterations[world] = iterations[world] + count

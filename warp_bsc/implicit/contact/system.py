@@ -192,31 +192,6 @@ def contact_count(contacts: Contacts) -> int:
 
 
 @wp.func
-def coupled_product(contacts: Contacts, unknowns: Unknowns, u: int, part: int, parts: int) -> wp.vec3:
-    """Returns the row of an unknown, or one of some parts of it, of the product of contacts that couple with a vector.
-
-    It reads what :func:`pull_contact` wrote.
-    """
-    total = wp.vec3()
-    for n in range(contacts.middle[u] + part, contacts.end[u], parts):
-        entry = contacts.entries[n]
-        i, place = entry >> 2, entry & 3
-        total += _by_corner(unknowns, contacts.corners[i][place], u, contacts.weights[i][place] * contacts.pull[i])
-    return total
-
-
-@wp.func
-def pull_contact(contacts: Contacts, unknowns: Unknowns, i: int, p: wp.array[wp.vec3]):
-    """Writes the product of the Hessian of a contact with a vector, which :func:`coupled_product` reads."""
-    corners, weights = contacts.corners[i], contacts.weights[i]
-    between = wp.vec3()
-    for j in range(4):
-        if weights[j] != 0.0:
-            between += weights[j] * displacement(unknowns, corners[j], p)
-    contacts.pull[i] = contacts.hessian[i] * between
-
-
-@wp.func
 def contact_block(contacts: Contacts, unknowns: Unknowns, u: int, v: int, part: int, parts: int) -> wp.mat33:
     """Returns the block of two unknowns of the Hessian of contacts that do not couple, or one of some parts of it."""
     block = wp.mat33()
