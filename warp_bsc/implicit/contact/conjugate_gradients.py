@@ -1,12 +1,16 @@
 """Conjugate gradients that stop at negative curvature, each world by one block of threads."""
 
+import functools
+
 import warp as wp
 
 from .matrix import Matrix
 from .system import Contacts, Unknowns
 
-_LARGEST_BLOCK = 1024
-"""Threads of the only block of a world, at most."""
+_LARGEST_BLOCK, _SMALL_BLOCK = 1024, 640
+"""Threads of the only block of a world, at most; and so few that each can keep much in registers."""
+_KEPT = 7
+"""Blocks of the Hessian that a thread of these keeps."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most: a GPU runs them together."""
 
@@ -68,23 +72,24 @@ class Vectors:
     along: wp.array[wp.vec3]
 
 
-@wp.func_native(
-    snippet="""
+_SOLVE = """
     const int parts = matrix.parts, width = matrix.width, blocks = team.blocks;
     const int first = unknowns.of_worlds.data[world], rows = unknowns.of_worlds.data[world + 1] - first;
     const int* is_free = unknowns.is_free.data + first;
-    const wp::mat33* inverse = vectors.inverse.data + first;
+    const int first_coupled = contacts.coupled_first.data[world];
+    const int coupled = contacts.coupled_end.data[world] - first_coupled;
+    float* pulls = (float*)(contacts.pull.data + first_coupled);
+    float* direction = (float*)(vectors.direction.data + first);
     float* solution = (float*)(vectors.solution.data + first);
     float* residual = (float*)(vectors.residual.data + first);
     float* along = (float*)(vectors.along.data + first);
-    const int first_coupled = contacts.coupled_first.data[world], end_coupled = contacts.coupled_end.data[world];
-    const bool couples = end_coupled > first_coupled;
-    int turn = 0;
 #if defined(__CUDA_ARCH__)
-    __shared__ float shared[3 * 1024];
+    __shared__ float shared_direction[3 * 1024], shared_pulls[3 * 512];
     __shared__ double sums_of_warps[2][32];
     const int lane = threadIdx.x, threads = blockDim.x;
-    float* direction = team.shares ? shared : (float*)(vectors.direction.data + first);
+    if (team.shares) direction = shared_direction;
+    if (blocks == 1 && coupled <= 512) pulls = shared_pulls;
+    int turn = 0;
     auto wait = [&]() {
         ++turn;
         __syncthreads();
@@ -108,16 +113,16 @@ class Vectors:
         return value;
     };
     auto sum = [&](double value) {
+        value = sum_of_block(value);
         if (blocks == 1) {
             ++turn;
-            return sum_of_block(value);
+            return value;
         }
-        value = sum_of_block(value);
-        double* sums = team.sums.data + (2 * world + ((turn + 1) & 1)) * blocks;
+        double* sums = team.sums.data + (2 * world + (turn & 1)) * blocks;
         if (lane == 0) sums[block] = value;
         wait();
         value = 0.0;
-        for (int other = 0; other < blocks; ++other) value += sums[other];
+        for (int other = 0; other < blocks; ++other) value += ((volatile double*)sums)[other];
         return value;
     };
     const unsigned sharers = (parts == 32 ? ~0u : (1u << parts) - 1u) << (lane & 31 & ~(parts - 1));
@@ -127,88 +132,112 @@ class Vectors:
     };
 #else
     const int lane = 0, threads = 1;
-    float* direction = (float*)(vectors.direction.data + first);
     auto wait = []() {};
     auto sum = [](double value) { return value; };
     auto sum_of_parts = [](float value) { return value; };
 #endif
     const int part = lane % parts, stride = blocks * threads / parts, begin = (block * threads + lane) / parts;
+    // a thread with one row has what it needs of it in registers: also some blocks
+    const bool keeps = KEPT > 0 && rows <= stride;
+    wp::vec3 own_x, own_r, own_z;
+    auto get = [&](const wp::vec3& own, const float* all, int row) {
+        return keeps ? own : wp::vec3(all[3 * row], all[3 * row + 1], all[3 * row + 2]);
+    };
+    auto put = [&](wp::vec3& own, float* all, int row, const wp::vec3& value) {
+        if (keeps) own = value;
+        else for (int c = 0; c < 3; ++c) all[3 * row + c] = value[c];
+    };
+    const int* first_entries = matrix.first.data + matrix.group.data[world];
+    auto first_entry = [&](int row) { return first_entries + (row * parts + part) / width; };
+    const int of_group = (begin * parts + part) % width;  // so it is for all rows of the thread
+    float kept[KEPT + 1][9];
+    int kept_column[KEPT + 1];
+    wp::mat33 own_inverse;
+    if (keeps && begin < rows) {
+        own_inverse = vectors.inverse.data[first + begin];
+        const int entry = first_entry(begin)[0], end = first_entry(begin)[1];
+#pragma unroll
+        for (int k = 0; k < KEPT; ++k) {
+            const int at = (entry + k) * width + of_group;
+            const int column = entry + k < end ? matrix.column.data[at] : -1;
+            kept_column[k] = column < 0 ? 0 : 3 * (column - first);
+            for (int c = 0; c < 9; ++c)
+                kept[k][c] = column < 0 ? 0.0f : matrix.value.data[9 * (at - of_group) + c * width + of_group];
+        }
+    }
     auto pull = [&](const float* p) {  // products of contacts that couple with a vector
-        if (!couples) return;
-        for (int n = first_coupled + block * threads + lane; n < end_coupled; n += blocks * threads) {
-            const int i = contacts.coupled.data[n];
-            const wp::vec4i corners = contacts.corners.data[i];
+        if (coupled == 0) return;
+        for (int n = block * threads + lane; n < coupled; n += blocks * threads) {
+            const int i = contacts.coupled.data[first_coupled + n];
+            const wp::vec4i corners = contacts.coupled_unknowns.data[first_coupled + n];
             const wp::vec4 weights = contacts.weights.data[i];
-            float x = 0.0f, y = 0.0f, z = 0.0f;
+            wp::vec3 apart;
             for (int j = 0; j < 4; ++j) {
-                const int u = unknowns.of_vertex.data[corners[j]];
-                if (weights[j] == 0.0f || u == -1) continue;
-                const float* d = p + 3 * ((u >= 0 ? u : -2 - u) - first);
-                x += weights[j] * d[0];
-                y += weights[j] * d[1];
-                z += weights[j] * d[2];
-                if (u < -1) {  // of a body: its turn follows its shift
-                    const wp::vec3 arm = unknowns.arm.data[corners[j]];
-                    x += weights[j] * (d[4] * arm[2] - d[5] * arm[1]);
-                    y += weights[j] * (d[5] * arm[0] - d[3] * arm[2]);
-                    z += weights[j] * (d[3] * arm[1] - d[4] * arm[0]);
-                }
+                const int u = corners[j];
+                const float* d = p + 3 * (u >= 0 ? u - first : u < -1 ? -2 - u - first : 0);
+                const float weight = u == -1 ? 0.0f : weights[j];
+                apart += weight * wp::vec3(d[0], d[1], d[2]);
+                if (u < -1)  // of a body: its turn follows its shift
+                    apart += weight * wp::cross(
+                        wp::vec3(d[3], d[4], d[5]), unknowns.arm.data[contacts.corners.data[i][j]]
+                    );
             }
-            contacts.pull.data[i] = wp::mul(contacts.hessian.data[i], wp::vec3(x, y, z));
+            apart = wp::mul(contacts.hessian.data[i], apart);
+            for (int c = 0; c < 3; ++c) pulls[3 * n + c] = apart[c];
         }
         wait();
     };
-    auto multiply = [&](int row, const float* p, float* result) {
-        const int thread = row * parts + part, u = first + row;
-        const int group = matrix.group.data[world] + thread / width, end = matrix.first.data[group + 1];
-        int entry = matrix.first.data[group];
-        const float* v = matrix.value.data + 9 * entry * width + thread % width;
-        const int* column = matrix.column.data + entry * width + thread % width;
-        float x = 0.0f, y = 0.0f, z = 0.0f;
-#if defined(__CUDA_ARCH__)
-#pragma unroll 4
-#endif
-        for (; entry < end; ++entry, v += 9 * width, column += width) {
-            const int c = *column;
-            if (c < 0) continue;
-            const float* d = p + 3 * (c - first);
-            x += v[0] * d[0] + v[width] * d[1] + v[2 * width] * d[2];
-            y += v[3 * width] * d[0] + v[4 * width] * d[1] + v[5 * width] * d[2];
-            z += v[6 * width] * d[0] + v[7 * width] * d[1] + v[8 * width] * d[2];
+    auto multiply = [&](int row, const float* p) {
+        const int u = first + row;
+        wp::vec3 total;
+        int entry = first_entry(row)[0];
+        const int end = first_entry(row)[1];
+        if (keeps) {
+#pragma unroll
+            for (int k = 0; k < KEPT; ++k) {
+                const float* d = p + kept_column[k];
+                for (int c = 0; c < 3; ++c)
+                    total[c] += kept[k][3 * c] * d[0] + kept[k][3 * c + 1] * d[1] + kept[k][3 * c + 2] * d[2];
+            }
+            entry += KEPT;
         }
-        if (couples) {
+        const float* v = matrix.value.data + 9 * entry * width + of_group;
+        for (; entry < end; ++entry, v += 9 * width) {
+            const int column = matrix.column.data[entry * width + of_group];
+            if (column < 0) break;
+            const float* d = p + 3 * (column - first);
+            for (int c = 0; c < 3; ++c)
+                total[c] += v[3 * c * width] * d[0] + v[(3 * c + 1) * width] * d[1] + v[(3 * c + 2) * width] * d[2];
+        }
+        if (coupled) {
             const bool of_body = unknowns.particle.data[u] < 0;
             for (int n = contacts.middle.data[u] + part; n < contacts.end.data[u]; n += parts) {
-                const int i = contacts.entries.data[n] >> 2, place = contacts.entries.data[n] & 3;
-                wp::vec3 force = contacts.weights.data[i][place] * contacts.pull.data[i];
-                const int vertex = of_body ? contacts.corners.data[i][place] : 0;
-                if (of_body && unknowns.of_vertex.data[vertex] == -1 - u)
-                    force = wp::cross(unknowns.arm.data[vertex], force);
-                x += force[0];
-                y += force[1];
-                z += force[2];
+                const float* by = pulls + 3 * contacts.pulled.data[n];
+                const float weight = contacts.entry_weight.data[n];
+                wp::vec3 force(weight * by[0], weight * by[1], weight * by[2]);
+                if (of_body) {
+                    const int entry = contacts.entries.data[n];
+                    const int vertex = contacts.corners.data[entry >> 2][entry & 3];
+                    if (unknowns.of_vertex.data[vertex] == -1 - u)
+                        force = wp::cross(unknowns.arm.data[vertex], force);
+                }
+                total += force;
             }
         }
-        result[0] = sum_of_parts(x);
-        result[1] = sum_of_parts(y);
-        result[2] = sum_of_parts(z);
+        for (int c = 0; c < 3; ++c) total[c] = sum_of_parts(total[c]);
+        return total;
     };
     pull(solution);
     double own = 0.0;
     for (int row = begin; row < rows; row += stride) {
-        wp::vec3 r, p;
-        if (is_free[row]) {
-            multiply(row, solution, &p[0]);
-            r = -vectors.gradient.data[first + row] - p;
-        }
-        if (part == 0) {
-            const wp::vec3 z = wp::mul(inverse[row], r);
-            for (int c = 0; c < 3; ++c) {
-                residual[3 * row + c] = r[c];
-                direction[3 * row + c] = z[c];
-            }
-            own += wp::dot(r, z);
-        }
+        wp::vec3 r;
+        if (is_free[row]) r = -vectors.gradient.data[first + row] - multiply(row, solution);
+        if (part) continue;
+        const wp::vec3 z = wp::mul(vectors.inverse.data[first + row], r);
+        if (keeps) own_x = vectors.solution.data[first + row];
+        put(own_r, residual, row, r);
+        for (int c = 0; c < 3; ++c) direction[3 * row + c] = z[c];
+        own += wp::dot(r, z);
     }
     double squared = sum(own);
     const double limit = tolerance * tolerance * squared;
@@ -219,12 +248,10 @@ class Vectors:
         own = 0.0;
         for (int row = begin; row < rows; row += stride) {
             if (!is_free[row]) continue;
-            wp::vec3 p;
-            multiply(row, direction, &p[0]);
-            if (part != 0) continue;
-            for (int c = 0; c < 3; ++c) along[3 * row + c] = p[c];
-            const float* d = direction + 3 * row;
-            own += d[0] * p[0] + d[1] * p[1] + d[2] * p[2];
+            const wp::vec3 p = multiply(row, direction);
+            if (part) continue;
+            put(own_z, along, row, p);
+            own += direction[3 * row] * p[0] + direction[3 * row + 1] * p[1] + direction[3 * row + 2] * p[2];
         }
         const double curvature = sum(own);
         const bool is_convex = curvature > 0.0;
@@ -234,14 +261,14 @@ class Vectors:
         ++count;
         own = 0.0;
         for (int row = begin; row < rows; row += stride) {
-            if (!is_free[row] || part != 0) continue;
-            wp::vec3 r;
-            for (int c = 0; c < 3; ++c) {
-                solution[3 * row + c] += step * direction[3 * row + c];
-                residual[3 * row + c] = r[c] = residual[3 * row + c] - step * along[3 * row + c];
-            }
-            const wp::vec3 z = wp::mul(inverse[row], r);
-            for (int c = 0; c < 3; ++c) along[3 * row + c] = z[c];
+            if (!is_free[row] || part) continue;
+            const wp::vec3 d(direction[3 * row], direction[3 * row + 1], direction[3 * row + 2]);
+            const wp::vec3 x = get(own_x, solution, row) + step * d;
+            const wp::vec3 r = get(own_r, residual, row) - step * get(own_z, along, row);
+            const wp::vec3 z = wp::mul(keeps ? own_inverse : vectors.inverse.data[first + row], r);
+            put(own_x, solution, row, x);
+            put(own_r, residual, row, r);
+            put(own_z, along, row, z);
             own += wp::dot(r, z);
         }
         const double after = sum(own);
@@ -250,58 +277,66 @@ class Vectors:
         squared = after;
         if (!goes_on) break;
         for (int row = begin; row < rows; row += stride) {
-            if (!is_free[row] || part != 0) continue;
-            for (int c = 0; c < 3; ++c)
-                direction[3 * row + c] = along[3 * row + c] + momentum * direction[3 * row + c];
+            if (!is_free[row] || part) continue;
+            const wp::vec3 z = get(own_z, along, row);
+            for (int c = 0; c < 3; ++c) direction[3 * row + c] = z[c] + momentum * direction[3 * row + c];
         }
         wait();
     }
+    if (keeps && part == 0 && begin < rows && is_free[begin]) vectors.solution.data[first + begin] = own_x;
     return count;
 """
-)
-def _solve(
-    matrix: Matrix,
-    contacts: Contacts,
-    unknowns: Unknowns,
-    tolerance: wp.float64,
-    max_iterations: int,
-    team: Team,
-    vectors: Vectors,
-    world: int,
-    block: int,
-) -> int:
-    """Solves for a world by the threads of one block, or several, and returns the number of iterations.
 
-    By hand, with plain pointers: most of an iteration would otherwise be the arithmetic of addresses.
+
+@functools.cache
+def make_solve_kernel(threads: int):
+    """Returns the kernel that solves for worlds, by blocks of so many threads.
+
+    By hand, with plain pointers and registers: most of an iteration would otherwise be arithmetic of addresses, and
+    waiting for memory.
     """
-    ...
+    is_small = 1 < threads <= _SMALL_BLOCK
 
+    @wp.func_native(snippet=_SOLVE.replace("KEPT", str(_KEPT if is_small else 0)))
+    def solve(
+        matrix: Matrix,
+        contacts: Contacts,
+        unknowns: Unknowns,
+        tolerance: wp.float64,
+        max_iterations: int,
+        team: Team,
+        vectors: Vectors,
+        world: int,
+        block: int,
+    ) -> int: ...
 
-@wp.kernel(module="unique", enable_backward=False, launch_bounds=_LARGEST_BLOCK)
-def solve_worlds(
-    # in
-    matrix: Matrix,
-    contacts: Contacts,
-    unknowns: Unknowns,
-    active: wp.array[int],
-    tolerance: wp.float64,
-    max_iterations: int,
-    team: Team,
-    # in and out
-    vectors: Vectors,
-    # out
-    iterations: wp.array[int],
-):
-    """Solves H d = -g in active worlds, until the norm of the residual, preconditioned, is a share of its first one.
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_SMALL_BLOCK if is_small else _LARGEST_BLOCK)
+    def solve_worlds(
+        # in
+        matrix: Matrix,
+        contacts: Contacts,
+        unknowns: Unknowns,
+        active: wp.array[int],
+        tolerance: wp.float64,
+        max_iterations: int,
+        team: Team,
+        # in and out
+        vectors: Vectors,
+        # out
+        iterations: wp.array[int],
+    ):
+        """Solves H d = -g in active worlds, until the norm of the residual, preconditioned, is a share of its first.
 
-    Where the matrix is found not to be positive definite, the solution so far ends the solve, or the preconditioned
-    negative gradient if there is none: both are directions in which the energy falls. What is given stays given.
-    """
-    thread = wp.tid()
-    number, lane = thread // wp.block_dim(), thread % wp.block_dim()
-    world, block = number // team.blocks, number % team.blocks
-    if active[world] == 0:
-        return
-    count = _solve(matrix, contacts, unknowns, tolerance, max_iterations, team, vectors, world, block)
-    if block == 0 and lane == 0:
-        iterations[world] = iterations[world] + count
+        Where the matrix is found not to be positive definite, the solution so far ends the solve, or the preconditioned
+        negative gradient if there is none: both are directions in which the energy falls. What is given stays given.
+        """
+        thread = wp.tid()
+        number, lane = thread // wp.block_dim(), thread % wp.block_dim()
+        world, block = number // team.blocks, number % team.blocks
+        if active[world] == 0:
+            return
+        count = solve(matrix, contacts, unknowns, tolerance, max_iterations, team, vectors, world, block)
+        if block == 0 and lane == 0:
+            iterations[world] = iterations[world] + count
+
+    return solve_worlds

@@ -63,6 +63,18 @@ def _list_entry(contacts: Contacts, u: int, entry: int):
     contacts.order[n] = wp.int64(contacts.couples[entry >> 2]) * _COUPLES + contacts.key[entry >> 2]
 
 
+@wp.func
+def _list_coupled(contacts: Contacts, unknowns: Unknowns, world: int, i: int):
+    n = wp.atomic_add(contacts.coupled_end, world, 1)
+    contacts.coupled[n] = i
+    contacts.place_in_coupled[i] = n - contacts.coupled_first[world]
+    corners, of_corners = contacts.corners[i], wp.vec4i(-1)
+    for j in range(4):
+        if contacts.weights[i][j] != 0.0:
+            of_corners[j] = unknowns.of_vertex[corners[j]]
+    contacts.coupled_unknowns[n] = of_corners
+
+
 @wp.kernel
 def list_entries(
     # in and out
@@ -75,7 +87,7 @@ def list_entries(
     """Lists the contacts of each unknown, behind its ``end``, which moves on, and those of each world that couple."""
     for i in range(wp.tid(), contact_count(contacts), threads):
         if contacts.couples[i] != 0:
-            contacts.coupled[wp.atomic_add(contacts.coupled_end, world[contacts.corners[i][0]], 1)] = i
+            _list_coupled(contacts, unknowns, world[contacts.corners[i][0]], i)
         for j in range(4):
             if contacts.weights[i][j] != 0.0:
                 vertex = contacts.corners[i][j]
@@ -107,5 +119,8 @@ def sort_entries(
             if other < own or (other == own and contacts.unsorted[m] < entry):
                 rank += 1
         contacts.entries[first + rank] = entry
+        if own >= _COUPLES:
+            contacts.pulled[first + rank] = contacts.place_in_coupled[entry >> 2]
+            contacts.entry_weight[first + rank] = contacts.weights[entry >> 2][entry & 3]
         if rank == 0:
             contacts.middle[u] = first + single

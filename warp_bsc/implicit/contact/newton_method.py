@@ -17,7 +17,7 @@ from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import bodies, bounds, contact_lists, held, merit, near, pairs, steps
 from .attachments import attach, attachments_of_model
-from .conjugate_gradients import Vectors, make_team, solve_worlds
+from .conjugate_gradients import Vectors, make_solve_kernel, make_team
 from .elasticity import differentiate, elements_of_model, make_derivatives
 from .impulses import publish_contacts
 from .matrix import make_matrix
@@ -30,6 +30,8 @@ _TRUNCATIONS = 4
 """Passes in which the displacements of single vertices are cut, before those of their world are."""
 _PREDICTIONS = 2
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
+_OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
+"""Arrays of contacts with an element for each corner."""
 _PARTS = 8
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
 _REACH_OF_EDGE = 0.1
@@ -108,6 +110,7 @@ class NewtonMethod:
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
         largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
         self._team, self._threads = make_team(largest, work.worlds, device)
+        self._solve_worlds = make_solve_kernel(self._threads)
         self._bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
         holder = np.arange(vertices)
         if len(solved):
@@ -328,7 +331,7 @@ class NewtonMethod:
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
-        sizes |= dict.fromkeys(("entries", "unsorted", "row", "order"), 4 * capacity)
+        sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = allocate(Contacts, capacity, device, **sizes)
 
@@ -386,7 +389,9 @@ class NewtonMethod:
         inputs = [self._matrix, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, team]
         outputs = [self._vectors, self.iterations]
         options = {"device": work.device, "block_dim": self._threads}
-        wp.launch(solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options)
+        wp.launch(
+            self._solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options
+        )
 
     def _assemble(self, active, begins):
         """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""

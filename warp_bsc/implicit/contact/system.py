@@ -91,7 +91,10 @@ class Contacts:
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
         unsorted, row, order: The same in any order, its unknown, and the number by which it is ordered.
         coupled: Contacts that couple, those of a world from ``coupled_first`` to ``coupled_end``.
-        pull: Product of the Hessian of each of them with a displacement [N].
+        coupled_unknowns: Of each of those, the ``of_vertex`` of its corners, -1 of corners without weight.
+        place_in_coupled: Place of each contact that couples among those of its world.
+        pulled, entry_weight: The same, and its weight, of each entry of one that couples.
+        pull: Product of the Hessian of each of ``coupled`` with a displacement [N].
     """
 
     count: wp.array[int]
@@ -115,6 +118,10 @@ class Contacts:
     coupled: wp.array[int]
     coupled_first: wp.array[int]
     coupled_end: wp.array[int]
+    coupled_unknowns: wp.array[wp.vec4i]
+    place_in_coupled: wp.array[int]
+    pulled: wp.array[int]
+    entry_weight: wp.array[float]
     pull: wp.array[wp.vec3]
 
 
