@@ -9,7 +9,7 @@ from .system import Contacts, Unknowns
 
 _LARGEST_BLOCK, _SMALL_BLOCK = 1024, 640
 """Threads of the only block of a world, at most; and so few that each can keep much in registers."""
-_KEPT = 7
+_KEPT = 4
 """Blocks of the Hessian that a thread of these keeps."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most: a GPU runs them together."""
@@ -31,7 +31,7 @@ class Team:
     parts: int
     shares: bool
     arrived: wp.array[int]
-    sums: wp.array2d[wp.float64]
+    sums: wp.array2d[float]
 
 
 def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]:
@@ -48,7 +48,7 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]
             team.blocks = min(_BLOCKS // worlds, -(-team.parts * unknowns // _BLOCK))
     team.shares = device.is_cuda and unknowns <= _LARGEST_BLOCK
     team.arrived = wp.zeros(worlds, dtype=int, device=device)
-    team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=wp.float64, device=device)
+    team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=float, device=device)
     return team, threads
 
 
@@ -73,6 +73,7 @@ class Vectors:
 
 
 _SOLVE = """
+#define INLINE __attribute__((always_inline))
     const int parts = matrix.parts, width = matrix.width, blocks = team.blocks;
     const int first = unknowns.of_worlds.data[world], rows = unknowns.of_worlds.data[world + 1] - first;
     const int* is_free = unknowns.is_free.data + first;
@@ -85,7 +86,8 @@ _SOLVE = """
     float* along = (float*)(vectors.along.data + first);
 #if defined(__CUDA_ARCH__)
     __shared__ float shared_direction[3 * 1024], shared_pulls[3 * 512];
-    __shared__ double sums_of_warps[2][32];
+    __shared__ float sums_of_warps[2][32];
+    typedef float real;
     const int lane = threadIdx.x, threads = blockDim.x;
     if (team.shares) direction = shared_direction;
     if (blocks == 1 && coupled <= 512) pulls = shared_pulls;
@@ -103,30 +105,27 @@ _SOLVE = """
             __syncthreads();
         }
     };
-    auto sum_of_block = [&](double value) {
-        double* sums = sums_of_warps[turn & 1];
+    // in single precision: a sum of a tree of warps is as good as its terms
+    auto sum = [&](float value) INLINE {
+        float* sums = sums_of_warps[turn & 1];
         for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
         if ((lane & 31) == 0) sums[lane >> 5] = value;
         __syncthreads();
-        value = (lane & 31) < (threads >> 5) ? sums[lane & 31] : 0.0;
-        for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
-        return value;
-    };
-    auto sum = [&](double value) {
-        value = sum_of_block(value);
+        value = 0.0f;
+        for (int warp = 0; warp < threads >> 5; ++warp) value += sums[warp];
         if (blocks == 1) {
             ++turn;
             return value;
         }
-        double* sums = team.sums.data + (2 * world + (turn & 1)) * blocks;
-        if (lane == 0) sums[block] = value;
+        float* of_blocks = team.sums.data + (2 * world + (turn & 1)) * blocks;
+        if (lane == 0) of_blocks[block] = value;
         wait();
-        value = 0.0;
-        for (int other = 0; other < blocks; ++other) value += ((volatile double*)sums)[other];
+        value = 0.0f;
+        for (int other = 0; other < blocks; ++other) value += ((volatile float*)of_blocks)[other];
         return value;
     };
     const unsigned sharers = (parts == 32 ? ~0u : (1u << parts) - 1u) << (lane & 31 & ~(parts - 1));
-    auto sum_of_parts = [&](float value) {
+    auto sum_of_parts = [&](float value) INLINE {
         for (int offset = parts / 2; offset; offset >>= 1) value += __shfl_xor_sync(sharers, value, offset);
         return value;
     };
@@ -134,6 +133,7 @@ _SOLVE = """
     const int lane = 0, threads = 1;
     auto wait = []() {};
     auto sum = [](double value) { return value; };
+    typedef double real;
     auto sum_of_parts = [](float value) { return value; };
 #endif
     const int part = lane % parts, stride = blocks * threads / parts, begin = (block * threads + lane) / parts;
@@ -165,7 +165,7 @@ _SOLVE = """
                 kept[k][c] = column < 0 ? 0.0f : matrix.value.data[9 * (at - of_group) + c * width + of_group];
         }
     }
-    auto pull = [&](const float* p) {  // products of contacts that couple with a vector
+    auto pull = [&](const float* p) INLINE {  // products of contacts that couple with a vector
         if (coupled == 0) return;
         for (int n = block * threads + lane; n < coupled; n += blocks * threads) {
             const int i = contacts.coupled.data[first_coupled + n];
@@ -187,7 +187,7 @@ _SOLVE = """
         }
         wait();
     };
-    auto multiply = [&](int row, const float* p) {
+    auto multiply = [&](int row, const float* p) INLINE {
         const int u = first + row;
         wp::vec3 total;
         int entry = first_entry(row)[0];
@@ -211,6 +211,7 @@ _SOLVE = """
         }
         if (coupled) {
             const bool of_body = unknowns.particle.data[u] < 0;
+#pragma unroll 4
             for (int n = contacts.middle.data[u] + part; n < contacts.end.data[u]; n += parts) {
                 const float* by = pulls + 3 * contacts.pulled.data[n];
                 const float weight = contacts.entry_weight.data[n];
@@ -228,7 +229,7 @@ _SOLVE = """
         return total;
     };
     pull(solution);
-    double own = 0.0;
+    real own = 0.0f;
     for (int row = begin; row < rows; row += stride) {
         wp::vec3 r;
         if (is_free[row]) r = -vectors.gradient.data[first + row] - multiply(row, solution);
@@ -239,13 +240,13 @@ _SOLVE = """
         for (int c = 0; c < 3; ++c) direction[3 * row + c] = z[c];
         own += wp::dot(r, z);
     }
-    double squared = sum(own);
-    const double limit = tolerance * tolerance * squared;
+    real squared = sum(own);
+    const real limit = tolerance * tolerance * squared;
     int count = 0;
-    bool goes_on = squared > 0.0;
+    bool goes_on = squared > 0.0f;
     while (goes_on) {
         pull(direction);
-        own = 0.0;
+        own = 0.0f;
         for (int row = begin; row < rows; row += stride) {
             if (!is_free[row]) continue;
             const wp::vec3 p = multiply(row, direction);
@@ -253,13 +254,13 @@ _SOLVE = """
             put(own_z, along, row, p);
             own += direction[3 * row] * p[0] + direction[3 * row + 1] * p[1] + direction[3 * row + 2] * p[2];
         }
-        const double curvature = sum(own);
-        const bool is_convex = curvature > 0.0;
+        const real curvature = sum(own);
+        const bool is_convex = curvature > 0.0f;
         float step = 0.0f;
         if (is_convex) step = (float)(squared / curvature);
-        else if (count == 0) step = (float)(squared / wp::max(-curvature, 1e-30 + 0.01 * squared));
+        else if (count == 0) step = (float)(squared / wp::max(-curvature, (real)1e-30f + (real)0.01f * squared));
         ++count;
-        own = 0.0;
+        own = 0.0f;
         for (int row = begin; row < rows; row += stride) {
             if (!is_free[row] || part) continue;
             const wp::vec3 d(direction[3 * row], direction[3 * row + 1], direction[3 * row + 2]);
@@ -271,7 +272,7 @@ _SOLVE = """
             put(own_z, along, row, z);
             own += wp::dot(r, z);
         }
-        const double after = sum(own);
+        const real after = sum(own);
         goes_on = is_convex && after > limit && count < max_iterations;
         const float momentum = (float)(after / squared);
         squared = after;
@@ -302,7 +303,7 @@ def make_solve_kernel(threads: int):
         matrix: Matrix,
         contacts: Contacts,
         unknowns: Unknowns,
-        tolerance: wp.float64,
+        tolerance: float,
         max_iterations: int,
         team: Team,
         vectors: Vectors,
@@ -317,7 +318,7 @@ def make_solve_kernel(threads: int):
         contacts: Contacts,
         unknowns: Unknowns,
         active: wp.array[int],
-        tolerance: wp.float64,
+        tolerance: float,
         max_iterations: int,
         team: Team,
         # in and out

@@ -386,7 +386,7 @@ class NewtonMethod:
         work, team = self._work, self._team
         if team.blocks > 1:
             team.arrived.zero_()
-        inputs = [self._matrix, self._contacts, self._unknowns, active, wp.float64(_TOLERANCE), _MAX_ITERATIONS, team]
+        inputs = [self._matrix, self._contacts, self._unknowns, active, _TOLERANCE, _MAX_ITERATIONS, team]
         outputs = [self._vectors, self.iterations]
         options = {"device": work.device, "block_dim": self._threads}
         wp.launch(
