@@ -7,10 +7,10 @@ import warp as wp
 from .matrix import Matrix
 from .system import Contacts, Unknowns
 
-_LARGEST_BLOCK, _SMALL_BLOCK = 1024, 640
-"""Threads of the only block of a world, at most; and so few that each can keep much in registers."""
-_KEPT = 4
-"""Blocks of the Hessian that a thread of these keeps."""
+_LARGEST_BLOCK = 1024
+"""Threads of the only block of a world, at most."""
+_KEPT = {320: 14, 640: 4, _LARGEST_BLOCK: 0}
+"""Blocks of the Hessian that a thread keeps in registers, in thread blocks of so many threads at most."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most: a GPU runs them together."""
 
@@ -40,7 +40,7 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]
     team.blocks = team.parts = 1
     if device.is_cuda:
         team.parts = 4
-        while team.parts > 1 and team.parts * unknowns > _LARGEST_BLOCK:
+        while team.parts > 1 and team.parts * unknowns > min(_KEPT):
             team.parts //= 2
         threads = min(_LARGEST_BLOCK, max(64, -(-team.parts * unknowns // 32) * 32))
         if unknowns > _LARGEST_BLOCK and worlds <= _BLOCKS // 2:
@@ -296,9 +296,10 @@ def make_solve_kernel(threads: int):
     By hand, with plain pointers and registers: most of an iteration would otherwise be arithmetic of addresses, and
     waiting for memory.
     """
-    is_small = 1 < threads <= _SMALL_BLOCK
+    bounds = min(size for size in _KEPT if threads <= size)
+    kept = 0 if threads == 1 else _KEPT[bounds]
 
-    @wp.func_native(snippet=_SOLVE.replace("KEPT", str(_KEPT if is_small else 0)))
+    @wp.func_native(snippet=_SOLVE.replace("KEPT", str(kept)))
     def solve(
         matrix: Matrix,
         contacts: Contacts,
@@ -311,7 +312,7 @@ def make_solve_kernel(threads: int):
         block: int,
     ) -> int: ...
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=_SMALL_BLOCK if is_small else _LARGEST_BLOCK)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
     def solve_worlds(
         # in
         matrix: Matrix,
