@@ -9,7 +9,7 @@ from .system import Contacts, Unknowns
 
 _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
-_KEPT = {320: 14, 640: 4, _LARGEST_BLOCK: 0}
+_KEPT = {320: 13, 640: 4, _LARGEST_BLOCK: 0}
 """Blocks of the Hessian that a thread keeps in registers, in thread blocks of so many threads at most."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most: a GPU runs them together."""
