@@ -20,7 +20,6 @@ from ...response.state.vectors import HALF, ONE, ZERO
 wp.set_module_options({"enable_backward": False})
 
 _TWO = wp.constant(wp.float64(2.0))
-_THREE = wp.constant(wp.float64(3.0))
 _FOUR = wp.constant(wp.float64(4.0))
 CURVATURE_AT_HALF = 6.386294361119891
 """Curvature of the barrier at half of its reach, in its stiffness."""
@@ -61,24 +60,23 @@ def barrier_curvature(gap: wp.float64, reach: wp.float64) -> wp.float64:
 def friction_energy(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
     """Returns the work of smoothed friction over a slid length, under a limit of 1."""
     if slid >= smoothing:
-        return slid
-    return slid * slid / smoothing * (ONE - slid / (_THREE * smoothing)) + smoothing / _THREE
+        return slid - HALF * smoothing
+    return HALF * slid * slid / smoothing
 
 
 @wp.func
 def friction_slope(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
-    """Returns the derivative of :func:`friction_energy` over the slid length."""
-    if slid >= smoothing:
-        return ONE / slid
-    return (_TWO - slid / smoothing) / smoothing
+    """Returns the derivative of :func:`friction_energy` over the slid length.
+
+    A constant below the smoothing length: one Newton step finds the force of what friction holds.
+    """
+    return ONE / wp.max(slid, smoothing)
 
 
 @wp.func
 def friction_curvature(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
     """Returns the second derivative of :func:`friction_energy`."""
-    if slid >= smoothing:
-        return ZERO
-    return (_TWO - _TWO * slid / smoothing) / smoothing
+    return wp.where(slid >= smoothing, ZERO, ONE / smoothing)
 
 
 @wp.func

@@ -42,7 +42,7 @@ _SHORT_EDGE = 0.25
 """Largest reach as a share of the shortest edge at a vertex."""
 _RECOVERY_SPEED = 0.3
 """Speed at which a barrier moves apart what is within its reach [m/s]: what is thrown rises by 5 mm."""
-_SMOOTHING_SPEED = 1e-3
+_SMOOTHING_SPEED = 0.5e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step ends [m/s]."""
