@@ -6,7 +6,7 @@ from ...response.contacts.queue import has_pair, pair_count, vertices_of
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
-from ...response.state.vectors import ZERO, corners_of, to_double
+from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
 from .system import Progress
@@ -50,10 +50,10 @@ def _bound(
         return
     a, b, c, d = corners_of(trial.x, corners)
     scale = progress.scale[world]
-    p = to_double(moved(trial, scale, corners[0])) - a
-    q = to_double(moved(trial, scale, corners[1])) - b
-    r = to_double(moved(trial, scale, corners[2])) - c
-    s = to_double(moved(trial, scale, corners[3])) - d
+    p = to_double(to_single(moved(trial, scale, corners[0]))) - a
+    q = to_double(to_single(moved(trial, scale, corners[1]))) - b
+    r = to_double(to_single(moved(trial, scale, corners[2]))) - c
+    s = to_double(to_single(moved(trial, scale, corners[3]))) - d
     # far apart for their ways: no need to find the closest points
     way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     kept = candidates.kept[i]
@@ -131,7 +131,7 @@ def bound_by_planes(
             continue
         before, _error = signed_distance(plane_at(planes, i, now), trial.x[vertex])
         then = now + (1.0 - now) * scale
-        after, _error_after = signed_distance(plane_at(planes, i, then), moved(trial, scale, vertex))
+        after, _error_after = signed_distance(plane_at(planes, i, then), to_single(moved(trial, scale, vertex)))
         gap, left = before - kept, after - kept
         least = barrier.least_gap(gap, reach)
         taken = scale * trial.share[trial.holder[vertex]]

@@ -350,7 +350,7 @@ class NewtonMethod:
         dt = wp.float64(self._dt)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
-        inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
+        inputs = [self._elements, trial.exact, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
         self._find_near(progress.active)
         self._assemble(progress.active, True)

@@ -9,7 +9,7 @@ from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices
 from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_mass_of, owner_of
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ...response.state.structs import Motion, Step, body_of
-from ...response.state.vectors import HALF, ONE, ZERO, corners_of
+from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
 from . import barrier
 
 wp.set_module_options({"enable_backward": False})
@@ -76,7 +76,8 @@ class Trial:
         share: Share of its displacement that a vertex takes of what its world takes.
         holder: Vertex whose share each vertex takes: itself, or the first of its body.
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
-        moved: Positions after displacements.
+        exact: Positions without rounding, which for friction is a large part of the way [m].
+        moved: The same after displacements.
         first: Positions after the first Newton step of the step, to which the straight way is free.
     """
 
@@ -85,14 +86,16 @@ class Trial:
     share: wp.array[float]
     holder: wp.array[int]
     bend: wp.array[float]
-    moved: wp.array[wp.vec3]
+    exact: wp.array[wp.vec3d]
+    moved: wp.array[wp.vec3d]
     first: wp.array[wp.vec3]
 
 
 @wp.func
-def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3:
-    """Returns the position of a vertex after a share of its displacement, rounded as it is stored."""
-    return trial.x[vertex] + (scale * trial.share[trial.holder[vertex]]) * trial.displaced[vertex]
+def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3d:
+    """Returns the position of a vertex after a share of its displacement, not on the arc of a body."""
+    share = wp.float64(scale * trial.share[trial.holder[vertex]])
+    return trial.exact[vertex] + share * to_double(trial.displaced[vertex])
 
 
 @wp.func
@@ -244,6 +247,7 @@ def part_touching(
     off = wp.max(_PARTED * settings.reach[v], _PARTED_ROUNDED * wp.max(wp.abs(x)))
     parted = x + off * wp.normalize(wp.cross(b - a, c - a))
     trial.x[v] = parted
+    trial.exact[v] = to_double(parted)
     origin[v] = parted
 
 
