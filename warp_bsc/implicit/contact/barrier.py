@@ -27,7 +27,7 @@ _NEXT = wp.constant(wp.float64(0.999))
 """Share of a safe time by which the search for an impact goes on: it may be rounded up."""
 _STALLED = wp.constant(wp.float64(1e-3))
 """Share of displacements by which it goes on at least; it ends early, and safe, where it does not."""
-_FLOOR = wp.constant(wp.float64(0.03))
+FLOOR = wp.constant(wp.float64(0.03))
 """Gap, as a share of the reach, below which a pair hardly comes nearer: the barrier would be too steep to solve for."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
@@ -170,10 +170,10 @@ def safe_share(
 def least_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
     """Returns the gap that a pair keeps in a Newton step: half of it, or less where it is large, more where small."""
     least = wp.min(HALF * gap, wp.float64(0.3) * reach)
-    return wp.max(least, wp.min(_FLOOR * reach, wp.float64(0.9) * gap))
+    return wp.max(least, wp.min(FLOOR * reach, wp.float64(0.9) * gap))
 
 
 @wp.func
 def goal_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
     """Returns the gap at which a pair is held that would come nearer than :func:`least_gap`."""
-    return wp.max(wp.min(wp.float64(0.6) * reach, wp.float64(0.75) * gap), _TWO * _FLOOR * reach)
+    return wp.max(wp.min(wp.float64(0.6) * reach, wp.float64(0.75) * gap), _TWO * FLOOR * reach)

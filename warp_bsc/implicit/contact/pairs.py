@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...detection.approach_phase import distances_of_pair
+from ...detection.approach_phase import KEPT, distances_of_pair
 from ...kernels.polynomials import VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
@@ -14,9 +14,9 @@ from . import barrier
 
 wp.set_module_options({"enable_backward": False})
 
-_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a pair keeps which starts within its minimum distance."""
-_LEAST_GAP = wp.constant(wp.float64(1e-6))
+_WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
+"""Share of its distance at the start that only pairs keep which start within their minimum distance."""
+_LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
@@ -138,10 +138,12 @@ def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, 
     """Returns the level and the reach of the barrier of a pair, by its distance at the start and that to keep.
 
     The reach of what starts within it ends a little above its gap: a barrier otherwise throws apart, at up to its reach
-    a step, what a program puts there or what fell there in the step before.
+    a step, what a program puts there or what fell there in the step before. That of a pair within its minimum distance
+    is as steep as in a press, so that the force on what is gripped there is one that floats can balance.
     """
     whole = wp.float64(reach)
-    level = wp.min(kept, start - _LEAST_GAP * whole)
+    least = wp.where(kept > ZERO and kept >= _WITHIN * start, barrier.FLOOR, _LEAST_GAP)
+    level = wp.min(kept, start - least * whole)
     return level, wp.min(whole, start - level + settings.recovery)
 
 
@@ -264,7 +266,7 @@ def gap_at_plane(motion: Motion, planes: MovingPlanes, settings: BarrierSettings
         return ZERO, ZERO, ZERO
     kept = wp.min(start - error, ZERO)
     if motion.distances.radius and start > error:
-        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (start - error))
+        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], KEPT * (start - error))
     whole = wp.where(body_of(motion, vertex) < 0, settings.reach[vertex], settings.reach_of_bodies[vertex])
     level, reach = _barrier_of(settings, start, kept, whole)
     return kept, level, reach
