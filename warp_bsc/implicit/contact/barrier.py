@@ -28,7 +28,7 @@ _NEXT = wp.constant(wp.float64(0.999))
 _STALLED = wp.constant(wp.float64(1e-3))
 """Share of displacements by which it goes on at least; it ends early, and safe, where it does not."""
 FLOOR = wp.constant(wp.float64(0.03))
-"""Gap, as a share of the reach, below which a pair hardly comes nearer: the barrier would be too steep to solve for."""
+"""Share of the reach of a barrier below which it is too steep to solve for in one step."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
 
@@ -167,13 +167,22 @@ def safe_share(
 
 
 @wp.func
-def least_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
-    """Returns the gap that a pair keeps in a Newton step: half of it, or less where it is large, more where small."""
-    least = wp.min(HALF * gap, wp.float64(0.3) * reach)
-    return wp.max(least, wp.min(FLOOR * reach, wp.float64(0.9) * gap))
+def floor_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
+    """Returns the gap below which a pair hardly comes nearer in a step, where its barrier would be too steep.
+
+    It depends on the gap at the start: what is pressed together comes as near as it must in some steps.
+    """
+    return wp.min(FLOOR * reach, wp.float64(0.45) * gap)
 
 
 @wp.func
-def goal_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
+def least_gap(gap: wp.float64, reach: wp.float64, floor: wp.float64) -> wp.float64:
+    """Returns the gap that a pair keeps in a Newton step: half of it, or less where it is large, more where small."""
+    least = wp.min(HALF * gap, wp.float64(0.3) * reach)
+    return wp.max(least, wp.min(floor, wp.float64(0.9) * gap))
+
+
+@wp.func
+def goal_gap(gap: wp.float64, reach: wp.float64, floor: wp.float64) -> wp.float64:
     """Returns the gap at which a pair is held that would come nearer than :func:`least_gap`."""
-    return wp.max(wp.min(wp.float64(0.6) * reach, wp.float64(0.75) * gap), _TWO * FLOOR * reach)
+    return wp.max(wp.min(wp.float64(0.6) * reach, wp.float64(0.75) * gap), _TWO * floor)

@@ -57,13 +57,13 @@ def _bound(
     # far apart for their ways: no need to find the closest points
     way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     kept = candidates.kept[i]
-    reach = wp.float64(candidates.reach[i])
+    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     apart = barrier.distance_of_boxes(queue.kind, a, b, c, d) - kept
     bends = _bends(trial, scale, corners)
-    if way + bends[0] <= apart - barrier.least_gap(apart, reach):
+    if way + bends[0] <= apart - barrier.least_gap(apart, reach, floor):
         return
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-    least = barrier.least_gap(distance - kept, reach)
+    least = barrier.least_gap(distance - kept, reach, floor)
     if way + bends[0] <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
@@ -126,14 +126,14 @@ def bound_by_planes(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, _level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        kept, _level, reach, floor = gap_at_plane(motion, planes, settings, i, vertex)
         if reach == ZERO:
             continue
         before, _error = signed_distance(plane_at(planes, i, now), trial.x[vertex])
         then = now + (1.0 - now) * scale
         after, _error_after = signed_distance(plane_at(planes, i, then), to_single(moved(trial, scale, vertex)))
         gap, left = before - kept, after - kept
-        least = barrier.least_gap(gap, reach)
+        least = barrier.least_gap(gap, reach, floor)
         taken = scale * trial.share[trial.holder[vertex]]
         bend = wp.float64(taken * trial.bend[vertex])
         flat = wp.float64(taken) * bend

@@ -137,7 +137,7 @@ def add_plane_energies(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        _kept, level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
         plane = plane_at(planes, i, now + (1.0 - now) * scale)
         distance, _error = signed_distance(plane, trial.moved[vertex])
         gap = distance - level

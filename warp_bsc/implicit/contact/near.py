@@ -187,7 +187,7 @@ def find_near_planes(
             return
         plane = plane_at(planes, i, plane_share[world])
         distance, _error = signed_distance(plane, trial.exact[vertex])
-        _kept, level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
         gap = distance - level
         if gap >= reach or not gap > ZERO:
             continue

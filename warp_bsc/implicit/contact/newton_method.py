@@ -328,6 +328,7 @@ class NewtonMethod:
             candidates.level = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
             candidates.share = wp.zeros(len(queue.pairs), dtype=float, device=device)
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
+            candidates.floor = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}

@@ -33,6 +33,7 @@ class Candidates:
         kept: Distance that each pair keeps in any case [m].
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m]; 0 of a pair that is excluded.
+        floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet.
     """
 
@@ -40,6 +41,7 @@ class Candidates:
     kept: wp.array[wp.float64]
     level: wp.array[wp.float64]
     reach: wp.array[float]
+    floor: wp.array[float]
     share: wp.array[float]
 
 
@@ -201,6 +203,7 @@ def _prepare(
     level, reach = _barrier_of(settings, start, candidates.kept[i], _reach_of(settings, corners))
     candidates.level[i] = level
     candidates.reach[i] = float(reach)
+    candidates.floor[i] = float(barrier.floor_gap(start - candidates.kept[i], reach))
 
 
 @wp.kernel
@@ -255,21 +258,21 @@ def part_touching(
 
 @wp.func
 def gap_at_plane(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int):
-    """Returns the distance that a vertex keeps from a plane, and the level and the reach of its barrier.
+    """Returns the distance that a vertex keeps from a plane, the level and the reach of its barrier, and its floor.
 
     The reach is 0 if it is excluded.
     """
     if is_filtered_by_plane(motion, planes, i, vertex) or not is_stopped_by_plane(motion, planes, i, vertex):
-        return ZERO, ZERO, ZERO
+        return ZERO, ZERO, ZERO, ZERO
     start, error = signed_distance(planes.start[i], motion.x0[vertex])
     if not start >= -error:
-        return ZERO, ZERO, ZERO
+        return ZERO, ZERO, ZERO, ZERO
     kept = wp.min(start - error, ZERO)
     if motion.distances.radius and start > error:
         kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], KEPT * (start - error))
     whole = wp.where(body_of(motion, vertex) < 0, settings.reach[vertex], settings.reach_of_bodies[vertex])
     level, reach = _barrier_of(settings, start, kept, whole)
-    return kept, level, reach
+    return kept, level, reach, barrier.floor_gap(start - kept, reach)
 
 
 @wp.func
