@@ -376,7 +376,7 @@ class NewtonMethod:
         for _ in range(_TRUNCATIONS):
             self._bound(progress.searches)
             self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
-        self._launch(steps.begin_hold, work.worlds, [], [progress, self._ahead])  # clears bounds
+        self._launch(steps.begin_hold, work.worlds, [True], [progress, self._ahead])  # clears bounds
         self._bound(progress.searches)
         self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(True, progress.trial_cut)
@@ -427,7 +427,7 @@ class NewtonMethod:
     def _hold(self, solves):
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         unknowns, ahead = self._unknowns, self._ahead
-        self._launch(steps.begin_hold, work.worlds, [], [self.progress, ahead])
+        self._launch(steps.begin_hold, work.worlds, [False], [self.progress, ahead])
         work.launch_over_entries(held.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
         self._over_candidates(held.hold_pairs, [motion], [*inputs, self._limit, *outputs])

@@ -114,6 +114,7 @@ def begin_step(
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
         progress.remaining[v] = 0.0
+        progress.plain[v] = 0
         plane_share[v] = 0.0
     if v >= trial.x.shape[0]:
         return
@@ -177,6 +178,12 @@ def _may_cut(progress: Progress, w: int) -> bool:
     return progress.active[w] != 0 and progress.scale[w] < 1.0 and progress.remaining[w] == 0.0
 
 
+@wp.func
+def _may_hold(progress: Progress, w: int) -> bool:
+    """Returns whether something would meet in a world, and is to be held."""
+    return progress.active[w] != 0 and progress.bound[w] < 1.0 and progress.plain[w] == 0
+
+
 @wp.kernel
 def find_meeting(
     # in
@@ -186,20 +193,22 @@ def find_meeting(
 ):
     """Says whether something would meet in a world."""
     w = wp.tid()
-    if progress.active[w] != 0 and progress.bound[w] < 1.0:
+    if _may_hold(progress, w):
         meets[0] = 1
 
 
 @wp.kernel
 def begin_hold(
+    # in
+    always: bool,
     # in and out
     progress: Progress,
     ahead: wp.array[int],
 ):
-    """Lets worlds in which something would meet solve once more, and clears their bounds."""
+    """Lets worlds in which something would meet solve once more, ``always`` all of them, and clears their bounds."""
     w = wp.tid()
     ahead[w] = 0
-    if progress.active[w] != 0 and progress.bound[w] < 1.0:
+    if _may_hold(progress, w) or (always and progress.active[w] != 0):
         ahead[w] = 1
         progress.bound[w] = 1.0
 
@@ -657,8 +666,10 @@ def decide_step(
     arrived = scale == 1.0 or progress.remaining[w] == 0.0
     steps = progress.steps[w]
     ends = arrived and (progress.change[w] <= least_change or steps >= max_steps)
-    if scale == 0.0 and arrived:
+    stands = scale == 0.0
+    if stands and arrived and progress.plain[w] != 0:
         ends = True
+    progress.plain[w] = int(stands)
     if ends or steps >= max_late_steps:
         progress.active[w] = 0
         return
