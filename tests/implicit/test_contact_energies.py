@@ -29,7 +29,7 @@ from warp_bsc.response.state.structs import Motion, allocate
 
 @wp.kernel
 def _energies(
-    elements: Elements, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, energy: wp.array[wp.float64]
+    elements: Elements, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64, energy: wp.array[wp.float64]
 ):
     i = wp.tid()
     energy[i] = elasticity.element_energy(elements, i, elasticity.kind_of(elements, i), x, x0, dt)
@@ -84,7 +84,7 @@ class Scene:
         out = make_derivatives(self.vertices, device)
         world = wp.zeros(self.model.particle_count, dtype=int, device=device)
         flags = [self.array([1], int), self.array([int(convex)], int)]
-        inputs = [self.elements, self.array(self.x), self.array(self.x0), wp.float64(DT), world, *flags]
+        inputs = [self.elements, self.array(self.x, wp.vec3d), self.array(self.x0), wp.float64(DT), world, *flags]
         wp.launch(elasticity.differentiate, self.count, inputs=inputs, outputs=[out], device=device)
         return out
 
@@ -105,7 +105,7 @@ class Scene:
 
     def energies(self, x):
         out = wp.zeros(self.count, dtype=wp.float64, device=self.model.device)
-        inputs = [self.elements, self.array(x.astype(np.float32)), self.array(self.x0), wp.float64(DT)]
+        inputs = [self.elements, self.array(x, wp.vec3d), self.array(self.x0), wp.float64(DT)]
         wp.launch(_energies, self.count, inputs=inputs, outputs=[out], device=self.model.device)
         return np.split(out.numpy(), np.cumsum([len(v) for v in self.vertices])[:-1])
 

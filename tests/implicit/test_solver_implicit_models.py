@@ -103,6 +103,14 @@ def test_pairs_keep_their_distance(options, device):
     assert fast > -0.15  # the sheet stops what would be 0.4 m below
 
 
+def test_a_sheet_lands_in_steps_of_a_second(device):
+    """Pairs that are held first keep it in the air: such displacements raise the energy, whatever share is taken."""
+    model = sheet(device, 0.3, n=12)
+    solver, state = run(model, 3, dt=1.0)
+    assert solver.report.certified
+    assert state.particle_q.numpy()[:, 2].min() > 0.0 and state.particle_q.numpy()[:, 2].max() < 0.1
+
+
 def test_radii_and_margins_of_the_model(device):
     builder = newton.ModelBuilder()
     add_patch(builder, 4, 0.04, (0.0, 0.0, 0.03))
@@ -137,7 +145,7 @@ def test_a_friction_table_decides_what_slides(friction, slides, on_plane, device
         expected = steps * DT * GRAVITY * (np.sin(angle) - friction * np.cos(angle))
         assert speed == pytest.approx(expected, rel=0.05)
     else:
-        assert abs(speed) < 2e-3  # smoothed below 1 mm/s
+        assert abs(speed) < 1e-3  # smoothed below 0.5 mm/s
 
 
 # Attachments

@@ -42,8 +42,11 @@ _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOUND = wp.constant(int(Count.FOUND))
-_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a pair must keep: the search certifies it for a pair at rest."""
+KEPT = wp.constant(wp.float64(1.0 - 2.0**-20))
+"""Share of its distance at the start that a pair must keep which starts within its minimum distance.
+
+The search certifies it for a pair at rest, also where that is pressed from both sides, and moves by rounding.
+"""
 SHARE_ON_ARCS = wp.constant(wp.float64(1.0 - 2.0**-6))
 """Share of its minimum distance that a pair keeps on arcs, between the start and the end of the step."""
 _ZERO = wp.constant(wp.float64(0.0))
@@ -108,7 +111,7 @@ def distances_of_pair(
     start = wp.max(found - _TWO * error, _ZERO)
     if are_within_rings(corners, firsts_of(kind), distances.rings):
         return start, _ZERO
-    return start, wp.min(distance_of_corners(kind, corners, distances.radius), _KEPT * start)
+    return start, wp.min(distance_of_corners(kind, corners, distances.radius), KEPT * start)
 
 
 @wp.func

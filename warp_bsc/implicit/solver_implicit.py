@@ -137,7 +137,7 @@ class SolverImplicit(SolverCCD):
         Args:
             model: A model with particles or free bodies.
             friction: Coefficient of particles, as of :class:`warp_bsc.SolverCCD`, like all that follow but for
-                ``max_iterations``. Below a speed of 1 mm/s it is proportional to the speed.
+                ``max_iterations``. Below a speed of 0.5 mm/s it is proportional to the speed.
             friction_table: Coefficients by pair of materials.
             bodies: Whether the solver moves free dynamic bodies, or leaves all of them where a program, or another
                 solver, puts them.

@@ -67,7 +67,7 @@ class SolverCCD(CollisionStage):
     certified.
 
     With ``min_distance`` or ``particle_radius`` the certificate is of distances: a pair that started farther apart
-    stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-30 of that distance
+    stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-20 of that distance
     and 2^-38 of the largest difference of coordinates of the pair). Pairs that touch at the start are excluded, and
     elements that an edge of the mesh joins only do not touch.
 

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from ...response.state.motion import continues
+from ...response.state.poses import point_of
 from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import ZERO, to_double, to_single
 from ..attachments import check_attachments
@@ -62,14 +63,6 @@ def _is_finite(pose: wp.transform) -> bool:
     return wp.isfinite(wp.transform_get_translation(pose)) and wp.isfinite(wp.transform_get_rotation(pose))
 
 
-@wp.func
-def _point(pose: wp.transform, point: wp.vec3) -> wp.vec3d:
-    """Returns a point of a body in the frame of the world [m]."""
-    q = wp.transform_get_rotation(pose)
-    rotation = wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
-    return wp.quat_rotate(rotation, to_double(point)) + to_double(wp.transform_get_translation(pose))
-
-
 @wp.kernel
 def attach(
     # in
@@ -98,7 +91,7 @@ def attach(
         body, point = attachments.body[i], attachments.body_point[i]
         if not attachments.enabled[i] or not _is_finite(ends[body]):
             continue
-        end = _point(ends[body], point)
+        end = point_of(ends[body], point)
         stiffness = attachments.stiffness[i]
         if wp.isinf(stiffness):
             unknowns.is_free[u] = 0
@@ -117,7 +110,7 @@ def attach(
             damping = wp.float64(attachments.damping[i]) / dt
             moved = wp.vec3d()
             if continues(motion, motion.world[p]) and _is_finite(starts[body]):
-                moved = end - _point(starts[body], point)
+                moved = end - point_of(starts[body], point)
             shifted += damping * (to_double(motion.x0[p]) + moved - origin)
             weight += damping
     unknowns.inertia[u] = weight

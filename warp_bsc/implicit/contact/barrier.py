@@ -20,7 +20,6 @@ from ...response.state.vectors import HALF, ONE, ZERO
 wp.set_module_options({"enable_backward": False})
 
 _TWO = wp.constant(wp.float64(2.0))
-_THREE = wp.constant(wp.float64(3.0))
 _FOUR = wp.constant(wp.float64(4.0))
 CURVATURE_AT_HALF = 6.386294361119891
 """Curvature of the barrier at half of its reach, in its stiffness."""
@@ -28,8 +27,8 @@ _NEXT = wp.constant(wp.float64(0.999))
 """Share of a safe time by which the search for an impact goes on: it may be rounded up."""
 _STALLED = wp.constant(wp.float64(1e-3))
 """Share of displacements by which it goes on at least; it ends early, and safe, where it does not."""
-_FLOOR = wp.constant(wp.float64(0.03))
-"""Gap, as a share of the reach, below which a pair hardly comes nearer: the barrier would be too steep to solve for."""
+FLOOR = wp.constant(wp.float64(0.03))
+"""Share of the reach of a barrier below which it is too steep to solve for in one step."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
 
@@ -61,24 +60,23 @@ def barrier_curvature(gap: wp.float64, reach: wp.float64) -> wp.float64:
 def friction_energy(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
     """Returns the work of smoothed friction over a slid length, under a limit of 1."""
     if slid >= smoothing:
-        return slid
-    return slid * slid / smoothing * (ONE - slid / (_THREE * smoothing)) + smoothing / _THREE
+        return slid - HALF * smoothing
+    return HALF * slid * slid / smoothing
 
 
 @wp.func
 def friction_slope(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
-    """Returns the derivative of :func:`friction_energy` over the slid length."""
-    if slid >= smoothing:
-        return ONE / slid
-    return (_TWO - slid / smoothing) / smoothing
+    """Returns the derivative of :func:`friction_energy` over the slid length.
+
+    A constant below the smoothing length: one Newton step finds the force of what friction holds.
+    """
+    return ONE / wp.max(slid, smoothing)
 
 
 @wp.func
 def friction_curvature(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
     """Returns the second derivative of :func:`friction_energy`."""
-    if slid >= smoothing:
-        return ZERO
-    return (_TWO - _TWO * slid / smoothing) / smoothing
+    return wp.where(slid >= smoothing, ZERO, ONE / smoothing)
 
 
 @wp.func
@@ -169,13 +167,22 @@ def safe_share(
 
 
 @wp.func
-def least_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
-    """Returns the gap that a pair keeps in a Newton step: half of it, or less where it is large, more where small."""
-    least = wp.min(HALF * gap, wp.float64(0.3) * reach)
-    return wp.max(least, wp.min(_FLOOR * reach, wp.float64(0.9) * gap))
+def floor_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
+    """Returns the gap below which a pair hardly comes nearer in a step, where its barrier would be too steep.
+
+    It depends on the gap at the start: what is pressed together comes as near as it must in some steps.
+    """
+    return wp.min(FLOOR * reach, wp.float64(0.45) * gap)
 
 
 @wp.func
-def goal_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
+def least_gap(gap: wp.float64, reach: wp.float64, floor: wp.float64) -> wp.float64:
+    """Returns the gap that a pair keeps in a Newton step: half of it, or less where it is large, more where small."""
+    least = wp.min(HALF * gap, wp.float64(0.3) * reach)
+    return wp.max(least, wp.min(floor, wp.float64(0.9) * gap))
+
+
+@wp.func
+def goal_gap(gap: wp.float64, reach: wp.float64, floor: wp.float64) -> wp.float64:
     """Returns the gap at which a pair is held that would come nearer than :func:`least_gap`."""
-    return wp.max(wp.min(wp.float64(0.6) * reach, wp.float64(0.75) * gap), _TWO * _FLOOR * reach)
+    return wp.max(wp.min(wp.float64(0.6) * reach, wp.float64(0.75) * gap), _TWO * floor)

@@ -10,7 +10,7 @@ from newton import BodyFlags
 
 from ...response.state.mesh import ModelMesh
 from ...response.state.motion import StateArrays
-from ...response.state.poses import centre_of, in_world, turn_between, turned_pose
+from ...response.state.poses import centre_of, in_world, point_of, turn_between, turned_pose
 from ...response.state.structs import Bodies, Motion
 from ...response.state.vectors import HALF, ONE, to_double, to_single
 from .system import Progress, Unknowns, to_single_block
@@ -21,7 +21,6 @@ _ITERATIONS = wp.constant(4)
 """Iterations for the spin that keeps an angular momentum in the middle of a step."""
 _SMALL_ANGLE = wp.constant(wp.float64(1e-3))
 _TWELFTH = wp.constant(wp.float64(1.0 / 12.0))
-_ROUNDING = wp.constant(wp.float64(2.0**-23))
 _REACH = 0.01
 """Reach of barriers between bodies as a share of the size of the smaller one."""
 
@@ -36,6 +35,7 @@ class SolvedBodies:
         goal: Pose to which inertia leads.
         pose: Pose now.
         moved: Pose after a share of its displacement.
+        low, low_moved: What their rounding takes from the centre of mass in both [m].
         inertia: Moments in the goal, in the frame of the world [kg m^2].
     """
 
@@ -44,6 +44,8 @@ class SolvedBodies:
     goal: wp.array[wp.transform]
     pose: wp.array[wp.transform]
     moved: wp.array[wp.transform]
+    low: wp.array[wp.vec3d]
+    low_moved: wp.array[wp.vec3d]
     inertia: wp.array[wp.mat33d]
 
 
@@ -127,6 +129,7 @@ def begin_bodies(
     bodies.goal[body] = goal
     bodies.inertia[body] = in_world(of_motion.inertia[body], goal)
     bodies.pose[body] = start
+    bodies.low[body] = wp.vec3d()
 
 
 @wp.func
@@ -135,6 +138,15 @@ def body_vertex(poses: wp.array[wp.transform], motion: Motion, vertex: int) -> w
     return wp.transform_point(
         poses[motion.bodies.of_vertex[vertex]], motion.bodies.position[vertex - motion.bodies.particle_count]
     )
+
+
+@wp.func
+def exact_on_body(poses: wp.array[wp.transform], low: wp.array[wp.vec3d], motion: Motion, vertex: int) -> wp.vec3d:
+    """Returns where a vertex of a body is in a pose of that, as rounded at the start and not since then [m]."""
+    body, of_motion = motion.bodies.of_vertex[vertex], motion.bodies
+    position = of_motion.position[vertex - of_motion.particle_count]
+    since_start = point_of(poses[body], position) + low[body] - point_of(of_motion.start[body], position)
+    return to_double(motion.x0[vertex]) + since_start
 
 
 @wp.func
@@ -151,17 +163,17 @@ def bend_of(arm: wp.vec3, turn: wp.vec3) -> float:
 
 
 @wp.func
-def _off_goal(bodies: SolvedBodies, motion: Motion, body: int, pose: wp.transform):
+def _off_goal(bodies: SolvedBodies, motion: Motion, body: int, pose: wp.transform, low: wp.vec3d):
     """Returns how far a pose is from the goal: its centre [m], and its rotation vector [rad]."""
     goal = bodies.goal[body]
-    off = centre_of(motion.bodies, body, pose) - centre_of(motion.bodies, body, goal)
+    off = centre_of(motion.bodies, body, pose) + low - centre_of(motion.bodies, body, goal)
     return off, turn_between(goal, pose)
 
 
 @wp.func
 def inertia_of_body(bodies: SolvedBodies, motion: Motion, body: int, u: int, dt: wp.float64):
     """Returns the gradient of the inertia of a body by one of its unknowns, and the block of the diagonal."""
-    off, turned = _off_goal(bodies, motion, body, bodies.pose[body])
+    off, turned = _off_goal(bodies, motion, body, bodies.pose[body], bodies.low[body])
     block = (ONE / wp.float64(motion.bodies.inverse_mass[body])) * wp.identity(n=3, dtype=wp.float64)
     gradient = block * off
     if u != bodies.unknown[body]:
@@ -180,19 +192,9 @@ def inertia_of_body(bodies: SolvedBodies, motion: Motion, body: int, u: int, dt:
 @wp.func
 def inertial_energy(bodies: SolvedBodies, motion: Motion, body: int, dt: wp.float64) -> wp.float64:
     """Returns the energy of the inertia of a body after a share of its displacement [J]."""
-    off, turned = _off_goal(bodies, motion, body, bodies.moved[body])
+    off, turned = _off_goal(bodies, motion, body, bodies.moved[body], bodies.low_moved[body])
     value = wp.dot(off, off) / wp.float64(motion.bodies.inverse_mass[body])
     return HALF * (value + wp.dot(turned, bodies.inertia[body] * turned)) / (dt * dt)
-
-
-@wp.func
-def rounding_energy(bodies: SolvedBodies, motion: Motion, body: int, dt: wp.float64) -> wp.float64:
-    """Returns how far the work of all that pushes a body may be off, as positions are rounded [J]."""
-    off, turned = _off_goal(bodies, motion, body, bodies.pose[body])
-    force = wp.length(off) / (wp.float64(motion.bodies.inverse_mass[body]) * dt * dt)
-    torque = wp.length(bodies.inertia[body] * turned) / (dt * dt)
-    x = motion.x0[bodies.first_vertex[body]]
-    return _ROUNDING * (force * wp.float64(wp.max(wp.abs(x))) + torque)
 
 
 @wp.func
@@ -223,13 +225,16 @@ def move_bodies(
         return
     u = bodies.unknown[body]
     taken = progress.scale[unknowns.world[u]] * share[bodies.first_vertex[body]]
-    pose = bodies.pose[body]
-    if displaced and taken > 0.0:
-        shift, turn = taken * solution[u], taken * solution[u + 1]
-        pose = turned_pose(motion.bodies, body, pose, to_double(shift), to_double(turn))
+    pose, low = bodies.pose[body], bodies.low[body] + wp.vec3d()
     bodies.moved[body] = pose
+    if displaced and taken > 0.0:
+        centre, shift = centre_of(motion.bodies, body, pose), low + to_double(taken * solution[u])
+        bodies.moved[body] = turned_pose(motion.bodies, body, pose, shift, to_double(taken * solution[u + 1]))
+        low = centre + shift - centre_of(motion.bodies, body, bodies.moved[body])
+    bodies.low_moved[body] = low
     if takes:
-        bodies.pose[body] = pose
+        bodies.pose[body] = bodies.moved[body]
+        bodies.low[body] = low
 
 
 @wp.kernel
@@ -246,7 +251,7 @@ def displace_bodies(
     body = wp.tid()
     if _is_active(bodies, unknowns, progress, body):
         u = bodies.unknown[body]
-        shift, turn = to_double(solution[u]), to_double(solution[u + 1])
+        shift, turn = bodies.low[body] + to_double(solution[u]), to_double(solution[u + 1])
         bodies.moved[body] = turned_pose(motion.bodies, body, bodies.pose[body], shift, turn)
 
 
@@ -267,7 +272,7 @@ def finish_bodies(
         return
     if unknowns.is_free[u] != 0:
         pose, before = bodies.pose[body], motion.bodies.velocity[body]
-        off, turned = _off_goal(bodies, motion, body, pose)
+        off, turned = _off_goal(bodies, motion, body, pose, bodies.low[body])
         linear = to_double(wp.spatial_top(before)) + off / wp.float64(dt)
         angular = to_double(wp.spatial_bottom(before)) + turned / wp.float64(dt)
         velocity = wp.spatial_vector(to_single(linear), to_single(angular))

@@ -6,7 +6,7 @@ from ...response.contacts.queue import has_pair, pair_count, vertices_of
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
-from ...response.state.vectors import ZERO, corners_of, to_double
+from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
 from .system import Progress
@@ -50,20 +50,20 @@ def _bound(
         return
     a, b, c, d = corners_of(trial.x, corners)
     scale = progress.scale[world]
-    p = to_double(moved(trial, scale, corners[0])) - a
-    q = to_double(moved(trial, scale, corners[1])) - b
-    r = to_double(moved(trial, scale, corners[2])) - c
-    s = to_double(moved(trial, scale, corners[3])) - d
+    p = to_double(to_single(moved(trial, scale, corners[0]))) - a
+    q = to_double(to_single(moved(trial, scale, corners[1]))) - b
+    r = to_double(to_single(moved(trial, scale, corners[2]))) - c
+    s = to_double(to_single(moved(trial, scale, corners[3]))) - d
     # far apart for their ways: no need to find the closest points
     way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     kept = candidates.kept[i]
-    reach = wp.float64(candidates.reach[i])
+    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     apart = barrier.distance_of_boxes(queue.kind, a, b, c, d) - kept
     bends = _bends(trial, scale, corners)
-    if way + bends[0] <= apart - barrier.least_gap(apart, reach):
+    if way + bends[0] <= apart - barrier.least_gap(apart, reach, floor):
         return
     _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
-    least = barrier.least_gap(distance - kept, reach)
+    least = barrier.least_gap(distance - kept, reach, floor)
     if way + bends[0] <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
@@ -126,14 +126,14 @@ def bound_by_planes(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, _level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        kept, _level, reach, floor = gap_at_plane(motion, planes, settings, i, vertex)
         if reach == ZERO:
             continue
         before, _error = signed_distance(plane_at(planes, i, now), trial.x[vertex])
         then = now + (1.0 - now) * scale
-        after, _error_after = signed_distance(plane_at(planes, i, then), moved(trial, scale, vertex))
+        after, _error_after = signed_distance(plane_at(planes, i, then), to_single(moved(trial, scale, vertex)))
         gap, left = before - kept, after - kept
-        least = barrier.least_gap(gap, reach)
+        least = barrier.least_gap(gap, reach, floor)
         taken = scale * trial.share[trial.holder[vertex]]
         bend = wp.float64(taken * trial.bend[vertex])
         flat = wp.float64(taken) * bend

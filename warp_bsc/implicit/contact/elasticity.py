@@ -1,8 +1,8 @@
 """Energies that Newton's VBD gives to elements, with their gradients and Hessians by hand.
 
 Stable neo-Hookean membranes and tetrahedra, dihedral bending, springs, and damping by the change since the start of the
-step, as in :mod:`..energies`, whose forces are the negative gradients here. All is computed in float64 from positions
-in float32; blocks of Hessians are stored in float32.
+step, as in :mod:`..energies`, whose forces are the negative gradients here. All is computed in float64; blocks of
+Hessians are stored in float32.
 
 References:
     B. Smith, F. De Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Transactions on Graphics 37(2), 2018,
@@ -12,6 +12,7 @@ References:
 """
 
 from enum import IntEnum
+from typing import Any
 
 import newton
 import numpy as np
@@ -154,7 +155,7 @@ def first_vertex(elements: Elements, kind: int, e: int) -> int:
 
 
 @wp.func
-def _is_finite(elements: Elements, kind: int, e: int, x: wp.array[wp.vec3]) -> bool:
+def _is_finite(elements: Elements, kind: int, e: int, x: wp.array[Any]) -> bool:
     """Returns whether the particles of an element have finite positions."""
     if kind == ElementKind.MEMBRANE:
         v = elements.tri_indices
@@ -197,7 +198,7 @@ def _identity() -> wp.mat33d:
 
 
 @wp.func
-def _membrane_frame(elements: Elements, e: int, x: wp.array[wp.vec3]):
+def _membrane_frame(elements: Elements, e: int, x: wp.array[Any]):
     """Returns the columns of the deformation gradient of a triangle."""
     pose = elements.tri_poses[e]
     origin = to_double(x[elements.tri_indices[e, 0]])
@@ -209,7 +210,7 @@ def _membrane_frame(elements: Elements, e: int, x: wp.array[wp.vec3]):
 
 
 @wp.func
-def _membrane_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64):
+def _membrane_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
     mu, lame = wp.float64(elements.tri_materials[e, 0]), wp.float64(elements.tri_materials[e, 1])
     if mu <= ZERO and lame <= ZERO:
         return ZERO
@@ -233,7 +234,7 @@ def _membrane_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.ar
 def _differentiate_membrane(
     elements: Elements,
     e: int,
-    x: wp.array[wp.vec3],
+    x: wp.array[wp.vec3d],
     x0: wp.array[wp.vec3],
     dt: wp.float64,
     is_convex: bool,
@@ -330,7 +331,7 @@ def _bends(elements: Elements, e: int):
 
 
 @wp.func
-def _edge_corners(elements: Elements, e: int, x: wp.array[wp.vec3]):
+def _edge_corners(elements: Elements, e: int, x: wp.array[Any]):
     v = elements.edge_indices
     return to_double(x[v[e, 0]]), to_double(x[v[e, 1]]), to_double(x[v[e, 2]]), to_double(x[v[e, 3]])
 
@@ -353,7 +354,7 @@ def _bending_change(elements: Elements, e: int, angle: wp.float64, x0: wp.array[
 
 
 @wp.func
-def _bending_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64):
+def _bending_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
     if not _bends(elements, e):
         return ZERO
     a, b, c, d = _edge_corners(elements, e, x)
@@ -368,7 +369,7 @@ def _bending_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.arr
 
 @wp.func
 def _differentiate_bending(
-    elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
+    elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
 ):
     corner = elements.first[_FIRST_CORNER + 1] + 4 * e
     flat = not _bends(elements, e)
@@ -415,7 +416,7 @@ def _double(m: wp.mat33) -> wp.mat33d:
 
 
 @wp.func
-def _tetrahedron_frame(elements: Elements, e: int, pose: wp.mat33d, x: wp.array[wp.vec3]) -> wp.mat33d:
+def _tetrahedron_frame(elements: Elements, e: int, pose: wp.mat33d, x: wp.array[Any]) -> wp.mat33d:
     """Returns the deformation gradient of a tetrahedron."""
     v = elements.tet_indices
     origin = to_double(x[v[e, 0]])
@@ -431,7 +432,7 @@ def _column(m: wp.mat33d, j: int) -> wp.vec3d:
 
 
 @wp.func
-def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64):
+def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
     mu, lame = wp.float64(elements.tet_materials[e, 0]), wp.float64(elements.tet_materials[e, 1])
     if mu <= ZERO and lame <= ZERO:
         return ZERO
@@ -453,7 +454,7 @@ def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp
 def _differentiate_tetrahedron(
     elements: Elements,
     e: int,
-    x: wp.array[wp.vec3],
+    x: wp.array[wp.vec3d],
     x0: wp.array[wp.vec3],
     dt: wp.float64,
     is_convex: bool,
@@ -531,9 +532,9 @@ def _corner_weights(pose: wp.mat33d, i: int) -> wp.vec3d:
 
 
 @wp.func
-def _spring_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64):
+def _spring_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
     a, b = elements.spring_indices[e, 0], elements.spring_indices[e, 1]
-    length = wp.max(wp.length(to_double(x[a]) - to_double(x[b])), _LEAST_LENGTH)
+    length = wp.max(wp.length(x[a] - x[b]), _LEAST_LENGTH)
     length_0 = wp.max(wp.length(to_double(x0[a]) - to_double(x0[b])), _LEAST_LENGTH)
     stretch, change = length - wp.float64(elements.spring_rest_length[e]), length - length_0
     energy = wp.float64(elements.spring_stiffness[e]) * stretch * stretch
@@ -544,7 +545,7 @@ def _spring_energy(elements: Elements, e: int, x: wp.array[wp.vec3], x0: wp.arra
 def _differentiate_spring(
     elements: Elements,
     e: int,
-    x: wp.array[wp.vec3],
+    x: wp.array[wp.vec3d],
     x0: wp.array[wp.vec3],
     dt: wp.float64,
     is_convex: bool,
@@ -552,7 +553,7 @@ def _differentiate_spring(
 ):
     corner, place = elements.first[_FIRST_CORNER + 3] + 2 * e, elements.first[_FIRST_BLOCK + 3] + 4 * e
     a, b = elements.spring_indices[e, 0], elements.spring_indices[e, 1]
-    between = to_double(x[a]) - to_double(x[b])
+    between = x[a] - x[b]
     length = wp.max(wp.length(between), _LEAST_LENGTH)
     length_0 = wp.max(wp.length(to_double(x0[a]) - to_double(x0[b])), _LEAST_LENGTH)
     stiffness, damping = wp.float64(elements.spring_stiffness[e]), wp.float64(elements.spring_damping[e]) / dt
@@ -577,7 +578,7 @@ def _differentiate_spring(
 
 @wp.func
 def element_energy(
-    elements: Elements, i: int, kind: int, x: wp.array[wp.vec3], x0: wp.array[wp.vec3], dt: wp.float64
+    elements: Elements, i: int, kind: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64
 ) -> wp.float64:
     """Returns the energy of an element of a kind above that at rest [J], damping included.
 
@@ -620,7 +621,7 @@ def _clear(elements: Elements, kind: int, e: int, out: Derivatives):
 def differentiate(
     # in
     elements: Elements,
-    x: wp.array[wp.vec3],
+    x: wp.array[wp.vec3d],
     x0: wp.array[wp.vec3],
     dt: wp.float64,
     world: wp.array[int],

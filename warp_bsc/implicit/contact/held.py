@@ -129,7 +129,7 @@ def _hold_pair(
     if not then > ZERO:
         return
     normal = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / then
-    goal = kept + barrier.goal_gap(gap, reach)
+    goal = kept + barrier.goal_gap(gap, reach, wp.float64(candidates.floor[i]))
     now = wp.dot(normal, weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d)
     pair = queue.pairs[i]
     key = key_of_pair(group, queue.kind, pair[0], pair[1])
@@ -191,7 +191,7 @@ def hold_at_planes(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, _level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        kept, _level, reach, floor = gap_at_plane(motion, planes, settings, i, vertex)
         if reach == ZERO:
             continue
         gap, _error = signed_distance(plane_at(planes, i, plane_share[world]), trial.x[vertex])
@@ -199,8 +199,8 @@ def hold_at_planes(
         left, _error_after = signed_distance(end, trial.x[vertex] + trial.displaced[vertex])
         now, _error_now = signed_distance(end, trial.x[vertex])
         gap -= kept
-        if left - kept < barrier.least_gap(gap, reach):
-            goal = kept + barrier.goal_gap(gap, reach)
+        if left - kept < barrier.least_gap(gap, reach, floor):
+            goal = kept + barrier.goal_gap(gap, reach, floor)
             normal = wp.vec3d(end[0], end[1], end[2])
             weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
             key = key_of_pair(group, 7, vertex, i)

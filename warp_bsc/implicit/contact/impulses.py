@@ -38,7 +38,7 @@ def publish_contacts(
         for j in range(4):
             weights[j] = wp.float64(contacts.weights[i][j])
             x0 = to_double(step.motion.x0[corners[j]])
-            slid += weights[j] * (to_double(trial.x[corners[j]]) - x0)
+            slid += weights[j] * (trial.exact[corners[j]] - x0)
             predicted += weights[j] * (to_double(goal[corners[j]]) - x0)
         slid -= wp.dot(slid, normal) * normal
         limit = wp.float64(contacts.friction[i]) * load

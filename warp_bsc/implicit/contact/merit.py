@@ -106,7 +106,7 @@ def add_friction_energies(
             slid, normal = wp.vec3d(), to_double(contacts.normal[i])
             for j in range(4):
                 v = corners[j]
-                slid += wp.float64(weights[j]) * (to_double(trial.moved[v]) - to_double(motion.x0[v]))
+                slid += wp.float64(weights[j]) * (trial.moved[v] - to_double(motion.x0[v]))
             slid -= wp.dot(slid, normal) * normal
             value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
             add_energy(energy, world, value, settings.units)
@@ -137,7 +137,7 @@ def add_plane_energies(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        _kept, level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
         plane = plane_at(planes, i, now + (1.0 - now) * scale)
         distance, _error = signed_distance(plane, trial.moved[vertex])
         gap = distance - level

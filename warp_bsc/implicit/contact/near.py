@@ -59,7 +59,7 @@ def _add_contact(
     slid, given = -shifted, ZERO
     for j in range(4):
         v = corners[j]
-        slid += weights[j] * (to_double(trial.x[v]) - to_double(motion.x0[v]))
+        slid += weights[j] * (trial.exact[v] - to_double(motion.x0[v]))
         if unknowns.of_vertex[v] < 0 and not is_solved(unknowns, v):
             given += weights[j] * wp.dot(normal, to_double(trial.displaced[v]))
     slid -= wp.dot(slid, normal) * normal
@@ -106,7 +106,7 @@ def _find_near(
     corners = vertices_of(queue, i)
     if active[motion.world[corners[0]]] == 0:
         return
-    a, b, c, d = corners_of(trial.x, corners)
+    a, b, c, d = corners_of(trial.exact, corners)
     if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
         return
     weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
@@ -186,16 +186,16 @@ def find_near_planes(
         if i < 0:
             return
         plane = plane_at(planes, i, plane_share[world])
-        distance, _error = signed_distance(plane, trial.x[vertex])
-        _kept, level, reach = gap_at_plane(motion, planes, settings, i, vertex)
+        distance, _error = signed_distance(plane, trial.exact[vertex])
+        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
         gap = distance - level
         if gap >= reach or not gap > ZERO:
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         stiffness = stiffness_at_plane(motion, settings, vertex)
         key = key_of_pair(1, 0, vertex, i)
-        there, _error_there = signed_distance(planes.end[i], trial.x[vertex])
-        since, _since_error = signed_distance(planes.start[i], trial.x[vertex])
+        there, _error_there = signed_distance(planes.end[i], trial.exact[vertex])
+        since, _since_error = signed_distance(planes.start[i], trial.exact[vertex])
         _add_contact(
             motion,
             contacts,

@@ -42,7 +42,7 @@ _SHORT_EDGE = 0.25
 """Largest reach as a share of the shortest edge at a vertex."""
 _RECOVERY_SPEED = 0.3
 """Speed at which a barrier moves apart what is within its reach [m/s]: what is thrown rises by 5 mm."""
-_SMOOTHING_SPEED = 1e-3
+_SMOOTHING_SPEED = 0.5e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step ends [m/s]."""
@@ -328,6 +328,7 @@ class NewtonMethod:
             candidates.level = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
             candidates.share = wp.zeros(len(queue.pairs), dtype=float, device=device)
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
+            candidates.floor = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
@@ -350,7 +351,7 @@ class NewtonMethod:
         dt = wp.float64(self._dt)
         self._launch(steps.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
-        inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
+        inputs = [self._elements, trial.exact, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
         self._find_near(progress.active)
         self._assemble(progress.active, True)
@@ -375,7 +376,7 @@ class NewtonMethod:
         for _ in range(_TRUNCATIONS):
             self._bound(progress.searches)
             self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
-        self._launch(steps.begin_hold, work.worlds, [], [progress, self._ahead])  # clears bounds
+        self._launch(steps.begin_hold, work.worlds, [True], [progress, self._ahead])  # clears bounds
         self._bound(progress.searches)
         self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(True, progress.trial_cut)
@@ -426,7 +427,7 @@ class NewtonMethod:
     def _hold(self, solves):
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         unknowns, ahead = self._unknowns, self._ahead
-        self._launch(steps.begin_hold, work.worlds, [], [self.progress, ahead])
+        self._launch(steps.begin_hold, work.worlds, [False], [self.progress, ahead])
         work.launch_over_entries(held.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
         self._over_candidates(held.hold_pairs, [motion], [*inputs, self._limit, *outputs])

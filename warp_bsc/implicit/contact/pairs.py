@@ -2,21 +2,21 @@
 
 import warp as wp
 
-from ...detection.approach_phase import distances_of_pair
+from ...detection.approach_phase import KEPT, distances_of_pair
 from ...kernels.polynomials import VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
 from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_mass_of, owner_of
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ...response.state.structs import Motion, Step, body_of
-from ...response.state.vectors import HALF, ONE, ZERO, corners_of
+from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
 from . import barrier
 
 wp.set_module_options({"enable_backward": False})
 
-_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a pair keeps which starts within its minimum distance."""
-_LEAST_GAP = wp.constant(wp.float64(1e-6))
+_WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
+"""Share of its distance at the start that only pairs keep which start within their minimum distance."""
+_LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
@@ -33,6 +33,7 @@ class Candidates:
         kept: Distance that each pair keeps in any case [m].
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m]; 0 of a pair that is excluded.
+        floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet.
     """
 
@@ -40,6 +41,7 @@ class Candidates:
     kept: wp.array[wp.float64]
     level: wp.array[wp.float64]
     reach: wp.array[float]
+    floor: wp.array[float]
     share: wp.array[float]
 
 
@@ -76,7 +78,8 @@ class Trial:
         share: Share of its displacement that a vertex takes of what its world takes.
         holder: Vertex whose share each vertex takes: itself, or the first of its body.
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
-        moved: Positions after displacements.
+        exact: Positions without rounding, which for friction is a large part of the way [m].
+        moved: The same after displacements.
         first: Positions after the first Newton step of the step, to which the straight way is free.
     """
 
@@ -85,14 +88,16 @@ class Trial:
     share: wp.array[float]
     holder: wp.array[int]
     bend: wp.array[float]
-    moved: wp.array[wp.vec3]
+    exact: wp.array[wp.vec3d]
+    moved: wp.array[wp.vec3d]
     first: wp.array[wp.vec3]
 
 
 @wp.func
-def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3:
-    """Returns the position of a vertex after a share of its displacement, rounded as it is stored."""
-    return trial.x[vertex] + (scale * trial.share[trial.holder[vertex]]) * trial.displaced[vertex]
+def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3d:
+    """Returns the position of a vertex after a share of its displacement, not on the arc of a body."""
+    share = wp.float64(scale * trial.share[trial.holder[vertex]])
+    return trial.exact[vertex] + share * to_double(trial.displaced[vertex])
 
 
 @wp.func
@@ -135,10 +140,12 @@ def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, 
     """Returns the level and the reach of the barrier of a pair, by its distance at the start and that to keep.
 
     The reach of what starts within it ends a little above its gap: a barrier otherwise throws apart, at up to its reach
-    a step, what a program puts there or what fell there in the step before.
+    a step, what a program puts there or what fell there in the step before. That of a pair within its minimum distance
+    is as steep as in a press, so that the force on what is gripped there is one that floats can balance.
     """
     whole = wp.float64(reach)
-    level = wp.min(kept, start - _LEAST_GAP * whole)
+    least = wp.where(kept > ZERO and kept >= _WITHIN * start, barrier.FLOOR, _LEAST_GAP)
+    level = wp.min(kept, start - least * whole)
     return level, wp.min(whole, start - level + settings.recovery)
 
 
@@ -196,6 +203,7 @@ def _prepare(
     level, reach = _barrier_of(settings, start, candidates.kept[i], _reach_of(settings, corners))
     candidates.level[i] = level
     candidates.reach[i] = float(reach)
+    candidates.floor[i] = float(barrier.floor_gap(start - candidates.kept[i], reach))
 
 
 @wp.kernel
@@ -244,26 +252,27 @@ def part_touching(
     off = wp.max(_PARTED * settings.reach[v], _PARTED_ROUNDED * wp.max(wp.abs(x)))
     parted = x + off * wp.normalize(wp.cross(b - a, c - a))
     trial.x[v] = parted
+    trial.exact[v] = to_double(parted)
     origin[v] = parted
 
 
 @wp.func
 def gap_at_plane(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int):
-    """Returns the distance that a vertex keeps from a plane, and the level and the reach of its barrier.
+    """Returns the distance that a vertex keeps from a plane, the level and the reach of its barrier, and its floor.
 
     The reach is 0 if it is excluded.
     """
     if is_filtered_by_plane(motion, planes, i, vertex) or not is_stopped_by_plane(motion, planes, i, vertex):
-        return ZERO, ZERO, ZERO
+        return ZERO, ZERO, ZERO, ZERO
     start, error = signed_distance(planes.start[i], motion.x0[vertex])
     if not start >= -error:
-        return ZERO, ZERO, ZERO
+        return ZERO, ZERO, ZERO, ZERO
     kept = wp.min(start - error, ZERO)
     if motion.distances.radius and start > error:
-        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (start - error))
+        kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], KEPT * (start - error))
     whole = wp.where(body_of(motion, vertex) < 0, settings.reach[vertex], settings.reach_of_bodies[vertex])
     level, reach = _barrier_of(settings, start, kept, whole)
-    return kept, level, reach
+    return kept, level, reach, barrier.floor_gap(start - kept, reach)
 
 
 @wp.func

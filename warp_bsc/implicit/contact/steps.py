@@ -5,7 +5,15 @@ import warp as wp
 from ...response.state.motion import StateArrays, predicted_velocity
 from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
-from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, inertia_of_body, inertial_energy, rounding_energy
+from .bodies import (
+    SolvedBodies,
+    arm_on_body,
+    bend_of,
+    body_vertex,
+    exact_on_body,
+    inertia_of_body,
+    inertial_energy,
+)
 from .conjugate_gradients import Vectors
 from .elasticity import Derivatives, Elements, element_energy, first_vertex, kind_of
 from .matrix import Matrix, block_of, set_block
@@ -106,11 +114,13 @@ def begin_step(
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
         progress.remaining[v] = 0.0
+        progress.plain[v] = 0
         plane_share[v] = 0.0
     if v >= trial.x.shape[0]:
         return
     x0, x1 = motion.x0[v], motion.x1[v]
     trial.x[v] = x0
+    trial.exact[v] = to_double(x0)
     trial.displaced[v] = wp.vec3()
     trial.share[v] = 1.0
     trial.bend[v] = 0.0
@@ -168,6 +178,12 @@ def _may_cut(progress: Progress, w: int) -> bool:
     return progress.active[w] != 0 and progress.scale[w] < 1.0 and progress.remaining[w] == 0.0
 
 
+@wp.func
+def _may_hold(progress: Progress, w: int) -> bool:
+    """Returns whether something would meet in a world, and is to be held."""
+    return progress.active[w] != 0 and progress.bound[w] < 1.0 and progress.plain[w] == 0
+
+
 @wp.kernel
 def find_meeting(
     # in
@@ -177,20 +193,22 @@ def find_meeting(
 ):
     """Says whether something would meet in a world."""
     w = wp.tid()
-    if progress.active[w] != 0 and progress.bound[w] < 1.0:
+    if _may_hold(progress, w):
         meets[0] = 1
 
 
 @wp.kernel
 def begin_hold(
+    # in
+    always: bool,
     # in and out
     progress: Progress,
     ahead: wp.array[int],
 ):
-    """Lets worlds in which something would meet solve once more, and clears their bounds."""
+    """Lets worlds in which something would meet solve once more, ``always`` all of them, and clears their bounds."""
     w = wp.tid()
     ahead[w] = 0
-    if progress.active[w] != 0 and progress.bound[w] < 1.0:
+    if _may_hold(progress, w) or (always and progress.active[w] != 0):
         ahead[w] = 1
         progress.bound[w] = 1.0
 
@@ -226,7 +244,7 @@ def _inertia(
     if p < 0:
         return inertia_of_body(bodies, motion, unknowns.body[u], u, dt)
     inertia = unknowns.inertia[u]
-    pull = to_single(inertia * (to_double(trial.x[p]) - to_double(goal[p])))
+    pull = to_single(inertia * (trial.exact[p] - to_double(goal[p])))
     return pull, float(inertia) * wp.identity(n=3, dtype=float)
 
 
@@ -494,7 +512,6 @@ def begin_newton_step(
         return
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
-    progress.noise[w] = wp.int64(0)
     progress.cuts[w] = 0
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
@@ -538,10 +555,8 @@ def add_energies(
         body = unknowns.body[u]
         if u == bodies.unknown[body]:
             add_energy(energy, world, inertial_energy(bodies, motion, body, settings.dt), settings.units)
-            if not displaced:
-                add_energy(progress.noise, world, rounding_energy(bodies, motion, body, settings.dt), settings.units)
         return
-    off = to_double(trial.moved[p]) - to_double(goal[p])
+    off = trial.moved[p] - to_double(goal[p])
     add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
 
 
@@ -562,7 +577,7 @@ def write_moved(
     if progress.active[world] != 0:
         x = moved(trial, wp.where(displaced, progress.scale[world], 0.0), v)
         if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
-            x = body_vertex(bodies.moved, motion, v)
+            x = exact_on_body(bodies.moved, bodies.low_moved, motion, v)
         trial.moved[v] = x
 
 
@@ -579,7 +594,7 @@ def decide_search(
         progress.trial[w] = wp.int64(0)
         return
     before = wp.float64(progress.energy[w])
-    allowed = before + _NOISE * wp.abs(before) + wp.float64(progress.noise[w])
+    allowed = before + _NOISE * wp.abs(before)
     falls = wp.float64(progress.trial[w]) <= allowed
     progress.trial[w] = wp.int64(0)
     if falls or progress.remaining[w] > 0.0:
@@ -612,10 +627,13 @@ def take(
     given = not is_solved(unknowns, v)
     if given and scale == 1.0:
         trial.x[v] = motion.x1[v]
+        trial.exact[v] = to_double(motion.x1[v])
     elif given or unknowns.of_vertex[v] >= 0:
-        trial.x[v] = moved(trial, scale, v)
+        trial.exact[v] = moved(trial, scale, v)
+        trial.x[v] = to_single(trial.exact[v])
     else:
         trial.x[v] = body_vertex(bodies.pose, motion, v)
+        trial.exact[v] = exact_on_body(bodies.pose, bodies.low, motion, v)
         unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
     if progress.steps[world] == 0:
         trial.first[v] = trial.x[v]
@@ -648,8 +666,10 @@ def decide_step(
     arrived = scale == 1.0 or progress.remaining[w] == 0.0
     steps = progress.steps[w]
     ends = arrived and (progress.change[w] <= least_change or steps >= max_steps)
-    if scale == 0.0 and arrived:
+    stands = scale == 0.0
+    if stands and arrived and progress.plain[w] != 0:
         ends = True
+    progress.plain[w] = int(stands)
     if ends or steps >= max_late_steps:
         progress.active[w] = 0
         return
@@ -673,7 +693,8 @@ def finish(
     if not is_solved(unknowns, v):
         return
     # not by the way from the start, which in short steps is rounding
-    velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
+    off = to_single(trial.exact[v] - to_double(motion.x1[v]))
+    velocity = motion.velocity[v] + off / dt
     if unknowns.of_vertex[v] < 0:
         velocity = predicted_velocity(motion, v, x)
     else:

@@ -49,8 +49,8 @@ class Progress:
         trial: Energy at the displaced positions, in units.
         trial_cut: The same, with displacements of single vertices cut.
         cuts: 1 if those are cut.
-        noise: How far the energy of what touches bodies may be off, as their vertices are rounded, in units.
         change: Largest displacement of an unknown [m].
+        plain: 1 if the next Newton step holds nothing, as the energy did not fall by one that may have.
         remaining: Largest way of what a program moves that is left [m].
     """
 
@@ -63,8 +63,8 @@ class Progress:
     trial: wp.array[wp.int64]
     trial_cut: wp.array[wp.int64]
     cuts: wp.array[int]
-    noise: wp.array[wp.int64]
     change: wp.array[float]
+    plain: wp.array[int]
     remaining: wp.array[float]
 
 

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...detection.approach_phase import KEPT
 from ...detection.settings import Count
 from ...kernels.arcs import Arcs
 from ...kernels.closest import contact_weights
@@ -24,8 +25,6 @@ from .rules import ContactClass
 wp.set_module_options({"enable_backward": False})
 
 _QUEUED = wp.constant(int(Count.QUEUED))
-_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a particle keeps."""
 
 
 @wp.func
@@ -116,7 +115,7 @@ def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: i
     if not motion.distances.radius:
         return ZERO, ZERO
     before, error = signed_distance(planes.start[i], motion.x0[vertex])
-    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], _KEPT * (before - error))
+    kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], KEPT * (before - error))
     return wp.max(kept, ZERO), motion.distances.reach
 
 

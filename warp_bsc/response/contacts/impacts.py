@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...detection.approach_phase import KEPT
 from ...detection.rings import are_within_rings
 from ...detection.settings import TOLERANCE
 from ...kernels.closest import closest_weights, contact_weights
@@ -17,8 +18,6 @@ from .queue import PairQueue, has_pair, pair_count, vertices_of
 from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))
-_KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
-"""Share of its distance at the start that a pair must keep, see :mod:`warp_bsc.detection.approach_phase`."""
 
 
 @wp.func
@@ -58,7 +57,7 @@ def kept_distance(motion: Motion, corners: wp.vec4i, kind: int):
     start = wp.length(relative(closest_weights(pair, a, b, c, d), corners, motion.x0))
     kept = distance_of_corners(pair, corners, motion.distances.radius)
     reach = motion.distances.reach + kept
-    kept = wp.min(kept, _KEPT * start)
+    kept = wp.min(kept, KEPT * start)
     return kept, reach
 
 

@@ -1,5 +1,7 @@
 """Infinite planes: each bounds a solid half-space."""
 
+from typing import Any
+
 import warp as wp
 
 from ...kernels.pipeline.pairs import PairFilter, groups_meet
@@ -40,7 +42,7 @@ def transformed_plane(point: wp.vec3, normal: wp.vec3, body: int, body_q: wp.arr
 
 
 @wp.func
-def signed_distance(plane: wp.vec4d, x: wp.vec3):
+def signed_distance(plane: wp.vec4d, x: Any):
     """Returns the distance of a point from a plane [m], negative in the solid, and a bound on its rounding error.
 
     Each of three products, and each of three sums, is off by 2^-53 of itself at most, and by 2^-1075 where it

@@ -43,9 +43,15 @@ def turn_between(start: wp.transform, end: wp.transform) -> wp.vec3d:
 
 
 @wp.func
+def point_of(pose: wp.transform, point: wp.vec3) -> wp.vec3d:
+    """Returns a point of a body in the frame of the world [m]."""
+    return to_double(wp.transform_get_translation(pose)) + wp.quat_rotate(_rotation(pose), to_double(point))
+
+
+@wp.func
 def centre_of(bodies: Bodies, body: int, pose: wp.transform) -> wp.vec3d:
     """Returns the centre of mass of a body in a pose [m]."""
-    return to_double(wp.transform_get_translation(pose)) + wp.quat_rotate(_rotation(pose), to_double(bodies.com[body]))
+    return point_of(pose, bodies.com[body])
 
 
 @wp.func

@@ -1,5 +1,7 @@
 """Vectors in single and double precision."""
 
+from typing import Any
+
 import warp as wp
 
 ZERO, HALF, ONE = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0))
@@ -7,8 +9,8 @@ ZERO, HALF, ONE = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0))
 
 
 @wp.func
-def to_double(x: wp.vec3) -> wp.vec3d:
-    """Returns the vector in double precision."""
+def to_double(x: Any) -> wp.vec3d:
+    """Returns the vector, which may be in single precision, in double precision."""
     return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
 
 
@@ -19,7 +21,7 @@ def to_single(x: wp.vec3d) -> wp.vec3:
 
 
 @wp.func
-def corners_of(x: wp.array[wp.vec3], corners: wp.vec4i):
+def corners_of(x: wp.array[Any], corners: wp.vec4i):
     """Returns the positions of four vertices in double precision."""
     return to_double(x[corners[0]]), to_double(x[corners[1]]), to_double(x[corners[2]]), to_double(x[corners[3]])
 
