@@ -1,4 +1,4 @@
-"""Elastic energy of cloth, soft bodies and springs: of what VBD has the forces, see :mod:`..implicit.energies`."""
+"""Elastic energy of cloth, soft bodies and springs: of what VBD has the forces."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ class ElasticEnergy:
     """The elastic energy of triangles, pairs of them at edges, tetrahedra and springs of a model; 0 of those at rest.
 
     It is that of VBD: a stable neo-Hookean one of triangles and tetrahedra, that of dihedral angles, and that of
-    springs. Contacts have none here, nor do attachments.
+    springs, see :mod:`..implicit.contact.elasticity`. Contacts have none here, nor do attachments.
     """
 
     def __init__(self, model: newton.Model):

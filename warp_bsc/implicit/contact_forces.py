@@ -1,6 +1,6 @@
 """Forces of VBD between particles and bodies as kernels over contacts and attachments, which Warp differentiates.
 
-The form is that of :mod:`.energies`. An element of contact has the particles of a vertex, an edge or a face. A contact
+The form is that of :mod:`.elements`. An element of contact has the particles of a vertex, an edge or a face. A contact
 is a plane through a point of the shape, which collision detection found: the point moves with the body, the normal does
 not. Within the radius of the particle a penalty pushes, and damping while the gap closes; friction is Coulomb's,
 smoothed below a velocity.

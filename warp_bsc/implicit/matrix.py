@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import warp as wp
 
 from . import matrix_kernels
+from .elastic import Elastic
 from .elements import Elements
 from .matrix_kernels import ContactRows, Matrix
 from .worlds import Worlds
@@ -22,30 +22,19 @@ class StepMatrix:
     come and go, so their Jacobians are listed by particle.
     """
 
-    def __init__(self, elements: Sequence[Elements], is_fixed: wp.array, worlds: Worlds):
-        """Finds the blocks of elements; rows and columns of particles with ``is_fixed`` not 0 are the identity's."""
-        self._elements, self._is_fixed, self._worlds, n = elements, is_fixed, worlds, len(is_fixed)
-        device = self._device = is_fixed.device
-        pairs = [np.arange(n, dtype=np.int64)[:, None] * (n + 1)]  # the diagonal, row n + column
-        for each in elements:
-            v = each.vertices.numpy().astype(np.int64)
-            exists = (v[:, :, None] >= 0) & (v[:, None, :] >= 0)
-            pairs.append(np.where(exists, v[:, :, None] * n + v[:, None, :], 0))
-        blocks, places = np.unique(np.concatenate([pair.ravel() for pair in pairs]), return_inverse=True)
-        splits = np.split(places.astype(np.int32), np.cumsum([pair.size for pair in pairs])[:-1])
-        self._diagonal, *self._places = (
-            wp.array(split.reshape(pair.shape), dtype=int, device=device)
-            for split, pair in zip(splits, pairs, strict=True)
-        )
-        offsets = np.searchsorted(blocks, np.arange(n + 1, dtype=np.int64) * n).astype(np.int32)
-        self._rows = wp.array((blocks // n).astype(np.int32), dtype=int, device=device)
-        self._inertia = wp.zeros(n, dtype=wp.float64, device=device)
+    def __init__(self, elastic: Elastic, springs: Sequence[Elements], is_fixed: wp.array, worlds: Worlds):
+        """Takes elements and springs of one particle; rows and columns of particles with ``is_fixed`` are those of 1.
+
+        A particle counts as fixed where that is not 0.
+        """
+        self._elastic, self._springs, self._is_fixed, self._worlds = elastic, springs, is_fixed, worlds
+        device, n = is_fixed.device, len(is_fixed)
+        self._device, self._inertia = device, wp.zeros(n, dtype=wp.float64, device=device)
         self._blocks = wp.zeros(n, dtype=wp.mat33d, device=device)
         self._lists: dict[wp.Kernel, _Lists] = {}
         matrix = self._matrix = Matrix()
-        matrix.offsets = wp.array(offsets, dtype=int, device=device)
-        matrix.columns = wp.array((blocks % n).astype(np.int32), dtype=int, device=device)
-        matrix.values = wp.zeros(len(blocks), dtype=wp.mat33d, device=device)
+        matrix.offsets, matrix.columns = elastic.rows.first, elastic.rows.column
+        matrix.values = wp.zeros(len(matrix.columns), dtype=wp.mat33d, device=device)
         matrix.roots = wp.zeros(n, dtype=wp.mat33d, device=device)
         matrix.eigenvalues = wp.zeros(3 * n, dtype=wp.float64, device=device)
         matrix.unsymmetric = wp.zeros(worlds.count, dtype=int, device=device)
@@ -55,20 +44,17 @@ class StepMatrix:
 
         Elastic forces have a symmetric one. The Jacobians of the elements ``in_contact`` are scaled where they are.
         """
-        matrix, n = self._matrix, len(mass)
-        matrix.values.zero_()
-        inputs = [wp.float64(dt), mass, self._is_fixed, self._diagonal]
-        self._launch(matrix_kernels.set_inertia, n, inputs, [self._inertia, matrix.values])
-        for each, places in zip(self._elements, self._places, strict=True):
-            inputs = [each.vertices, self._is_fixed, each.jacobian, places]
-            self._launch(matrix_kernels.add_element_blocks, places.shape, inputs, [matrix.values])
-        self._launch(matrix_kernels.copy_diagonal, n, [self._diagonal, matrix.values], [self._blocks])
+        matrix, n, elastic = self._matrix, len(mass), self._elastic
+        self._blocks.zero_()
+        for each in self._springs:
+            each.add_blocks(self._is_fixed, self._blocks)
+        inputs = [wp.float64(dt), mass, self._is_fixed, elastic.rows, elastic.blocks, elastic.bends]
+        self._launch(matrix_kernels.add_up_rows, n, inputs, [self._blocks, self._inertia, matrix.values])
         for each in in_contact:
             each.add_blocks(self._is_fixed, self._blocks)
         scales = [matrix.roots, matrix.eigenvalues]
         self._launch(matrix_kernels.factor_blocks, n, [self._inertia, self._blocks], scales)
-        inputs = [self._rows, matrix.columns, matrix.roots]
-        self._launch(matrix_kernels.scale_blocks, len(self._rows), inputs, [matrix.values])
+        self._launch(matrix_kernels.scale_rows, n, [matrix.offsets, matrix.columns, matrix.roots], [matrix.values])
         self._load_contacts(in_contact, int(transposed))
         return matrix
 

@@ -1,6 +1,6 @@
 """Forces of VBD's self-contact as kernels over pairs of features, which Warp differentiates.
 
-The form is that of :mod:`.energies`; an element has the four particles of a vertex and a triangle, or of two edges.
+The form is that of :mod:`.elements`; an element has the four particles of a vertex and a triangle, or of two edges.
 Where the closest points of both are nearer than a distance, a penalty pushes them apart that is logarithmic below half
 of it, and damping while the gap closes; friction is Coulomb's, smoothed below a velocity. The closest points follow
 from the positions at the end of the step, and are differentiated as well.
