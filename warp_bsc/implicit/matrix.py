@@ -10,7 +10,7 @@ from .elements import Elements
 from .matrix_kernels import ContactRows, Matrix
 from .worlds import Worlds
 
-_CONTACTS = "contacts", "vertex_triangle", "edge_edge"
+_CONTACTS = "contacts", "pairs"
 """Fields of :class:`.matrix_kernels.Matrix`."""
 
 

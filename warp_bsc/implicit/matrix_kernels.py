@@ -36,7 +36,7 @@ class Matrix:
         offsets: First block of each row, and the end of the last, int32, shape [particle_count + 1].
         columns: Columns of blocks, int32, shape [n].
         values: Blocks of inertia and elastic forces, shape [n].
-        contacts, vertex_triangle, edge_edge: Blocks of contacts.
+        contacts, pairs: Blocks of contacts with shapes, and of self-contact.
         roots: R by particle.
         eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R, float64,
             shape [3 particle_count].
@@ -47,8 +47,7 @@ class Matrix:
     columns: wp.array[int]
     values: wp.array[wp.mat33d]
     contacts: ContactRows
-    vertex_triangle: ContactRows
-    edge_edge: ContactRows
+    pairs: ContactRows
     roots: wp.array[wp.mat33d]
     eigenvalues: wp.array[wp.float64]
     unsymmetric: wp.array[int]
@@ -110,8 +109,7 @@ def row_product(matrix: Matrix, i: int, x: wp.array[wp.float64], part: int, part
     for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
         product += matrix.values[k] * vector_at(x, matrix.columns[k])
     product -= _contact_product(matrix.contacts, i, x, part, parts)
-    product -= _contact_product(matrix.vertex_triangle, i, x, part, parts)
-    product -= _contact_product(matrix.edge_edge, i, x, part, parts)
+    product -= _contact_product(matrix.pairs, i, x, part, parts)
     return _sum_of_parts(product, parts)
 
 

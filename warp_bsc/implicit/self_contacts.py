@@ -8,7 +8,7 @@ from newton.solvers import SolverVBD
 
 from . import element_kernels
 from .elements import Elements
-from .self_contact_forces import SelfContactSettings, edge_edge_forces, vertex_triangle_forces
+from .self_contact_forces import SelfContactSettings, pair_forces
 from .worlds import Worlds
 
 
@@ -16,13 +16,14 @@ class RecordedPairs(NamedTuple):
     """The pairs between which self-contact of VBD has forces in a step.
 
     Attributes:
-        vertex_triangle: Particles of a vertex and a triangle, int32, shape [n, 4], -1 where there is no pair.
-        edge_edge: Particles of two edges, the first of which the pair pushes, likewise.
+        vertices: Particles of a vertex and a triangle, then of two edges, the first of which the pair pushes, int32,
+            shape [n, 4], -1 where there is no pair.
+        triangles: How many have a triangle.
         dropped: 1 for worlds with pairs that did not fit into the buffers of VBD, int32, shape [world_count].
     """
 
-    vertex_triangle: wp.array
-    edge_edge: wp.array
+    vertices: wp.array
+    triangles: int
     dropped: wp.array
 
 
@@ -34,28 +35,23 @@ def record_pairs(solver: SolverVBD, worlds: Worlds) -> RecordedPairs | None:
     """
     if not solver.particle_enable_self_contact:
         return None
-    model, dropped = solver.model, wp.zeros(worlds.count, dtype=int, device=solver.model.device)
-    triangles = _collect(solver, "vertex_colliding_triangles", model.tri_indices, worlds, dropped)
-    edges = _collect(solver, "edge_colliding_edges", model.edge_indices, worlds, dropped)
-    return RecordedPairs(triangles, edges, dropped)
-
-
-def _collect(solver, name, primitives, worlds, dropped):
-    """Returns the particles of the pairs in one of the buffers of VBD; marks worlds whose pairs did not fit."""
-    buffer, offsets, sizes, counts = (
-        getattr(solver.trimesh_collision_info, name + field) for field in ("", "_offsets", "_buffer_sizes", "_count")
-    )
-    device = counts.device
-    if device.is_cpu:
-        ends = np.cumsum(np.minimum(counts.numpy(), sizes.numpy()), dtype=np.int32)
-        starts, n = wp.array(np.append(0, ends[:-1]), dtype=int, device=device), int(ends[-1])
-    else:
+    info, model, found, total = solver.trimesh_collision_info, solver.model, [], 0
+    device, fields = model.device, ("", "_offsets", "_buffer_sizes", "_count")
+    of_kinds = ("vertex_colliding_triangles", model.tri_indices), ("edge_colliding_edges", model.edge_indices)
+    for name, primitives in of_kinds:
+        buffer, offsets, sizes, counts = (getattr(info, name + field) for field in fields)
         starts, n = offsets, len(buffer) // 2
-    vertices = wp.full((n, 4), -1, dtype=int, device=device)
-    kernel = element_kernels.collect_triangles if primitives.shape[1] == 3 else element_kernels.collect_edges
-    inputs = [primitives, buffer, offsets, sizes, counts, starts, worlds.of_particles]
-    wp.launch(kernel, len(counts), inputs=inputs, outputs=[vertices, dropped], device=device)
-    return vertices
+        if device.is_cpu:
+            ends = np.cumsum(np.minimum(counts.numpy(), sizes.numpy()), dtype=np.int32)
+            starts, n = wp.array(np.append(0, ends[:-1]), dtype=int, device=device), int(ends[-1])
+        found.append([primitives, buffer, offsets, sizes, counts, starts, total, worlds.of_particles])
+        total += n
+    vertices = wp.full((total, 4), -1, dtype=int, device=device)
+    dropped = wp.zeros(worlds.count, dtype=int, device=device)
+    for inputs in found:
+        kernel, outputs = element_kernels.collect_pairs, [vertices, dropped]
+        wp.launch(kernel, len(inputs[4]), inputs=inputs, outputs=outputs, device=device)
+    return RecordedPairs(vertices, found[1][6], dropped)
 
 
 class SelfContactElements:
@@ -63,24 +59,20 @@ class SelfContactElements:
 
     def __init__(self, solver: SolverVBD):
         """Takes the coefficients of VBD and its model; the first step with pairs allocates buffers."""
-        self._solver, self._elements = solver, {}
+        self._solver, self._elements = solver, None
 
     def load(self, pairs: RecordedPairs | None) -> list[Elements]:
         """Takes the pairs of a step; returns their elements, none without pairs."""
-        if pairs is None:
+        if pairs is None or not len(pairs.vertices):
             return []
-        kinds = (vertex_triangle_forces, pairs.vertex_triangle), (edge_edge_forces, pairs.edge_edge)
-        return [self._loaded(kernel, vertices) for kernel, vertices in kinds if len(vertices)]
-
-    def _loaded(self, kernel, vertices):
-        elements, n = self._elements.get(kernel), len(vertices)
+        elements, n, device = self._elements, len(pairs.vertices), pairs.vertices.device
         if elements is None or len(elements.jacobian) < n:
-            spare = n // 2 if vertices.device.is_cpu else 0  # elsewhere the number does not change
-            places = wp.empty((n + spare, 4), dtype=int, device=vertices.device)
-            elements = self._elements[kernel] = Elements(kernel, places, [])
-        elements.vertices, elements.count = vertices, n
-        elements.parameters = [vertices, self._settings()]
-        return elements
+            spare = n // 2 if device.is_cpu else 0  # elsewhere the number does not change
+            places = wp.empty((n + spare, 4), dtype=int, device=device)
+            elements = self._elements = Elements(pair_forces, places, [])
+        elements.vertices, elements.count = pairs.vertices, n
+        elements.parameters = [pairs.vertices, pairs.triangles, self._settings()]
+        return [elements]
 
     def _settings(self):
         solver, model, settings = self._solver, self._solver.model, SelfContactSettings()
