@@ -26,9 +26,8 @@ from newton._src.solvers.vbd.particle_vbd_kernels import (
 from newton._src.solvers.vbd.rigid_vbd_kernels import update_duals_particle_body_attachments
 
 from warp_bsc.implicit.bodies import Poses
-from warp_bsc.implicit.contacts import record_contacts
+from warp_bsc.implicit.contacts import record_contacts, record_pairs
 from warp_bsc.implicit.equations import Equations, Step
-from warp_bsc.implicit.self_contacts import record_pairs
 from warp_bsc.implicit.worlds import Worlds
 
 

@@ -15,10 +15,9 @@ from implicit_scenes import (
 )
 
 from warp_bsc.implicit.bodies import Poses
-from warp_bsc.implicit.contacts import record_contacts
+from warp_bsc.implicit.contacts import record_contacts, record_pairs
 from warp_bsc.implicit.equations import Equations, Step
 from warp_bsc.implicit.linear import LinearSolver
-from warp_bsc.implicit.self_contacts import record_pairs
 from warp_bsc.implicit.worlds import Worlds
 
 TOLERANCE = 1e-9

@@ -86,7 +86,7 @@ def set_contact_vertices(
     """Writes the particles of contacts, -1 beyond their number."""
     e, i = wp.tid()
     vertex = int(-1)
-    if e < wp.min(count[0], indices.shape[0]):
+    if i < 3 and e < wp.min(count[0], indices.shape[0]):
         vertex = indices[e][i]
     vertices[e, i] = vertex
 

@@ -15,12 +15,11 @@ from ..response.adjoint.arrays import launch_adjoint
 from . import energies, kernels
 from .attachments import Attachments
 from .bodies import Poses
-from .contacts import ContactElements, RecordedContacts
+from .contacts import ContactElements, RecordedContacts, RecordedPairs
 from .elastic import Elastic
 from .elements import Elements, with_gradient
 from .matrix import StepMatrix
 from .matrix_kernels import Matrix
-from .self_contacts import RecordedPairs, SelfContactElements
 from .worlds import Worlds
 
 
@@ -65,7 +64,7 @@ class Equations:
         self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
         self._attachments = Attachments(model, self.is_fixed)
         self._elastic = Elastic(model)
-        self._contacts, self._self_contacts = ContactElements(solver), SelfContactElements(solver)
+        self._contacts = ContactElements(solver)
         self._in_contact: list[Elements] = []
         self._matrix = StepMatrix(self._elastic, self._attachments.springs, self.is_fixed, worlds)
         self._step: Step | None = None
@@ -82,7 +81,7 @@ class Equations:
         self._launch(kernels.find_fixed, inputs, [self.is_fixed])
         self._launch(kernels.to_double, [step.x0], [self._x0])
         self._attachments.load(step.poses)
-        self._in_contact = self._contacts.load(step.contacts, step.poses) + self._self_contacts.load(step.pairs)
+        self._in_contact = self._contacts.load(step.contacts, step.pairs, step.poses)
         self.load_end(step.x1)
 
     def load_end(self, x1: wp.array) -> None:

@@ -10,9 +10,6 @@ from .elements import Elements
 from .matrix_kernels import ContactRows, Matrix
 from .worlds import Worlds
 
-_CONTACTS = "contacts", "pairs"
-"""Fields of :class:`.matrix_kernels.Matrix`."""
-
 
 class StepMatrix:
     """Minus the derivative of the forces of a step, scaled so that the blocks of the diagonal are near the identity.
@@ -31,8 +28,10 @@ class StepMatrix:
         device, n = is_fixed.device, len(is_fixed)
         self._device, self._inertia = device, wp.zeros(n, dtype=wp.float64, device=device)
         self._blocks = wp.zeros(n, dtype=wp.mat33d, device=device)
-        self._lists: dict[wp.Kernel, _Lists] = {}
+        self._counts = wp.zeros(n + 1, dtype=int, device=device)
         matrix = self._matrix = Matrix()
+        self._contacts = ContactRows()
+        self._contacts.offsets = wp.zeros(n + 1, dtype=int, device=device)
         matrix.offsets, matrix.columns = elastic.rows.first, elastic.rows.column
         matrix.values = wp.zeros(len(matrix.columns), dtype=wp.mat33d, device=device)
         matrix.roots = wp.zeros(n, dtype=wp.mat33d, device=device)
@@ -55,50 +54,29 @@ class StepMatrix:
         scales = [matrix.roots, matrix.eigenvalues]
         self._launch(matrix_kernels.factor_blocks, n, [self._inertia, self._blocks], scales)
         self._launch(matrix_kernels.scale_rows, n, [matrix.offsets, matrix.columns, matrix.roots], [matrix.values])
-        self._load_contacts(in_contact, int(transposed))
+        matrix.unsymmetric.zero_()
+        self._contacts.offsets.zero_()
+        for each in in_contact:
+            self._load_contacts(each, int(transposed))
+        matrix.contacts = self._contacts
         return matrix
 
-    def _load_contacts(self, in_contact, transposed):
+    def _load_contacts(self, elements, transposed):
         """Scales and lists the Jacobians of contacts."""
-        matrix, n = self._matrix, len(self._is_fixed)
-        matrix.unsymmetric.zero_()
-        for name in _CONTACTS:
-            setattr(matrix, name, ContactRows())
-        for name, elements in zip(_CONTACTS, in_contact, strict=False):
-            size = elements.vertices.shape[1]
-            inputs = [transposed, elements.vertices, self._is_fixed, matrix.roots]
-            shape = elements.count, size, size
-            self._launch(matrix_kernels.scale_jacobians, shape, inputs, [elements.jacobian])
-            lists = self._lists.get(elements.kernel)
-            if lists is None or lists.capacity < elements.count * size:
-                lists = self._lists[elements.kernel] = _Lists(n, elements.vertices.size, self._device)
-            setattr(matrix, name, lists.load(elements, self._is_fixed, self._worlds.of_particles, matrix.unsymmetric))
+        matrix, is_fixed, n = self._matrix, self._is_fixed, elements.count * 4
+        vertices, shape = elements.vertices, (elements.count, 4)
+        inputs = [transposed, vertices, is_fixed, matrix.roots]
+        self._launch(matrix_kernels.scale_jacobians, (*shape, 4), inputs, [elements.jacobian])
+        rows = self._contacts
+        if rows.entries is None or len(rows.entries) < n:
+            rows.entries = wp.zeros(vertices.size, dtype=int, device=self._device)
+        self._counts.zero_()
+        inputs, outputs = [vertices, is_fixed, self._worlds.of_particles], [self._counts, matrix.unsymmetric]
+        self._launch(matrix_kernels.count_entries, shape, inputs, outputs)
+        wp.utils.array_scan(self._counts, rows.offsets, inclusive=False)
+        wp.copy(self._counts, rows.offsets)
+        self._launch(matrix_kernels.list_entries, shape, [vertices, is_fixed], [self._counts, rows.entries])
+        rows.vertices, rows.jacobian = vertices, elements.jacobian
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._device)
-
-
-class _Lists:
-    """Elements of one kind by particle."""
-
-    def __init__(self, particle_count, capacity, device):
-        self.capacity = capacity
-        self._counts, self._offsets, self._ends = (
-            wp.zeros(particle_count + 1, dtype=int, device=device) for _ in range(3)
-        )
-        self._entries = wp.zeros(capacity, dtype=int, device=device)
-
-    def load(self, elements, is_fixed, world, unsymmetric):
-        """Lists elements; marks the worlds that have some."""
-        shape, vertices, device = (elements.count, elements.vertices.shape[1]), elements.vertices, elements.device
-        self._counts.zero_()
-        inputs, outputs = [vertices, is_fixed, world], [self._counts, unsymmetric]
-        wp.launch(matrix_kernels.count_entries, shape, inputs=inputs, outputs=outputs, device=device)
-        wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
-        wp.copy(self._ends, self._offsets)
-        outputs = [self._ends, self._entries]
-        wp.launch(matrix_kernels.list_entries, shape, inputs=[vertices, is_fixed], outputs=outputs, device=device)
-        rows = ContactRows()
-        rows.offsets, rows.entries = self._offsets, self._entries
-        rows.vertices, rows.jacobian = vertices, elements.jacobian
-        return rows

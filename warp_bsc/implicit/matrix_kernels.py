@@ -16,9 +16,9 @@ class ContactRows:
     """Jacobians of the forces of contacts, by particle.
 
     Attributes:
-        offsets: First entry of each particle, and the end of the last, int32, shape [particle_count + 1]; or none.
-        entries: Element times the number of its particles plus the place of the particle in it, int32.
-        vertices: Particles of elements, -1 for none, int32, shape [n, size].
+        offsets: First entry of each particle, and the end of the last, int32, shape [particle_count + 1].
+        entries: Four times an element plus the place of the particle in it, int32.
+        vertices: Particles of elements, -1 for none, int32, shape [n, 4].
         jacobian: Minus blocks of the matrix, see :class:`.elements.Elements`.
     """
 
@@ -36,7 +36,7 @@ class Matrix:
         offsets: First block of each row, and the end of the last, int32, shape [particle_count + 1].
         columns: Columns of blocks, int32, shape [n].
         values: Blocks of inertia and elastic forces, shape [n].
-        contacts, pairs: Blocks of contacts with shapes, and of self-contact.
+        contacts: Blocks of contacts.
         roots: R by particle.
         eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R, float64,
             shape [3 particle_count].
@@ -47,7 +47,6 @@ class Matrix:
     columns: wp.array[int]
     values: wp.array[wp.mat33d]
     contacts: ContactRows
-    pairs: ContactRows
     roots: wp.array[wp.mat33d]
     eigenvalues: wp.array[wp.float64]
     unsymmetric: wp.array[int]
@@ -85,12 +84,9 @@ def _sum_of_parts(value: wp.vec3d, parts: int) -> wp.vec3d:
 def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
     """Returns a part of row i of the product of the Jacobian of contacts with x."""
     product = wp.vec3d()
-    if not rows.offsets:
-        return product
-    size = rows.vertices.shape[1]
     for k in range(rows.offsets[i] + part, rows.offsets[i + 1], parts):
-        e, row = rows.entries[k] // size, 3 * (rows.entries[k] % size)
-        for j in range(size):
+        e, row = rows.entries[k] // 4, 3 * (rows.entries[k] % 4)
+        for j in range(4):
             vertex = rows.vertices[e, j]
             if vertex >= 0:
                 of = vector_at(x, vertex)
@@ -109,7 +105,6 @@ def row_product(matrix: Matrix, i: int, x: wp.array[wp.float64], part: int, part
     for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
         product += matrix.values[k] * vector_at(x, matrix.columns[k])
     product -= _contact_product(matrix.contacts, i, x, part, parts)
-    product -= _contact_product(matrix.pairs, i, x, part, parts)
     return _sum_of_parts(product, parts)
 
 
@@ -248,7 +243,7 @@ def list_entries(
     v = vertices[e, i]
     if v >= 0:
         if is_fixed[v] == 0:
-            entries[wp.atomic_add(ends, v, 1)] = e * vertices.shape[1] + i
+            entries[wp.atomic_add(ends, v, 1)] = 4 * e + i
 
 
 @wp.kernel
