@@ -200,6 +200,12 @@ def first_corner(elements: Elements, kind: int, e: int) -> int:
 
 
 @wp.func
+def first_block(elements: Elements, kind: int, e: int) -> int:
+    """Returns the number of the first block of an element of any kind but bending."""
+    return elements.first[_FIRST_BLOCK + kind] + element_size(kind) * element_size(kind) * e
+
+
+@wp.func
 def _rest_stretch(mu: wp.float64, lame: wp.float64):
     """Returns the ratio of areas or volumes at which the volumetric term is at rest, alpha of Smith et al."""
     return ONE + mu / (wp.sign(lame) * wp.max(wp.abs(lame), _LEAST_LAMBDA))
@@ -309,15 +315,9 @@ def _membrane_gradient(elements: Elements, e: int, x: wp.array[Any], x0: wp.arra
 
 @wp.func
 def _store_membrane_hessian(
-    elements: Elements,
-    e: int,
-    x: wp.array[Any],
-    x0: wp.array[Any],
-    dt: wp.float64,
-    is_convex: bool,
-    place: int,
-    blocks: wp.array[Any],
+    elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64, is_convex: bool, out: wp.array[Any]
 ):
+    place = first_block(elements, ElementKind.MEMBRANE, e)
     mu, lame = _membrane_material(elements, e)
     f0, f1 = _membrane_frame(elements, e, x)
     normal, ratio = _area(f0, f1)
@@ -364,7 +364,7 @@ def _store_membrane_hessian(
         s, t = area * along_0[i], area * along_1[i]
         by_0, by_1 = s * h00 + t * h10, s * h01 + t * h11
         for j in range(3):
-            _store(blocks, place + 3 * i + j, along_0[j] * by_0 + along_1[j] * by_1)
+            _store(out, place + 3 * i + j, along_0[j] * by_0 + along_1[j] * by_1)
 
 
 # Bending
@@ -531,15 +531,9 @@ def _tetrahedron_gradient(elements: Elements, e: int, x: wp.array[Any], x0: wp.a
 
 @wp.func
 def _store_tetrahedron_hessian(
-    elements: Elements,
-    e: int,
-    x: wp.array[Any],
-    x0: wp.array[Any],
-    dt: wp.float64,
-    is_convex: bool,
-    place: int,
-    blocks: wp.array[Any],
+    elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64, is_convex: bool, out: wp.array[Any]
 ):
+    place = first_block(elements, ElementKind.TETRAHEDRON, e)
     mu, lame = _solid_material(elements, e)
     pose = _double(elements.tet_poses[e])
     volume = ONE / (_SIX * wp.determinant(pose))
@@ -583,7 +577,7 @@ def _store_tetrahedron_hessian(
         by_2 = volume * (b[0] * h02 + b[1] * h12 + b[2] * h22)
         for j in range(4):
             c = _corner_weights(pose, j)
-            _store(blocks, place + 4 * i + j, c[0] * by_0 + c[1] * by_1 + c[2] * by_2)
+            _store(out, place + 4 * i + j, c[0] * by_0 + c[1] * by_1 + c[2] * by_2)
 
 
 # Springs
@@ -613,25 +607,19 @@ def _tension(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt
 
 @wp.func
 def _store_spring_hessian(
-    elements: Elements,
-    e: int,
-    x: wp.array[Any],
-    x0: wp.array[Any],
-    dt: wp.float64,
-    is_convex: bool,
-    place: int,
-    blocks: wp.array[Any],
+    elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64, is_convex: bool, out: wp.array[Any]
 ):
+    place = first_block(elements, ElementKind.SPRING, e)
     along, length, tension, stiffness = _tension(elements, e, x, x0, dt)
     outer = wp.outer(along, along)
     across = tension / length
     if is_convex:
         across = wp.max(across, ZERO)
     block = stiffness * outer + across * (identity() - outer)
-    _store(blocks, place, block)
-    _store(blocks, place + 1, -block)
-    _store(blocks, place + 2, -block)
-    _store(blocks, place + 3, block)
+    _store(out, place, block)
+    _store(out, place + 1, -block)
+    _store(out, place + 2, -block)
+    _store(out, place + 3, block)
 
 
 # All kinds
@@ -687,17 +675,16 @@ def store_hessian(
     blocks: wp.array[Any],
 ):
     """Writes the Hessian of an element of any kind but bending, convex or exact."""
-    size = element_size(kind)
-    place = elements.first[_FIRST_BLOCK + kind] + size * size * e
     if not has_energy(elements, kind, e, x):
-        for k in range(size * size):
+        place = first_block(elements, kind, e)
+        for k in range(element_size(kind) * element_size(kind)):
             _store(blocks, place + k, wp.mat33d())
     elif kind == ElementKind.MEMBRANE:
-        _store_membrane_hessian(elements, e, x, x0, dt, is_convex, place, blocks)
+        _store_membrane_hessian(elements, e, x, x0, dt, is_convex, blocks)
     elif kind == ElementKind.TETRAHEDRON:
-        _store_tetrahedron_hessian(elements, e, x, x0, dt, is_convex, place, blocks)
+        _store_tetrahedron_hessian(elements, e, x, x0, dt, is_convex, blocks)
     else:
-        _store_spring_hessian(elements, e, x, x0, dt, is_convex, place, blocks)
+        _store_spring_hessian(elements, e, x, x0, dt, is_convex, blocks)
 
 
 @wp.kernel
