@@ -10,6 +10,7 @@ from . import energies
 from .contact import elasticity
 from .contact.elasticity import SIZES, ElementKind, Elements, cross_matrix, identity
 from .contact.rows import Rows, make_rows
+from .element_kernels import gather
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,16 +38,17 @@ class Elastic:
         def zeros(count, dtype):
             return wp.zeros(count, dtype=dtype, device=model.device)
 
-        self._gradient = zeros(sum(v.size for v in vertices), wp.vec3d)
+        corners = np.concatenate([v.ravel() for v in vertices])
+        self._corners = wp.array(corners.astype(np.int32).reshape(-1, 1), dtype=int, device=model.device)
+        self._forces = zeros((len(corners), 1, 1), wp.vec3d)
         self.blocks, self.bends = zeros(blocks, wp.mat33d), zeros(bends, wp.mat33d)
-        self._ones = wp.ones(self._count, dtype=wp.float64, device=model.device)
 
     def add_forces(self, dt: float, x1: wp.array, x0: wp.array, forces: wp.array) -> None:
         """Adds the forces on particles, vec3d, at positions at the end and at the start of a step, vec3d."""
-        inputs = [self._elements, x1, x0, wp.float64(dt)]
-        wp.launch(_find_gradients, self._count, inputs=inputs, outputs=[self._gradient], device=self.device)
-        inputs = [self.rows, self._gradient]
-        wp.launch(_subtract_gradients, len(forces), inputs=inputs, outputs=[forces], device=self.device)
+        inputs, outputs = [self._elements, wp.float64(dt), x1, x0], [self._forces.flatten()]
+        wp.launch(energies.elastic_forces, self._count, inputs=inputs, outputs=outputs, device=self.device)
+        inputs = [self.rows, *outputs]
+        wp.launch(_add_corners, len(forces), inputs=inputs, outputs=[forces], device=self.device)
 
     def differentiate(self, dt: float, x1: wp.array, x0: wp.array) -> None:
         """Computes the Hessians of elements at these positions."""
@@ -58,44 +60,26 @@ class Elastic:
         elements = Elements()
         for name in struct_fields(Elements):  # with the gradients that arrays have now
             setattr(elements, name, getattr(self._elements, name))
-        inputs = [elements, wp.float64(dt), x1, x0, multipliers]
-        launch_adjoint(energies.work_of_elements, self._count, inputs, [self._ones], self.device)
+        inputs, of_forces = [self._corners, multipliers], self._forces
+        wp.launch(gather, self._corners.shape, inputs=inputs, outputs=[of_forces], device=self.device)
+        inputs = [elements, wp.float64(dt), x1, x0]
+        launch_adjoint(energies.elastic_forces, self._count, inputs, [of_forces.flatten()], self.device)
 
 
 @wp.kernel
-def _find_gradients(
-    # in
-    elements: Elements,
-    x1: wp.array[wp.vec3d],
-    x0: wp.array[wp.vec3d],
-    dt: wp.float64,
-    # out
-    gradient: wp.array[wp.vec3d],
-):
-    """Computes the gradient of the energy of each element."""
-    i = wp.tid()
-    kind = elasticity.kind_of(elements, i)
-    e = i - elements.first[kind]
-    of_element = elasticity.element_gradient(elements, kind, e, x1, x0, dt)
-    corner = elasticity.first_corner(elements, kind, e)
-    for j in range(elasticity.element_size(kind)):
-        gradient[corner + j] = of_element[j]
-
-
-@wp.kernel
-def _subtract_gradients(
+def _add_corners(
     # in
     rows: Rows,
-    gradient: wp.array[wp.vec3d],
+    of_corners: wp.array[wp.vec3d],
     # in and out
     forces: wp.array[wp.vec3d],
 ):
-    """Subtracts the gradients of elements from the forces on their particles."""
+    """Adds the forces on corners of elements to those on their particles."""
     i = wp.tid()
     total = wp.vec3d()
     for n in range(rows.first_corner[i], rows.first_corner[i + 1]):
-        total += gradient[rows.corner[n]]
-    forces[i] = forces[i] - total
+        total += of_corners[rows.corner[n]]
+    forces[i] = forces[i] + total
 
 
 @wp.func

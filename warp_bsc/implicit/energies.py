@@ -1,32 +1,29 @@
-"""Forces on particles as kernels that Warp differentiates: inertia, and the work of elements along a displacement."""
+"""Forces on particles as kernels that Warp differentiates: inertia, and those of elements."""
 
 import warp as wp
 
-from .contact.elasticity import Elements, element_gradient, kind_of, vertex_of
+from .contact.elasticity import Elements, element_gradient, element_size, first_corner, kind_of
 
 
 @wp.kernel
-def work_of_elements(
+def elastic_forces(
     # in
     elements: Elements,
     dt: wp.float64,
     x1: wp.array[wp.vec3d],
     x0: wp.array[wp.vec3d],
-    multipliers: wp.array[wp.vec3d],
     # out
-    work: wp.array[wp.float64],
+    forces: wp.array[wp.vec3d],
 ):
-    """Computes the product of the forces of each element and multipliers of its particles."""
+    """Computes the force of each element on each of its corners."""
     i = wp.tid()
     kind = kind_of(elements, i)
     e = i - elements.first[kind]
     gradient = element_gradient(elements, kind, e, x1, x0, dt)
-    total = wp.float64(0.0)
+    corner, size = first_corner(elements, kind, e), element_size(kind)
     for j in range(4):
-        v = vertex_of(elements, kind, e, j)
-        if v >= 0:
-            total -= wp.dot(multipliers[v], gradient[j])
-    work[i] = total
+        if j < size:
+            forces[corner + j] = -gradient[j]
 
 
 @wp.kernel
