@@ -26,9 +26,8 @@ from newton._src.solvers.vbd.particle_vbd_kernels import (
 from newton._src.solvers.vbd.rigid_vbd_kernels import update_duals_particle_body_attachments
 
 from warp_bsc.implicit.bodies import Poses
-from warp_bsc.implicit.contacts import record_contacts
+from warp_bsc.implicit.contacts import record_contacts, record_pairs
 from warp_bsc.implicit.equations import Equations, Step
-from warp_bsc.implicit.self_contacts import record_pairs
 from warp_bsc.implicit.worlds import Worlds
 
 
@@ -208,7 +207,7 @@ def test_forces_of_self_contact_are_those_of_vbd(device):
     equations.load(Step(DT, x0, v0, x1, f, None, pairs, poses))
     forces = equations.evaluate().numpy()
     np.testing.assert_allclose(forces, expected, atol=2e-5 * np.abs(expected).max())
-    for kind in ("vertex_triangle", "edge_edge"):
-        left = pairs._replace(**{kind: getattr(pairs, kind)[:0]})
+    triangles, edges = pairs.vertices[: pairs.triangles], pairs.vertices[pairs.triangles :]
+    for left in (pairs._replace(vertices=triangles), pairs._replace(vertices=edges, triangles=0)):
         equations.load(Step(DT, x0, v0, x1, f, None, left, poses))
         assert np.abs(equations.evaluate().numpy() - expected).max() > 0.01 * np.abs(expected).max()

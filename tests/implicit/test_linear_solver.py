@@ -4,13 +4,20 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from implicit_scenes import DT, SELF_CONTACT, cloth_on_slope, colliding_cloths, hanging_cloth, soft_block
+from implicit_scenes import (
+    DT,
+    SELF_CONTACT,
+    cloth_on_slope,
+    colliding_cloths,
+    exact_hessians,
+    hanging_cloth,
+    soft_block,
+)
 
 from warp_bsc.implicit.bodies import Poses
-from warp_bsc.implicit.contacts import record_contacts
+from warp_bsc.implicit.contacts import record_contacts, record_pairs
 from warp_bsc.implicit.equations import Equations, Step
 from warp_bsc.implicit.linear import LinearSolver
-from warp_bsc.implicit.self_contacts import record_pairs
 from warp_bsc.implicit.worlds import Worlds
 
 TOLERANCE = 1e-9
@@ -46,21 +53,25 @@ class System:
         self.b = wp.array(b, dtype=wp.vec3d, device=model.device)
 
     def dense(self):
-        """The matrix, from the Jacobians of all elements."""
+        """The matrix, from the Hessians or Jacobians of all elements."""
         equations = self.equations
         fixed = equations.is_fixed.numpy() != 0
         mass = equations.model.particle_mass.numpy().astype(float)
         n = len(mass)
         matrix = np.zeros((n, 3, n, 3))
         matrix[np.arange(n), :, np.arange(n), :] = np.where(fixed, 1.0, mass / DT**2)[:, None, None] * np.eye(3)
+        equations.differentiate(transposed=False)
+        terms = list(exact_hessians(equations._elastic, equations.model))
         for elements in equations._elements():
-            elements.differentiate(DT)
-            jacobian = elements.jacobian.numpy()
-            for vertices, rows in zip(elements.vertices.numpy()[: elements.count], jacobian, strict=False):
-                for i, v in enumerate(vertices):
-                    for j, w in enumerate(vertices):
-                        if min(v, w) >= 0 and not (fixed[v] or fixed[w]):
-                            matrix[v, :, w, :] -= rows[3 * i : 3 * i + 3, j]
+            elements.differentiate(DT)  # unscaled
+            jacobian, size = elements.jacobian.numpy()[: elements.count], elements.vertices.shape[1]
+            vertices = elements.vertices.numpy()[: elements.count]
+            terms.append((vertices, -jacobian.reshape(len(jacobian), size, 3, size, 3)))
+        for vertices, hessian in terms:
+            for e, i, j in np.ndindex(*vertices.shape, vertices.shape[1]):
+                v, w = vertices[e, [i, j]]
+                if min(v, w) >= 0 and not (fixed[v] or fixed[w]):
+                    matrix[v, :, w, :] += hessian[e, i, :, j]
         return matrix.reshape(3 * n, 3 * n)
 
     def solve(self, *, transposed=False, max_iterations=2000, tolerance=TOLERANCE, b=None):

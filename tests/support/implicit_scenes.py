@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 import warp_bsc as bsc
+from warp_bsc.implicit.contact.elasticity import ElementKind, elements_of_model
 
 __all__ = [
     "CLOTH",
@@ -16,6 +17,7 @@ __all__ = [
     "attached_cloth",
     "cloth_on_slope",
     "colliding_cloths",
+    "exact_hessians",
     "hanging_cloth",
     "held_cloth",
     "soft_block",
@@ -147,6 +149,19 @@ def colliding_cloths(device, heights=(0.012,)):
     model = _finished(scene, device)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = 300.0, 0.0, 0.4
     return model
+
+
+def exact_hessians(elastic, model):
+    """Yields the particles of elements of each kind, -1 for none, and the Hessians that ``elastic`` has computed."""
+    _, vertices = elements_of_model(model)
+    blocks, bends, place = elastic.blocks.numpy(), elastic.bends.numpy(), 0
+    for kind, v in enumerate(vertices):
+        n, size = v.shape
+        if kind == ElementKind.BENDING:
+            hessian = bends
+        else:
+            hessian, place = blocks[place : place + n * size * size], place + n * size * size
+        yield v, hessian.reshape(n, size, size, 3, 3).transpose(0, 1, 3, 2, 4)
 
 
 class Rollout:

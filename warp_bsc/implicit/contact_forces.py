@@ -1,23 +1,35 @@
-"""Forces of VBD between particles and bodies as kernels over contacts and attachments, which Warp differentiates.
+"""Forces of VBD in contacts and of attachments as kernels over elements, which Warp differentiates.
 
-The form is that of :mod:`.energies`. An element of contact has the particles of a vertex, an edge or a face. A contact
-is a plane through a point of the shape, which collision detection found: the point moves with the body, the normal does
-not. Within the radius of the particle a penalty pushes, and damping while the gap closes; friction is Coulomb's,
-smoothed below a velocity.
+The form is that of :mod:`.elements`. An element of contact has the particles of a vertex, an edge or a face at a plane,
+of a vertex and a triangle, or of two edges. A plane goes through a point of the shape, which collision detection found:
+the point moves with the body, the normal does not. Within the radius of the particle a penalty pushes, and damping
+while the gap closes; friction is Coulomb's, smoothed below a velocity.
+
+Where the closest points of a pair of self-contact are nearer than a distance, the same pushes them apart; the penalty
+is logarithmic below half of it. The points follow from the positions at the end of the step, and are differentiated as
+well. VBD has each pair of edges twice, once for each edge to push. Both have the same forces unless the edges are
+parallel, where the closest points are not unique. So does this: an element of edges has forces on the first edge alone.
 
 An attachment pulls a particle to a point of a body. VBD iterates on a multiplier for it, whose limit is the force of a
 damped spring of length zero. That is the force here, so that a step in which the multiplier is not there yet has a
 residual. In the limit of infinite stiffness the particle is at the point.
+
+References:
+    M. Li, Z. Ferguson, T. Schneider, T. Langlois, D. Zorin, D. Panozzo, C. Jiang and D. M. Kaufman, Incremental
+    Potential Contact, ACM Transactions on Graphics 39(4), 2020, doi:10.1145/3386569.3392425.
 """
 
 import warp as wp
 
+from ..kernels.closest import closest_weights
+from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from .kernels import HELD
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
 _TWO = wp.constant(wp.float64(2.0))
+_LEAST_CLOSING_SPEED = wp.constant(wp.float64(1.0e-6))  # of the damping of pairs [m/s], as in VBD
 _LEAST_DISTANCE = wp.constant(wp.float64(1.0e-5))  # of the logarithmic barrier, as in VBD
 
 
@@ -35,7 +47,12 @@ class ContactPlanes:
 
 @wp.struct
 class ContactSettings:
-    """Coefficients of contacts."""
+    """Coefficients of contacts, and which elements are which."""
+
+    first_pair: int  # of a vertex and a triangle
+    first_edges: int  # pair of edges
+    distance: wp.float64  # nearer than which pairs push [m]
+    least_edge_squared: wp.float64  # squared length of an edge that counts as a point [m^2]
 
     ke: wp.float64  # of particles [N/m]
     kd: wp.float64  # of particles [N s/m]
@@ -62,7 +79,7 @@ def _transform(pose: wp.transform, p: wp.vec3d):
 
 
 @wp.func
-def normal_force(distance: wp.float64, radius: wp.float64, ke: wp.float64, has_barrier: int):
+def _normal_force(distance: wp.float64, radius: wp.float64, ke: wp.float64, has_barrier: int):
     """Returns the penalty of a contact, logarithmic below half the radius if it has a barrier."""
     tau = _HALF * radius
     force = ke * (radius - distance)
@@ -76,7 +93,7 @@ def normal_force(distance: wp.float64, radius: wp.float64, ke: wp.float64, has_b
 
 
 @wp.func
-def friction(limit: wp.float64, slid: wp.vec3d, smoothing: wp.float64):
+def _friction(limit: wp.float64, slid: wp.vec3d, smoothing: wp.float64):
     """Returns Coulomb's friction against sliding, whose magnitude falls below its limit where less than that slid."""
     length = wp.length(slid)
     scale = _ZERO
@@ -85,6 +102,66 @@ def friction(limit: wp.float64, slid: wp.vec3d, smoothing: wp.float64):
     elif smoothing > _ZERO:
         scale = (_TWO - length / smoothing) / smoothing
     return -(limit * scale) * slid
+
+
+@wp.func
+def _plane_force(
+    dt: wp.float64,
+    x1: wp.vec3d,
+    x0: wp.vec3d,
+    radius: wp.float64,
+    e: int,
+    planes: ContactPlanes,
+    settings: ContactSettings,
+    pose_1: wp.array[wp.transform],
+    pose_0: wp.array[wp.transform],
+):
+    """Returns the force on a point at a plane."""
+    shape = planes.shape[e]
+    if settings.shape_margin.shape[0] > 0:
+        radius = radius + wp.float64(settings.shape_margin[shape])
+    point = wp.vec3d(planes.body_pos[e])
+    slid = dt * wp.vec3d(planes.body_vel[e])
+    normal = wp.vec3d(planes.normal[e])
+    body = settings.shape_body[shape]
+    if body >= 0:
+        start = _transform(pose_0[body], point)
+        point = _transform(pose_1[body], point)
+        slid = _rotate(pose_1[body], slid) + point - start
+    distance = wp.dot(normal, x1 - point)
+    if distance >= radius:
+        return wp.vec3d()
+    ke = _HALF * (settings.ke + wp.float64(settings.shape_ke[shape]))
+    load = _normal_force(distance, radius, ke, settings.has_barrier)
+    slid = x1 - x0 - slid
+    closing = wp.dot(normal, slid)
+    push = load
+    if closing < _ZERO:
+        push = push - _HALF * (settings.kd + wp.float64(settings.shape_kd[shape])) / dt * closing
+    force = push * normal
+    mu = settings.mu * wp.float64(settings.shape_mu[shape])
+    if mu > _ZERO:
+        force += _friction(wp.sqrt(mu) * load, slid - closing * normal, settings.friction_velocity * dt)
+    return force
+
+
+@wp.func
+def _pair_force(dt: wp.float64, gap: wp.vec3d, gap_0: wp.vec3d, settings: ContactSettings):
+    """Returns the force that pushes the first of two closest points away from the second, ``gap`` being between them.
+
+    ``gap_0`` is between the same points of both at the start of the step.
+    """
+    distance = wp.length(gap)
+    if distance == _ZERO or distance >= settings.distance:
+        return wp.vec3d()
+    normal = gap / distance
+    load = _normal_force(distance, settings.distance, settings.ke, 1)
+    slid = gap - gap_0
+    closing = wp.dot(normal, slid)
+    push = load
+    if closing < -_LEAST_CLOSING_SPEED * dt:
+        push = push - settings.kd / dt * closing
+    return push * normal + _friction(settings.mu * load, slid - closing * normal, settings.friction_velocity * dt)
 
 
 @wp.kernel
@@ -103,47 +180,39 @@ def contact_forces(
 ):
     """Computes the forces of contacts."""
     e, row = wp.tid()
-    for i in range(3):
+    for i in range(4):
         forces[e, row, i] = wp.vec3d()
-    a, b, c = vertices[e, 0], vertices[e, 1], vertices[e, 2]
-    if a < 0:
+    if vertices[e, 0] < 0:
         return
-    weights = wp.vec3d(_ONE, _ZERO, _ZERO)
-    radius = wp.float64(settings.particle_radius[a])
-    if b >= 0:
-        weights = wp.vec3d(planes.barycentric[e])
-        radius = wp.max(radius, wp.float64(settings.particle_radius[b]))
-    if c >= 0:
-        radius = wp.max(radius, wp.float64(settings.particle_radius[c]))
-    shape = planes.shape[e]
-    if settings.shape_margin.shape[0] > 0:
-        radius = radius + wp.float64(settings.shape_margin[shape])
-    point = wp.vec3d(planes.body_pos[e])
-    slid = dt * wp.vec3d(planes.body_vel[e])
-    normal = wp.vec3d(planes.normal[e])
-    body = settings.shape_body[shape]
-    if body >= 0:
-        start = _transform(pose_0[body], point)
-        point = _transform(pose_1[body], point)
-        slid = _rotate(pose_1[body], slid) + point - start
-    x = weights[0] * x1[e, row, 0] + weights[1] * x1[e, row, 1] + weights[2] * x1[e, row, 2]
-    distance = wp.dot(normal, x - point)
-    if distance >= radius:
-        return
-    load = normal_force(
-        distance, radius, _HALF * (settings.ke + wp.float64(settings.shape_ke[shape])), settings.has_barrier
-    )
-    slid = x - weights[0] * x0[e, row, 0] - weights[1] * x0[e, row, 1] - weights[2] * x0[e, row, 2] - slid
-    closing = wp.dot(normal, slid)
-    push = load
-    if closing < _ZERO:
-        push = push - _HALF * (settings.kd + wp.float64(settings.shape_kd[shape])) / dt * closing
-    force = push * normal
-    mu = settings.mu * wp.float64(settings.shape_mu[shape])
-    if mu > _ZERO:
-        force += friction(wp.sqrt(mu) * load, slid - closing * normal, settings.friction_velocity * dt)
-    for i in range(3):
-        forces[e, row, i] = weights[i] * force
+    a, b, c, d = x1[e, row, 0], x1[e, row, 1], x1[e, row, 2], x1[e, row, 3]
+    p, q, r, s = x0[e, row, 0], x0[e, row, 1], x0[e, row, 2], x0[e, row, 3]
+    w, radius = wp.vec4d(_ONE, _ZERO, _ZERO, _ZERO), _ZERO
+    if e < settings.first_pair:
+        radius = wp.float64(settings.particle_radius[vertices[e, 0]])
+        if vertices[e, 1] >= 0:
+            shares = wp.vec3d(planes.barycentric[e])
+            w = wp.vec4d(shares[0], shares[1], shares[2], _ZERO)
+            radius = wp.max(radius, wp.float64(settings.particle_radius[vertices[e, 1]]))
+        if vertices[e, 2] >= 0:
+            radius = wp.max(radius, wp.float64(settings.particle_radius[vertices[e, 2]]))
+    elif e < settings.first_edges:
+        w = closest_weights(VERTEX_FACE, a, b, c, d)
+    else:  # VBD takes short edges for points
+        end = wp.where(wp.length_sq(b - a) <= settings.least_edge_squared, a, b)
+        other = wp.where(wp.length_sq(d - c) <= settings.least_edge_squared, c, d)
+        w = closest_weights(EDGE_EDGE, a, end, c, other)
+    gap = w[0] * a + w[1] * b + w[2] * c + w[3] * d
+    gap_0 = w[0] * p + w[1] * q + w[2] * r + w[3] * s
+    force = wp.vec3d()
+    if e < settings.first_pair:
+        force = _plane_force(dt, gap, gap_0, radius, e, planes, settings, pose_1, pose_0)
+    else:
+        force = _pair_force(dt, gap, gap_0, settings)
+    forces[e, row, 0] = w[0] * force
+    forces[e, row, 1] = w[1] * force
+    if e < settings.first_edges:
+        forces[e, row, 2] = w[2] * force
+        forces[e, row, 3] = w[3] * force
 
 
 @wp.kernel

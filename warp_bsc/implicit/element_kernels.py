@@ -86,56 +86,43 @@ def set_contact_vertices(
     """Writes the particles of contacts, -1 beyond their number."""
     e, i = wp.tid()
     vertex = int(-1)
-    if e < wp.min(count[0], indices.shape[0]):
+    if i < 3 and e < wp.min(count[0], indices.shape[0]):
         vertex = indices[e][i]
     vertices[e, i] = vertex
 
 
 @wp.kernel
-def collect_triangles(
+def collect_pairs(
     # in
-    tri_indices: wp.array2d[int],
+    primitives: wp.array2d[int],
     pairs: wp.array[int],
     offsets: wp.array[int],
     sizes: wp.array[int],
     counts: wp.array[int],
     starts: wp.array[int],
+    first: int,
     world: wp.array[int],
     # out
     vertices: wp.array2d[int],
     dropped: wp.array[int],
 ):
-    """Writes the particles of pairs of vertices and triangles, and marks worlds whose pairs did not all fit."""
-    v = wp.tid()
-    if counts[v] > sizes[v]:
-        dropped[world[v]] = 1
-    for k in range(wp.min(counts[v], sizes[v])):
-        triangle = pairs[2 * (offsets[v] + k) + 1]
-        vertices[starts[v] + k, 0] = v
-        for i in range(3):
-            vertices[starts[v] + k, i + 1] = tri_indices[triangle, i]
+    """Writes the particles of pairs of vertices and triangles, or of edges; marks worlds whose pairs did not all fit.
 
-
-@wp.kernel
-def collect_edges(
-    # in
-    edge_indices: wp.array2d[int],
-    pairs: wp.array[int],
-    offsets: wp.array[int],
-    sizes: wp.array[int],
-    counts: wp.array[int],
-    starts: wp.array[int],
-    world: wp.array[int],
-    # out
-    vertices: wp.array2d[int],
-    dropped: wp.array[int],
-):
-    """Writes the particles of pairs of edges, and marks worlds whose pairs did not all fit."""
-    e = wp.tid()
-    if counts[e] > sizes[e]:
-        dropped[world[edge_indices[e, 2]]] = 1
-    for k in range(wp.min(counts[e], sizes[e])):
-        other = pairs[2 * (offsets[e] + k) + 1]
-        for i in range(2):
-            vertices[starts[e] + k, i] = edge_indices[e, i + 2]
-            vertices[starts[e] + k, i + 2] = edge_indices[other, i + 2]
+    The primitives are triangles, or edges as Newton has them: the particles of an edge are the last two of four.
+    """
+    i = wp.tid()
+    for k in range(wp.min(counts[i], sizes[i])):
+        row, other = first + starts[i] + k, pairs[2 * (offsets[i] + k) + 1]
+        if primitives.shape[1] == 3:
+            vertices[row, 0] = i
+            for j in range(3):
+                vertices[row, j + 1] = primitives[other, j]
+        else:
+            for j in range(2):
+                vertices[row, j] = primitives[i, j + 2]
+                vertices[row, j + 2] = primitives[other, j + 2]
+    if counts[i] > sizes[i]:
+        vertex = int(i)
+        if primitives.shape[1] == 4:
+            vertex = primitives[i, 2]
+        dropped[world[vertex]] = 1

@@ -1,4 +1,10 @@
-"""Forces over elements of one kind, evaluated and differentiated."""
+"""Forces over elements of one kind, such as contacts, evaluated and differentiated by Warp.
+
+Every kernel of them has the same form. Thread (e, row) reads the positions of the particles of element e at the end and
+at the start of the step, ``x1[e, row]`` and ``x0[e, row]``, and writes ``forces[e, row]``. There is one row to compute
+forces. To compute a Jacobian there is one row for each component of force: the adjoint of row i, given unit vector i,
+is row i of the Jacobian. All is computed in float64 from the values in float32.
+"""
 
 from collections.abc import Sequence
 
@@ -25,7 +31,7 @@ class Elements:
         """Allocates buffers for forces on ``vertices``.
 
         Args:
-            kernel: A kernel as in :mod:`.energies`.
+            kernel: A kernel of the form above.
             vertices: Particles of the elements, int32, shape [capacity, size].
             parameters: What the kernel reads beside positions; arrays that require gradients get them.
         """

@@ -7,7 +7,6 @@ all that the forces depend on: with A = -d forces / d x1 and A^T l = g, they are
 
 from typing import NamedTuple
 
-import newton
 import warp as wp
 from newton import ParticleFlags
 from newton.solvers import SolverVBD
@@ -16,11 +15,11 @@ from ..response.adjoint.arrays import launch_adjoint
 from . import energies, kernels
 from .attachments import Attachments
 from .bodies import Poses
-from .contacts import ContactElements, RecordedContacts
+from .contacts import ContactElements, RecordedContacts, RecordedPairs
+from .elastic import Elastic
 from .elements import Elements, with_gradient
 from .matrix import StepMatrix
 from .matrix_kernels import Matrix
-from .self_contacts import RecordedPairs, SelfContactElements
 from .worlds import Worlds
 
 
@@ -64,10 +63,10 @@ class Equations:
         self._x1, self._x0, self._of_x1, self._of_x0, self.forces = (self.zeros() for _ in range(5))
         self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
         self._attachments = Attachments(model, self.is_fixed)
-        self._elastic = _elastic_elements(model) + self._attachments.springs
-        self._contacts, self._self_contacts = ContactElements(solver), SelfContactElements(solver)
+        self._elastic = Elastic(model)
+        self._contacts = ContactElements(solver)
         self._in_contact: list[Elements] = []
-        self._matrix = StepMatrix(self._elastic, self.is_fixed, worlds)
+        self._matrix = StepMatrix(self._elastic, self._attachments.springs, self.is_fixed, worlds)
         self._step: Step | None = None
         self.matrix: Matrix | None = None
 
@@ -82,7 +81,7 @@ class Equations:
         self._launch(kernels.find_fixed, inputs, [self.is_fixed])
         self._launch(kernels.to_double, [step.x0], [self._x0])
         self._attachments.load(step.poses)
-        self._in_contact = self._contacts.load(step.contacts, step.poses) + self._self_contacts.load(step.pairs)
+        self._in_contact = self._contacts.load(step.contacts, step.pairs, step.poses)
         self.load_end(step.x1)
 
     def load_end(self, x1: wp.array) -> None:
@@ -95,6 +94,7 @@ class Equations:
         """Returns the forces, which vanish where the step is solved."""
         assert self._step is not None
         self._launch(energies.inertial_forces, self._inertial(self._x1, self._x0), [self.forces])
+        self._elastic.add_forces(self._step.dt, self._x1, self._x0, self.forces)
         for elements in self._elements():
             elements.add_forces(self._step.dt, self.forces)
         self._launch(kernels.clear_fixed, [self.is_fixed], [self.forces])
@@ -106,6 +106,7 @@ class Equations:
         """Computes the matrix A, the derivative of minus the forces, or A^T."""
         assert self._step is not None
         dt, mass = self._step.dt, self.model.particle_mass
+        self._elastic.differentiate(dt, self._x1, self._x0)
         for elements in self._elements():
             elements.differentiate(dt)
         assert mass is not None
@@ -132,6 +133,7 @@ class Equations:
         x1, x0 = with_gradient(self._x1, self._of_x1), with_gradient(self._x0, self._of_x0)
         inputs = self._inertial(x1, x0, of_velocity, of_force)
         launch_adjoint(energies.inertial_forces, len(x1), inputs, [multipliers], self.device)
+        self._elastic.add_gradients(self._step.dt, x1, x0, multipliers)
         for elements in self._elements():
             elements.add_gradients(self._step.dt, multipliers, self._of_x1, self._of_x0)
         for elements in self._attachments.holds:
@@ -141,7 +143,7 @@ class Equations:
         return self._of_x1, self._of_x0
 
     def _elements(self):
-        return [*self._elastic, *self._in_contact]
+        return [*self._attachments.springs, *self._in_contact]
 
     def _inertial(self, x1, x0, of_velocity=None, of_force=None):
         step, model = self._step, self.model
@@ -154,23 +156,3 @@ class Equations:
 
     def _launch(self, kernel, inputs, outputs):
         wp.launch(kernel, self.model.particle_count, inputs=inputs, outputs=outputs, device=self.device)
-
-
-def _elastic_elements(model: newton.Model) -> list[Elements]:
-    """Returns the elements of a model that VBD gives energy to."""
-    membrane = [model.tri_poses, model.tri_areas, model.tri_materials]
-    bending = [model.edge_indices, model.edge_rest_angle, model.edge_rest_length, model.edge_bending_properties]
-    tetrahedra = [model.tet_poses, model.tet_materials]
-    springs = [model.spring_rest_length, model.spring_stiffness, model.spring_damping]
-    kinds = (
-        (energies.membrane_forces, model.tri_indices, membrane),
-        (energies.bending_forces, model.edge_indices, bending),
-        (energies.tetrahedron_forces, model.tet_indices, tetrahedra),
-        (energies.spring_forces, model.spring_indices, springs),
-    )
-    found = []
-    for kernel, vertices, parameters in kinds:
-        if vertices is not None and len(vertices):
-            vertices = vertices.reshape((-1, 2)) if vertices.ndim == 1 else vertices  # noqa: PLW2901
-            found.append(Elements(kernel, vertices, parameters))
-    return found

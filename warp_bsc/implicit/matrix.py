@@ -2,16 +2,13 @@
 
 from collections.abc import Sequence
 
-import numpy as np
 import warp as wp
 
 from . import matrix_kernels
+from .elastic import Elastic
 from .elements import Elements
 from .matrix_kernels import ContactRows, Matrix
 from .worlds import Worlds
-
-_CONTACTS = "contacts", "vertex_triangle", "edge_edge"
-"""Fields of :class:`.matrix_kernels.Matrix`."""
 
 
 class StepMatrix:
@@ -22,30 +19,21 @@ class StepMatrix:
     come and go, so their Jacobians are listed by particle.
     """
 
-    def __init__(self, elements: Sequence[Elements], is_fixed: wp.array, worlds: Worlds):
-        """Finds the blocks of elements; rows and columns of particles with ``is_fixed`` not 0 are the identity's."""
-        self._elements, self._is_fixed, self._worlds, n = elements, is_fixed, worlds, len(is_fixed)
-        device = self._device = is_fixed.device
-        pairs = [np.arange(n, dtype=np.int64)[:, None] * (n + 1)]  # the diagonal, row n + column
-        for each in elements:
-            v = each.vertices.numpy().astype(np.int64)
-            exists = (v[:, :, None] >= 0) & (v[:, None, :] >= 0)
-            pairs.append(np.where(exists, v[:, :, None] * n + v[:, None, :], 0))
-        blocks, places = np.unique(np.concatenate([pair.ravel() for pair in pairs]), return_inverse=True)
-        splits = np.split(places.astype(np.int32), np.cumsum([pair.size for pair in pairs])[:-1])
-        self._diagonal, *self._places = (
-            wp.array(split.reshape(pair.shape), dtype=int, device=device)
-            for split, pair in zip(splits, pairs, strict=True)
-        )
-        offsets = np.searchsorted(blocks, np.arange(n + 1, dtype=np.int64) * n).astype(np.int32)
-        self._rows = wp.array((blocks // n).astype(np.int32), dtype=int, device=device)
-        self._inertia = wp.zeros(n, dtype=wp.float64, device=device)
+    def __init__(self, elastic: Elastic, springs: Sequence[Elements], is_fixed: wp.array, worlds: Worlds):
+        """Takes elements and springs of one particle; rows and columns of particles with ``is_fixed`` are those of 1.
+
+        A particle counts as fixed where that is not 0.
+        """
+        self._elastic, self._springs, self._is_fixed, self._worlds = elastic, springs, is_fixed, worlds
+        device, n = is_fixed.device, len(is_fixed)
+        self._device, self._inertia = device, wp.zeros(n, dtype=wp.float64, device=device)
         self._blocks = wp.zeros(n, dtype=wp.mat33d, device=device)
-        self._lists: dict[wp.Kernel, _Lists] = {}
+        self._counts = wp.zeros(n + 1, dtype=int, device=device)
         matrix = self._matrix = Matrix()
-        matrix.offsets = wp.array(offsets, dtype=int, device=device)
-        matrix.columns = wp.array((blocks % n).astype(np.int32), dtype=int, device=device)
-        matrix.values = wp.zeros(len(blocks), dtype=wp.mat33d, device=device)
+        self._contacts = ContactRows()
+        self._contacts.offsets = wp.zeros(n + 1, dtype=int, device=device)
+        matrix.offsets, matrix.columns = elastic.rows.first, elastic.rows.column
+        matrix.values = wp.zeros(len(matrix.columns), dtype=wp.mat33d, device=device)
         matrix.roots = wp.zeros(n, dtype=wp.mat33d, device=device)
         matrix.eigenvalues = wp.zeros(3 * n, dtype=wp.float64, device=device)
         matrix.unsymmetric = wp.zeros(worlds.count, dtype=int, device=device)
@@ -55,64 +43,40 @@ class StepMatrix:
 
         Elastic forces have a symmetric one. The Jacobians of the elements ``in_contact`` are scaled where they are.
         """
-        matrix, n = self._matrix, len(mass)
-        matrix.values.zero_()
-        inputs = [wp.float64(dt), mass, self._is_fixed, self._diagonal]
-        self._launch(matrix_kernels.set_inertia, n, inputs, [self._inertia, matrix.values])
-        for each, places in zip(self._elements, self._places, strict=True):
-            inputs = [each.vertices, self._is_fixed, each.jacobian, places]
-            self._launch(matrix_kernels.add_element_blocks, places.shape, inputs, [matrix.values])
-        self._launch(matrix_kernels.copy_diagonal, n, [self._diagonal, matrix.values], [self._blocks])
+        matrix, n, elastic = self._matrix, len(mass), self._elastic
+        self._blocks.zero_()
+        for each in self._springs:
+            each.add_blocks(self._is_fixed, self._blocks)
+        inputs = [wp.float64(dt), mass, self._is_fixed, elastic.rows, elastic.blocks, elastic.bends]
+        self._launch(matrix_kernels.add_up_rows, n, inputs, [self._blocks, self._inertia, matrix.values])
         for each in in_contact:
             each.add_blocks(self._is_fixed, self._blocks)
         scales = [matrix.roots, matrix.eigenvalues]
         self._launch(matrix_kernels.factor_blocks, n, [self._inertia, self._blocks], scales)
-        inputs = [self._rows, matrix.columns, matrix.roots]
-        self._launch(matrix_kernels.scale_blocks, len(self._rows), inputs, [matrix.values])
-        self._load_contacts(in_contact, int(transposed))
+        self._launch(matrix_kernels.scale_rows, n, [matrix.offsets, matrix.columns, matrix.roots], [matrix.values])
+        matrix.unsymmetric.zero_()
+        self._contacts.offsets.zero_()
+        for each in in_contact:
+            self._load_contacts(each, int(transposed))
+        matrix.contacts = self._contacts
         return matrix
 
-    def _load_contacts(self, in_contact, transposed):
+    def _load_contacts(self, elements, transposed):
         """Scales and lists the Jacobians of contacts."""
-        matrix, n = self._matrix, len(self._is_fixed)
-        matrix.unsymmetric.zero_()
-        for name in _CONTACTS:
-            setattr(matrix, name, ContactRows())
-        for name, elements in zip(_CONTACTS, in_contact, strict=False):
-            size = elements.vertices.shape[1]
-            inputs = [transposed, elements.vertices, self._is_fixed, matrix.roots]
-            shape = elements.count, size, size
-            self._launch(matrix_kernels.scale_jacobians, shape, inputs, [elements.jacobian])
-            lists = self._lists.get(elements.kernel)
-            if lists is None or lists.capacity < elements.count * size:
-                lists = self._lists[elements.kernel] = _Lists(n, elements.vertices.size, self._device)
-            setattr(matrix, name, lists.load(elements, self._is_fixed, self._worlds.of_particles, matrix.unsymmetric))
+        matrix, is_fixed, n = self._matrix, self._is_fixed, elements.count * 4
+        vertices, shape = elements.vertices, (elements.count, 4)
+        inputs = [transposed, vertices, is_fixed, matrix.roots]
+        self._launch(matrix_kernels.scale_jacobians, (*shape, 4), inputs, [elements.jacobian])
+        rows = self._contacts
+        if rows.entries is None or len(rows.entries) < n:
+            rows.entries = wp.zeros(vertices.size, dtype=int, device=self._device)
+        self._counts.zero_()
+        inputs, outputs = [vertices, is_fixed, self._worlds.of_particles], [self._counts, matrix.unsymmetric]
+        self._launch(matrix_kernels.count_entries, shape, inputs, outputs)
+        wp.utils.array_scan(self._counts, rows.offsets, inclusive=False)
+        wp.copy(self._counts, rows.offsets)
+        self._launch(matrix_kernels.list_entries, shape, [vertices, is_fixed], [self._counts, rows.entries])
+        rows.vertices, rows.jacobian = vertices, elements.jacobian
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._device)
-
-
-class _Lists:
-    """Elements of one kind by particle."""
-
-    def __init__(self, particle_count, capacity, device):
-        self.capacity = capacity
-        self._counts, self._offsets, self._ends = (
-            wp.zeros(particle_count + 1, dtype=int, device=device) for _ in range(3)
-        )
-        self._entries = wp.zeros(capacity, dtype=int, device=device)
-
-    def load(self, elements, is_fixed, world, unsymmetric):
-        """Lists elements; marks the worlds that have some."""
-        shape, vertices, device = (elements.count, elements.vertices.shape[1]), elements.vertices, elements.device
-        self._counts.zero_()
-        inputs, outputs = [vertices, is_fixed, world], [self._counts, unsymmetric]
-        wp.launch(matrix_kernels.count_entries, shape, inputs=inputs, outputs=outputs, device=device)
-        wp.utils.array_scan(self._counts, self._offsets, inclusive=False)
-        wp.copy(self._ends, self._offsets)
-        outputs = [self._ends, self._entries]
-        wp.launch(matrix_kernels.list_entries, shape, inputs=[vertices, is_fixed], outputs=outputs, device=device)
-        rows = ContactRows()
-        rows.offsets, rows.entries = self._offsets, self._entries
-        rows.vertices, rows.jacobian = vertices, elements.jacobian
-        return rows

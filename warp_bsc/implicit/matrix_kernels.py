@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .contact.rows import Rows
 from .element_kernels import block
 from .kernels import FIXED
 
@@ -15,9 +16,9 @@ class ContactRows:
     """Jacobians of the forces of contacts, by particle.
 
     Attributes:
-        offsets: First entry of each particle, and the end of the last, int32, shape [particle_count + 1]; or none.
-        entries: Element times the number of its particles plus the place of the particle in it, int32.
-        vertices: Particles of elements, -1 for none, int32, shape [n, size].
+        offsets: First entry of each particle, and the end of the last, int32, shape [particle_count + 1].
+        entries: Four times an element plus the place of the particle in it, int32.
+        vertices: Particles of elements, -1 for none, int32, shape [n, 4].
         jacobian: Minus blocks of the matrix, see :class:`.elements.Elements`.
     """
 
@@ -35,7 +36,7 @@ class Matrix:
         offsets: First block of each row, and the end of the last, int32, shape [particle_count + 1].
         columns: Columns of blocks, int32, shape [n].
         values: Blocks of inertia and elastic forces, shape [n].
-        contacts, vertex_triangle, edge_edge: Blocks of contacts.
+        contacts: Blocks of contacts.
         roots: R by particle.
         eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R, float64,
             shape [3 particle_count].
@@ -46,8 +47,6 @@ class Matrix:
     columns: wp.array[int]
     values: wp.array[wp.mat33d]
     contacts: ContactRows
-    vertex_triangle: ContactRows
-    edge_edge: ContactRows
     roots: wp.array[wp.mat33d]
     eigenvalues: wp.array[wp.float64]
     unsymmetric: wp.array[int]
@@ -85,12 +84,9 @@ def _sum_of_parts(value: wp.vec3d, parts: int) -> wp.vec3d:
 def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
     """Returns a part of row i of the product of the Jacobian of contacts with x."""
     product = wp.vec3d()
-    if not rows.offsets:
-        return product
-    size = rows.vertices.shape[1]
     for k in range(rows.offsets[i] + part, rows.offsets[i + 1], parts):
-        e, row = rows.entries[k] // size, 3 * (rows.entries[k] % size)
-        for j in range(size):
+        e, row = rows.entries[k] // 4, 3 * (rows.entries[k] % 4)
+        for j in range(4):
             vertex = rows.vertices[e, j]
             if vertex >= 0:
                 of = vector_at(x, vertex)
@@ -109,60 +105,43 @@ def row_product(matrix: Matrix, i: int, x: wp.array[wp.float64], part: int, part
     for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
         product += matrix.values[k] * vector_at(x, matrix.columns[k])
     product -= _contact_product(matrix.contacts, i, x, part, parts)
-    product -= _contact_product(matrix.vertex_triangle, i, x, part, parts)
-    product -= _contact_product(matrix.edge_edge, i, x, part, parts)
     return _sum_of_parts(product, parts)
 
 
 @wp.kernel
-def set_inertia(
+def add_up_rows(
     # in
     dt: wp.float64,
     mass: wp.array[float],
     is_fixed: wp.array[int],
-    diagonal: wp.array2d[int],
+    rows: Rows,
+    of_elements: wp.array[wp.mat33d],
+    of_bending: wp.array[wp.mat33d],
+    # in and out
+    diagonal: wp.array[wp.mat33d],
     # out
     inertia: wp.array[wp.float64],
     values: wp.array[wp.mat33d],
 ):
-    """Sets the blocks of the diagonal to the inertia m / dt^2 of particles, 1 for those that nothing moves."""
-    i = wp.tid()
-    value = _ONE
-    if is_fixed[i] != FIXED:
-        value = wp.float64(mass[i]) / (dt * dt)
-    inertia[i] = value
-    values[diagonal[i, 0]] = value * wp.identity(3, wp.float64)
+    """Adds up the blocks of elements, those of the diagonal, and inertia m / dt^2, 1 for particles that nothing moves.
 
-
-@wp.kernel
-def add_element_blocks(
-    # in
-    vertices: wp.array2d[int],
-    is_fixed: wp.array[int],
-    jacobian: wp.array3d[wp.vec3d],
-    places: wp.array3d[int],
-    # out
-    values: wp.array[wp.mat33d],
-):
-    """Subtracts blocks of Jacobians at their places in a matrix."""
-    e, i, j = wp.tid()
-    v, w = vertices[e, i], vertices[e, j]
-    if v >= 0 and w >= 0:
-        if is_fixed[v] == 0 and is_fixed[w] == 0:
-            wp.atomic_sub(values, places[e, i, j], block(jacobian, e, i, j))
-
-
-@wp.kernel
-def copy_diagonal(
-    # in
-    diagonal: wp.array2d[int],
-    values: wp.array[wp.mat33d],
-    # out
-    blocks: wp.array[wp.mat33d],
-):
-    """Copies the blocks of the diagonal."""
-    i = wp.tid()
-    blocks[i] = values[diagonal[i, 0]]
+    Blocks of fixed particles are 0 beside that. The blocks of the diagonal are returned as well.
+    """
+    u = wp.tid()
+    inertia[u] = wp.where(is_fixed[u] != FIXED, wp.float64(mass[u]) / (dt * dt), _ONE)
+    for k in range(rows.first[u], rows.first[u + 1]):
+        total = wp.mat33d()
+        if k == rows.first[u]:
+            total = diagonal[u] + inertia[u] * wp.identity(3, wp.float64)
+        if is_fixed[u] == 0 and is_fixed[rows.column[k]] == 0:
+            for n in range(rows.first_source[k], rows.first_source[k + 1]):
+                source = rows.source[n] + int(0)
+                if source >= 0:
+                    total += of_elements[source]
+                else:
+                    total += of_bending[-1 - source]
+        values[k] = total
+    diagonal[u] = values[rows.first[u]]
 
 
 @wp.kernel
@@ -190,17 +169,18 @@ def factor_blocks(
 
 
 @wp.kernel
-def scale_blocks(
+def scale_rows(
     # in
-    rows: wp.array[int],
+    offsets: wp.array[int],
     columns: wp.array[int],
     roots: wp.array[wp.mat33d],
     # in and out
     values: wp.array[wp.mat33d],
 ):
     """Multiplies the blocks of a matrix by roots from both sides."""
-    k = wp.tid()
-    values[k] = wp.transpose(roots[rows[k]]) * values[k] * roots[columns[k]]
+    u = wp.tid()
+    for k in range(offsets[u], offsets[u + 1]):
+        values[k] = wp.transpose(roots[u]) * values[k] * roots[columns[k]]
 
 
 @wp.kernel
@@ -263,7 +243,7 @@ def list_entries(
     v = vertices[e, i]
     if v >= 0:
         if is_fixed[v] == 0:
-            entries[wp.atomic_add(ends, v, 1)] = e * vertices.shape[1] + i
+            entries[wp.atomic_add(ends, v, 1)] = 4 * e + i
 
 
 @wp.kernel

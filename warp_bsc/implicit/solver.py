@@ -19,12 +19,11 @@ from ..response.integration.wrapped_solver import WrappedSolver
 from . import kernels, matrix_kernels
 from .attachments import check_attachments
 from .bodies import BodyPoses, Poses
-from .contacts import record_contacts
+from .contacts import record_contacts, record_pairs
 from .equations import Equations, Step
 from .linear import LinearSolver
 from .polish import Polish
 from .report import RESIDUAL_LIMIT, ImplicitReport
-from .self_contacts import record_pairs
 from .worlds import Worlds
 
 _STANDARD_GRAVITY = 9.80665

@@ -1,8 +1,7 @@
 """Energies that Newton's VBD gives to elements, with their gradients and Hessians by hand.
 
 Stable neo-Hookean membranes and tetrahedra, dihedral bending, springs, and damping by the change since the start of the
-step, as in :mod:`..energies`, whose forces are the negative gradients here. All is computed in float64; blocks of
-Hessians are stored in float32.
+step. All is computed in float64, from positions and into blocks of either precision.
 
 References:
     B. Smith, F. De Goes and T. Kim, Stable Neo-Hookean Flesh Simulation, ACM Transactions on Graphics 37(2), 2018,
@@ -18,7 +17,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
+from ...response.state.vectors import HALF, ONE, ZERO, to_single
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,6 +39,8 @@ class ElementKind(IntEnum):
     TETRAHEDRON = 2
     SPRING = 3
 
+
+mat43d = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
 
 SIZES = 3, 4, 4, 2
 """Particles of an element of each kind."""
@@ -143,33 +144,65 @@ def kind_of(elements: Elements, i: int) -> int:
 
 
 @wp.func
-def first_vertex(elements: Elements, kind: int, e: int) -> int:
-    """Returns a particle of an element of a kind."""
+def vertex_of(elements: Elements, kind: int, e: int, j: int) -> int:
+    """Returns a particle of an element of a kind, -1 for none, as of the fourth corner of a triangle."""
     if kind == ElementKind.MEMBRANE:
-        return elements.tri_indices[e, 0]
+        return wp.where(j < 3, elements.tri_indices[e, wp.min(j, 2)], -1)
     if kind == ElementKind.BENDING:
-        return elements.edge_indices[e, 2]
+        return elements.edge_indices[e, j]
     if kind == ElementKind.TETRAHEDRON:
-        return elements.tet_indices[e, 0]
-    return elements.spring_indices[e, 0]
+        return elements.tet_indices[e, j]
+    return wp.where(j < 2, elements.spring_indices[e, wp.min(j, 1)], -1)
 
 
 @wp.func
-def _is_finite(elements: Elements, kind: int, e: int, x: wp.array[Any]) -> bool:
-    """Returns whether the particles of an element have finite positions."""
-    if kind == ElementKind.MEMBRANE:
-        v = elements.tri_indices
-        return wp.isfinite(x[v[e, 0]]) and wp.isfinite(x[v[e, 1]]) and wp.isfinite(x[v[e, 2]])
-    if kind == ElementKind.SPRING:
-        return wp.isfinite(x[elements.spring_indices[e, 0]]) and wp.isfinite(x[elements.spring_indices[e, 1]])
-    v = elements.tet_indices
+def first_vertex(elements: Elements, kind: int, e: int) -> int:
+    """Returns a particle of an element of a kind."""
     if kind == ElementKind.BENDING:
-        v = elements.edge_indices
+        return vertex_of(elements, kind, e, 2)
+    return vertex_of(elements, kind, e, 0)
+
+
+@wp.func
+def has_energy(elements: Elements, kind: int, e: int, x: wp.array[Any]) -> bool:
+    """Returns whether an element has a material, and all particles that it takes, in finite positions."""
+    materials = elements.tet_materials
+    if kind == ElementKind.MEMBRANE:
+        materials = elements.tri_materials
+    if kind == ElementKind.MEMBRANE or kind == ElementKind.TETRAHEDRON:
+        if materials[e, 0] <= 0.0 and materials[e, 1] <= 0.0:
+            return False
+    elif kind == ElementKind.BENDING:
+        if elements.edge_properties[e, 0] <= 0.0 or elements.edge_indices[e, 0] < 0 or elements.edge_indices[e, 1] < 0:
+            return False
     finite = bool(True)
     for j in range(4):
-        if v[e, j] >= 0:
-            finite = finite and wp.isfinite(x[v[e, j]])
+        v = vertex_of(elements, kind, e, j)
+        if v >= 0:
+            finite = finite and wp.isfinite(x[v])
     return finite
+
+
+@wp.func
+def element_size(kind: int) -> int:
+    """Returns the number of particles of an element of a kind."""
+    if kind == ElementKind.MEMBRANE:
+        return 3
+    if kind == ElementKind.SPRING:
+        return 2
+    return 4
+
+
+@wp.func
+def first_corner(elements: Elements, kind: int, e: int) -> int:
+    """Returns the number of the first corner of an element of a kind."""
+    return elements.first[_FIRST_CORNER + kind] + element_size(kind) * e
+
+
+@wp.func
+def first_block(elements: Elements, kind: int, e: int) -> int:
+    """Returns the number of the first block of an element of any kind but bending."""
+    return elements.first[_FIRST_BLOCK + kind] + element_size(kind) * element_size(kind) * e
 
 
 @wp.func
@@ -179,18 +212,20 @@ def _rest_stretch(mu: wp.float64, lame: wp.float64):
 
 
 @wp.func
-def _cross_matrix(a: wp.vec3d) -> wp.mat33d:
+def cross_matrix(a: wp.vec3d) -> wp.mat33d:
     """Returns the matrix [a] for which [a] b is the cross product of a and b."""
     return wp.mat33d(ZERO, -a[2], a[1], a[2], ZERO, -a[0], -a[1], a[0], ZERO)
 
 
 @wp.func
-def _single(m: wp.mat33d) -> wp.mat33:
-    return wp.matrix_from_rows(to_single(m[0]), to_single(m[1]), to_single(m[2]))
+def _store(blocks: wp.array[Any], k: int, block: wp.mat33d):
+    """Writes a block in the precision of the array."""
+    blocks[k] = blocks.dtype(block)
 
 
 @wp.func
-def _identity() -> wp.mat33d:
+def identity() -> wp.mat33d:
+    """Returns the identity."""
     return wp.identity(n=3, dtype=wp.float64)
 
 
@@ -201,61 +236,93 @@ def _identity() -> wp.mat33d:
 def _membrane_frame(elements: Elements, e: int, x: wp.array[Any]):
     """Returns the columns of the deformation gradient of a triangle."""
     pose = elements.tri_poses[e]
-    origin = to_double(x[elements.tri_indices[e, 0]])
-    u = to_double(x[elements.tri_indices[e, 1]]) - origin
-    v = to_double(x[elements.tri_indices[e, 2]]) - origin
+    origin = wp.vec3d(x[elements.tri_indices[e, 0]])
+    u = wp.vec3d(x[elements.tri_indices[e, 1]]) - origin
+    v = wp.vec3d(x[elements.tri_indices[e, 2]]) - origin
     f0 = wp.float64(pose[0, 0]) * u + wp.float64(pose[1, 0]) * v
     f1 = wp.float64(pose[0, 1]) * u + wp.float64(pose[1, 1]) * v
     return f0, f1
 
 
 @wp.func
-def _membrane_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
+def _membrane_material(elements: Elements, e: int):
+    """Returns mu and lambda of the energy of a triangle."""
     mu, lame = wp.float64(elements.tri_materials[e, 0]), wp.float64(elements.tri_materials[e, 1])
-    if mu <= ZERO and lame <= ZERO:
-        return ZERO
-    lame = lame + mu
-    f0, f1 = _membrane_frame(elements, e, x)
+    return mu, lame + mu
+
+
+@wp.func
+def _area(f0: wp.vec3d, f1: wp.vec3d):
+    """Returns the normal of a triangle, and the ratio of its area to that at rest."""
     area_vector = wp.cross(f0, f1)
-    ratio = wp.sqrt(wp.max(wp.length_sq(area_vector), _LEAST_AREA_SQUARED)) - _rest_stretch(mu, lame)
+    ratio = wp.sqrt(wp.max(wp.length_sq(area_vector), _LEAST_AREA_SQUARED))
+    return area_vector / ratio, ratio
+
+
+@wp.func
+def _membrane_change(elements: Elements, e: int, f0: wp.vec3d, f1: wp.vec3d, x0: wp.array[Any]) -> wp.vec3d:
+    """Returns the change of the strain F^T F since the start: entries 00, 01 and 11."""
+    g0, g1 = _membrane_frame(elements, e, x0)
+    return wp.vec3d(wp.dot(f0, f0) - wp.dot(g0, g0), wp.dot(f0, f1) - wp.dot(g0, g1), wp.dot(f1, f1) - wp.dot(g1, g1))
+
+
+@wp.func
+def _membrane_energy(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    mu, lame = _membrane_material(elements, e)
+    f0, f1 = _membrane_frame(elements, e, x)
+    _normal, area = _area(f0, f1)
+    ratio = area - _rest_stretch(mu, lame)
     rest = ONE - _rest_stretch(mu, lame)
     energy = HALF * mu * (wp.length_sq(f0) + wp.length_sq(f1) - _TWO) + HALF * lame * (ratio * ratio - rest * rest)
     damping = wp.float64(elements.tri_materials[e, 2])
     if damping > ZERO:
-        g0, g1 = _membrane_frame(elements, e, x0)
-        c00 = wp.dot(f0, f0) - wp.dot(g0, g0)
-        c01 = wp.dot(f0, f1) - wp.dot(g0, g1)
-        c11 = wp.dot(f1, f1) - wp.dot(g1, g1)
-        energy += HALF * damping / dt * (c00 * c00 + _TWO * c01 * c01 + c11 * c11)
+        c = _membrane_change(elements, e, f0, f1, x0)
+        energy += HALF * damping / dt * (c[0] * c[0] + _TWO * c[1] * c[1] + c[2] * c[2])
     return wp.float64(elements.tri_areas[e]) * energy
 
 
 @wp.func
-def _differentiate_membrane(
-    elements: Elements,
-    e: int,
-    x: wp.array[wp.vec3d],
-    x0: wp.array[wp.vec3],
-    dt: wp.float64,
-    is_convex: bool,
-    out: Derivatives,
-):
-    corner, place = elements.first[_FIRST_CORNER] + 3 * e, elements.first[_FIRST_BLOCK] + 9 * e
-    mu, lame = wp.float64(elements.tri_materials[e, 0]), wp.float64(elements.tri_materials[e, 1])
-    if mu <= ZERO and lame <= ZERO:
-        for i in range(3):
-            out.gradient[corner + i] = wp.vec3()
-        for k in range(9):
-            out.block[place + k] = wp.mat33()
-        return
-    lame = lame + mu
+def _membrane_weights(elements: Elements, e: int):
+    """Returns the derivatives of both columns of the deformation gradient by corners."""
+    pose = elements.tri_poses[e]
+    a, b = wp.float64(pose[0, 0]), wp.float64(pose[0, 1])
+    c, d = wp.float64(pose[1, 0]), wp.float64(pose[1, 1])
+    return wp.vec3d(-a - c, a, c), wp.vec3d(-b - d, b, d)
+
+
+@wp.func
+def _membrane_gradient(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    mu, lame = _membrane_material(elements, e)
     f0, f1 = _membrane_frame(elements, e, x)
-    area_vector = wp.cross(f0, f1)
-    ratio = wp.sqrt(wp.max(wp.length_sq(area_vector), _LEAST_AREA_SQUARED))
-    normal = area_vector / ratio
+    normal, ratio = _area(f0, f1)
+    pressure = lame * (ratio - _rest_stretch(mu, lame))
+    stress_0 = mu * f0 + pressure * wp.cross(f1, normal)
+    stress_1 = mu * f1 + pressure * wp.cross(normal, f0)
+    damping = wp.float64(elements.tri_materials[e, 2])
+    if damping > ZERO:
+        rate = _TWO * damping / dt * _membrane_change(elements, e, f0, f1, x0)
+        stress_0 += rate[0] * f0 + rate[1] * f1
+        stress_1 += rate[1] * f0 + rate[2] * f1
+    along_0, along_1 = _membrane_weights(elements, e)
+    area = wp.float64(elements.tri_areas[e])
+    return wp.matrix_from_rows(
+        area * along_0[0] * stress_0 + area * along_1[0] * stress_1,
+        area * along_0[1] * stress_0 + area * along_1[1] * stress_1,
+        area * along_0[2] * stress_0 + area * along_1[2] * stress_1,
+        wp.vec3d(),
+    )
+
+
+@wp.func
+def _store_membrane_hessian(
+    elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64, is_convex: bool, out: wp.array[Any]
+):
+    place = first_block(elements, ElementKind.MEMBRANE, e)
+    mu, lame = _membrane_material(elements, e)
+    f0, f1 = _membrane_frame(elements, e, x)
+    normal, ratio = _area(f0, f1)
     pressure = lame * (ratio - _rest_stretch(mu, lame))
     g0, g1 = wp.cross(f1, normal), wp.cross(normal, f0)  # derivatives of the ratio of areas
-    stress_0, stress_1 = mu * f0 + pressure * g0, mu * f1 + pressure * g1
     # d^2 ratio = n n^T (f1.f1, -f0.f1; -f0.f1, f0.f0) / ratio, and (0, -[n]; [n], 0)
     s00 = mu + pressure / ratio * wp.dot(f1, f1)
     s11 = mu + pressure / ratio * wp.dot(f0, f0)
@@ -274,38 +341,30 @@ def _differentiate_membrane(
             s11 = HALF * top - scale_p * half
             s01 = scale_p * s01
     nn = wp.outer(normal, normal)
-    plane = _identity() - nn
+    plane = identity() - nn
     h00 = mu * plane + lame * wp.outer(g0, g0) + s00 * nn
     h11 = mu * plane + lame * wp.outer(g1, g1) + s11 * nn
-    h01 = lame * wp.outer(g0, g1) + s01 * nn - within * _cross_matrix(normal)
+    h01 = lame * wp.outer(g0, g1) + s01 * nn - within * cross_matrix(normal)
     damping = wp.float64(elements.tri_materials[e, 2])
     if damping > ZERO:
-        r0, r1 = _membrane_frame(elements, e, x0)
         scale = _TWO * damping / dt
-        rate_00 = scale * (wp.dot(f0, f0) - wp.dot(r0, r0))
-        rate_01 = scale * (wp.dot(f0, f1) - wp.dot(r0, r1))
-        rate_11 = scale * (wp.dot(f1, f1) - wp.dot(r1, r1))
-        stress_0 += rate_00 * f0 + rate_01 * f1
-        stress_1 += rate_01 * f0 + rate_11 * f1
         p00, p11 = wp.outer(f0, f0), wp.outer(f1, f1)
         h00 += scale * (_TWO * p00 + p11)
         h11 += scale * (_TWO * p11 + p00)
         h01 += scale * wp.outer(f1, f0)
         if not is_convex:
-            h00 += rate_00 * _identity()
-            h11 += rate_11 * _identity()
-            h01 += rate_01 * _identity()
-    pose, area = elements.tri_poses[e], wp.float64(elements.tri_areas[e])
-    a, b = wp.float64(pose[0, 0]), wp.float64(pose[0, 1])
-    c, d = wp.float64(pose[1, 0]), wp.float64(pose[1, 1])
-    along_0, along_1 = wp.vec3d(-a - c, a, c), wp.vec3d(-b - d, b, d)  # derivatives of f0 and f1 by corners
+            rate = scale * _membrane_change(elements, e, f0, f1, x0)
+            h00 += rate[0] * identity()
+            h11 += rate[2] * identity()
+            h01 += rate[1] * identity()
+    area = wp.float64(elements.tri_areas[e])
+    along_0, along_1 = _membrane_weights(elements, e)
     h10 = wp.transpose(h01)
     for i in range(3):
         s, t = area * along_0[i], area * along_1[i]
-        out.gradient[corner + i] = to_single(s * stress_0 + t * stress_1)
         by_0, by_1 = s * h00 + t * h10, s * h01 + t * h11
         for j in range(3):
-            out.block[place + 3 * i + j] = _single(along_0[j] * by_0 + along_1[j] * by_1)
+            _store(out, place + 3 * i + j, along_0[j] * by_0 + along_1[j] * by_1)
 
 
 # Bending
@@ -325,24 +384,19 @@ def _dihedral_angle(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
 
 
 @wp.func
-def _bends(elements: Elements, e: int):
+def edge_corners(elements: Elements, e: int, x: wp.array[Any]):
+    """Returns the positions of the particles of two triangles: those off their edge, then those of the edge."""
     v = elements.edge_indices
-    return v[e, 0] >= 0 and v[e, 1] >= 0 and elements.edge_properties[e, 0] > 0.0
+    return wp.vec3d(x[v[e, 0]]), wp.vec3d(x[v[e, 1]]), wp.vec3d(x[v[e, 2]]), wp.vec3d(x[v[e, 3]])
 
 
 @wp.func
-def _edge_corners(elements: Elements, e: int, x: wp.array[Any]):
-    v = elements.edge_indices
-    return to_double(x[v[e, 0]]), to_double(x[v[e, 1]]), to_double(x[v[e, 2]]), to_double(x[v[e, 3]])
-
-
-@wp.func
-def _bending_change(elements: Elements, e: int, angle: wp.float64, x0: wp.array[wp.vec3]):
+def _bending_change(elements: Elements, e: int, angle: wp.float64, x0: wp.array[Any]):
     """Returns the change of an angle since the start, and the damping of it, 0 where there is none."""
     damping = wp.float64(elements.edge_properties[e, 1])
     if damping <= ZERO:
         return ZERO, ZERO
-    p, q, r, s = _edge_corners(elements, e, x0)
+    p, q, r, s = edge_corners(elements, e, x0)
     if _is_degenerate(p, q, r, s):
         return ZERO, ZERO
     change = angle - _dihedral_angle(p, q, r, s)
@@ -354,10 +408,8 @@ def _bending_change(elements: Elements, e: int, angle: wp.float64, x0: wp.array[
 
 
 @wp.func
-def _bending_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
-    if not _bends(elements, e):
-        return ZERO
-    a, b, c, d = _edge_corners(elements, e, x)
+def _bending_energy(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    a, b, c, d = edge_corners(elements, e, x)
     if _is_degenerate(a, b, c, d):
         return ZERO
     angle = _dihedral_angle(a, b, c, d)
@@ -368,20 +420,11 @@ def _bending_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.ar
 
 
 @wp.func
-def _differentiate_bending(
-    elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64, out: Derivatives
-):
-    corner = elements.first[_FIRST_CORNER + 1] + 4 * e
-    flat = not _bends(elements, e)
-    a, b, c, d = wp.vec3d(), wp.vec3d(), wp.vec3d(), wp.vec3d()
-    if not flat:
-        a, b, c, d = _edge_corners(elements, e, x)
-        flat = _is_degenerate(a, b, c, d)
-    if flat:
-        for i in range(4):
-            out.gradient[corner + i] = wp.vec3()
-        out.curvature[e] = 0.0
-        return
+def bend(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    """Returns the derivatives of the angle by corners, and both derivatives of the energy by the angle, or zeros."""
+    a, b, c, d = edge_corners(elements, e, x)
+    if _is_degenerate(a, b, c, d):
+        return mat43d(), ZERO, ZERO
     n1, n2, edge = wp.cross(c - a, d - a), wp.cross(d - b, c - b), d - c
     length = wp.length(edge)
     along = edge / length
@@ -391,16 +434,13 @@ def _differentiate_bending(
     rest = wp.float64(elements.edge_rest_length[e])
     stiffness = wp.float64(elements.edge_properties[e, 0])
     moment = rest * (stiffness * (angle - wp.float64(elements.edge_rest_angle[e])) + damping / dt * change)
-    out.curvature[e] = float(rest * (stiffness + damping / dt))
-    by = wp.matrix_from_rows(
+    turn = wp.matrix_from_rows(
         -length * m1,
         -length * m2,
-        wp.vec3d(-(wp.dot(a - d, along) * m1 + wp.dot(b - d, along) * m2)),
-        wp.vec3d(wp.dot(a - c, along) * m1 + wp.dot(b - c, along) * m2),
+        -(wp.dot(a - d, along) * m1 + wp.dot(b - d, along) * m2),
+        wp.dot(a - c, along) * m1 + wp.dot(b - c, along) * m2,
     )
-    for i in range(4):
-        out.gradient[corner + i] = to_single(moment * by[i])
-        out.turn[4 * e + i] = to_single(by[i])
+    return turn, moment, rest * (stiffness + damping / dt)
 
 
 # Tetrahedra
@@ -419,9 +459,9 @@ def _double(m: wp.mat33) -> wp.mat33d:
 def _tetrahedron_frame(elements: Elements, e: int, pose: wp.mat33d, x: wp.array[Any]) -> wp.mat33d:
     """Returns the deformation gradient of a tetrahedron."""
     v = elements.tet_indices
-    origin = to_double(x[v[e, 0]])
+    origin = wp.vec3d(x[v[e, 0]])
     sides = wp.matrix_from_cols(
-        to_double(x[v[e, 1]]) - origin, to_double(x[v[e, 2]]) - origin, to_double(x[v[e, 3]]) - origin
+        wp.vec3d(x[v[e, 1]]) - origin, wp.vec3d(x[v[e, 2]]) - origin, wp.vec3d(x[v[e, 3]]) - origin
     )
     return sides * pose
 
@@ -432,11 +472,22 @@ def _column(m: wp.mat33d, j: int) -> wp.vec3d:
 
 
 @wp.func
-def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
+def _solid_material(elements: Elements, e: int):
+    """Returns mu and lambda of the energy of a tetrahedron."""
     mu, lame = wp.float64(elements.tet_materials[e, 0]), wp.float64(elements.tet_materials[e, 1])
-    if mu <= ZERO and lame <= ZERO:
-        return ZERO
-    lame = lame + mu
+    return mu, lame + mu
+
+
+@wp.func
+def _tetrahedron_change(elements: Elements, e: int, pose: wp.mat33d, f: wp.mat33d, x0: wp.array[Any]) -> wp.mat33d:
+    """Returns the change of the strain F^T F since the start."""
+    g = _tetrahedron_frame(elements, e, pose, x0)
+    return wp.transpose(f) * f - wp.transpose(g) * g
+
+
+@wp.func
+def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    mu, lame = _solid_material(elements, e)
     pose = _double(elements.tet_poses[e])
     f = _tetrahedron_frame(elements, e, pose, x)
     ratio = wp.determinant(f) - _rest_stretch(mu, lame)
@@ -444,80 +495,9 @@ def _tetrahedron_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: w
     energy = HALF * mu * (wp.ddot(f, f) - _THREE) + HALF * lame * (ratio * ratio - rest * rest)
     damping = wp.float64(elements.tet_materials[e, 2])
     if damping > ZERO:
-        g = _tetrahedron_frame(elements, e, pose, x0)
-        rate = wp.transpose(f) * f - wp.transpose(g) * g
-        energy += HALF * damping / dt * wp.ddot(rate, rate)
+        change = _tetrahedron_change(elements, e, pose, f, x0)
+        energy += HALF * damping / dt * wp.ddot(change, change)
     return energy / (_SIX * wp.determinant(pose))
-
-
-@wp.func
-def _differentiate_tetrahedron(
-    elements: Elements,
-    e: int,
-    x: wp.array[wp.vec3d],
-    x0: wp.array[wp.vec3],
-    dt: wp.float64,
-    is_convex: bool,
-    out: Derivatives,
-):
-    corner, place = elements.first[_FIRST_CORNER + 2] + 4 * e, elements.first[_FIRST_BLOCK + 2] + 16 * e
-    mu, lame = wp.float64(elements.tet_materials[e, 0]), wp.float64(elements.tet_materials[e, 1])
-    if mu <= ZERO and lame <= ZERO:
-        for i in range(4):
-            out.gradient[corner + i] = wp.vec3()
-        for k in range(16):
-            out.block[place + k] = wp.mat33()
-        return
-    lame = lame + mu
-    pose = _double(elements.tet_poses[e])
-    volume = ONE / (_SIX * wp.determinant(pose))
-    f = _tetrahedron_frame(elements, e, pose, x)
-    f0, f1, f2 = _column(f, 0), _column(f, 1), _column(f, 2)
-    g0, g1, g2 = wp.cross(f1, f2), wp.cross(f2, f0), wp.cross(f0, f1)  # derivatives of the ratio of volumes
-    pressure = lame * (wp.dot(f0, g0) - _rest_stretch(mu, lame))
-    s0, s1, s2 = mu * f0 + pressure * g0, mu * f1 + pressure * g1, mu * f2 + pressure * g2
-    h00 = mu * _identity() + lame * wp.outer(g0, g0)
-    h11 = mu * _identity() + lame * wp.outer(g1, g1)
-    h22 = mu * _identity() + lame * wp.outer(g2, g2)
-    within = pressure
-    if is_convex:
-        most = mu / wp.sqrt(wp.max(wp.ddot(f, f) / _THREE, ONE))
-        within = wp.clamp(pressure, -most, most)
-    h01 = lame * wp.outer(g0, g1) - within * _cross_matrix(f2)
-    h02 = lame * wp.outer(g0, g2) + within * _cross_matrix(f1)
-    h12 = lame * wp.outer(g1, g2) - within * _cross_matrix(f0)
-    damping = wp.float64(elements.tet_materials[e, 2])
-    if damping > ZERO:
-        g = _tetrahedron_frame(elements, e, pose, x0)
-        scale = _TWO * damping / dt
-        rate = scale * (wp.transpose(f) * f - wp.transpose(g) * g)
-        s0 += rate[0, 0] * f0 + rate[0, 1] * f1 + rate[0, 2] * f2
-        s1 += rate[1, 0] * f0 + rate[1, 1] * f1 + rate[1, 2] * f2
-        s2 += rate[2, 0] * f0 + rate[2, 1] * f1 + rate[2, 2] * f2
-        p = wp.outer(f0, f0) + wp.outer(f1, f1) + wp.outer(f2, f2)
-        h00 += scale * (wp.outer(f0, f0) + p)
-        h11 += scale * (wp.outer(f1, f1) + p)
-        h22 += scale * (wp.outer(f2, f2) + p)
-        h01 += scale * wp.outer(f1, f0)
-        h02 += scale * wp.outer(f2, f0)
-        h12 += scale * wp.outer(f2, f1)
-        if not is_convex:
-            h00 += rate[0, 0] * _identity()
-            h11 += rate[1, 1] * _identity()
-            h22 += rate[2, 2] * _identity()
-            h01 += rate[0, 1] * _identity()
-            h02 += rate[0, 2] * _identity()
-            h12 += rate[1, 2] * _identity()
-    h10, h20, h21 = wp.transpose(h01), wp.transpose(h02), wp.transpose(h12)
-    for i in range(4):
-        b = _corner_weights(pose, i)
-        out.gradient[corner + i] = to_single(volume * (b[0] * s0 + b[1] * s1 + b[2] * s2))
-        by_0 = volume * (b[0] * h00 + b[1] * h10 + b[2] * h20)
-        by_1 = volume * (b[0] * h01 + b[1] * h11 + b[2] * h21)
-        by_2 = volume * (b[0] * h02 + b[1] * h12 + b[2] * h22)
-        for j in range(4):
-            c = _corner_weights(pose, j)
-            out.block[place + 4 * i + j] = _single(c[0] * by_0 + c[1] * by_1 + c[2] * by_2)
 
 
 @wp.func
@@ -528,49 +508,118 @@ def _corner_weights(pose: wp.mat33d, i: int) -> wp.vec3d:
     return pose[i - 1]
 
 
+@wp.func
+def _tetrahedron_gradient(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    mu, lame = _solid_material(elements, e)
+    pose = _double(elements.tet_poses[e])
+    volume = ONE / (_SIX * wp.determinant(pose))
+    f = _tetrahedron_frame(elements, e, pose, x)
+    f0, f1, f2 = _column(f, 0), _column(f, 1), _column(f, 2)
+    g0, g1, g2 = wp.cross(f1, f2), wp.cross(f2, f0), wp.cross(f0, f1)
+    pressure = lame * (wp.dot(f0, g0) - _rest_stretch(mu, lame))
+    s0, s1, s2 = mu * f0 + pressure * g0, mu * f1 + pressure * g1, mu * f2 + pressure * g2
+    damping = wp.float64(elements.tet_materials[e, 2])
+    if damping > ZERO:
+        rate = _TWO * damping / dt * _tetrahedron_change(elements, e, pose, f, x0)
+        s0 += rate[0, 0] * f0 + rate[0, 1] * f1 + rate[0, 2] * f2
+        s1 += rate[1, 0] * f0 + rate[1, 1] * f1 + rate[1, 2] * f2
+        s2 += rate[2, 0] * f0 + rate[2, 1] * f1 + rate[2, 2] * f2
+    stress = wp.matrix_from_rows(s0, s1, s2)
+    by_1, by_2, by_3 = volume * (pose[0] * stress), volume * (pose[1] * stress), volume * (pose[2] * stress)
+    return wp.matrix_from_rows(volume * (_corner_weights(pose, 0) * stress), by_1, by_2, by_3)
+
+
+@wp.func
+def _store_tetrahedron_hessian(
+    elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64, is_convex: bool, out: wp.array[Any]
+):
+    place = first_block(elements, ElementKind.TETRAHEDRON, e)
+    mu, lame = _solid_material(elements, e)
+    pose = _double(elements.tet_poses[e])
+    volume = ONE / (_SIX * wp.determinant(pose))
+    f = _tetrahedron_frame(elements, e, pose, x)
+    f0, f1, f2 = _column(f, 0), _column(f, 1), _column(f, 2)
+    g0, g1, g2 = wp.cross(f1, f2), wp.cross(f2, f0), wp.cross(f0, f1)  # derivatives of the ratio of volumes
+    pressure = lame * (wp.dot(f0, g0) - _rest_stretch(mu, lame))
+    h00 = mu * identity() + lame * wp.outer(g0, g0)
+    h11 = mu * identity() + lame * wp.outer(g1, g1)
+    h22 = mu * identity() + lame * wp.outer(g2, g2)
+    within = pressure
+    if is_convex:
+        most = mu / wp.sqrt(wp.max(wp.ddot(f, f) / _THREE, ONE))
+        within = wp.clamp(pressure, -most, most)
+    h01 = lame * wp.outer(g0, g1) - within * cross_matrix(f2)
+    h02 = lame * wp.outer(g0, g2) + within * cross_matrix(f1)
+    h12 = lame * wp.outer(g1, g2) - within * cross_matrix(f0)
+    damping = wp.float64(elements.tet_materials[e, 2])
+    if damping > ZERO:
+        scale = _TWO * damping / dt
+        p = wp.outer(f0, f0) + wp.outer(f1, f1) + wp.outer(f2, f2)
+        h00 += scale * (wp.outer(f0, f0) + p)
+        h11 += scale * (wp.outer(f1, f1) + p)
+        h22 += scale * (wp.outer(f2, f2) + p)
+        h01 += scale * wp.outer(f1, f0)
+        h02 += scale * wp.outer(f2, f0)
+        h12 += scale * wp.outer(f2, f1)
+        if not is_convex:
+            rate = scale * _tetrahedron_change(elements, e, pose, f, x0)
+            h00 += rate[0, 0] * identity()
+            h11 += rate[1, 1] * identity()
+            h22 += rate[2, 2] * identity()
+            h01 += rate[0, 1] * identity()
+            h02 += rate[0, 2] * identity()
+            h12 += rate[1, 2] * identity()
+    h10, h20, h21 = wp.transpose(h01), wp.transpose(h02), wp.transpose(h12)
+    for i in range(4):
+        b = _corner_weights(pose, i)
+        by_0 = volume * (b[0] * h00 + b[1] * h10 + b[2] * h20)
+        by_1 = volume * (b[0] * h01 + b[1] * h11 + b[2] * h21)
+        by_2 = volume * (b[0] * h02 + b[1] * h12 + b[2] * h22)
+        for j in range(4):
+            c = _corner_weights(pose, j)
+            _store(out, place + 4 * i + j, c[0] * by_0 + c[1] * by_1 + c[2] * by_2)
+
+
 # Springs
 
 
 @wp.func
-def _spring_energy(elements: Elements, e: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64):
+def _spring_energy(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
     a, b = elements.spring_indices[e, 0], elements.spring_indices[e, 1]
-    length = wp.max(wp.length(x[a] - x[b]), _LEAST_LENGTH)
-    length_0 = wp.max(wp.length(to_double(x0[a]) - to_double(x0[b])), _LEAST_LENGTH)
+    length = wp.max(wp.length(wp.vec3d(x[a]) - wp.vec3d(x[b])), _LEAST_LENGTH)
+    length_0 = wp.max(wp.length(wp.vec3d(x0[a]) - wp.vec3d(x0[b])), _LEAST_LENGTH)
     stretch, change = length - wp.float64(elements.spring_rest_length[e]), length - length_0
     energy = wp.float64(elements.spring_stiffness[e]) * stretch * stretch
     return HALF * (energy + wp.float64(elements.spring_damping[e]) / dt * change * change)
 
 
 @wp.func
-def _differentiate_spring(
-    elements: Elements,
-    e: int,
-    x: wp.array[wp.vec3d],
-    x0: wp.array[wp.vec3],
-    dt: wp.float64,
-    is_convex: bool,
-    out: Derivatives,
-):
-    corner, place = elements.first[_FIRST_CORNER + 3] + 2 * e, elements.first[_FIRST_BLOCK + 3] + 4 * e
+def _tension(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
+    """Returns direction, length and tension of a spring, and the derivative of the tension by the length."""
     a, b = elements.spring_indices[e, 0], elements.spring_indices[e, 1]
-    between = x[a] - x[b]
+    between = wp.vec3d(x[a]) - wp.vec3d(x[b])
     length = wp.max(wp.length(between), _LEAST_LENGTH)
-    length_0 = wp.max(wp.length(to_double(x0[a]) - to_double(x0[b])), _LEAST_LENGTH)
+    length_0 = wp.max(wp.length(wp.vec3d(x0[a]) - wp.vec3d(x0[b])), _LEAST_LENGTH)
     stiffness, damping = wp.float64(elements.spring_stiffness[e]), wp.float64(elements.spring_damping[e]) / dt
     tension = stiffness * (length - wp.float64(elements.spring_rest_length[e])) + damping * (length - length_0)
-    along = between / length
+    return between / length, length, tension, stiffness + damping
+
+
+@wp.func
+def _store_spring_hessian(
+    elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64, is_convex: bool, out: wp.array[Any]
+):
+    place = first_block(elements, ElementKind.SPRING, e)
+    along, length, tension, stiffness = _tension(elements, e, x, x0, dt)
     outer = wp.outer(along, along)
     across = tension / length
     if is_convex:
         across = wp.max(across, ZERO)
-    block = _single((stiffness + damping) * outer + across * (_identity() - outer))
-    force = to_single(tension * along)
-    out.gradient[corner] = force
-    out.gradient[corner + 1] = -force
-    out.block[place] = block
-    out.block[place + 1] = -block
-    out.block[place + 2] = -block
-    out.block[place + 3] = block
+    block = stiffness * outer + across * (identity() - outer)
+    _store(out, place, block)
+    _store(out, place + 1, -block)
+    _store(out, place + 2, -block)
+    _store(out, place + 3, block)
 
 
 # All kinds
@@ -578,14 +627,14 @@ def _differentiate_spring(
 
 @wp.func
 def element_energy(
-    elements: Elements, i: int, kind: int, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64
+    elements: Elements, i: int, kind: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64
 ) -> wp.float64:
     """Returns the energy of an element of a kind above that at rest [J], damping included.
 
     It is 0 where a particle has no finite position, like the derivatives.
     """
     e = i - elements.first[kind]
-    if not _is_finite(elements, kind, e, x):
+    if not has_energy(elements, kind, e, x):
         return ZERO
     if kind == ElementKind.MEMBRANE:
         return _membrane_energy(elements, e, x, x0, dt)
@@ -597,24 +646,45 @@ def element_energy(
 
 
 @wp.func
-def _clear(elements: Elements, kind: int, e: int, out: Derivatives):
-    """Writes derivatives of 0."""
-    size = 4
+def element_gradient(
+    elements: Elements, kind: int, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64
+) -> mat43d:
+    """Returns the derivatives of the energy of an element of a kind by its corners, one a row, 0 for none [N]."""
+    if not has_energy(elements, kind, e, x):
+        return mat43d()
     if kind == ElementKind.MEMBRANE:
-        size = 3
-    elif kind == ElementKind.SPRING:
-        size = 2
-    corner, place = (
-        elements.first[_FIRST_CORNER + kind] + size * e,
-        elements.first[_FIRST_BLOCK + kind] + size * size * e,
-    )
-    for i in range(size):
-        out.gradient[corner + i] = wp.vec3()
-    if kind == ElementKind.BENDING:  # has no blocks
-        out.curvature[e] = 0.0
-        return
-    for k in range(size * size):
-        out.block[place + k] = wp.mat33()
+        return _membrane_gradient(elements, e, x, x0, dt)
+    if kind == ElementKind.BENDING:
+        turn, moment, _curvature = bend(elements, e, x, x0, dt)
+        return moment * turn
+    if kind == ElementKind.TETRAHEDRON:
+        return _tetrahedron_gradient(elements, e, x, x0, dt)
+    along, _length, tension, _stiffness = _tension(elements, e, x, x0, dt)
+    return wp.matrix_from_rows(tension * along, -tension * along, wp.vec3d(), wp.vec3d())
+
+
+@wp.func
+def store_hessian(
+    elements: Elements,
+    kind: int,
+    e: int,
+    x: wp.array[Any],
+    x0: wp.array[Any],
+    dt: wp.float64,
+    is_convex: bool,
+    blocks: wp.array[Any],
+):
+    """Writes the Hessian of an element of any kind but bending, convex or exact."""
+    if not has_energy(elements, kind, e, x):
+        place = first_block(elements, kind, e)
+        for k in range(element_size(kind) * element_size(kind)):
+            _store(blocks, place + k, wp.mat33d())
+    elif kind == ElementKind.MEMBRANE:
+        _store_membrane_hessian(elements, e, x, x0, dt, is_convex, blocks)
+    elif kind == ElementKind.TETRAHEDRON:
+        _store_tetrahedron_hessian(elements, e, x, x0, dt, is_convex, blocks)
+    else:
+        _store_spring_hessian(elements, e, x, x0, dt, is_convex, blocks)
 
 
 @wp.kernel
@@ -641,15 +711,16 @@ def differentiate(
     in_world = world[first_vertex(elements, kind, e)]
     if active[in_world] == 0:
         return
-    is_convex = convex[in_world] != 0
-    if not _is_finite(elements, kind, e, x):
-        _clear(elements, kind, e, out)
+    gradient = element_gradient(elements, kind, e, x, x0, dt)
+    corner = first_corner(elements, kind, e)
+    for j in range(element_size(kind)):
+        out.gradient[corner + j] = to_single(gradient[j])
+    if kind != ElementKind.BENDING:
+        store_hessian(elements, kind, e, x, x0, dt, convex[in_world] != 0, out.block)
         return
-    if kind == ElementKind.MEMBRANE:
-        _differentiate_membrane(elements, e, x, x0, dt, is_convex, out)
-    elif kind == ElementKind.BENDING:
-        _differentiate_bending(elements, e, x, x0, dt, out)
-    elif kind == ElementKind.TETRAHEDRON:
-        _differentiate_tetrahedron(elements, e, x, x0, dt, is_convex, out)
-    else:
-        _differentiate_spring(elements, e, x, x0, dt, is_convex, out)
+    turn, curvature = mat43d(), ZERO
+    if has_energy(elements, kind, e, x):
+        turn, _moment, curvature = bend(elements, e, x, x0, dt)
+    out.curvature[e] = float(curvature)
+    for j in range(4):
+        out.turn[4 * e + j] = to_single(turn[j])
