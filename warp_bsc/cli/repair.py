@@ -17,7 +17,21 @@ from .device import find_device, load_detector, loading_kernels
 from .error_boundary import describe
 from .exit_status import ExitStatus, explain_statuses
 from .interrupts import INTERRUPTS
-from .options import Commands, add_command, add_device, add_fail_on, add_json, add_scene, distance, scene_path
+from .options import (
+    DEVICE,
+    JSON,
+    Commands,
+    add_command,
+    add_fail_on,
+    add_options,
+    add_scene,
+    distance,
+    file_option,
+    flag,
+    number,
+    patterns,
+    scene_path,
+)
 from .progress import RunProgress
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
@@ -67,52 +81,50 @@ def add_to(commands: Commands, summary: str) -> None:
     )
     add_scene(command)
     which = command.add_argument_group("selection")
-    which.add_argument(
-        "--keep",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="PATTERN",
-        help="obstacles: do not move meshes at or below these prims; * matches any text",
+    add_options(
+        which, {"--keep": patterns("obstacles: do not move meshes at or below these prims; * matches any text")}
     )
     add_scene_selection(which)
     how = command.add_argument_group("repair")
-    how.add_argument(
-        "--include-initial",
-        action="store_true",
-        help="repair also pairs of two meshes that cross at the first frame; by default these are left",
-    )
-    how.add_argument(
-        "--max-move",
-        type=distance,
-        metavar="D",
-        help="leave stretches of the scene as they are in which a point must move more than D, in the scene's unit",
-    )
-    how.add_argument(
-        "--min-distance",
-        type=distance,
-        default=0.0,
-        metavar="D",
-        help="repair also what comes nearer than D, in the scene's unit, at the samples or between them, and keep that "
-        "distance where the scene is repaired, certified between samples too. Elements that an edge joins only do not "
-        "touch; pairs that are nearer at the first sample are named, and come no nearer where the scene is repaired",
+    add_options(
+        how,
+        {
+            "--include-initial": flag(
+                "repair also pairs of two meshes that cross at the first frame; by default these are left"
+            ),
+            "--max-move": number(
+                distance,
+                "leave stretches of the scene as they are in which a point must move more than D, in the scene's unit",
+                metavar="D",
+            ),
+            "--min-distance": number(
+                distance,
+                "repair also what comes nearer than D, in the scene's unit, at the samples or between them, and keep "
+                "that distance where the scene is repaired, certified between samples too. Elements that an edge joins "
+                "only do not touch; pairs that are nearer at the first sample are named, and come no nearer where the "
+                "scene is repaired",
+                default=0.0,
+                metavar="D",
+            ),
+        },
     )
     out = command.add_argument_group("output")
-    out.add_argument("--output", required=True, metavar="FILE", help="the layer, .usda, .usdc or .usd")
-    out.add_argument(
-        "--report",
-        metavar="FILE",
-        help="a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html",
+    add_options(
+        out,
+        {
+            "--output": {"required": True, "metavar": "FILE", "help": "the layer, .usda, .usdc or .usd"},
+            "--report": file_option(
+                "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
+            ),
+            "--resume": flag(
+                "continue an earlier run with the same options and files that was stopped or killed: take what it "
+                "found and repaired from FILE.part, beside the layer; without that file, repair all"
+            ),
+        },
     )
-    out.add_argument(
-        "--resume",
-        action="store_true",
-        help="continue an earlier run with the same options and files that was stopped or killed: take what it found "
-        "and repaired from FILE.part, beside the layer; without that file, repair all",
-    )
-    add_json(command)
+    add_options(command, JSON)
     add_fail_on(out, {"left": "collisions or intersections that are left"})
-    add_device(command)
+    add_options(command, DEVICE)
 
 
 def _run(arguments: argparse.Namespace) -> int:

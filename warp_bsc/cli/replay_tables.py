@@ -3,7 +3,6 @@
 from collections import defaultdict
 
 from rich.console import Console
-from rich.text import Text
 
 from ..repair.shot.findings import kept_meshes
 from ..replay.baseline import NewFinding
@@ -11,12 +10,23 @@ from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Near
 from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
 from .option_names import with_option
-from .tables import LONGEST, count, make_table, say
+from .tables import LONGEST, Column, count, print_table, say
 
 __all__ = ["print_new", "print_repair", "print_replay", "print_work"]
 
 _WITH_POSITIONS = 60
 """Least width of a terminal on which the table of intervals has positions."""
+
+_POSITION = [
+    Column(axis, lambda found, i=i: getattr(found, "earliest", found).position[i], ".4g")
+    for i, axis in enumerate("xyz")
+]
+_WORST = (
+    Column("Collisions", "hits"),
+    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), "", kind="text"),
+    Column("At", lambda interval: round(interval.earliest.time, 6), ".6g"),
+)
+_NEAREST = (Column("Distance", "distance", ".6g"), Column("Time", "time", "g"), *_POSITION)
 
 _RANGES = 4
 """Most ranges of time in a line."""
@@ -170,23 +180,10 @@ def _print_certificate(console: Console, summary: Summary) -> None:
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
     """Prints the intervals, those with the most collisions first: of which prims the first is, when and where."""
     arrow = "->" if console.options.ascii_only else "→"
-    has_room = console.width >= _WITH_POSITIONS
-    table = make_table("Frames", "Collisions", "First contact", "At", *("x", "y", "z") * has_room)
-    table.columns[0].no_wrap = True
-    prims = table.columns[2]
-    prims.justify, prims.no_wrap, prims.overflow = "left", False, "fold"
-    for interval in listed:
-        first = interval.earliest
-        assert first  # it collides
-        others = len(interval.mesh_pairs) - 1
-        table.add_row(
-            Text(f"{interval.start:g} {arrow} {interval.end:g}"),
-            f"{interval.hits:,}",
-            Text(_contact(first) + f"; also {count(others, 'other pair')}" * (others > 0)),
-            f"{round(first.time, 6):.6g}",
-            *(f"{coordinate:.4g}" for coordinate in first.position * has_room),
-        )
-    console.print(table)
+    first = Column("Frames", kind="word")
+    positions = _POSITION if console.width >= _WITH_POSITIONS else ()
+    rows = [(f"{interval.start:g} {arrow} {interval.end:g}", interval) for interval in listed]
+    print_table(console, first, [*_WORST, *positions], rows)
 
 
 def _print_collisions(console: Console, summary: Summary) -> None:
@@ -268,15 +265,8 @@ def _print_proximities(console: Console, summary: Summary, clearance: float) -> 
         f"Elements are at most {clearance:g} apart at {near:,} of {times}. The smallest distance is "
         f"{nearest[0].distance:.6g}, at {nearest[0].time:g}; the most pairs at {worst.time:g}: {worst.pairs:,}.",
     )
-    table = make_table("Nearest elements", "Distance", "Time", "x", "y", "z", caption="The nearest of all times.")
-    for found in nearest[:LONGEST]:
-        table.add_row(
-            Text(_contact(found)),
-            f"{found.distance:.6g}",
-            f"{found.time:g}",
-            *(f"{coordinate:.4g}" for coordinate in found.position),
-        )
-    console.print(table)
+    rows = [(_contact(found), found) for found in nearest[:LONGEST]]
+    print_table(console, "Nearest elements", _NEAREST, rows, caption="The nearest of all times.")
     if len(nearest) > LONGEST:
         say(console, f"  and {len(nearest) - LONGEST} more pairs of meshes; --json has all.")
 
@@ -295,6 +285,12 @@ def _contact(found: Contact | Nearest) -> str:
     """Returns the prims and the elements of two that meet, or are nearest, in words."""
     (first, second), (element, other) = found.meshes, found.elements
     return f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"
+
+
+def _others(interval: IntervalSummary) -> str:
+    """Returns how many other pairs of meshes than the first collide, in words."""
+    others = len(interval.mesh_pairs) - 1
+    return f"; also {count(others, 'other pair')}" * (others > 0)
 
 
 def _pair(meshes: tuple[str, str]) -> str:
