@@ -74,12 +74,12 @@ def print_queries(
     names = [os.path.relpath(found.file.path.with_suffix(""), folder) for found in results]
     numbers = [(len(a.file.points), a.hits, *a.certified.values(), a.milliseconds) for a in results]
     _print_sums(console, ("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms"), names, numbers)
-    known = [(name, found) for name, found in zip(names, results, strict=True) if found.confusion]
+    known = [(name, found.confusion) for name, found in zip(names, results, strict=True) if found.confusion]
     if known:
         console.print()
         headers = ("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
-        _print_sums(console, headers, [name for name, _ in known], [(*a.confusion.values(),) for _, a in known])
-    for file in (found.file for _, found in known):
+        _print_sums(console, headers, [name for name, _ in known], [tuple(counts.values()) for _, counts in known])
+    for file in (found.file for found in results):
         if file.truth_path and file.truth_path != file.path:
             say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
 

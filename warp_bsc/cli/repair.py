@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import importlib
 import json
 import os
 
@@ -10,13 +9,8 @@ from .._atomic_file import STDOUT, unfinished_path
 from ..repair.shot.findings import kept_meshes
 from ..repair.shot.report import RepairPage
 from ..replay.hit_files import replay_facts
-from ..usd.frames import FrameRange
-from ..usd.scene import Scene
-from ..usd.selection import Selection
 from .device import find_device, load_detector, loading_kernels
-from .error_boundary import describe
 from .exit_status import ExitStatus, explain_statuses
-from .interrupts import INTERRUPTS
 from .options import (
     DEVICE,
     JSON,
@@ -32,10 +26,9 @@ from .options import (
     patterns,
     scene_path,
 )
-from .progress import RunProgress
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
-from .replay_options import add_scene_selection, describe_selection
+from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
 from .tables import Console
 
 __all__ = ["add_to"]
@@ -140,18 +133,8 @@ def _run(arguments: argparse.Namespace) -> int:
         if paths.count(path) > 1:
             raise ValueError(f"{path}: named twice, as two files of a repair")
     device = find_device(arguments.device)
-    with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
-        importlib.import_module("warp_bsc.usd.find_meshes")
-    INTERRUPTS.check()
-    selection = Selection(
-        prims=tuple(arguments.prims),
-        exclude=tuple(arguments.exclude),
-        self_collisions=arguments.self_collisions,
-        between=tuple(arguments.between) if arguments.between else None,
-        purposes=tuple(arguments.purpose or Selection.purposes),
-        ignore=tuple(map(tuple, arguments.ignore)),
-    )
-    scene = _open(arguments.scene, arguments, selection, arguments.frames)
+    options = {"selection": read_selection(arguments), "frames": arguments.frames}
+    scene = read_scene(arguments.scene, arguments, **options)
     for file in written:
         if file in scene.files:
             raise ValueError(f"{file}: the scene is read from this file; write to another one")
@@ -170,7 +153,7 @@ def _run(arguments: argparse.Namespace) -> int:
         run.run()
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and run.is_written:
-            fixed = _open(arguments.output, arguments, selection, arguments.frames)
+            fixed = read_scene(arguments.output, arguments, **options)
             assert run.journal.findings
             after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].left_pairs)
         if page and run.journal.findings is not None:
@@ -188,21 +171,3 @@ def _run(arguments: argparse.Namespace) -> int:
     if "left" in arguments.fail_on and any(left.values()):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
-
-
-def _open(path: str, arguments: argparse.Namespace, selection: Selection, frames: FrameRange | None) -> Scene:
-    """Opens a scene with the options that say how it is read."""
-    try:
-        with RunProgress("Comparing vertices") as progress:
-            return Scene(
-                path,
-                selection=selection,
-                frames=frames,
-                strict=arguments.strict,
-                allow_missing=arguments.allow_missing,
-                progress=progress.show,
-            )
-    except (OSError, ValueError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: {describe(error)}") from error

@@ -1,6 +1,7 @@
 """The options of ``warp-bsc replay``, their types and its help text."""
 
 import argparse
+import importlib
 import math
 import shlex
 from collections.abc import Iterable, Sequence
@@ -12,8 +13,10 @@ from .._atomic_file import STDOUT
 from ..replay.workers import checked_address
 from ..usd.frames import FrameRange
 from ..usd.scene import Scene
-from ..usd.selection import PURPOSES
+from ..usd.selection import PURPOSES, Selection
+from .error_boundary import describe
 from .exit_status import ExitStatus, explain_statuses
+from .interrupts import INTERRUPTS
 from .options import (
     Options,
     add_fail_on,
@@ -29,6 +32,7 @@ from .options import (
     positive,
     switch,
 )
+from .progress import RunProgress
 
 __all__ = [
     "DESCRIPTION",
@@ -37,6 +41,8 @@ __all__ = [
     "add_scene_selection",
     "command_of",
     "describe_selection",
+    "read_scene",
+    "read_selection",
     "repair_command_of",
 ]
 
@@ -107,6 +113,44 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
 def add_scene_selection(which: argparse._ArgumentGroup) -> None:
     """Adds the options that select meshes, pairs of them and the time of a scene, and how it is read."""
     add_options(which, _SCENE)
+
+
+def read_selection(arguments: argparse.Namespace, ignored: Iterable[tuple[str, str]] = ()) -> Selection:
+    """Returns the selection that the options of :func:`add_scene_selection` make, with more pairs that are ignored."""
+    return Selection(
+        prims=tuple(arguments.prims),
+        exclude=tuple(arguments.exclude),
+        self_collisions=arguments.self_collisions,
+        between=tuple(arguments.between) if arguments.between else None,
+        purposes=tuple(arguments.purpose or Selection.purposes),
+        ignore=(*map(tuple, arguments.ignore), *ignored),
+    )
+
+
+def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = False, **options: Any) -> Scene:
+    """Opens a scene with the options of :func:`add_scene_selection` that say how it is read, and shows the progress.
+
+    Args:
+        path: The file.
+        arguments: The options.
+        as_json: Whether the progress is for programs.
+        options: Other arguments of the scene.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If the options do not fit the scene, or the file is broken.
+    """
+    with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
+        importlib.import_module("warp_bsc.usd.find_meshes")
+    INTERRUPTS.check()
+    how = {"strict": arguments.strict, "allow_missing": arguments.allow_missing}
+    try:
+        with RunProgress("Comparing vertices", as_json=as_json) as progress:
+            return Scene(path, **how, **options, progress=progress.show)
+    except (OSError, ValueError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: {describe(error)}") from error
 
 
 def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from ..repair.shot.findings import kept_meshes
 from ..replay.baseline import NewFinding
 from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
 from ..replay.scene_contacts import PHASES
-from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
+from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
+from ..replay.validation import Validation
 from .option_names import with_option
 from .tables import LONGEST, Column, count, print_table, say
 
@@ -310,7 +311,7 @@ def _history(span: IntersectionSpan) -> str:
     return f"from {span.since:g} to {span.until:g}, {numbers}: {trend}"
 
 
-def _print_validation(console: Console, found: ValidationSummary, has_strands: bool) -> None:
+def _print_validation(console: Console, found: Validation, has_strands: bool) -> None:
     """Prints the comparison with the exact checker."""
     wrong = found.disagreements
     say(
