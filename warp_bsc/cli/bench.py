@@ -23,7 +23,6 @@ __all__ = [
     "BENCHMARKS",
     "JSON_FILE",
     "Benchmark",
-    "Run",
     "add_to",
     "check_json",
     "measure_each",
@@ -73,8 +72,6 @@ JSON_FILE: Options = {
 """``--json``, whose file may be omitted."""
 
 _Run = TypeVar("_Run")
-Run = Callable[[Callable[[int, int], None]], _Run]
-"""Measures a run, given a function to call with how much of it is done, and how much there is."""
 
 
 @dataclass(frozen=True)
@@ -229,31 +226,41 @@ def run_to_dict(run: Any, to_dict: Callable[[Any], dict[str, Any]]) -> dict[str,
 
 
 def measure_each(
-    jobs: Iterable[tuple[str, Run[_Run]]], device: wp.Device, *, unit: str = "", holds: bool = True
+    cases: Iterable[tuple[Any, ...]],
+    measure: Callable[..., _Run],
+    device: wp.Device,
+    *,
+    title: Callable[..., str] = "{}, {}".format,
+    unit: str = "",
+    holds: bool = True,
 ) -> Generator[_Run, None, None]:
     """Yields runs, and shows the progress.
 
     Args:
-        jobs: The title of each run, and what measures it.
+        cases: The arguments of each run.
+        measure: Measures a run, given these and ``progress``, a function to call with how much of it is done, and how
+            much there is.
         device: The Warp device.
+        title: Returns the title of a run, given its arguments.
         unit: What a run is done in; shares without.
         holds: Whether interrupts wait for the next progress: a library that is interrupted while it loads raises other
             errors, or none.
     """
-    jobs = list(jobs)
-    with show_progress(len(jobs)) as (console, show), loading_kernels(device, console):
-        for done, (title, measure) in enumerate(jobs):
-            show(done, f"{title}: starts")
+    cases = list(cases)
+    with show_progress(len(cases)) as (console, show), loading_kernels(device, console):
+        for done, case in enumerate(cases):
+            name = title(*case)
+            show(done, f"{name}: starts")
 
-            def show_part(part: int, parts: int, title: str = title, done: int = done) -> None:
+            def show_part(part: int, parts: int, name: str = name, done: int = done) -> None:
                 INTERRUPTS.check()
                 how_much = f"{unit} {part:,} of {parts:,}" if unit else f"{part / parts:.0%}"
-                show(done + part / parts, f"{title}: {how_much}")
+                show(done + part / parts, f"{name}: {how_much}")
 
             with INTERRUPTS.held() if holds else contextlib.nullcontext():
-                run = measure(show_part)
+                run = measure(*case, progress=show_part)
             if (problem := getattr(run, "problem", None)) and console.is_terminal:
-                say(console, f"{title}: {problem}")
+                say(console, f"{name}: {problem}")
             yield run
             INTERRUPTS.check()
 

@@ -89,8 +89,12 @@ def _measure(
         for dtype in {scene.x0.dtype for scene in scenes}:
             load_detector(arguments.method, dtype, device)
     options = {"method": arguments.method, "device": device, "repeat": arguments.repeat, "compare": arguments.compare}
-    jobs = [(scene.name, lambda _, scene=scene: benchmark_detector(scene, **options)) for scene in scenes]
-    yield from measure_each(jobs, device, holds=False)
+
+    def measure(scene: BenchmarkScene, progress: object) -> DetectorBenchmark:
+        return benchmark_detector(scene, **options)
+
+    cases = [(scene,) for scene in scenes]
+    yield from measure_each(cases, measure, device, title=lambda scene: scene.name, holds=False)
 
 
 def _show(console: Console, benchmarks: list[DetectorBenchmark]) -> None:

@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import itertools
 from dataclasses import asdict
 from typing import Any
 
@@ -10,7 +11,6 @@ from ..bench.newton_examples import (
     WARM_UP,
     ExampleMeasurement,
     ExampleRun,
-    NewtonExample,
     describe_needs,
     find_examples,
     measure_example,
@@ -79,26 +79,12 @@ def _run(arguments: argparse.Namespace) -> None:
         print_table(Console(), "Example", _NEEDS, [(example.title, example) for example in examples])
         return
 
-    def measure(example: NewtonExample, mode: str, progress: Any) -> ExampleRun:
-        return measure_example(
-            example,
-            mode,
-            device=str(device),
-            frames=arguments.frames,
-            check_every=arguments.check_every,
-            download=arguments.download,
-            progress=progress,
-        )
-
-    jobs = [
-        (f"{example.name}, {mode}", functools.partial(measure, example, mode))
-        for example in examples
-        for mode in arguments.modes
-    ]
+    options = {"frames": arguments.frames, "check_every": arguments.check_every, "download": arguments.download}
+    measure = functools.partial(measure_example, device=str(device), **options)
     report_runs(
         arguments,
         device,
-        measure_each(jobs, device, unit="frame", holds=False),
+        measure_each(itertools.product(examples, arguments.modes), measure, device, unit="frame", holds=False),
         name="newton",
         heading=f"Newton's examples on {device}, {device.name}; times of a frame without the first {WARM_UP}",
         show=_show,

@@ -2,6 +2,7 @@
 
 import argparse
 import functools
+import itertools
 from dataclasses import asdict
 from typing import Any
 
@@ -61,19 +62,13 @@ _COLUMNS = (
 def _run(arguments: argparse.Namespace) -> None:
     device = find_device(arguments.device)
 
-    def measure(scene: str, simulator: str, progress: Any) -> PenetrationRun:
-        return measure_penetration(scene, simulator, device=device, frames=arguments.frames, progress=progress)
-
-    jobs = [
-        (f"{scene}, {SIMULATORS[simulator].title}", functools.partial(measure, scene, simulator))
-        for scene in arguments.scene
-        for simulator in arguments.simulator
-    ]
+    measure = functools.partial(measure_penetration, device=device, frames=arguments.frames)
+    cases = itertools.product(arguments.scene, arguments.simulator)
     place = f"{device}, {device.name}"
     report_runs(
         arguments,
         device,
-        measure_each(jobs, device),
+        measure_each(cases, measure, device, title=lambda scene, name: f"{scene}, {SIMULATORS[name].title}"),
         name="penetration",
         heading=f"Penetration, Newton's solvers on {place}; medians of a step without the first {WARM_UP}",
         show=_show,

@@ -77,7 +77,7 @@ def _run(arguments: argparse.Namespace) -> None:
     check_json(arguments.json, is_mesh_name, "a mesh file", "meshes")
     device = find_device(arguments.device)
 
-    def measure(kind: str, name: str, make: Callable[[], TangledMesh], _progress: object) -> RepairRun:
+    def measure(kind: str, name: str, make: Callable[[], TangledMesh], progress: object) -> RepairRun:
         return measure_repair(kind, name, make(), device=device)
 
     files = {path: load_tangled(path) for path in arguments.meshes}
@@ -88,12 +88,11 @@ def _run(arguments: argparse.Namespace) -> None:
         for kind in arguments.kinds
         for number in range(arguments.seed, arguments.seed + arguments.random)
     ]
-    jobs = [(f"{kind} {name}", functools.partial(measure, kind, name, make)) for kind, name, make in meshes]
     place = f"{device}, {device.name}"
     report_runs(
         arguments,
         device,
-        measure_each(jobs, device),
+        measure_each(meshes, measure, device, title=lambda kind, name, make: f"{kind} {name}"),
         name="repair",
         heading=f"bsc.repair on {place}; moves in median edge lengths; times of a second call",
         show=_show,

@@ -3,7 +3,7 @@
 import argparse
 import difflib
 import functools
-import math
+import itertools
 from dataclasses import asdict
 from typing import Any
 
@@ -23,7 +23,7 @@ from ..bench.response import (
 )
 from .bench import JSON_FILE, Benchmark, check_json, measure_each, report_runs, run_to_dict
 from .device import find_device
-from .options import DEVICE, distance, names_of, number, positive, several, switch
+from .options import DEVICE, distance, names_of, number, positive, positive_real, several, switch
 from .tables import Column, Console, count, grouped, print_table, say
 
 __all__ = ["BENCHMARK"]
@@ -90,28 +90,12 @@ def _run(arguments: argparse.Namespace) -> None:
         raise ValueError("--perturb runs the configuration stage a second time, and --configurations omits it")
     device = find_device(arguments.device)
 
-    def measure(scene: str, configuration: str, progress: Any) -> ResponseRun:
-        return measure_response(
-            scene,
-            configuration,
-            solver=arguments.solver,
-            device=device,
-            seconds=arguments.seconds,
-            rate=arguments.rate,
-            reference_rate=arguments.reference_rate,
-            perturb=arguments.perturb,
-            progress=progress,
-        )
-
-    jobs = [
-        (f"{scene}, {configuration}", functools.partial(measure, scene, configuration))
-        for scene in scenes
-        for configuration in configurations
-    ]
+    names = "solver", "seconds", "rate", "reference_rate", "perturb"
+    measure = functools.partial(measure_response, device=device, **{name: getattr(arguments, name) for name in names})
     report_runs(
         arguments,
         device,
-        measure_each(jobs, device, unit="step"),
+        measure_each(itertools.product(scenes, configurations), measure, device, unit="step"),
         name="response",
         heading=f"Contact on {device}, {device.name}; times of a step without the first {WARM_UP}",
         show=_show,
@@ -142,17 +126,6 @@ def _choose_configurations(arguments: argparse.Namespace) -> tuple[str, ...]:
     omitted = set() if arguments.solver == "vbd" else {"self-contact", "implicit", CONVERGED}
     omitted |= set() if arguments.reference else {REFERENCE}
     return tuple(name for name in CONFIGURATIONS if name not in omitted)
-
-
-def _seconds(text: str) -> float:
-    """Returns the time that a text holds."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0.0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
-    return number
 
 
 def _show(console: Console, runs: list[ResponseRun]) -> None:
@@ -219,7 +192,7 @@ BENCHMARK = Benchmark(
         "--reference-rate": number(
             positive, "steps a second of the reference (default: %(default)s)", default=REFERENCE_RATE
         ),
-        "--seconds": number(_seconds, "simulated time of each run [s] (default: that of the scene)", metavar="T"),
+        "--seconds": number(positive_real, "simulated time of each run [s] (default: that of the scene)", metavar="T"),
         "--perturb": number(
             distance,
             "run stage a second time with all particles moved sideways by D [m], and report how much its stretch "

@@ -30,6 +30,7 @@ __all__ = [
     "pair",
     "patterns",
     "positive",
+    "positive_real",
     "repeat_options",
     "scene_path",
     "several",
@@ -102,12 +103,25 @@ def distance(text: str) -> float:
     Raises:
         argparse.ArgumentTypeError: If it is not a number, not finite or less than 2^-1021, for example 0.
     """
+    return _real(text, SMALLEST_DISTANCE, "more than 0, at least 2^-1021")
+
+
+def positive_real(text: str) -> float:
+    """Returns the number that a text holds.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is not a number, not finite or not more than 0.
+    """
+    return _real(text, math.ulp(0.0), "more than 0")
+
+
+def _real(text: str, least: float, what: str) -> float:
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not SMALLEST_DISTANCE <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, at least 2^-1021, not {text}")
+    if not least <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a finite number {what}, not {text}")
     return number
 
 

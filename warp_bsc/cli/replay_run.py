@@ -176,9 +176,7 @@ class ReplayRun(contextlib.ExitStack):
     def _finish(self, summary: Summary) -> list[ReplayOutput]:
         """Finishes the files, and returns those that were to be finished."""
         finished = self._outputs if self._intervals else []  # an earlier file is better than an empty one
-        if (
-            self._earlier and len(self._intervals) < self._earlier.count
-        ):  # or than a shorter one, to resume
+        if self._earlier and len(self._intervals) < self._earlier.count:  # or than a shorter one, to resume
             finished = [output for output in finished if not isinstance(output, HitsJson)]
         # Signals do not interrupt the files. They do interrupt streams, whose reader may not read to the end.
         self.problems += _finish([output for output in finished if not output.file.is_stream], summary)
