@@ -115,26 +115,20 @@ def _show(console: Console, benchmarks: list[DetectorBenchmark]) -> None:
 
 
 def _scene_to_dict(found: DetectorBenchmark) -> dict[str, Any]:
-    return {
+    names = "precision", "candidates", "survivors", "hits", "unsure", "certified", "candidates_per_second"
+    return {name: getattr(found, name) for name in names} | {
         "scene": shorten_path(found.scene.name),
-        "precision": found.precision,
         "triangles": len(found.scene.faces),
         "vertices": len(found.scene.x0),
-        "candidates": found.candidates,
-        "survivors": found.survivors,
-        "hits": found.hits,
-        "unsure": found.unsure,
         "vertex_face": asdict(found.vertex_face),
         "edge_edge": asdict(found.edge_edge),
         "earliest_toi": found.earliest_toi if found.hits else None,
-        "certified": found.certified,
         "milliseconds": {
             "detect": found.detect_milliseconds,
             "detect_and_read": found.read_milliseconds,
             "cuda_graph": found.graph_milliseconds,
             "stages": found.stage_milliseconds,
         },
-        "candidates_per_second": found.candidates_per_second,
         "memory_bytes": found.memory,
         "ipc_toolkit": asdict(found.ipc_toolkit) if found.ipc_toolkit else None,
     }

@@ -242,26 +242,16 @@ def _to_dict(benchmarks: list[SceneBenchmark], adversarial: _Adversarial, *, qui
 
 
 def _scene_to_dict(found: SceneBenchmark) -> dict[str, Any]:
-    return {
+    fields = vars(found) | {
         "scene": shorten_path(found.name),
         "name": _short(found.name),
-        "triangles": found.triangles,
-        "precision": found.precision,
-        "intervals": found.intervals,
-        "overlapping": found.overlapping,
         "queries": {kind.label: number for kind, number in found.queries.items()},
-        "collisions": found.collisions,
-        "unsure": found.unsure,
-        "checked": found.checked,
-        "sample": found.sample,
         "errors": {method: asdict(errors) for method, errors in found.errors.items()},
-        "disagreeing": found.disagreeing,
-        "decided_by": found.stages,
         "timings": [_timing_to_dict(timing) for timing in found.timings],
-        "stage_milliseconds": found.stage_milliseconds,
-        "frame_milliseconds": found.frame_milliseconds,
         "ipc_toolkit": {method: asdict(took) for method, took in found.ipc_toolkit.items()},
     }
+    fields["decided_by"] = fields.pop("stages")
+    return fields
 
 
 def _timing_to_dict(timing: Timing) -> dict[str, Any]:

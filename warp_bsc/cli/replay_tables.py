@@ -11,7 +11,7 @@ from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
 from ..replay.validation import Validation
 from .option_names import with_option
-from .tables import LONGEST, Column, count, print_table, say
+from .tables import LONGEST, Column, count, print_table, say, say_list
 
 __all__ = ["print_new", "print_repair", "print_replay", "print_work"]
 
@@ -134,10 +134,9 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
         by_worker[work.worker and f"{work.worker} on {work.device}"].append(work.reading + work.checking)
     if "" in by_worker:  # this process alone
         return
-    for worker, seconds in sorted(by_worker.items())[:LONGEST]:
-        say(console, f"  {worker}: {count(len(seconds), 'interval')}, {sum(seconds):,.2f} s")
-    if len(by_worker) > LONGEST:
-        say(console, f"  and {len(by_worker) - LONGEST} more workers.")
+    workers = sorted(by_worker.items())
+    lines = [f"{name}: {count(len(seconds), 'interval')}, {sum(seconds):,.2f} s" for name, seconds in workers]
+    say_list(console, lines, " workers.")
 
 
 def print_new(console: Console, new: list[NewFinding]) -> None:
@@ -146,16 +145,17 @@ def print_new(console: Console, new: list[NewFinding]) -> None:
         say(console, "Nothing is new against the baseline.")
         return
     say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
-    for what, meshes, start, end in new[:LONGEST]:
-        finding = f"{_pair((meshes[0], meshes[-1]))} {what}"
-        if what == "is inside":
-            finding = " is inside ".join(meshes)
-        elif what == "are duplicates":
-            finding = f"{meshes[0]} and {count(len(meshes) - 1, 'other')} are duplicates"
-        when = f"at {start:g}" if start == end else f"from {start:g} to {end:g}"
-        say(console, f"  {finding} {when}")
-    if len(new) > LONGEST:
-        say(console, f"  and {len(new) - LONGEST} more.")
+    say_list(console, [_new_finding(*finding) for finding in new], ".")
+
+
+def _new_finding(what: str, meshes: tuple[str, ...], start: float, end: float) -> str:
+    """Returns what a baseline does not contain, in words."""
+    finding = f"{_pair((meshes[0], meshes[-1]))} {what}"
+    if what == "is inside":
+        finding = " is inside ".join(meshes)
+    elif what == "are duplicates":
+        finding = f"{meshes[0]} and {count(len(meshes) - 1, 'other')} are duplicates"
+    return f"{finding} at {start:g}" if start == end else f"{finding} from {start:g} to {end:g}"
 
 
 def _print_certificate(console: Console, summary: Summary) -> None:
@@ -201,12 +201,12 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     spans = defaultdict(list)
     for span in summary.collision_spans:
         spans[span.meshes].append(span)
-    for meshes, hits in summary.mesh_pairs[:LONGEST]:
+    lines = []
+    for meshes, hits in summary.mesh_pairs:
         ranges = [f"{span.since:g} to {span.until:g}" for span in spans[meshes]]
         more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
-        say(console, f"  {hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
-    if len(summary.mesh_pairs) > LONGEST:
-        say(console, f"  and {len(summary.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
+        lines.append(f"{hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
+    say_list(console, lines, " pairs of meshes; --json has all.")
     contact = colliding[0].earliest
     assert contact  # it collides
     say(console, f"The first at time {contact.time:.6g}: {_contact(contact)}.")
@@ -232,12 +232,9 @@ def _print_intersections(console: Console, summary: Summary) -> None:
         console,
         f"Intersections at rest at {intersecting:,} of {times}; the most at {worst.time:g}: {_intersecting(worst)}.",
     )
-    for span in spans[:LONGEST]:
-        first, second = span.meshes
-        pair = f"{first} inside {second}" if span.inside else _pair(span.meshes)
-        say(console, f"  {pair}: {_history(span)}")
-    if len(spans) > LONGEST:
-        say(console, f"  and {len(spans) - LONGEST} more; --json has all.")
+    pairs = [" inside ".join(span.meshes) if span.inside else _pair(span.meshes) for span in spans]
+    lines = [f"{pair}: {_history(span)}" for pair, span in zip(pairs, spans, strict=True)]
+    say_list(console, lines, "; --json has all.")
     if summary.colliding:
         phases = [
             sum(column) for column in zip(*(interval.phases or () for interval in summary.colliding), strict=True)
@@ -321,13 +318,7 @@ def _print_validation(console: Console, found: Validation, has_strands: bool) ->
     )
     if has_strands:
         say(console, "Collisions of curves and points are not validated.")
-    for line in wrong[:LONGEST]:
-        say(console, f"  {line}")
-    if len(wrong) > LONGEST:
-        say(console, f"  and {len(wrong) - LONGEST} more; --json has all.")
+    say_list(console, wrong, "; --json has all.")
     if found.false_hits:
-        say(
-            console,
-            f"False collisions, which method conservative allows: {found.false_hits:,}.",
-        )
+        say(console, f"False collisions, which method conservative allows: {found.false_hits:,}.")
     say(console, f"Certified by floating point: {found.certified:,} of {found.decided:,} pairs.")

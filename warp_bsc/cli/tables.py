@@ -1,6 +1,6 @@
 """The console, lines and tables of all commands."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -9,7 +9,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["LONGEST", "Column", "Console", "count", "grouped", "print_table", "say"]
+__all__ = ["LONGEST", "Column", "Console", "count", "grouped", "print_table", "say", "say_list"]
 
 _Row = TypeVar("_Row")
 
@@ -95,6 +95,14 @@ def print_table(
 def say(console: rich.console.Console, line: str) -> None:
     """Prints a line without markup; on a terminal it wraps."""
     console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+
+
+def say_list(console: rich.console.Console, lines: Sequence[str], more: str) -> None:
+    """Prints the first of some lines, indented, and how many there are more, of what ``more`` says."""
+    for line in lines[:LONGEST]:
+        say(console, f"  {line}")
+    if len(lines) > LONGEST:
+        say(console, f"  and {len(lines) - LONGEST} more{more}")
 
 
 def count(number: int, one: str, many: str = "") -> str:
