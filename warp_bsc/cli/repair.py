@@ -64,14 +64,7 @@ examples:
 
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
-    command = add_command(
-        commands,
-        "repair",
-        _run,
-        summary=summary,
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-    )
+    command = add_command(commands, "repair", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     add_scene(command)
     which = command.add_argument_group("selection")
     add_options(

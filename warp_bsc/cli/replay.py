@@ -11,14 +11,7 @@ from ..replay.workers import device_of_cluster
 from ..usd.scene import Scene
 from .device import find_device, load_detector, loading_kernels
 from .options import Commands, add_command, scene_path
-from .replay_options import (
-    DESCRIPTION,
-    EPILOG,
-    add_replay_options,
-    describe_selection,
-    read_scene,
-    read_selection,
-)
+from .replay_options import DESCRIPTION, EPILOG, add_replay_options, describe_selection, read_scene, read_selection
 from .replay_run import ReplayRun
 
 __all__ = ["add_to"]
@@ -26,14 +19,7 @@ __all__ = ["add_to"]
 
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
-    command = add_command(
-        commands,
-        "replay",
-        _run,
-        summary=summary,
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    command = add_command(commands, "replay", _run, summary=summary, description=DESCRIPTION, epilog=EPILOG)
     add_replay_options(command)
 
 
