@@ -470,7 +470,7 @@ def test_unforeseen_error(capsys, monkeypatch, falling_scene, error):
     monkeypatch.setattr(replay_options, "Scene", fail_to_open)
     line = fail(capsys, "replay", falling_scene)
     assert f"{falling_scene}: {type(error).__name__}" in line
-    assert "(replay.py:" in line
+    assert "(replay_options.py:" in line
 
 
 def test_output_that_cannot_encode_all(monkeypatch, scenes):

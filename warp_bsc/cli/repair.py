@@ -126,8 +126,8 @@ def _run(arguments: argparse.Namespace) -> int:
         if paths.count(path) > 1:
             raise ValueError(f"{path}: named twice, as two files of a repair")
     device = find_device(arguments.device)
-    options = {"selection": read_selection(arguments), "frames": arguments.frames}
-    scene = read_scene(arguments.scene, arguments, **options)
+    chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
+    scene = read_scene(arguments.scene, arguments, **chosen)
     for file in written:
         if file in scene.files:
             raise ValueError(f"{file}: the scene is read from this file; write to another one")
@@ -146,7 +146,7 @@ def _run(arguments: argparse.Namespace) -> int:
         run.run()
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and run.is_written:
-            fixed = read_scene(arguments.output, arguments, **options)
+            fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
             after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].left_pairs)
         if page and run.journal.findings is not None:
