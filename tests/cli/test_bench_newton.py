@@ -164,7 +164,7 @@ def test_list(capsys, monkeypatch, measured):
     ("arguments", "part"),
     [
         (["cloth_twst"], "'cloth_twst': Newton has no example of this name; did you mean cloth_twist"),
-        (["--modes", "plain,both"], "must be one of plain, stage, implicit, not 'both'"),
+        (["--modes", "plain,both"], "must be of plain, stage, implicit, not 'both'"),
         (["cloth_twist", "--frames", "2"], "frames must be more than 2"),
         (["--json", "cloth_twist"], "--json cloth_twist: this is an example; name examples before the options"),
         (["--json", "gone/found.json"], "there is no folder gone"),

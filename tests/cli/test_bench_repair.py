@@ -6,7 +6,7 @@ import pytest
 
 from warp_bsc.bench.repair import RepairAttempt, RepairRun
 from warp_bsc.bench.repair_scenes import KINDS, KNOWN
-from warp_bsc.cli import bench_repair, bench_repair_tables
+from warp_bsc.cli import bench_repair
 from warp_bsc.cli.main import main
 
 
@@ -45,8 +45,8 @@ def measured(monkeypatch):
 
     monkeypatch.setattr(bench_repair, "measure_repair", measure_repair)
     monkeypatch.setattr(bench_repair, "damaged", lambda kind, number: (kind, number))
-    monkeypatch.setattr(bench_repair_tables.ipc_toolkit, "is_installed", lambda: True)
-    monkeypatch.setattr(bench_repair_tables.ipc_toolkit, "version", lambda: "1.5")
+    monkeypatch.setattr(bench_repair.ipc_toolkit, "is_installed", lambda: True)
+    monkeypatch.setattr(bench_repair.ipc_toolkit, "version", lambda: "1.5")
     return calls
 
 
@@ -95,7 +95,7 @@ def test_tables(capsys, monkeypatch, tmp_path, measured):
 
 
 def test_without_the_toolkit(capsys, monkeypatch, measured):
-    monkeypatch.setattr(bench_repair_tables.ipc_toolkit, "is_installed", lambda: False)
+    monkeypatch.setattr(bench_repair.ipc_toolkit, "is_installed", lambda: False)
     output = run(capsys, "--random", 0).out
     assert measured == [("known", name) for name in KNOWN]
     assert "The IPC Toolkit, which would check the outputs, is not installed" in output

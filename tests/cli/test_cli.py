@@ -14,8 +14,7 @@ from progress_lines import without_progress
 from pxr import Tf, Usd, UsdGeom
 from stages import with_names
 
-from warp_bsc.cli import progress
-from warp_bsc.cli import replay as replay_command
+from warp_bsc.cli import progress, replay_options
 from warp_bsc.cli.main import main
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
@@ -379,7 +378,7 @@ def test_interrupt(capsys, monkeypatch, falling_scene):
     def interrupt(path, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(replay_command, "Scene", interrupt)
+    monkeypatch.setattr(replay_options, "Scene", interrupt)
     assert main(["replay", falling_scene]) == 130
     assert capsys.readouterr().err == "warp-bsc: interrupted\n"
 
@@ -468,10 +467,10 @@ def test_unforeseen_error(capsys, monkeypatch, falling_scene, error):
     def fail_to_open(path, **options):
         raise error
 
-    monkeypatch.setattr(replay_command, "Scene", fail_to_open)
+    monkeypatch.setattr(replay_options, "Scene", fail_to_open)
     line = fail(capsys, "replay", falling_scene)
     assert f"{falling_scene}: {type(error).__name__}" in line
-    assert "(replay.py:" in line
+    assert "(replay_options.py:" in line
 
 
 def test_output_that_cannot_encode_all(monkeypatch, scenes):

@@ -17,7 +17,7 @@ from pxr import Sdf, Usd
 from replay_files import errors_of
 from waving_sheets import FRAMES, OUTPUTS, options, write_old, write_scene
 
-from warp_bsc.cli import replay as replay_command
+from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
 
 if sys.platform == "win32":
@@ -116,7 +116,7 @@ def test_stopped_at_random_moments(tmp_path, scene, seconds, number, times):
 
 def replay_with(monkeypatch, scene, folder, happens, at=3):
     """The exit status of a replay in which something happens before the results of an interval are taken."""
-    whole = replay_command.replay
+    whole = replay_run.replay
 
     def interrupted(*arguments, **options):
         for index, found in enumerate(whole(*arguments, **options)):
@@ -124,7 +124,7 @@ def replay_with(monkeypatch, scene, folder, happens, at=3):
                 happens()
             yield found
 
-    monkeypatch.setattr(replay_command, "replay", interrupted)
+    monkeypatch.setattr(replay_run, "replay", interrupted)
     write_old(folder)
     return main(["replay", scene, *options(folder)])
 
@@ -142,26 +142,26 @@ def test_signal(tmp_path, monkeypatch, capsys, scene, number):
 
 
 def test_signals_that_follow_disturb_nothing(tmp_path, monkeypatch, scene):
-    finish = replay_command._finish
+    finish = replay_run._finish
 
     def disturbed(*arguments):
         os.kill(os.getpid(), signal.SIGHUP)
         return finish(*arguments)
 
-    monkeypatch.setattr(replay_command, "_finish", disturbed)
+    monkeypatch.setattr(replay_run, "_finish", disturbed)
     status = replay_with(monkeypatch, scene, tmp_path, lambda: os.kill(os.getpid(), signal.SIGTERM))
     assert status == 128 + signal.SIGTERM
     assert read_left(tmp_path, "interrupted by SIGTERM") == [3] * len(OUTPUTS)
 
 
 def test_signal_while_the_files_are_finished(tmp_path, monkeypatch, capsys, scene):
-    finish = replay_command._finish
+    finish = replay_run._finish
 
     def disturbed(*arguments):
         os.kill(os.getpid(), signal.SIGTERM)
         return finish(*arguments)
 
-    monkeypatch.setattr(replay_command, "_finish", disturbed)
+    monkeypatch.setattr(replay_run, "_finish", disturbed)
     write_old(tmp_path)
     assert main(["replay", scene, *options(tmp_path)]) == 128 + signal.SIGTERM
     assert read_left(tmp_path, "") == [FRAMES - 1] * len(OUTPUTS)

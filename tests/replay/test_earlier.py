@@ -11,7 +11,7 @@ import pytest
 from waving_sheets import OUTPUTS, options, write_old, write_scene
 
 from warp_bsc._atomic_file import OutputFile, unfinished_path
-from warp_bsc.cli import replay as replay_command
+from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
 from warp_bsc.replay import hit_files
 
@@ -150,7 +150,7 @@ def test_what_is_resumed_is_kept_until_there_is_more(tmp_path, monkeypatch, scen
     file = tmp_path / name
     earlier = cut_in_the_end(whole["hits.json"]) if name == PART else whole["hits.json"]
     file.write_bytes(earlier)
-    original = replay_command.replay
+    original = replay_run.replay
 
     def interrupted(*arguments, **named):
         for result in original(*arguments, **named):
@@ -159,7 +159,7 @@ def test_what_is_resumed_is_kept_until_there_is_more(tmp_path, monkeypatch, scen
             yield result
 
     with monkeypatch.context() as patch:
-        patch.setattr(replay_command, "replay", interrupted)
+        patch.setattr(replay_run, "replay", interrupted)
         left = replay(scene, tmp_path, "--resume", status=128 + signal.SIGTERM)
     assert left.keys() == {name, "hits.csv"} and left[name] == earlier
     assert replay(scene, tmp_path, "--resume") == whole

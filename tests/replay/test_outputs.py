@@ -27,7 +27,7 @@ from replay_files import (
 from stages import FALLING, add_floor, add_mesh, moved, new_stage, save
 
 from warp_bsc._atomic_file import OutputFile
-from warp_bsc.cli import replay as replay_command
+from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
 from warp_bsc.replay import usd_overlay
 
@@ -95,7 +95,7 @@ def check_partial(folder, count, reason):
 
 
 def test_interrupted(stage, tmp_path, monkeypatch, capsys):
-    whole = replay_command.replay
+    whole = replay_run.replay
 
     def interrupted(*arguments, **options):
         for index, found in enumerate(whole(*arguments, **options)):
@@ -103,7 +103,7 @@ def test_interrupted(stage, tmp_path, monkeypatch, capsys):
                 raise KeyboardInterrupt
             yield found
 
-    monkeypatch.setattr(replay_command, "replay", interrupted)
+    monkeypatch.setattr(replay_run, "replay", interrupted)
     replay(stage, status=130)
     found, overlay = check_partial(tmp_path, 3, "interrupted")
     assert found["hits"] == 1
@@ -267,7 +267,7 @@ def test_what_was_there_stays_if_no_interval_is_finished(stage, tmp_path, monkey
         raise RuntimeError("of the first interval")
         yield
 
-    monkeypatch.setattr(replay_command, "replay", broken)
+    monkeypatch.setattr(replay_run, "replay", broken)
     replay(stage, status=2)
     assert capsys.readouterr().err.startswith(
         f"warp-bsc: error: {tmp_path}/scene.usda: RuntimeError: of the first interv"

@@ -22,7 +22,7 @@ from pxr import Ts, UsdGeom, Vt
 from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
-from warp_bsc.cli import replay as replay_command
+from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
 from warp_bsc.replay import checking, worker, workers
 
@@ -291,7 +291,7 @@ def test_an_error_in_a_worker(tmp_path, capsys):
 
 def stop(monkeypatch, scene, folder, at, *options):
     """Replays a scene until an interval is found, then sends this process SIGINT."""
-    whole = replay_command.replay
+    whole = replay_run.replay
 
     def interrupted(*arguments, **named):
         for result in whole(*arguments, **named):
@@ -300,7 +300,7 @@ def stop(monkeypatch, scene, folder, at, *options):
             yield result
 
     with monkeypatch.context() as patch:
-        patch.setattr(replay_command, "replay", interrupted)
+        patch.setattr(replay_run, "replay", interrupted)
         run(scene, folder, *options, status=130)
     assert len(json.loads((folder / "hits.json").read_bytes())["intervals"]) == at
 
@@ -445,7 +445,7 @@ def test_a_cluster_writes_the_same_files(tmp_path, monkeypatch, cluster, trouble
     assert found == list(enumerate(expected))
 
     capsys.readouterr()
-    whole = replay_command.replay
+    whole = replay_run.replay
 
     def lost(*arguments, **named):
         for result in whole(*arguments, **named):
@@ -454,7 +454,7 @@ def test_a_cluster_writes_the_same_files(tmp_path, monkeypatch, cluster, trouble
             yield result
 
     with monkeypatch.context() as patch:
-        patch.setattr(replay_command, "replay", lost)
+        patch.setattr(replay_run, "replay", lost)
         assert main(["replay", waves, "--workers", address, "--subdivide", "100"]) == 2
     said = f"warp-bsc: error: --workers: {address}: lost the scheduler of the Dask cluster\n"
     assert without_progress(capsys.readouterr().err) == said

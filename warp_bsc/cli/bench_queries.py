@@ -1,39 +1,25 @@
 """The command ``warp-bsc bench queries``: measures how many elementary queries a second are decided."""
 
 import argparse
+from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from .._atomic_file import STDOUT
-from ..bench.provenance import with_record
-from ..bench.queries import benchmark_copy, benchmark_queries, check_query_count
-from ..bench.query_files import benchmark_given_queries
+from ..bench.queries import MODES, SEED, QueryBenchmark, benchmark_copy, benchmark_queries, check_query_count
+from ..bench.query_files import METHODS, GivenQueries, benchmark_given_queries
 from ..bench.timing import count_threads, limited_threads
 from ..detection.launch import cores
 from ..detection.settings import PairKind
-from .bench_queries_tables import (
-    given_queries_to_dict,
-    print_given_queries,
-    print_query_benchmarks,
-    query_benchmarks_to_dict,
-)
-from .bench_runs import add_json_file, open_json
+from .bench import JSON_FILE, Benchmark, name_place, report_runs
 from .device import find_device, loading_kernels
-from .exit_status import explain_statuses
-from .options import (
-    Commands,
-    add_command,
-    add_device,
-    add_repeat,
-    add_threads,
-    positive,
-)
+from .options import DEVICE, THREADS, number, positive, repeat_options, several
 from .query_file import find_query_files, read_query_file
-from .tables import Console
+from .tables import Column, Console, count, print_table, say
 
-__all__ = ["add_to"]
+__all__ = ["BENCHMARK"]
 
 _KINDS = {kind.display_name: kind for kind in PairKind}
 
@@ -44,73 +30,180 @@ and results stay on the device. On a GPU, replays of a CUDA graph are timed by
 events. With files of queries, measure the time that each method takes for one
 of them, beside a floating-point cubic solver."""
 
-_EPILOG = f"""\
-examples:
+_EXAMPLES = """\
   warp-bsc bench queries
   warp-bsc bench queries --device cpu --threads 1 --count 1000000
   warp-bsc bench queries unit-tests 227vf.csv --device cpu --threads 1
-  warp-bsc bench queries --json rates.json
+  warp-bsc bench queries --json rates.json"""
 
-{explain_statuses()}"""
+_RESULTS = (
+    Column("Queries", lambda found: len(found.status)),
+    Column("Survivors", "survivors"),
+    Column("Share", "survivor_share", ".1%"),
+    Column("Free", "free"),
+    Column("Hit", "hits"),
+    Column("Unsure", "unsure"),
+)
+_RATES = (
+    Column("ms", lambda took: took["milliseconds"], ",.2f"),
+    Column("Million\nqueries/s", lambda took: took["queries_per_second"] / 1e6, ",.1f"),
+    Column("Bytes\na query", lambda took: took["bytes_per_query"]),
+    Column("GB/s", lambda took: took["bytes_per_second"] / 1e9, ",.1f"),
+    Column("Share of\ncopying", lambda took: took["share_of_copy"], ".1%"),
+)
+_GIVEN = (
+    Column("Number", "queries"),
+    Column("Collide", lambda found: found.hits / found.queries, ".0%"),
+    *(
+        Column(
+            method.replace("conservative", "conser-\nvative"),
+            lambda found, method=method: found.nanoseconds[method],
+            ",.1f",
+        )
+        for method in METHODS
+    ),
+    Column("float /\ncubic", lambda found: found.nanoseconds["float"] / found.nanoseconds["cubic"], ".2f"),
+    Column("exact /\ncubic", lambda found: found.nanoseconds["exact"] / found.nanoseconds["cubic"], ".2f"),
+)
 
 
-def add_to(commands: Commands, summary: str) -> None:
-    """Adds the command with its options, and a line for the list of commands."""
-    command = add_command(commands, "queries", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    command.add_argument(
-        "paths",
-        metavar="FILE",
-        nargs="*",
-        help="a CSV file as of warp-bsc query, or a folder: all CSV files in it and below, in one row for each kind",
-    )
-    command.add_argument(
-        "--count", type=positive, metavar="N", help="queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"
-    )
-    add_repeat(command, default=20)
-    add_threads(command)
-    add_device(command)
-    add_json_file(command)
-
-
-def _run(arguments: argparse.Namespace) -> int:
+def _run(arguments: argparse.Namespace) -> None:
     if arguments.count is not None:
         check_query_count(arguments.count)
     if arguments.paths and arguments.count is not None:
         raise ValueError("--count is for random queries: omit it, or the files")
     device = find_device(arguments.device)
-    if arguments.paths:
-        return _measure_files(arguments, device)
+    with limited_threads(arguments.threads):
+        (_measure_files if arguments.paths else _measure_random)(arguments, device)
+
+
+def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
+    """Measures random queries in each mode."""
     options = {"device": device, "repeat": arguments.repeat}
-    with open_json(arguments.json) as write, limited_threads(arguments.threads):
+
+    def measure() -> Generator[QueryBenchmark, None, None]:
         with loading_kernels(device):
             for kind in PairKind:
                 benchmark_queries(kind, count=1, device=device, repeat=1)
-        benchmarks = [benchmark_queries(kind, count=arguments.count, **options) for kind in PairKind]
-        settings = {"copy_rate": benchmark_copy(**options), "threads": count_threads(), **options}
-        if arguments.json != STDOUT:
-            print_query_benchmarks(Console(), benchmarks, **settings)
-        write(with_record(query_benchmarks_to_dict(benchmarks, **settings), arguments.command_line, [device]))
-    return 0
+        for kind in PairKind:
+            yield benchmark_queries(kind, count=arguments.count, **options)
+
+    copy_rate = benchmark_copy(**options)
+    threads = count_threads()
+    report_runs(
+        arguments,
+        device,
+        measure(),
+        name="queries",
+        heading=f"Random queries on {name_place(device, threads)}; medians of {count(arguments.repeat, 'repetition')}",
+        show=lambda console, benchmarks: _show_random(console, benchmarks, copy_rate),
+        to_dict=lambda benchmarks: {
+            "threads": threads,
+            "repeat": arguments.repeat,
+            "seed": SEED,
+            "copy_bytes_per_second": copy_rate,
+            "kinds": [_kind_to_dict(found, copy_rate) for found in benchmarks],
+        },
+    )
 
 
-def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> int:
+def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> None:
     """Measures the methods on the queries of files."""
     points: dict[tuple[str, str], list[np.ndarray]] = {}
     for path in arguments.paths:
         for file in find_query_files([path]):
             queries = read_query_file(file)
             points.setdefault((path, queries.kind), []).append(queries.points)
-    options = {"device": device, "repeat": arguments.repeat}
-    with open_json(arguments.json) as write, limited_threads(arguments.threads), cores(count_threads()):
-        with loading_kernels(device):
-            for kind in {kind for _, kind in points}:
-                benchmark_given_queries("", _KINDS[kind], np.zeros((1, 8, 3)), device=device, repeat=1)
-        measured = [
-            benchmark_given_queries(Path(path).name, _KINDS[kind], np.concatenate(parts), **options)
-            for (path, kind), parts in points.items()
-        ]
-        settings = {"threads": count_threads(), **options}
-        if arguments.json != STDOUT:
-            print_given_queries(Console(), measured, **settings)
-        write(with_record(given_queries_to_dict(measured, **settings), arguments.command_line, [device]))
-    return 0
+    threads = count_threads()
+
+    def measure() -> Generator[GivenQueries, None, None]:
+        with cores(threads):
+            with loading_kernels(device):
+                for kind in {kind for _, kind in points}:
+                    benchmark_given_queries("", _KINDS[kind], np.zeros((1, 8, 3)), device=device, repeat=1)
+            for (path, kind), parts in points.items():
+                queries = np.concatenate(parts)
+                yield benchmark_given_queries(
+                    Path(path).name, _KINDS[kind], queries, device=device, repeat=arguments.repeat
+                )
+
+    time = "Nanoseconds of processor time" if device.is_cpu else "Nanoseconds"
+    place = name_place(device, threads)
+    report_runs(
+        arguments,
+        device,
+        measure(),
+        name="given queries",
+        heading=f"{time} a query on {place}; the fastest of {count(arguments.repeat, 'turn')}",
+        show=_show_given,
+        to_dict=lambda measured: {
+            "threads": threads,
+            "repeat": arguments.repeat,
+            "queries": [vars(found) | {"kind": found.kind.display_name} for found in measured],
+        },
+    )
+
+
+def _show_random(console: Console, benchmarks: list[QueryBenchmark], copy_rate: float) -> None:
+    """Prints the results of random queries, and how many a second were decided."""
+    rows = [(found.kind.display_name, found) for found in benchmarks]
+    print_table(console, "Kind", _RESULTS, rows, caption="Survivors: queries that no cull decides.")
+    console.print()
+    modes = [
+        (f"{kind}, {mode}", took)
+        for kind, found in rows
+        for mode, took in _kind_to_dict(found, copy_rate)["modes"].items()
+    ]
+    print_table(console, "Mode", _RATES, modes)
+    console.print()
+    say(console, "status: finds the status of each query, in one kernel.")
+    say(console, "impact: finds the time of impact, coordinates and normal as well.")
+    say(console, "queued: finds the status by two kernels: culls, and a decision of the survivors.")
+    say(console, "exact: finds the status in integers, where floating point cannot certify it.")
+    say(console, "function: query_vertex_face or query_edge_edge with out=, exact, with times.")
+    say(console, f"A copy on this device reads and writes {copy_rate / 1e9:,.1f} GB/s.")
+
+
+def _kind_to_dict(found: QueryBenchmark, copy_rate: float) -> dict[str, Any]:
+    return {
+        "kind": found.kind.display_name,
+        "queries": len(found.status),
+        "survivors": found.survivors,
+        "survivor_share": found.survivor_share,
+        "certified": {"free": found.free, "hit": found.hits, "unsure": found.unsure},
+        "modes": {
+            mode: {
+                "milliseconds": milliseconds,
+                "queries_per_second": found.queries_per_second[mode],
+                "bytes_per_query": MODES[mode],
+                "bytes_per_second": found.bytes_per_second[mode],
+                "share_of_copy": found.bytes_per_second[mode] / copy_rate,
+            }
+            for mode, milliseconds in found.milliseconds.items()
+        },
+    }
+
+
+def _show_given(console: Console, measured: list[GivenQueries]) -> None:
+    """Prints the times of the methods on given queries."""
+    rows = [(f"{found.name}, {found.kind.display_name}", found) for found in measured]
+    caption = "cubic: a floating-point cubic solver, see warp-bsc bench. Times of impact are not sought."
+    print_table(console, "Queries", _GIVEN, rows, caption=caption)
+
+
+BENCHMARK = Benchmark(
+    _run,
+    _DESCRIPTION,
+    _EXAMPLES,
+    {
+        "paths": several(
+            "FILE",
+            "a CSV file as of warp-bsc query, or a folder: all CSV files in it and below, in one row for each kind",
+        ),
+        "--count": number(positive, "queries of each kind (default: 2^24 on a GPU, 2^18 on the CPU)"),
+        **repeat_options(20),
+        **THREADS,
+        **DEVICE,
+        **JSON_FILE,
+    },
+)

@@ -1,21 +1,31 @@
 """The command ``warp-bsc bench repair``: measures bsc.repair on known meshes, files and random damage."""
 
 import argparse
-from collections.abc import Generator
+import functools
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
 
-import warp as wp
-
+from ..bench import ipc_toolkit
 from ..bench.mesh_files import is_mesh_name
-from ..bench.repair import FILE, KNOWN_MESH, RepairRun, measure_repair
+from ..bench.repair import (
+    CROSSING_RANGES,
+    FILE,
+    HINTS,
+    KNOWN_MESH,
+    STRAIN,
+    Hint,
+    RepairRun,
+    measure_repair,
+    summarize,
+)
 from ..bench.repair_scenes import KINDS, KNOWN, TangledMesh, damaged, load_tangled
-from .bench_repair_tables import print_repair_runs, repair_runs_to_dict
-from .bench_runs import RunsProgress, add_json_file, report_runs
-from .device import find_device, loading_kernels
-from .exit_status import explain_statuses
-from .interrupts import INTERRUPTS
-from .options import Commands, add_command, add_device, natural
+from .bench import JSON_FILE, Benchmark, check_json, measure_each, report_runs
+from .device import find_device
+from .options import DEVICE, names_of, natural, number, several
+from .tables import LONGEST, Column, Console, count, grouped, print_table, say
 
-__all__ = ["add_to"]
+__all__ = ["BENCHMARK"]
 
 _DESCRIPTION = f"""\
 Measure bsc.repair on known meshes that cross themselves, on mesh files, and on
@@ -30,96 +40,146 @@ order= and x_previous=. Lines below say what came back with more crossings, what
 moved where nothing crossed, and where the IPC Toolkit, if installed, disagrees.
 Vertices of a file at the same position are one."""
 
-_EPILOG = f"""\
-examples:
+_EXAMPLES = """\
   warp-bsc bench repair
   warp-bsc bench repair body.obj --random 0
   warp-bsc bench repair --random 60 --json repair.json
-  warp-bsc bench repair --kinds folds --random 1 --seed 17
+  warp-bsc bench repair --kinds folds --random 1 --seed 17"""
 
-{explain_statuses()}
-After a signal, the repairs that were complete are printed or written first."""
-
-
-def add_to(commands: Commands, summary: str) -> None:
-    """Adds the command with its options, and a line for the list of commands."""
-    command = add_command(
-        commands,
-        "repair",
-        _run,
-        summary=summary,
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-    )
-    command.add_argument(
-        "meshes", metavar="MESH", nargs="*", help="mesh files to measure beside the known meshes and random damage"
-    )
-    command.add_argument(
-        "--random",
-        type=natural,
-        default=10,
-        metavar="N",
-        help="meshes of each kind that are pushed into themselves (default: %(default)s)",
-    )
-    command.add_argument(
-        "--kinds",
-        type=_kinds,
-        default=tuple(KINDS),
-        metavar="NAME,...",
-        help=f"kinds of meshes to push into themselves, of {', '.join(KINDS)} (default: all)",
-    )
-    command.add_argument(
-        "--seed",
-        type=natural,
-        default=0,
-        metavar="N",
-        help="number of the first mesh of each kind, on which its damage depends (default: %(default)s)",
-    )
-    add_json_file(command)
-    add_device(command)
+_MESHES = (  # of a run and an attempt; the mean move is that of vertices that moved
+    Column("Ver-\ntices", lambda row: row[0].vertices),
+    Column("Crossings\nbefore", lambda row: row[0].crossings),
+    Column("\nafter", lambda row: row[1].crossings),
+    Column("Largest\nmove", lambda row: row[1].largest_move, ".2f"),
+    Column("Mean\nmove", lambda row: row[1].mean_move, ".2f"),
+    Column("Strain\n[%]", lambda row: 100 * row[1].strain, ".1f"),
+    Column("Time\n[s]", lambda row: row[1].seconds, ".2f"),
+)
+_FREED = (  # of a summary, as the next ones
+    Column("Meshes", "meshes"),
+    *(
+        Column(header, lambda found, hint=hint: found.freed_by_hint[hint] if hint else found.freed)
+        for header, hint in zip(("Freed", "with\norder=", "with\nx_previous="), (None, *HINTS), strict=True)
+    ),
+    Column("Crossings", "crossings", lambda ends: f"{ends[0]:,} to {ends[1]:,}"),
+)
+_COSTS = (
+    Column("Largest move,\nmedian", lambda found: found.move[0], ".2f"),
+    Column("at\nmost", lambda found: found.move[1], ".2f"),
+    Column("Strain,\nmedian\n[%]", lambda found: 100 * found.strain[0], ".1f"),
+    Column("at\nmost\n[%]", lambda found: 100 * found.strain[1], ".1f"),
+    Column(f"more\nthan\n{100 * STRAIN:.0f}%", "strained"),
+    Column("Time,\nmedian\n[s]", "seconds", ".2f"),
+)
 
 
-def _kinds(text: str) -> tuple[str, ...]:
-    """Returns the kinds that an argument lists, each once."""
-    kinds = tuple(dict.fromkeys(text.split(",")))
-    for kind in kinds:
-        if kind not in KINDS:
-            raise argparse.ArgumentTypeError(f"must be of {', '.join(KINDS)}, not {kind!r}")
-    return kinds
-
-
-def _run(arguments: argparse.Namespace) -> int:
-    if arguments.json and is_mesh_name(arguments.json):
-        raise ValueError(f"--json {arguments.json}: this is a mesh file; name meshes before the options")
+def _run(arguments: argparse.Namespace) -> None:
+    check_json(arguments.json, is_mesh_name, "a mesh file", "meshes")
     device = find_device(arguments.device)
+
+    def measure(kind: str, name: str, make: Callable[[], TangledMesh], progress: object) -> RepairRun:
+        return measure_repair(kind, name, make(), device=device)
+
     files = {path: load_tangled(path) for path in arguments.meshes}
-    report_runs(
-        _measure(files, arguments, device),
-        to_dict=repair_runs_to_dict,
-        show=print_repair_runs,
-        json_path=arguments.json,
-        command=arguments.command_line,
-        device=device,
-    )
-    return 0
-
-
-def _measure(
-    files: dict[str, TangledMesh], arguments: argparse.Namespace, device: wp.Device
-) -> Generator[RepairRun, None, None]:
-    """Yields the repairs of each mesh, and shows the progress."""
-    numbers = range(arguments.seed, arguments.seed + arguments.random)
-    meshes = [(KNOWN_MESH, name, KNOWN[name]) for name in KNOWN]
-    meshes += [(FILE, path, lambda path=path: files[path]) for path in files]
+    meshes = [(KNOWN_MESH, name, make) for name, make in KNOWN.items()]
+    meshes += [(FILE, path, lambda mesh=mesh: mesh) for path, mesh in files.items()]
     meshes += [
-        (kind, str(number), lambda kind=kind, number=number: damaged(kind, number))
+        (kind, str(number), functools.partial(damaged, kind, number))
         for kind in arguments.kinds
-        for number in numbers
+        for number in range(arguments.seed, arguments.seed + arguments.random)
     ]
-    with RunsProgress(len(meshes)) as progress, loading_kernels(device, progress.console):
-        for done, (kind, name, make) in enumerate(meshes):
-            progress.show(done, f"{kind} {name}")
-            with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
-                run = measure_repair(kind, name, make(), device=device)
-            yield run
-            INTERRUPTS.check()
+    place = f"{device}, {device.name}"
+    report_runs(
+        arguments,
+        device,
+        measure_each(meshes, measure, device, title=lambda kind, name, make: f"{kind} {name}"),
+        name="repair",
+        heading=f"bsc.repair on {place}; moves in median edge lengths; times of a second call",
+        show=_show,
+        to_dict=lambda runs: {"ipc_toolkit": ipc_toolkit.version(), "runs": [asdict(run) for run in runs]},
+        what="repairs",
+    )
+
+
+def _show(console: Console, runs: list[RepairRun]) -> None:
+    """Prints a table of known meshes and files, tables of random damage, and what should not have happened."""
+    named = [run for run in runs if run.kind in (KNOWN_MESH, FILE)]
+    if named:
+        rows = [(_title(run, attempt.hint), (run, attempt)) for run in named for attempt in run.attempts]
+        console.print()
+        print_table(console, "Mesh", _MESHES, rows)
+    random = [run for run in runs if run.kind not in (KNOWN_MESH, FILE)]
+    if random:
+        kinds, ranges = grouped(random, "kind"), {}
+        for least, largest in CROSSING_RANGES:
+            title = f"{least} or more crossings" if largest is None else f"{least} to {largest} crossings"
+            within = [run for run in random if run.crossings >= least and (largest is None or run.crossings <= largest)]
+            ranges |= {title: within} if within else {}
+        for columns, groups in ((_FREED, kinds | ranges), (_COSTS, kinds)):
+            console.print()
+            print_table(console, "Damage", columns, [(title, summarize(group)) for title, group in groups.items()])
+    console.print()
+    for line in [*_describe_failures(runs), *_describe_checks(runs)]:
+        say(console, line)
+
+
+def _describe_failures(runs: list[RepairRun]) -> list[str]:
+    """Returns a line for each repair that left crossings, with the reasons."""
+    lines = [
+        f"{_title(run, attempt.hint)}: {run.crossings:,} to {attempt.crossings:,} crossings: "
+        f"{'; '.join(attempt.reasons)}."
+        for run in runs
+        for attempt in run.attempts
+        if not attempt.certified
+    ]
+    return [*lines[:LONGEST], *([f"{len(lines) - LONGEST} more are not listed."] if len(lines) > LONGEST else [])]
+
+
+def _describe_checks(runs: list[RepairRun]) -> list[str]:
+    """Returns what came back worse, what moved without need, and what the IPC Toolkit finds."""
+    outputs = [(run, attempt) for run in runs for attempt in run.attempts]
+    worse = [_title(run, attempt.hint) for run, attempt in outputs if attempt.crossings > run.crossings]
+    moved = [_title(run, "none") for run in runs if run.keeps_free is False]
+    checked = sum(run.keeps_free is not None for run in runs)
+    lines = [
+        f"Returned with more crossings: {_list(worse)} of {count(len(outputs), 'repair')}.",
+        f"Changed where nothing crossed: {_list(moved)} of {count(checked, 'mesh', 'meshes')}.",
+    ]
+    if ipc_toolkit.is_installed():
+        others = [_title(run, attempt.hint) for run, attempt in outputs if attempt.toolkit_agrees is False]
+        title = f"Where IPC Toolkit {ipc_toolkit.version()} disagrees whether anything crosses"
+        return [*lines, f"{title}: {_list(others)} of {count(len(outputs), 'output')}."]
+    return [*lines, "The IPC Toolkit, which would check the outputs, is not installed: pip install 'warp-bsc[bench]'."]
+
+
+def _list(titles: list[str]) -> str:
+    """Returns the number of titles, with the titles."""
+    return f"{len(titles):,}" + (f" ({', '.join(titles[:LONGEST])})" if titles else "")
+
+
+def _title(run: RepairRun, hint: Hint) -> str:
+    """Returns the name of a mesh, with the hint that a repair of it had."""
+    name = run.name if run.kind == KNOWN_MESH else Path(run.name).name if run.kind == FILE else f"{run.kind} {run.name}"
+    return name if hint == "none" else f"{name}, {hint}="
+
+
+BENCHMARK = Benchmark(
+    _run,
+    _DESCRIPTION,
+    _EXAMPLES,
+    {
+        "meshes": several("MESH", "mesh files to measure beside the known meshes and random damage"),
+        "--random": number(
+            natural, "meshes of each kind that are pushed into themselves (default: %(default)s)", default=10
+        ),
+        "--kinds": names_of(KINDS, f"kinds of meshes to push into themselves, of {', '.join(KINDS)} (default: all)"),
+        "--seed": number(
+            natural,
+            "number of the first mesh of each kind, on which its damage depends (default: %(default)s)",
+            default=0,
+        ),
+        **JSON_FILE,
+        **DEVICE,
+    },
+    kept="repairs",
+)

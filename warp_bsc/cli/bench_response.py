@@ -2,30 +2,31 @@
 
 import argparse
 import difflib
-import math
-from collections.abc import Generator
-
-import warp as wp
+import functools
+import itertools
+from dataclasses import asdict
+from typing import Any
 
 from ..bench.response import (
     CONFIGURATIONS,
     CONVERGED,
+    EARLY_STEPS,
     REFERENCE,
     REFERENCE_RATE,
     SCENES,
     SEMI_IMPLICIT_STEPS,
     SOLVERS,
+    WARM_UP,
+    ResponseMeasurement,
     ResponseRun,
     measure_response,
 )
-from .bench_response_tables import print_response_runs, response_runs_to_dict
-from .bench_runs import RunsProgress, add_json_file, report_runs
-from .device import find_device, loading_kernels
-from .exit_status import explain_statuses
-from .interrupts import INTERRUPTS
-from .options import Commands, add_command, add_device, distance, positive
+from .bench import JSON_FILE, Benchmark, check_json, measure_each, report_runs, run_to_dict
+from .device import find_device
+from .options import DEVICE, distance, names_of, number, positive, positive_real, several, switch
+from .tables import Column, Console, count, grouped, print_table, say
 
-__all__ = ["add_to"]
+__all__ = ["BENCHMARK"]
 
 _DESCRIPTION = f"""\
 Run scenes in which cloth, soft bodies, ropes and a ball touch, at 1/60 s, and
@@ -49,91 +50,63 @@ semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all conf
 --rate is given. A scene that the solver cannot run is a row, and a line below
 says why."""
 
-_EPILOG = f"""\
+_SECTIONS = f"""\
 scenes:
   {" ".join(SCENES[:8])}
   {" ".join(SCENES[8:])}
 
-examples:
+"""
+
+_EXAMPLES = """\
   warp-bsc bench response --no-reference
   warp-bsc bench response box_edge --rate 240 --no-reference
   warp-bsc bench response sphere box_edge --device cuda:0
   warp-bsc bench response sphere --configurations stage --perturb 1e-6
-  warp-bsc bench response --solver xpbd --json response.json
-
-{explain_statuses()}
-After a signal, the runs that were complete are printed or written first."""
+  warp-bsc bench response --solver xpbd --json response.json"""
 
 
-def add_to(commands: Commands, summary: str) -> None:
-    """Adds the command with its options, and a line for the list of commands."""
-    command = add_command(
-        commands,
-        "response",
-        _run,
-        summary=summary,
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-    )
-    command.add_argument("scenes", metavar="SCENE", nargs="*", help="the scenes to run (default: all)")
-    command.add_argument("--solver", choices=SOLVERS, default="vbd", help="the inner solver (default: %(default)s)")
-    command.add_argument(
-        "--configurations",
-        type=_configurations,
-        metavar="NAME,...",
-        help="the configurations to run (default: all, self-contact, implicit and converged only for vbd)",
-    )
-    command.add_argument(
-        "--reference",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="whether the reference is among the default configurations",
-    )
-    command.add_argument(
-        "--rate",
-        type=positive,
-        metavar="N",
-        help="steps a second of the other configurations (default: that of the scene)",
-    )
-    command.add_argument(
-        "--reference-rate",
-        type=positive,
-        default=REFERENCE_RATE,
-        metavar="N",
-        help="steps a second of the reference (default: %(default)s)",
-    )
-    command.add_argument(
-        "--seconds", type=_seconds, metavar="T", help="simulated time of each run [s] (default: that of the scene)"
-    )
-    command.add_argument(
-        "--perturb",
-        type=distance,
-        metavar="D",
-        help="run stage a second time with all particles moved sideways by D [m], and report how much its stretch "
-        "differs",
-    )
-    add_json_file(command)
-    add_device(command)
+def _digits(decimals: int, value: float) -> str:
+    """Returns a number, without decimals from 1,000 on."""
+    return f"{value:,.{decimals if value < 1000.0 else 0}f}"
 
 
-def _configurations(text: str) -> tuple[str, ...]:
-    """Returns the configurations that an argument lists, each once."""
-    names = tuple(dict.fromkeys(text.split(",")))
-    for name in names:
-        if name not in CONFIGURATIONS:
-            raise argparse.ArgumentTypeError(f"must be of {', '.join(CONFIGURATIONS)}, not {name!r}")
-    return names
+_COLUMNS = (
+    Column("Stretch\nat end\n[%]", "stretch_at_end", functools.partial(_digits, 2), width=7),
+    Column("at\nmost\n[%]", "stretch_at_most", functools.partial(_digits, 2), width=7),
+    Column("Speed\nat end\n[mm/s]", "rest_speed", functools.partial(_digits, 1), width=6),
+    Column("Energy\ngained\n[J]", "energy_gained", ",.4f", width=7),
+    Column("Cross-\nings", "crossings", width=6),
+    Column("Pairs\nmeet", "collisions", width=6),
+    Column("Sub-\nsteps", "substeps", ".1f", width=5),
+    Column("A step:\nmedian\n[ms]", "median", functools.partial(_digits, 2), width=7),
+    Column("\nmean\n[ms]", "mean", functools.partial(_digits, 2), width=6),
+)  # 80 columns with the first one and the gaps
 
 
-def _seconds(text: str) -> float:
-    """Returns the time that a text holds."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not 0.0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, not {text}")
-    return number
+def _run(arguments: argparse.Namespace) -> None:
+    scenes, configurations = _check_scenes(arguments.scenes), _choose_configurations(arguments)
+    check_json(arguments.json, SCENES.__contains__, "a scene", "scenes")
+    if arguments.perturb is not None and "stage" not in configurations:
+        raise ValueError("--perturb runs the configuration stage a second time, and --configurations omits it")
+    device = find_device(arguments.device)
+
+    names = "solver", "seconds", "rate", "reference_rate", "perturb"
+    measure = functools.partial(measure_response, device=device, **{name: getattr(arguments, name) for name in names})
+    report_runs(
+        arguments,
+        device,
+        measure_each(itertools.product(scenes, configurations), measure, device, unit="step"),
+        name="response",
+        heading=f"Contact on {device}, {device.name}; times of a step without the first {WARM_UP}",
+        show=_show,
+        to_dict=lambda runs: {
+            "steps_left_out": WARM_UP,
+            "runs": [
+                run_to_dict(run, _measurement_to_dict) | {"from_converged": _distance_from_converged(run, runs)}
+                for run in runs
+            ],
+        },
+    )
 
 
 def _check_scenes(names: list[str]) -> tuple[str, ...]:
@@ -155,50 +128,80 @@ def _choose_configurations(arguments: argparse.Namespace) -> tuple[str, ...]:
     return tuple(name for name in CONFIGURATIONS if name not in omitted)
 
 
-def _run(arguments: argparse.Namespace) -> int:
-    scenes, configurations = _check_scenes(arguments.scenes), _choose_configurations(arguments)
-    if arguments.json in SCENES:
-        raise ValueError(f"--json {arguments.json}: this is a scene; name scenes before the options")
-    if arguments.perturb is not None and "stage" not in configurations:
-        raise ValueError("--perturb runs the configuration stage a second time, and --configurations omits it")
-    device = find_device(arguments.device)
-    report_runs(
-        _measure(scenes, configurations, arguments, device),
-        to_dict=response_runs_to_dict,
-        show=print_response_runs,
-        json_path=arguments.json,
-        command=arguments.command_line,
-        device=device,
-    )
-    return 0
+def _show(console: Console, runs: list[ResponseRun]) -> None:
+    """Prints a table for each scene, a row a run, and below it why runs are missing."""
+    for scene, group in grouped(runs, "scene").items():
+        console.print()
+        first = Column(f"{scene}\n{group[0].solver}", width=14, kind="text")
+        print_table(console, first, _COLUMNS, [(run.configuration, run.measured) for run in group])
+        for note in _describe(group):
+            say(console, note)
 
 
-def _measure(
-    scenes: tuple[str, ...], configurations: tuple[str, ...], arguments: argparse.Namespace, device: wp.Device
-) -> Generator[ResponseRun, None, None]:
-    """Yields a run for each scene and configuration, and shows the progress."""
-    pairs = [(scene, configuration) for scene in scenes for configuration in configurations]
-    with RunsProgress(len(pairs)) as progress, loading_kernels(device, progress.console):
-        for done, (scene, configuration) in enumerate(pairs):
-            title = f"{scene}, {configuration}"
-            progress.show(done, f"{title}: starts")
+def _describe(runs: list[ResponseRun]) -> list[str]:
+    """Returns the lines below the table of a scene."""
+    lines = []
+    if measured := [run.measured for run in runs if run.measured]:
+        steps = dict.fromkeys(f"{count(took.steps, 'step')} of 1/{took.rate} s" for took in measured)
+        sizes = count(measured[0].particles, "particle"), count(measured[0].triangles, "triangle")
+        lines.append(", ".join([*sizes, " or ".join(steps)]))
+    for run in runs:
+        if run.measured is None:
+            lines.append(f"{run.configuration}: not run: {run.problem}")
+            continue
+        if run.measured.uncertified_steps:
+            lines.append(f"{run.configuration}: {count(run.measured.uncertified_steps, 'step')} not certified")
+        if spread := run.measured.spread:
+            lines.append(
+                f"{run.configuration}, moved by {spread.distance:g} m: stretch differs by "
+                f"{spread.stretch_at_end:.2f} at the end, {spread.stretch_at_most:.2f} at most"
+            )
+    distances = {run.configuration: _distance_from_converged(run, runs) for run in runs}
+    shown = [f"{name} {mm:.2f}" for name, mm in distances.items() if mm is not None and name != CONVERGED]
+    if shown:
+        lines.append(f"Mean distance from {CONVERGED} after {EARLY_STEPS} steps [mm]: {', '.join(shown)}")
+    return lines
 
-            def show(step: int, steps: int, title: str = title, done: int = done) -> None:
-                INTERRUPTS.check()
-                progress.show(done + step / steps, f"{title}: step {step:,} of {steps:,}")
 
-            with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
-                run = measure_response(
-                    scene,
-                    configuration,
-                    solver=arguments.solver,
-                    device=device,
-                    seconds=arguments.seconds,
-                    rate=arguments.rate,
-                    reference_rate=arguments.reference_rate,
-                    perturb=arguments.perturb,
-                    progress=show,
-                )
-            if run.problem:
-                progress.note(f"{title}: {run.problem}")
-            yield run
+def _distance_from_converged(run: ResponseRun, runs: list[ResponseRun]) -> float | None:
+    """Returns how far particles are from those of the converged run of the scene in the mean [mm]; None without it."""
+    converged = next((o.measured for o in runs if (o.scene, o.configuration) == (run.scene, CONVERGED)), None)
+    return run.measured.distance_from(converged) if run.measured and converged else None
+
+
+def _measurement_to_dict(took: ResponseMeasurement) -> dict[str, Any]:
+    values = asdict(took)
+    del values["early"]
+    return values | {"milliseconds": {"median": took.median, "mean": took.mean, "worst": max(took.milliseconds)}}
+
+
+BENCHMARK = Benchmark(
+    _run,
+    _DESCRIPTION,
+    _EXAMPLES,
+    {
+        "scenes": several("SCENE", "the scenes to run (default: all)"),
+        "--solver": {"choices": SOLVERS, "default": "vbd", "help": "the inner solver (default: %(default)s)"},
+        "--configurations": names_of(
+            CONFIGURATIONS,
+            "the configurations to run (default: all, self-contact, implicit and converged only for vbd)",
+            all_by_default=False,
+        ),
+        "--reference": switch("whether the reference is among the default configurations"),
+        "--rate": number(positive, "steps a second of the other configurations (default: that of the scene)"),
+        "--reference-rate": number(
+            positive, "steps a second of the reference (default: %(default)s)", default=REFERENCE_RATE
+        ),
+        "--seconds": number(positive_real, "simulated time of each run [s] (default: that of the scene)", metavar="T"),
+        "--perturb": number(
+            distance,
+            "run stage a second time with all particles moved sideways by D [m], and report how much its stretch "
+            "differs",
+            metavar="D",
+        ),
+        **JSON_FILE,
+        **DEVICE,
+    },
+    sections=_SECTIONS,
+    kept="runs",
+)

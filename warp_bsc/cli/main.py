@@ -21,40 +21,13 @@ examples:
 
 {explain_statuses(*ExitStatus)}"""
 
-_BENCH = """\
-Measure detection, SolverCCD and repair. Without the name of a benchmark,
-warp-bsc bench runs the paper's five benchmarks, as warp-bsc bench paper does."""
-
-_BENCH_EPILOG = f"""\
-examples:
-  warp-bsc bench
-  warp-bsc bench --quick
-  warp-bsc bench paper --help
-  warp-bsc bench detector
-  warp-bsc bench queries
-  warp-bsc bench newton
-  warp-bsc bench response
-  warp-bsc bench repair
-  warp-bsc bench penetration
-  warp-bsc bench detector --help
-
-{explain_statuses()}"""
-
 _COMMANDS = {
     "replay": "find the collisions in a USD scene",
     "repair": "move the meshes of a USD scene so that they do not collide",
     "query": "decide queries of CSV files",
+    "bench": "measure detection, SolverCCD and repair",
 }
-_BENCHMARKS = {
-    "paper": "measure the paper's benchmarks",
-    "detector": "measure the detector",
-    "queries": "measure elementary queries",
-    "newton": "measure Newton's own examples",
-    "response": "measure stretch, rest, energy and time of contact",
-    "repair": "measure what repair frees, and how",
-    "penetration": "judge simulators by exact detection: who penetrates, where",
-}
-"""The commands and the benchmarks. Each is a module of this package, imported when it is named: some take seconds."""
+"""The commands. Each is a module of this package, imported when it is named: some take seconds."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -78,7 +51,7 @@ def run(argv: list[str]) -> int:
     argv = _with_joined_frames(_with_benchmark(argv))
     arguments = _build_parser(argv).parse_args(argv)
     arguments.command_line = ["warp-bsc", *argv]
-    return arguments.run(arguments)
+    return arguments.run(arguments) or ExitStatus.DONE
 
 
 def _build_parser(argv: list[str] | None = None) -> argparse.ArgumentParser:
@@ -91,32 +64,23 @@ def _build_parser(argv: list[str] | None = None) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"warp-bsc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    _add(commands, _COMMANDS, "", None if argv is None else argv[:1])
-    bench = commands.add_parser(
-        "bench",
-        help="measure detection, SolverCCD and repair",
-        description=_BENCH,
-        epilog=_BENCH_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    benchmarks = bench.add_subparsers(required=True, metavar="BENCHMARK")
-    _add(benchmarks, _BENCHMARKS, "bench_", None if argv is None else argv[1:2] if argv[:1] == ["bench"] else [])
-    return parser
-
-
-def _add(commands: argparse._SubParsersAction, summaries: dict[str, str], prefix: str, named: list[str] | None) -> None:
-    """Adds commands: with options those that are named, or all, and without options, which --help omits, the others."""
-    for name, summary in summaries.items():
-        if named is None or name in named:
-            importlib.import_module(f".{prefix}{name}", __package__).add_to(commands, summary)
+    for name, summary in _COMMANDS.items():
+        if argv is None or argv[:1] == [name]:
+            module = importlib.import_module(f".{name}", __package__)
+            more = {"named": None if argv is None else argv[1:2]} if name == "bench" else {}
+            module.add_to(commands, summary, **more)
         else:
             commands.add_parser(name, help=summary)
+    return parser
 
 
 def _with_benchmark(argv: list[str]) -> list[str]:
     """Returns the arguments with the default benchmark inserted if ``bench`` names none."""
-    if argv[:1] == ["bench"] and argv[1:2] not in [[name] for name in (*_BENCHMARKS, "-h", "--help")]:
-        return ["bench", "paper", *argv[1:]]
+    if argv[:1] == ["bench"]:
+        from .bench import BENCHMARKS  # noqa: PLC0415 (slow)
+
+        if argv[1:2] not in [[name] for name in (*BENCHMARKS, "-h", "--help")]:
+            return ["bench", "paper", *argv[1:]]
     return argv
 
 

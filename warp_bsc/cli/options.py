@@ -3,30 +3,45 @@
 import argparse
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from .._arguments import SMALLEST_DISTANCE
 from ..detection.settings import METHODS
 
 __all__ = [
+    "DEVICE",
+    "JSON",
+    "THREADS",
     "Commands",
+    "Options",
     "add_command",
-    "add_detection_options",
-    "add_device",
     "add_fail_on",
-    "add_json",
-    "add_repeat",
+    "add_options",
     "add_scene",
-    "add_threads",
+    "detection_options",
     "distance",
+    "file_option",
+    "flag",
+    "names_of",
     "natural",
+    "number",
+    "pair",
+    "patterns",
     "positive",
+    "positive_real",
+    "repeat_options",
     "scene_path",
+    "several",
+    "switch",
 ]
 
 Commands = argparse._SubParsersAction
 """What ``ArgumentParser.add_subparsers`` returns: the commands, to which each module adds its own."""
+
+Options = Mapping[str, Mapping[str, Any]]
+"""Arguments and options of a command: what ``ArgumentParser.add_argument`` takes, by name."""
 
 _DEMO = "assets/cloth_twist.usd"
 """The scene called demo. In a checkout it stands beside the package, as the device code does, else in it."""
@@ -35,7 +50,7 @@ _DEMO = "assets/cloth_twist.usd"
 def add_command(
     commands: Commands,
     name: str,
-    run: Callable[[argparse.Namespace], int] | None,
+    run: Callable[[argparse.Namespace], int | None] | None,
     *,
     summary: str,
     description: str,
@@ -46,7 +61,7 @@ def add_command(
     Args:
         commands: The commands to add it to.
         name: The command's name.
-        run: Runs it with the parsed arguments and returns the exit status; None for a group of commands.
+        run: Runs it with the parsed arguments and returns the exit status, None for 0; None for a group of commands.
         summary: One line for the list of commands.
         description: The help text above the options.
         epilog: The help text below the options.
@@ -76,70 +91,10 @@ def scene_path(name: str) -> str:
     return next(str(folder / _DEMO) for folder in (package, package.parent) if (folder / _DEMO).exists())
 
 
-def add_detection_options(command: argparse.ArgumentParser, *, method: str) -> None:
-    """Adds --method, with this default, and --device."""
-    command.add_argument(
-        "--method",
-        choices=METHODS,
-        default=method,
-        help="float: trust the signs that floating point computes; conservative: count pairs that floating point "
-        "cannot certify as collisions; exact: decide these pairs in exact arithmetic (default: %(default)s)",
-    )
-    add_device(command)
-
-
-def add_device(command: argparse.ArgumentParser) -> None:
-    """Adds --device."""
-    command.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
-
-
-def add_json(command: argparse.ArgumentParser) -> None:
-    """Adds --json, without a file."""
-    command.add_argument("--json", action="store_true", help="print all results as JSON instead of tables")
-
-
-def add_fail_on(group: argparse._ActionsContainer, reasons: dict[str, str]) -> None:
-    """Adds --fail-on, whose value is a set of reasons.
-
-    Args:
-        group: The command, or a group of its options.
-        reasons: The kinds of finding, and an explanation of each, which may be empty.
-    """
-
-    def parse(text: str) -> frozenset[str]:
-        named = frozenset(text.split(","))
-        if unknown := named - reasons.keys():
-            known = ", ".join(reasons)
-            raise argparse.ArgumentTypeError(f"must be of {known}, not {', '.join(sorted(unknown))!r}")
-        return named
-
-    explained = ", ".join(f"{reason} ({text})" if text else reason for reason, text in reasons.items())
-    several = " of these, separated by commas" if len(reasons) > 1 else ""
-    group.add_argument(
-        "--fail-on",
-        type=parse,
-        default=frozenset(),
-        metavar="WHAT",
-        help=f"exit with status 1 if there is any{several}: {explained}",
-    )
-
-
-def add_repeat(command: argparse.ArgumentParser, *, default: int) -> None:
-    """Adds --repeat."""
-    command.add_argument(
-        "--repeat",
-        type=positive,
-        default=default,
-        metavar="N",
-        help="number of repetitions; their median is reported (default: %(default)s)",
-    )
-
-
-def add_threads(command: argparse.ArgumentParser) -> None:
-    """Adds --threads."""
-    command.add_argument(
-        "--threads", type=positive, metavar="N", help="number of CPU cores to use, on Linux only (default: all)"
-    )
+def add_options(group: argparse._ActionsContainer, options: Options) -> None:
+    """Adds options to a command, or to a group of its options."""
+    for name, option in options.items():
+        group.add_argument(name, **option)
 
 
 def distance(text: str) -> float:
@@ -148,12 +103,25 @@ def distance(text: str) -> float:
     Raises:
         argparse.ArgumentTypeError: If it is not a number, not finite or less than 2^-1021, for example 0.
     """
+    return _real(text, SMALLEST_DISTANCE, "more than 0, at least 2^-1021")
+
+
+def positive_real(text: str) -> float:
+    """Returns the number that a text holds.
+
+    Raises:
+        argparse.ArgumentTypeError: If it is not a number, not finite or not more than 0.
+    """
+    return _real(text, math.ulp(0.0), "more than 0")
+
+
+def _real(text: str, least: float, what: str) -> float:
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not SMALLEST_DISTANCE <= number < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a finite number more than 0, at least 2^-1021, not {text}")
+    if not least <= number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a finite number {what}, not {text}")
     return number
 
 
@@ -183,3 +151,107 @@ def _integer(text: str, least: int) -> int:
     if not least <= number < 2**31:
         raise argparse.ArgumentTypeError(f"must be an integer of at least {least}, less than 2^31, not {text}")
     return number
+
+
+def number(kind: Callable[[str], Any], help: str, *, default: float | None = None, metavar: str = "N") -> dict:
+    """Returns an option whose value is a number, or another that ``kind`` makes of a text."""
+    return {"type": kind, "help": help, "default": default, "metavar": metavar}
+
+
+def flag(help: str) -> dict:
+    """Returns an option without a value."""
+    return {"action": "store_true", "help": help}
+
+
+def switch(help: str) -> dict:
+    """Returns an option that is set, unless its name begins with no-."""
+    return {"action": argparse.BooleanOptionalAction, "default": True, "help": help}
+
+
+def several(metavar: str, help: str, *, nargs: str = "*") -> dict:
+    """Returns an argument that may be given any number of times."""
+    return {"metavar": metavar, "nargs": nargs, "help": help}
+
+
+def file_option(help: str, **more: Any) -> dict:
+    """Returns an option whose value is a file."""
+    return {"metavar": "FILE", "help": help, **more}
+
+
+def patterns(help: str) -> dict:
+    """Returns an option whose value is a list of patterns, and which may be repeated."""
+    return {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN", "help": help}
+
+
+def pair(help: str) -> dict:
+    """Returns an option whose value is two patterns."""
+    return {"nargs": 2, "metavar": ("A", "B"), "help": help}
+
+
+def names_of(known: Iterable[str], help: str, *, metavar: str = "NAME,...", all_by_default: bool = True) -> dict:
+    """Returns an option whose value is a tuple of names, each once, in the order that they are given in.
+
+    Args:
+        known: The names that there are.
+        help: The help text.
+        metavar: What stands for the value in help texts.
+        all_by_default: Whether the default is all that there are, not None.
+    """
+    known = tuple(known)
+
+    def parse(text: str) -> tuple[str, ...]:
+        names = tuple(dict.fromkeys(text.split(",")))
+        for name in names:
+            if name not in known:
+                raise argparse.ArgumentTypeError(f"must be of {', '.join(known)}, not {name!r}")
+        return names
+
+    return {"type": parse, "help": help, "default": known if all_by_default else None, "metavar": metavar}
+
+
+DEVICE: Options = {
+    "--device": {"help": "Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)"},
+}
+JSON: Options = {"--json": flag("print all results as JSON instead of tables")}
+THREADS: Options = {"--threads": number(positive, "number of CPU cores to use, on Linux only (default: all)")}
+
+
+def detection_options(method: str) -> Options:
+    """Returns --method, with this default, and --device."""
+    text = (
+        "float: trust the signs that floating point computes; conservative: count pairs that floating point "
+        "cannot certify as collisions; exact: decide these pairs in exact arithmetic (default: %(default)s)"
+    )
+    return {"--method": {"choices": METHODS, "default": method, "help": text}, **DEVICE}
+
+
+def repeat_options(default: int) -> Options:
+    """Returns --repeat."""
+    text = "number of repetitions; their median is reported (default: %(default)s)"
+    return {"--repeat": number(positive, text, default=default)}
+
+
+def add_fail_on(group: argparse._ActionsContainer, reasons: dict[str, str]) -> None:
+    """Adds --fail-on, whose value is a set of reasons.
+
+    Args:
+        group: The command, or a group of its options.
+        reasons: The kinds of finding, and an explanation of each, which may be empty.
+    """
+
+    def parse(text: str) -> frozenset[str]:
+        named = frozenset(text.split(","))
+        if unknown := named - reasons.keys():
+            known = ", ".join(reasons)
+            raise argparse.ArgumentTypeError(f"must be of {known}, not {', '.join(sorted(unknown))!r}")
+        return named
+
+    explained = ", ".join(f"{reason} ({text})" if text else reason for reason, text in reasons.items())
+    several = " of these, separated by commas" if len(reasons) > 1 else ""
+    group.add_argument(
+        "--fail-on",
+        type=parse,
+        default=frozenset(),
+        metavar="WHAT",
+        help=f"exit with status 1 if there is any{several}: {explained}",
+    )

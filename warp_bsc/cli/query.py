@@ -12,12 +12,15 @@ from ..detection.query import QueryResult, query_edge_edge, query_vertex_face
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import (
+    JSON,
     Commands,
     add_command,
-    add_detection_options,
     add_fail_on,
-    add_json,
+    add_options,
+    detection_options,
     distance,
+    number,
+    several,
 )
 from .query_file import KINDS, find_query_files, read_query_file
 from .query_tables import QueryResults, print_queries, queries_to_dict
@@ -46,24 +49,27 @@ _QUERIES: dict[str, Callable[..., QueryResult]] = dict(zip(KINDS, (query_vertex_
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
     command = add_command(commands, "query", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    command.add_argument(
-        "paths", metavar="FILE", nargs="+", help="a CSV file, or a folder: all CSV files in it and below"
+    add_options(
+        command,
+        {
+            "paths": several("FILE", "a CSV file, or a folder: all CSV files in it and below", nargs="+"),
+            "--kind": {
+                "choices": KINDS,
+                "help": "kind of the queries (default: that of a folder vertex-face or edge-edge, or a name ending in "
+                "vf or ee)",
+            },
+            "--min-distance": number(
+                distance,
+                "count pairs that come within D of each other, in the unit of the points, as collisions (default: "
+                "pairs that touch); the true results in the files, which hold without a distance, are not compared "
+                "then",
+                default=0.0,
+                metavar="D",
+            ),
+            **detection_options("exact"),
+            **JSON,
+        },
     )
-    command.add_argument(
-        "--kind",
-        choices=KINDS,
-        help="kind of the queries (default: that of a folder vertex-face or edge-edge, or a name ending in vf or ee)",
-    )
-    command.add_argument(
-        "--min-distance",
-        type=distance,
-        default=0.0,
-        metavar="D",
-        help="count pairs that come within D of each other, in the unit of the points, as collisions (default: pairs "
-        "that touch); the true results in the files, which hold without a distance, are not compared then",
-    )
-    add_detection_options(command, method="exact")
-    add_json(command)
     add_fail_on(command, {"collisions": ""})
 
 

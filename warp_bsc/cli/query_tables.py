@@ -1,16 +1,16 @@
 """Shows the results of query files: tables for people, plain data for programs."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from ..detection.query import QueryResult
 from .query_file import QueryFile
-from .tables import count, make_table, say
+from .tables import Column, count, print_table, say
 
 __all__ = ["QueryResults", "print_queries", "queries_to_dict"]
 
@@ -71,21 +71,15 @@ def print_queries(
     distance = f"; minimum distance {min_distance:g}" if min_distance else ""
     say(console, f"{count(len(results), 'file')} in {folder}; method {method} on {device}{distance}")
     say(console, "Free, hit and unsure: the certificates of floating point, the same for every method.")
-    table = make_table("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms")
-    _add_files(
-        table,
-        folder,
-        [(a.file, [len(a.file.points), a.hits, *a.certified.values(), a.milliseconds]) for a in results],
-    )
-    console.print(table)
-
-    known = [(found.file, found.confusion) for found in results if found.confusion]
+    names = [os.path.relpath(found.file.path.with_suffix(""), folder) for found in results]
+    numbers = [(len(a.file.points), a.hits, *a.certified.values(), a.milliseconds) for a in results]
+    _print_sums(console, ("File", "Queries", "Hits", "Free", "Hit", "Unsure", "ms"), names, numbers)
+    known = [(name, found.confusion) for name, found in zip(names, results, strict=True) if found.confusion]
     if known:
-        table = make_table("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
-        _add_files(table, folder, [(file, list(confusion.values())) for file, confusion in known])
         console.print()
-        console.print(table)
-    for file, _ in known:
+        headers = ("Against the truth", "True\npos.", "False\npos.", "True\nneg.", "False\nneg.")
+        _print_sums(console, headers, [name for name, _ in known], [tuple(counts.values()) for _, counts in known])
+    for file in (found.file for found in results):
         if file.truth_path and file.truth_path != file.path:
             say(console, f"Truth of {file.path.name} from {file.truth_path.name}.")
 
@@ -115,14 +109,14 @@ def queries_to_dict(results: list[QueryResults], *, method: str, device: str, mi
     }
 
 
-def _add_files(table: Table, folder: str, rows: list[tuple[QueryFile, list[int | float]]]) -> None:
-    """Adds a row for each file and, if there are several, one for their sum."""
+def _print_sums(
+    console: Console, headers: Sequence[str], names: list[str], numbers: list[tuple[int | float, ...]]
+) -> None:
+    """Prints a row of numbers for each file and, if there are several, one of their sums."""
 
-    def format_all(numbers: Iterable[int | float]) -> list[str]:
-        return [f"{number:,.1f}" if isinstance(number, float) else f"{number:,}" for number in numbers]
+    def write(number: float) -> str:
+        return f"{number:,.1f}" if isinstance(number, float) else f"{number:,}"
 
-    for file, numbers in rows:
-        table.add_row(os.path.relpath(file.path.with_suffix(""), folder), *format_all(numbers))
-    if len(rows) > 1:
-        table.add_section()
-        table.add_row("all", *format_all(map(sum, zip(*(numbers for _, numbers in rows), strict=True))))
+    columns = [Column(header, itemgetter(i), write) for i, header in enumerate(headers[1:])]
+    total = tuple(map(sum, zip(*numbers, strict=True))) if len(numbers) > 1 else None
+    print_table(console, headers[0], columns, zip(names, numbers, strict=True), total=total)

@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import importlib
 import json
 import os
 
@@ -10,18 +9,26 @@ from .._atomic_file import STDOUT, unfinished_path
 from ..repair.shot.findings import kept_meshes
 from ..repair.shot.report import RepairPage
 from ..replay.hit_files import replay_facts
-from ..usd.frames import FrameRange
-from ..usd.scene import Scene
-from ..usd.selection import Selection
 from .device import find_device, load_detector, loading_kernels
-from .error_boundary import describe
 from .exit_status import ExitStatus, explain_statuses
-from .interrupts import INTERRUPTS
-from .options import Commands, add_command, add_device, add_fail_on, add_json, add_scene, distance, scene_path
-from .progress import RunProgress
+from .options import (
+    DEVICE,
+    JSON,
+    Commands,
+    add_command,
+    add_fail_on,
+    add_options,
+    add_scene,
+    distance,
+    file_option,
+    flag,
+    number,
+    patterns,
+    scene_path,
+)
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
-from .replay_options import add_scene_selection, describe_selection
+from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
 from .tables import Console
 
 __all__ = ["add_to"]
@@ -57,62 +64,53 @@ examples:
 
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
-    command = add_command(
-        commands,
-        "repair",
-        _run,
-        summary=summary,
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-    )
+    command = add_command(commands, "repair", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     add_scene(command)
     which = command.add_argument_group("selection")
-    which.add_argument(
-        "--keep",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="PATTERN",
-        help="obstacles: do not move meshes at or below these prims; * matches any text",
+    add_options(
+        which, {"--keep": patterns("obstacles: do not move meshes at or below these prims; * matches any text")}
     )
     add_scene_selection(which)
     how = command.add_argument_group("repair")
-    how.add_argument(
-        "--include-initial",
-        action="store_true",
-        help="repair also pairs of two meshes that cross at the first frame; by default these are left",
-    )
-    how.add_argument(
-        "--max-move",
-        type=distance,
-        metavar="D",
-        help="leave stretches of the scene as they are in which a point must move more than D, in the scene's unit",
-    )
-    how.add_argument(
-        "--min-distance",
-        type=distance,
-        default=0.0,
-        metavar="D",
-        help="repair also what comes nearer than D, in the scene's unit, at the samples or between them, and keep that "
-        "distance where the scene is repaired, certified between samples too. Elements that an edge joins only do not "
-        "touch; pairs that are nearer at the first sample are named, and come no nearer where the scene is repaired",
+    add_options(
+        how,
+        {
+            "--include-initial": flag(
+                "repair also pairs of two meshes that cross at the first frame; by default these are left"
+            ),
+            "--max-move": number(
+                distance,
+                "leave stretches of the scene as they are in which a point must move more than D, in the scene's unit",
+                metavar="D",
+            ),
+            "--min-distance": number(
+                distance,
+                "repair also what comes nearer than D, in the scene's unit, at the samples or between them, and keep "
+                "that distance where the scene is repaired, certified between samples too. Elements that an edge joins "
+                "only do not touch; pairs that are nearer at the first sample are named, and come no nearer where the "
+                "scene is repaired",
+                default=0.0,
+                metavar="D",
+            ),
+        },
     )
     out = command.add_argument_group("output")
-    out.add_argument("--output", required=True, metavar="FILE", help="the layer, .usda, .usdc or .usd")
-    out.add_argument(
-        "--report",
-        metavar="FILE",
-        help="a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html",
+    add_options(
+        out,
+        {
+            "--output": {"required": True, "metavar": "FILE", "help": "the layer, .usda, .usdc or .usd"},
+            "--report": file_option(
+                "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
+            ),
+            "--resume": flag(
+                "continue an earlier run with the same options and files that was stopped or killed: take what it "
+                "found and repaired from FILE.part, beside the layer; without that file, repair all"
+            ),
+        },
     )
-    out.add_argument(
-        "--resume",
-        action="store_true",
-        help="continue an earlier run with the same options and files that was stopped or killed: take what it found "
-        "and repaired from FILE.part, beside the layer; without that file, repair all",
-    )
-    add_json(command)
+    add_options(command, JSON)
     add_fail_on(out, {"left": "collisions or intersections that are left"})
-    add_device(command)
+    add_options(command, DEVICE)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -128,18 +126,8 @@ def _run(arguments: argparse.Namespace) -> int:
         if paths.count(path) > 1:
             raise ValueError(f"{path}: named twice, as two files of a repair")
     device = find_device(arguments.device)
-    with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
-        importlib.import_module("warp_bsc.usd.find_meshes")
-    INTERRUPTS.check()
-    selection = Selection(
-        prims=tuple(arguments.prims),
-        exclude=tuple(arguments.exclude),
-        self_collisions=arguments.self_collisions,
-        between=tuple(arguments.between) if arguments.between else None,
-        purposes=tuple(arguments.purpose or Selection.purposes),
-        ignore=tuple(map(tuple, arguments.ignore)),
-    )
-    scene = _open(arguments.scene, arguments, selection, arguments.frames)
+    chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
+    scene = read_scene(arguments.scene, arguments, **chosen)
     for file in written:
         if file in scene.files:
             raise ValueError(f"{file}: the scene is read from this file; write to another one")
@@ -158,7 +146,7 @@ def _run(arguments: argparse.Namespace) -> int:
         run.run()
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and run.is_written:
-            fixed = _open(arguments.output, arguments, selection, arguments.frames)
+            fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
             after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].left_pairs)
         if page and run.journal.findings is not None:
@@ -176,21 +164,3 @@ def _run(arguments: argparse.Namespace) -> int:
     if "left" in arguments.fail_on and any(left.values()):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
-
-
-def _open(path: str, arguments: argparse.Namespace, selection: Selection, frames: FrameRange | None) -> Scene:
-    """Opens a scene with the options that say how it is read."""
-    try:
-        with RunProgress("Comparing vertices") as progress:
-            return Scene(
-                path,
-                selection=selection,
-                frames=frames,
-                strict=arguments.strict,
-                allow_missing=arguments.allow_missing,
-                progress=progress.show,
-            )
-    except (OSError, ValueError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: {describe(error)}") from error

@@ -4,9 +4,22 @@ from pathlib import Path
 
 from .option_names import with_option
 from .repair_run import RepairRun
-from .tables import LONGEST, Console, count, make_table, say
+from .tables import LONGEST, Column, Console, count, print_table, say
 
 __all__ = ["print_repair"]
+
+_STRETCHES = (  # of a stretch and its frames
+    Column("frames", lambda row: len(row[1])),
+    Column("points", lambda row: row[0].moved),
+    Column("largest move", lambda row: row[0].largest_move / row[0].edge_length, ".3f"),
+    Column("mean", lambda row: row[0].mean_move / row[0].edge_length, ".3f"),
+    Column("edges", lambda row: row[0].edge_ratio, lambda ends: f"{ends[0]:.2f} to {ends[1]:.2f}"),
+    Column(
+        "acceleration",
+        lambda row: [acceleration / row[0].edge_length for acceleration in row[0].acceleration],
+        lambda both: f"{both[0]:.3f} ({both[1]:.3f})",
+    ),
+)
 
 
 def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: dict[str, int]) -> None:
@@ -62,31 +75,15 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
 def _print_stretches(console: Console, run: RepairRun) -> None:
     """Prints a table of the stretches."""
     lengths = sorted({f"{stretch.edge_length:.3g}" for stretch in run.stretches})
-    table = make_table(
+    rows = zip(run.stretches[:LONGEST], run.frames, strict=False)
+    print_table(
+        console,
         "time",
-        "frames",
-        "points",
-        "largest move",
-        "mean",
-        "edges",
-        "acceleration",
+        _STRETCHES,
+        [(f"{stretch.start:g} → {stretch.end:g}", (stretch, frames)) for stretch, frames in rows],
         caption="Points: the most of a frame. Moves and the added acceleration a frame in median edge lengths "
         f"({' or '.join(lengths)} in the scene's unit, as of --max-move), in parentheses that of the scene; edges: the "
         "shortest and the longest against the scene at the same time.",
     )
-    for stretch, frames in zip(run.stretches[:LONGEST], run.frames, strict=False):
-        unit = stretch.edge_length
-        low, high = stretch.edge_ratio
-        added, own = stretch.acceleration
-        table.add_row(
-            f"{stretch.start:g} → {stretch.end:g}",
-            f"{len(frames):,}",
-            f"{stretch.moved:,}",
-            f"{stretch.largest_move / unit:.3f}",
-            f"{stretch.mean_move / unit:.3f}",
-            f"{low:.2f} to {high:.2f}",
-            f"{added / unit:.3f} ({own / unit:.3f})",
-        )
-    console.print(table)
     if len(run.stretches) > LONGEST:
         say(console, f"{len(run.stretches) - LONGEST} stretches are not listed; --json has all.")

@@ -1,6 +1,7 @@
 """The options of ``warp-bsc replay``, their types and its help text."""
 
 import argparse
+import importlib
 import math
 import shlex
 from collections.abc import Iterable, Sequence
@@ -12,9 +13,26 @@ from .._atomic_file import STDOUT
 from ..replay.workers import checked_address
 from ..usd.frames import FrameRange
 from ..usd.scene import Scene
-from ..usd.selection import PURPOSES
+from ..usd.selection import PURPOSES, Selection
+from .error_boundary import describe
 from .exit_status import ExitStatus, explain_statuses
-from .options import add_detection_options, add_fail_on, add_scene, distance, positive
+from .interrupts import INTERRUPTS
+from .options import (
+    Options,
+    add_fail_on,
+    add_options,
+    add_scene,
+    detection_options,
+    distance,
+    file_option,
+    flag,
+    number,
+    pair,
+    patterns,
+    positive,
+    switch,
+)
+from .progress import RunProgress
 
 __all__ = [
     "DESCRIPTION",
@@ -23,6 +41,8 @@ __all__ = [
     "add_scene_selection",
     "command_of",
     "describe_selection",
+    "read_scene",
+    "read_selection",
     "repair_command_of",
 ]
 
@@ -73,81 +93,9 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
 
     which = command.add_argument_group("selection")
     add_scene_selection(which)
-    which.add_argument(
-        "--intersections",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="find the edges that pass through faces or touch them at the time samples themselves, and the meshes that "
-        "are wholly inside others (default: yes)",
-    )
-    which.add_argument(
-        "--clearance",
-        type=distance,
-        metavar="D",
-        help="find the proximities at the time samples themselves: vertices and faces, and edges, that are at most D "
-        "apart, in the scene's unit, and neither share a vertex nor are joined by an edge. Distances between the "
-        "samples are not checked, nor are those of curves and points; an edge that passes through a face is an "
-        "intersection instead",
-    )
-    which.add_argument(
-        "--ignore-from",
-        metavar="FILE",
-        help="read pairs for --ignore from a file: two patterns a line, in quotation marks if they contain blanks; # "
-        "begins a comment",
-    )
-    which.add_argument(
-        "--ignore-initial",
-        action="store_true",
-        help="ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; for "
-        "meshes that are inside others then, ignore only that they are inside",
-    )
-    which.add_argument(
-        "--subdivide",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="divide the time from each sample to the next into N intervals, for motion that is neither linear nor a "
-        "turn about one axis, such as that of skeletons (default: 1)",
-    )
-    which.add_argument(
-        "--validate",
-        type=_validate,
-        default=0,
-        metavar="all|N",
-        help="decide pairs of each interval again by the exact checker: all, or N hits and N other pairs",
-    )
-
+    add_options(which, _SELECTION)
     out = command.add_argument_group("output")
-    out.add_argument(
-        "--overlay",
-        metavar="FILE",
-        help="a USD layer over the scene, .usda or .usdc, which shows the collisions as guides",
-    )
-    file = {"type": _output, "metavar": "FILE"}
-    out.add_argument(
-        "--report", **file, help="a page with a timeline, every interval in 3D, and a table of all collisions, .html"
-    )
-    printed = {"nargs": "?", "const": STDOUT, **file}
-    out.add_argument("--json", **printed, help="every collision as JSON; without FILE, print only that")
-    out.add_argument("--csv", **printed, help="every collision as CSV; without FILE, print only that")
-    out.add_argument(
-        "--npz", **file, help="every collision as columns for NumPy, .npz, in a fifteenth of the space of JSON"
-    )
-    out.add_argument(
-        "--limit",
-        type=positive,
-        metavar="N",
-        help="list in all these files at most N collisions of an interval, the earliest, and N edges through faces, "
-        "parts inside others and proximities at a time, with one of each two meshes; all are counted, and files and "
-        "tables say how many are not listed (default: all)",
-    )
-    out.add_argument(
-        "--baseline",
-        metavar="FILE",
-        help="compare with the JSON file of an earlier replay with the same options: print which meshes collide, "
-        "cross, are inside others or, with --clearance, are near each other at times at which they were not then; "
-        "the page of --report marks them",
-    )
+    add_options(out, _OUTPUT)
     add_fail_on(
         out,
         {
@@ -158,87 +106,51 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
             "new": "findings that --baseline does not contain",
         },
     )
-    run = command.add_argument_group("running")
-    run.add_argument(
-        "--workers",
-        type=_workers,
-        default=1,
-        metavar="N|ADDRESS",
-        help="check intervals in N processes on this machine, which share its cores or, unless --device names one "
-        "such as cuda:0, its GPUs (default: 1); or in the workers of the Dask cluster whose scheduler has this "
-        "address, such as tcp://head:8786, which need the scene at the same path and pip install 'warp-bsc[cluster]'",
-    )
-    run.add_argument(
-        "--progress",
-        choices=("text", "json"),
-        default="text",
-        help="text: a bar on a terminal, else a line every ten seconds; json: an object of JSON in a line of standard "
-        "error after each interval: activity, done, of, seconds, hits (default: text)",
-    )
-    run.add_argument(
-        "--resume",
-        action="store_true",
-        help="continue an earlier run with the same options and files that was stopped or killed: take its finished "
-        "intervals from the file of --json, or that name with .part appended, and check the others; without these "
-        "files, check all",
-    )
-    add_detection_options(command, method="exact")
+    add_options(command.add_argument_group("running"), _RUNNING)
+    add_options(command, detection_options("exact"))
 
 
 def add_scene_selection(which: argparse._ArgumentGroup) -> None:
     """Adds the options that select meshes, pairs of them and the time of a scene, and how it is read."""
-    patterns = {"nargs": "+", "action": "extend", "default": [], "metavar": "PATTERN"}
-    which.add_argument(
-        "--prims",
-        **patterns,
-        help="check only meshes at or below these prims or instances, named as in the report; * matches any text",
+    add_options(which, _SCENE)
+
+
+def read_selection(arguments: argparse.Namespace, ignored: Iterable[tuple[str, str]] = ()) -> Selection:
+    """Returns the selection that the options of :func:`add_scene_selection` make, with more pairs that are ignored."""
+    return Selection(
+        prims=tuple(arguments.prims),
+        exclude=tuple(arguments.exclude),
+        self_collisions=arguments.self_collisions,
+        between=tuple(arguments.between) if arguments.between else None,
+        purposes=tuple(arguments.purpose or Selection.purposes),
+        ignore=(*map(tuple, arguments.ignore), *ignored),
     )
-    which.add_argument("--exclude", **patterns, help="do not check meshes at or below these prims")
-    which.add_argument(
-        "--self",
-        dest="self_collisions",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="check each mesh with itself (default: yes, unless only its transform moves it)",
-    )
-    which.add_argument(
-        "--between", nargs=2, metavar=("A", "B"), help="check only pairs of a mesh of pattern A and one of pattern B"
-    )
-    which.add_argument(
-        "--ignore",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("A", "B"),
-        help="only count the collisions of a mesh of pattern A and one of pattern B; may be repeated",
-    )
-    which.add_argument(
-        "--purpose",
-        nargs="+",
-        action="extend",
-        choices=PURPOSES,
-        metavar="PURPOSE",
-        help="purposes of the meshes to check: default, render, proxy, guide (default: default render)",
-    )
-    which.add_argument(
-        "--frames",
-        type=_frames,
-        metavar="START:END:STEP",
-        help="time codes to check, each of the three optional; without STEP, all samples from START to END; 5:5 "
-        "checks time 5 alone, at rest",
-    )
-    which.add_argument(
-        "--strict",
-        action="store_true",
-        help="end with status 2 if a part of the scene cannot be read, instead of leaving it out",
-    )
-    which.add_argument(
-        "--allow-missing",
-        **patterns,
-        help="do not count these files, or the files and prims that these prims refer to, as left out if they are "
-        "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
-        "may always be missing",
-    )
+
+
+def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = False, **options: Any) -> Scene:
+    """Opens a scene with the options of :func:`add_scene_selection` that say how it is read, and shows the progress.
+
+    Args:
+        path: The file.
+        arguments: The options.
+        as_json: Whether the progress is for programs.
+        options: Other arguments of the scene.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If the options do not fit the scene, or the file is broken.
+    """
+    with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
+        importlib.import_module("warp_bsc.usd.find_meshes")
+    INTERRUPTS.check()
+    how = {"strict": arguments.strict, "allow_missing": arguments.allow_missing}
+    try:
+        with RunProgress("Comparing vertices", as_json=as_json) as progress:
+            return Scene(path, **how, **options, progress=progress.show)
+    except (OSError, ValueError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: {describe(error)}") from error
 
 
 def describe_selection(scene: Scene, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -283,8 +195,8 @@ def _selection_words(arguments: argparse.Namespace, ignore: Iterable[Sequence[st
     for name in ("between", "purpose", "prims", "exclude", "allow_missing"):
         values = getattr(arguments, name)
         words += [_option(name), *values] if values else []
-    for pair in ignore:
-        words += ["--ignore", *pair]
+    for meshes in ignore:
+        words += ["--ignore", *meshes]
     return words
 
 
@@ -329,3 +241,118 @@ def _workers(text: str) -> int | str:
     except (argparse.ArgumentTypeError, ValueError) as error:
         message = f"must be an integer of at least 1, or an address such as tcp://head:8786, not {text}"
         raise argparse.ArgumentTypeError(message) from error
+
+
+_SCENE: Options = {
+    "--prims": patterns(
+        "check only meshes at or below these prims or instances, named as in the report; * matches any text"
+    ),
+    "--exclude": patterns("do not check meshes at or below these prims"),
+    "--self": {
+        "dest": "self_collisions",
+        **switch("check each mesh with itself (default: yes, unless only its transform moves it)"),
+    },
+    "--between": pair("check only pairs of a mesh of pattern A and one of pattern B"),
+    "--ignore": {
+        **pair("only count the collisions of a mesh of pattern A and one of pattern B; may be repeated"),
+        "action": "append",
+        "default": [],
+    },
+    "--purpose": {
+        "nargs": "+",
+        "action": "extend",
+        "choices": PURPOSES,
+        "metavar": "PURPOSE",
+        "help": "purposes of the meshes to check: default, render, proxy, guide (default: default render)",
+    },
+    "--frames": number(
+        _frames,
+        "time codes to check, each of the three optional; without STEP, all samples from START to END; 5:5 "
+        "checks time 5 alone, at rest",
+        metavar="START:END:STEP",
+    ),
+    "--strict": flag("end with status 2 if a part of the scene cannot be read, instead of leaving it out"),
+    "--allow-missing": patterns(
+        "do not count these files, or the files and prims that these prims refer to, as left out if they are "
+        "missing, only note them; * matches any text. Materials, textures and other files that cannot hold geometry "
+        "may always be missing"
+    ),
+}
+_SELECTION: Options = {
+    "--intersections": switch(
+        "find the edges that pass through faces or touch them at the time samples themselves, and the meshes that "
+        "are wholly inside others (default: yes)"
+    ),
+    "--clearance": number(
+        distance,
+        "find the proximities at the time samples themselves: vertices and faces, and edges, that are at most D "
+        "apart, in the scene's unit, and neither share a vertex nor are joined by an edge. Distances between the "
+        "samples are not checked, nor are those of curves and points; an edge that passes through a face is an "
+        "intersection instead",
+        metavar="D",
+    ),
+    "--ignore-from": file_option(
+        "read pairs for --ignore from a file: two patterns a line, in quotation marks if they contain blanks; # "
+        "begins a comment"
+    ),
+    "--ignore-initial": flag(
+        "ignore all pairs of meshes that cross at the first time, and meshes that cross themselves then; for "
+        "meshes that are inside others then, ignore only that they are inside"
+    ),
+    "--subdivide": number(
+        positive,
+        "divide the time from each sample to the next into N intervals, for motion that is neither linear nor a "
+        "turn about one axis, such as that of skeletons (default: 1)",
+        default=1,
+    ),
+    "--validate": number(
+        _validate,
+        "decide pairs of each interval again by the exact checker: all, or N hits and N other pairs",
+        default=0,
+        metavar="all|N",
+    ),
+}
+_PRINTED = {"type": _output, "nargs": "?", "const": STDOUT}
+_OUTPUT: Options = {
+    "--overlay": file_option("a USD layer over the scene, .usda or .usdc, which shows the collisions as guides"),
+    "--report": file_option(
+        "a page with a timeline, every interval in 3D, and a table of all collisions, .html", type=_output
+    ),
+    "--json": file_option("every collision as JSON; without FILE, print only that", **_PRINTED),
+    "--csv": file_option("every collision as CSV; without FILE, print only that", **_PRINTED),
+    "--npz": file_option(
+        "every collision as columns for NumPy, .npz, in a fifteenth of the space of JSON", type=_output
+    ),
+    "--limit": number(
+        positive,
+        "list in all these files at most N collisions of an interval, the earliest, and N edges through faces, "
+        "parts inside others and proximities at a time, with one of each two meshes; all are counted, and files and "
+        "tables say how many are not listed (default: all)",
+    ),
+    "--baseline": file_option(
+        "compare with the JSON file of an earlier replay with the same options: print which meshes collide, "
+        "cross, are inside others or, with --clearance, are near each other at times at which they were not then; "
+        "the page of --report marks them"
+    ),
+}
+_RUNNING: Options = {
+    "--workers": number(
+        _workers,
+        "check intervals in N processes on this machine, which share its cores or, unless --device names one "
+        "such as cuda:0, its GPUs (default: 1); or in the workers of the Dask cluster whose scheduler has this "
+        "address, such as tcp://head:8786, which need the scene at the same path and pip install 'warp-bsc[cluster]'",
+        default=1,
+        metavar="N|ADDRESS",
+    ),
+    "--progress": {
+        "choices": ("text", "json"),
+        "default": "text",
+        "help": "text: a bar on a terminal, else a line every ten seconds; json: an object of JSON in a line of "
+        "standard error after each interval: activity, done, of, seconds, hits (default: text)",
+    },
+    "--resume": flag(
+        "continue an earlier run with the same options and files that was stopped or killed: take its finished "
+        "intervals from the file of --json, or that name with .part appended, and check the others; without these "
+        "files, check all"
+    ),
+}

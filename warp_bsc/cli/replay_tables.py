@@ -3,20 +3,31 @@
 from collections import defaultdict
 
 from rich.console import Console
-from rich.text import Text
 
 from ..repair.shot.findings import kept_meshes
 from ..replay.baseline import NewFinding
 from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
 from ..replay.scene_contacts import PHASES
-from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary, ValidationSummary
+from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
+from ..replay.validation import Validation
 from .option_names import with_option
-from .tables import LONGEST, count, make_table, say
+from .tables import LONGEST, Column, count, print_table, say, say_list
 
 __all__ = ["print_new", "print_repair", "print_replay", "print_work"]
 
 _WITH_POSITIONS = 60
 """Least width of a terminal on which the table of intervals has positions."""
+
+_POSITION = [
+    Column(axis, lambda found, i=i: getattr(found, "earliest", found).position[i], ".4g")
+    for i, axis in enumerate("xyz")
+]
+_WORST = (
+    Column("Collisions", "hits"),
+    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), "", kind="text"),
+    Column("At", lambda interval: round(interval.earliest.time, 6), ".6g"),
+)
+_NEAREST = (Column("Distance", "distance", ".6g"), Column("Time", "time", "g"), *_POSITION)
 
 _RANGES = 4
 """Most ranges of time in a line."""
@@ -123,10 +134,9 @@ def print_work(console: Console, works: list[Work | None], writing: float) -> No
         by_worker[work.worker and f"{work.worker} on {work.device}"].append(work.reading + work.checking)
     if "" in by_worker:  # this process alone
         return
-    for worker, seconds in sorted(by_worker.items())[:LONGEST]:
-        say(console, f"  {worker}: {count(len(seconds), 'interval')}, {sum(seconds):,.2f} s")
-    if len(by_worker) > LONGEST:
-        say(console, f"  and {len(by_worker) - LONGEST} more workers.")
+    workers = sorted(by_worker.items())
+    lines = [f"{name}: {count(len(seconds), 'interval')}, {sum(seconds):,.2f} s" for name, seconds in workers]
+    say_list(console, lines, " workers.")
 
 
 def print_new(console: Console, new: list[NewFinding]) -> None:
@@ -135,16 +145,17 @@ def print_new(console: Console, new: list[NewFinding]) -> None:
         say(console, "Nothing is new against the baseline.")
         return
     say(console, f"New against the baseline: {count(len(new), 'interval or time', 'intervals and times')}.")
-    for what, meshes, start, end in new[:LONGEST]:
-        finding = f"{_pair((meshes[0], meshes[-1]))} {what}"
-        if what == "is inside":
-            finding = " is inside ".join(meshes)
-        elif what == "are duplicates":
-            finding = f"{meshes[0]} and {count(len(meshes) - 1, 'other')} are duplicates"
-        when = f"at {start:g}" if start == end else f"from {start:g} to {end:g}"
-        say(console, f"  {finding} {when}")
-    if len(new) > LONGEST:
-        say(console, f"  and {len(new) - LONGEST} more.")
+    say_list(console, [_new_finding(*finding) for finding in new], ".")
+
+
+def _new_finding(what: str, meshes: tuple[str, ...], start: float, end: float) -> str:
+    """Returns what a baseline does not contain, in words."""
+    finding = f"{_pair((meshes[0], meshes[-1]))} {what}"
+    if what == "is inside":
+        finding = " is inside ".join(meshes)
+    elif what == "are duplicates":
+        finding = f"{meshes[0]} and {count(len(meshes) - 1, 'other')} are duplicates"
+    return f"{finding} at {start:g}" if start == end else f"{finding} from {start:g} to {end:g}"
 
 
 def _print_certificate(console: Console, summary: Summary) -> None:
@@ -170,23 +181,10 @@ def _print_certificate(console: Console, summary: Summary) -> None:
 def _print_worst(console: Console, listed: list[IntervalSummary]) -> None:
     """Prints the intervals, those with the most collisions first: of which prims the first is, when and where."""
     arrow = "->" if console.options.ascii_only else "→"
-    has_room = console.width >= _WITH_POSITIONS
-    table = make_table("Frames", "Collisions", "First contact", "At", *("x", "y", "z") * has_room)
-    table.columns[0].no_wrap = True
-    prims = table.columns[2]
-    prims.justify, prims.no_wrap, prims.overflow = "left", False, "fold"
-    for interval in listed:
-        first = interval.earliest
-        assert first  # it collides
-        others = len(interval.mesh_pairs) - 1
-        table.add_row(
-            Text(f"{interval.start:g} {arrow} {interval.end:g}"),
-            f"{interval.hits:,}",
-            Text(_contact(first) + f"; also {count(others, 'other pair')}" * (others > 0)),
-            f"{round(first.time, 6):.6g}",
-            *(f"{coordinate:.4g}" for coordinate in first.position * has_room),
-        )
-    console.print(table)
+    first = Column("Frames", kind="word")
+    positions = _POSITION if console.width >= _WITH_POSITIONS else ()
+    rows = [(f"{interval.start:g} {arrow} {interval.end:g}", interval) for interval in listed]
+    print_table(console, first, [*_WORST, *positions], rows)
 
 
 def _print_collisions(console: Console, summary: Summary) -> None:
@@ -203,12 +201,12 @@ def _print_collisions(console: Console, summary: Summary) -> None:
     spans = defaultdict(list)
     for span in summary.collision_spans:
         spans[span.meshes].append(span)
-    for meshes, hits in summary.mesh_pairs[:LONGEST]:
+    lines = []
+    for meshes, hits in summary.mesh_pairs:
         ranges = [f"{span.since:g} to {span.until:g}" for span in spans[meshes]]
         more = f", and {len(ranges) - _RANGES} more times" * (len(ranges) > _RANGES)
-        say(console, f"  {hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
-    if len(summary.mesh_pairs) > LONGEST:
-        say(console, f"  and {len(summary.mesh_pairs) - LONGEST} more pairs of meshes; --json has all.")
+        lines.append(f"{hits:,} of {_pair(meshes)}, from {', '.join(ranges[:_RANGES])}{more}")
+    say_list(console, lines, " pairs of meshes; --json has all.")
     contact = colliding[0].earliest
     assert contact  # it collides
     say(console, f"The first at time {contact.time:.6g}: {_contact(contact)}.")
@@ -234,12 +232,9 @@ def _print_intersections(console: Console, summary: Summary) -> None:
         console,
         f"Intersections at rest at {intersecting:,} of {times}; the most at {worst.time:g}: {_intersecting(worst)}.",
     )
-    for span in spans[:LONGEST]:
-        first, second = span.meshes
-        pair = f"{first} inside {second}" if span.inside else _pair(span.meshes)
-        say(console, f"  {pair}: {_history(span)}")
-    if len(spans) > LONGEST:
-        say(console, f"  and {len(spans) - LONGEST} more; --json has all.")
+    pairs = [" inside ".join(span.meshes) if span.inside else _pair(span.meshes) for span in spans]
+    lines = [f"{pair}: {_history(span)}" for pair, span in zip(pairs, spans, strict=True)]
+    say_list(console, lines, "; --json has all.")
     if summary.colliding:
         phases = [
             sum(column) for column in zip(*(interval.phases or () for interval in summary.colliding), strict=True)
@@ -268,15 +263,8 @@ def _print_proximities(console: Console, summary: Summary, clearance: float) -> 
         f"Elements are at most {clearance:g} apart at {near:,} of {times}. The smallest distance is "
         f"{nearest[0].distance:.6g}, at {nearest[0].time:g}; the most pairs at {worst.time:g}: {worst.pairs:,}.",
     )
-    table = make_table("Nearest elements", "Distance", "Time", "x", "y", "z", caption="The nearest of all times.")
-    for found in nearest[:LONGEST]:
-        table.add_row(
-            Text(_contact(found)),
-            f"{found.distance:.6g}",
-            f"{found.time:g}",
-            *(f"{coordinate:.4g}" for coordinate in found.position),
-        )
-    console.print(table)
+    rows = [(_contact(found), found) for found in nearest[:LONGEST]]
+    print_table(console, "Nearest elements", _NEAREST, rows, caption="The nearest of all times.")
     if len(nearest) > LONGEST:
         say(console, f"  and {len(nearest) - LONGEST} more pairs of meshes; --json has all.")
 
@@ -297,6 +285,12 @@ def _contact(found: Contact | Nearest) -> str:
     return f"{first}, {element}, with {'its' if first == second else f'{second},'} {other}"
 
 
+def _others(interval: IntervalSummary) -> str:
+    """Returns how many other pairs of meshes than the first collide, in words."""
+    others = len(interval.mesh_pairs) - 1
+    return f"; also {count(others, 'other pair')}" * (others > 0)
+
+
 def _pair(meshes: tuple[str, str]) -> str:
     first, second = meshes
     return f"{first} with {'itself' if first == second else second}"
@@ -314,7 +308,7 @@ def _history(span: IntersectionSpan) -> str:
     return f"from {span.since:g} to {span.until:g}, {numbers}: {trend}"
 
 
-def _print_validation(console: Console, found: ValidationSummary, has_strands: bool) -> None:
+def _print_validation(console: Console, found: Validation, has_strands: bool) -> None:
     """Prints the comparison with the exact checker."""
     wrong = found.disagreements
     say(
@@ -324,13 +318,7 @@ def _print_validation(console: Console, found: ValidationSummary, has_strands: b
     )
     if has_strands:
         say(console, "Collisions of curves and points are not validated.")
-    for line in wrong[:LONGEST]:
-        say(console, f"  {line}")
-    if len(wrong) > LONGEST:
-        say(console, f"  and {len(wrong) - LONGEST} more; --json has all.")
+    say_list(console, wrong, "; --json has all.")
     if found.false_hits:
-        say(
-            console,
-            f"False collisions, which method conservative allows: {found.false_hits:,}.",
-        )
+        say(console, f"False collisions, which method conservative allows: {found.false_hits:,}.")
     say(console, f"Certified by floating point: {found.certified:,} of {found.decided:,} pairs.")

@@ -182,11 +182,6 @@ class IntervalSummary:
     def _stages(self) -> list[StageCounts]:
         return [getattr(self.stats, kind.label) for kind in DistanceKind]
 
-    @property
-    def milliseconds(self) -> float:
-        """Time of the detector's stages together [ms]."""
-        return sum(self.stats.milliseconds.values())
-
 
 @dataclass(frozen=True)
 class Work:

@@ -111,7 +111,6 @@ def find_contacts(
         )
 
     named = name_elements(segment, vertices, faces, ends)
-    meshes = named["meshes"]
     toi = np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi])
     normal = np.concatenate([collisions.vertex_face_normal, collisions.edge_edge_normal])
 
@@ -121,24 +120,8 @@ def find_contacts(
     first = positions_at(interval, arcs, ends[:, 0], toi[n_vertex_face:])
     position = np.concatenate([on_faces, (1.0 - s) * first[:, 0] + s * first[:, 1]])
 
-    moves = np.array([part.moves for part in segment.meshes])
-    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
-    counted &= ~are_stiff_pairs(segment, vertices, meshes[:n_vertex_face, 1], ends)
-    ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
-    counted &= ~ignored
-    arrays = named | {
-        "toi": toi,
-        "time": interval.start + toi * (interval.end - interval.start),
-        "position": position,
-        "normal": normal,
-    }
-    return SceneContacts(
-        segment,
-        **take_rows(arrays, counted),
-        interval=interval,
-        counted=counted,
-        ignored={names: number for names, (number,) in count_by_meshes(segment, meshes[ignored]).items()},
-    )
+    stiff = are_stiff_pairs(segment, vertices, named["meshes"][:n_vertex_face, 1], ends)
+    return _select(interval, named | {"toi": toi, "position": position, "normal": normal}, stiff, selection)
 
 
 def find_strand_contacts(
@@ -151,15 +134,8 @@ def find_strand_contacts(
     """Names the detected pairs with curves or points that are checked by prims and elements.
 
     Excluded are the pairs that :func:`find_contacts` excludes, and edges of one curve that are near along it, as thick
-    curves always touch themselves there.
-
-    Args:
-        interval: The interval.
-        mesh: The mesh of the detection, made of the interval's segment with its curves and points, in which pairs of
-            two elements of faces are excluded.
-        collisions: Collisions of that mesh in the interval.
-        selection: The pairs of meshes that are checked.
-        arcs: The motion of the vertices on arcs; None if all move straight.
+    curves always touch themselves there. Arguments: as of that, with the mesh of the detection, made of the interval's
+    segment with its curves and points, in which pairs of two elements of faces are excluded.
     """
     segment = interval.segment
     ends = mesh.edges[collisions.edge_edge].astype(np.int64)
@@ -193,19 +169,23 @@ def find_strand_contacts(
         collisions.vertex_edge_normal,
         collisions.vertex_vertex_normal,
     ]
-    meshes, toi = named["meshes"], np.concatenate(tois)
+    first, second = named["meshes"].T
+    is_stiff = np.array([part.moves and not part.deforms for part in segment.meshes])
+    arrays = {"toi": tois, "position": position, "normal": normal}
+    arrays = named | {name: np.concatenate(parts) for name, parts in arrays.items()}
+    return _select(interval, arrays, (first == second) & is_stiff[first], selection)
+
+
+def _select(
+    interval: Interval, arrays: dict[str, np.ndarray], stiff: np.ndarray, selection: Selection
+) -> SceneContacts:
+    """Returns the contacts that are checked, given the arrays of all, and which are of one stiff mesh."""
+    segment, meshes = interval.segment, arrays["meshes"]
     moves = np.array([part.moves for part in segment.meshes])
-    stiff = np.array([part.moves and not part.deforms for part in segment.meshes])
-    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes)
-    counted &= ~((meshes[:, 0] == meshes[:, 1]) & stiff[meshes[:, 0]])
+    counted = moves[meshes].any(axis=1) & selection.counted_pairs(segment.meshes, meshes) & ~stiff
     ignored = counted & selection.ignored_pairs(segment.meshes, meshes)
     counted &= ~ignored
-    arrays = named | {
-        "toi": toi,
-        "time": interval.start + toi * (interval.end - interval.start),
-        "position": np.concatenate(position),
-        "normal": np.concatenate(normal),
-    }
+    arrays = arrays | {"time": interval.start + arrays["toi"] * (interval.end - interval.start)}
     return SceneContacts(
         segment,
         **take_rows(arrays, counted),

@@ -1,11 +1,15 @@
 """A whole replay in numbers, as tables and files show them at the end."""
 
+import functools
 from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 from ..usd.scene import Scene
 from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
+from .validation import Validation
 
 __all__ = [
     "CERTIFIED_FOR",
@@ -14,32 +18,13 @@ __all__ = [
     "IntersectionSpan",
     "ProximitySpan",
     "Summary",
-    "ValidationSummary",
 ]
+
+_Span = TypeVar("_Span")
+_AtRest = TypeVar("_AtRest", IntersectionSummary, ProximitySummary)
 
 CERTIFIED_FOR = "vertices that move straight or turn about one axis between the times checked"
 """The motion that a certificate holds for."""
-
-
-@dataclass(frozen=True)
-class ValidationSummary:
-    """Comparison of a whole replay with the exact checker.
-
-    Attributes:
-        hits: Number of reported collisions that the checker decided.
-        others: Number of unreported pairs with overlapping swept boxes that the checker decided.
-        decided: Number of pairs that the detector decided.
-        certified: Number of these that floating point certified.
-        false_hits: Number of reported pairs of method "conservative" that do not collide, as that method permits.
-        disagreements: The pairs that the checker decides differently, a sentence with the interval each.
-    """
-
-    hits: int
-    others: int
-    decided: int
-    certified: int
-    false_hits: int
-    disagreements: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -198,28 +183,24 @@ class Summary:
     @cached_property
     def ignored(self) -> list[tuple[tuple[str, str], int]]:
         """Names of two meshes and their number of colliding pairs that were ignored, the largest first."""
-        total: Counter[tuple[str, str]] = Counter()
-        for interval in self.intervals:
-            total.update(interval.ignored)
-        return total.most_common()
+        return self._largest("ignored")
 
     @cached_property
     def collision_spans(self) -> list[CollisionSpan]:
         """The times over which two meshes collide, by their start, then by descending number of hits."""
-        spans, running = [], {}
-        for interval in self.intervals:
-            for meshes in [meshes for meshes in running if meshes not in interval.mesh_pairs]:
-                spans.append(running.pop(meshes))
-            for meshes, hits in interval.mesh_pairs.items():
-                before = running.get(meshes, CollisionSpan(meshes, interval.start, interval.end, 0))
-                running[meshes] = replace(before, until=interval.end, hits=before.hits + hits)
-        return sorted([*spans, *running.values()], key=lambda span: (span.since, -span.hits))
+        begun = (
+            {meshes: CollisionSpan(meshes, at.start, at.end, hits) for meshes, hits in at.mesh_pairs.items()}
+            for at in self.intervals
+        )
+        return sorted(
+            _joined(begun, lambda a, b: replace(a, until=b.until, hits=a.hits + b.hits)),
+            key=lambda span: (span.since, -span.hits),
+        )
 
     @cached_property
     def intersections(self) -> list[IntersectionSummary]:
         """The intersections at all times of the finished intervals, in order; empty if none were searched."""
-        found = [interval.intersections for interval in self.intervals if interval.intersections]
-        return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+        return _at_all_times(interval.intersections for interval in self.intervals)
 
     @cached_property
     def intersection_spans(self) -> list[IntersectionSpan]:
@@ -248,35 +229,30 @@ class Summary:
     @cached_property
     def proximities(self) -> list[ProximitySummary]:
         """The proximities at all times of the finished intervals, in order; empty if none were searched."""
-        found = [interval.proximities for interval in self.intervals if interval.proximities]
-        return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+        return _at_all_times(interval.proximities for interval in self.intervals)
 
     @cached_property
     def proximity_spans(self) -> list[ProximitySpan]:
         """The times over which two meshes are near each other, by their start, then by ascending distance."""
-        spans, running = [], {}
-        for sample in self.proximities:
-            found = {(min(near.meshes), max(near.meshes)): near.distance for near in sample.nearest}
-            for meshes in [meshes for meshes in running if meshes not in found]:
-                spans.append(running.pop(meshes))
-            for meshes, distance in found.items():
-                span = running.get(meshes, ProximitySpan(meshes, sample.time, sample.time, distance, sample.time))
-                if distance < span.distance:
-                    span = replace(span, distance=distance, nearest_at=sample.time)
-                running[meshes] = replace(span, until=sample.time)
-        return sorted([*spans, *running.values()], key=lambda span: (span.since, span.distance))
+        begun = (
+            {
+                (meshes := (min(near.meshes), max(near.meshes))): ProximitySpan(
+                    meshes, at.time, at.time, near.distance, at.time
+                )
+                for near in at.nearest
+            }
+            for at in self.proximities
+        )
+        return sorted(
+            _joined(begun, lambda a, b: replace(b if b.distance < a.distance else a, since=a.since, until=b.until)),
+            key=lambda span: (span.since, span.distance),
+        )
 
     @cached_property
     def duplicate_spans(self) -> list[DuplicateSpan]:
         """The times over which meshes are duplicates of each other, by their start."""
-        spans, running = [], {}
-        for interval in self.intervals:
-            for meshes in [meshes for meshes in running if meshes not in interval.duplicates]:
-                spans.append(running.pop(meshes))
-            for meshes in interval.duplicates:
-                before = running.get(meshes, DuplicateSpan(meshes, interval.start, interval.end))
-                running[meshes] = replace(before, until=interval.end)
-        return sorted([*spans, *running.values()], key=lambda span: span.since)
+        begun = ({meshes: DuplicateSpan(meshes, at.start, at.end) for meshes in at.duplicates} for at in self.intervals)
+        return sorted(_joined(begun, lambda a, b: replace(a, until=b.until)), key=lambda span: span.since)
 
     @cached_property
     def nearest(self) -> list[Nearest]:
@@ -296,10 +272,7 @@ class Summary:
     @cached_property
     def mesh_pairs(self) -> list[tuple[tuple[str, str], int]]:
         """Names of two meshes and their number of colliding pairs, the largest first."""
-        total: Counter[tuple[str, str]] = Counter()
-        for interval in self.intervals:
-            total.update(interval.mesh_pairs)
-        return total.most_common()
+        return self._largest("mesh_pairs")
 
     @property
     def toi_counts(self) -> list[int]:
@@ -307,32 +280,28 @@ class Summary:
         counts = [interval.toi_counts for interval in self.intervals]
         return [sum(column) for column in zip(*counts, strict=True)] or [0] * TOI_BINS
 
-    @property
-    def milliseconds(self) -> dict[str, float]:
-        """Time by stage of the detector [ms]."""
-        total = Counter()
+    def _largest(self, counts: str) -> list[tuple[tuple[str, str], int]]:
+        """Returns counts by two meshes of all intervals, the largest first."""
+        total: Counter[tuple[str, str]] = Counter()
         for interval in self.intervals:
-            total.update(interval.stats.milliseconds)
-        return dict(total)
+            total.update(getattr(interval, counts))
+        return total.most_common()
 
     @property
-    def validation(self) -> ValidationSummary | None:
-        """The comparison with the exact checker, None without validation."""
-        found = [(interval, interval.validation) for interval in self.intervals if interval.validation]
-        if not found:
-            return None
-        return ValidationSummary(
-            hits=sum(validation.hits for _, validation in found),
-            others=sum(validation.others for _, validation in found),
-            decided=sum(validation.decided for _, validation in found),
-            certified=sum(validation.certified for _, validation in found),
-            false_hits=sum(validation.false_hits for _, validation in found),
-            disagreements=tuple(
-                f"from time {interval.start:g} to {interval.end:g}: {line}"
-                for interval, validation in found
-                for line in validation.disagreements
-            ),
-        )
+    def validation(self) -> Validation | None:
+        """The comparison of all intervals with the exact checker, which names them; None without validation."""
+        found = [
+            replace(
+                interval.validation,
+                disagreements=tuple(
+                    f"from time {interval.start:g} to {interval.end:g}: {line}"
+                    for line in interval.validation.disagreements
+                ),
+            )
+            for interval in self.intervals
+            if interval.validation
+        ]
+        return functools.reduce(Validation.__add__, found) if found else None
 
     @property
     def motion(self) -> str:
@@ -361,6 +330,22 @@ class Summary:
         if count == len(self.intervals):
             return self
         return replace(self, intervals=self.intervals[:count], stopped=self.stopped or "the disk is full")
+
+
+def _at_all_times(intervals: Iterable[tuple[_AtRest, _AtRest] | None]) -> list[_AtRest]:
+    """Returns what is at the starts of intervals, and at the end of the last one."""
+    found = [both for both in intervals if both]
+    return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+
+def _joined(times: Iterable[dict[tuple[str, ...], _Span]], join: Callable[[_Span, _Span], _Span]) -> list[_Span]:
+    """Returns the spans of consecutive times, given those of each time by their meshes, and what joins two."""
+    spans, running = [], {}
+    for found in times:
+        spans += [span for meshes, span in running.items() if meshes not in found]
+        both = {meshes: join(span, found[meshes]) for meshes, span in running.items() if meshes in found}
+        running = both | {meshes: span for meshes, span in found.items() if meshes not in both}
+    return [*spans, *running.values()]
 
 
 def _span(inside, meshes, samples, is_open, becomes) -> IntersectionSpan:

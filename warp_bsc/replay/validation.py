@@ -1,7 +1,7 @@
 """Compares a detection with the exact checker, on pairs found independently of the detector."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -35,6 +35,10 @@ class Validation:
     certified: int
     disagreements: tuple[str, ...]
     false_hits: int
+
+    def __add__(self, other: "Validation") -> "Validation":
+        """Returns the comparison of both detections."""
+        return Validation(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
 
 
 def validate(

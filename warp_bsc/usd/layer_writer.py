@@ -3,6 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
+import contextlib
 import errno
 import os
 import re
@@ -19,7 +20,7 @@ __all__ = [
     "LayerGroup",
     "LayerPrim",
     "PrimKind",
-    "as_os_error",
+    "new_layer",
     "write_binary_layer",
     "write_text_layer",
 ]
@@ -114,25 +115,49 @@ def write_binary_layer(content: LayerContent, path: Path) -> None:
     Raises:
         OSError: If the file cannot be written.
     """
-    from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
-
-    try:
-        layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(path))
+    with new_layer(path, "usdc") as (layer, add):
         _define_prims(layer, content)
         _describe(layer, content)
-        waiting = 0
         for prim, attribute, value_type in _attributes(content):
             for time, value in content.samples(prim, attribute):
-                layer.SetTimeSample(f"{content.root}/{prim}.{attribute}", time, _to_vt(value_type, value))
-                waiting += value.nbytes
-                if waiting > _SAVED:
-                    layer.Save()
-                    waiting = 0
+                add(f"{content.root}/{prim}.{attribute}", time, _to_vt(value_type, value), value.nbytes)
+
+
+@contextlib.contextmanager
+def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str, float, Any, int], None]]]:
+    """Makes a layer, and saves it at the end of the block.
+
+    Args:
+        path: A file that does not exist, with any name. After an error it does not exist.
+        file_format: ``"usdc"``, USD's binary format, in which saved samples leave the memory, or ``"usda"``.
+
+    Yields:
+        The layer, and a function that adds a sample to it, given the path of its attribute, its time code, its value
+        and its size [bytes].
+
+    Raises:
+        OSError: If the file cannot be written.
+    """
+    from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
+
+    waiting = 0
+
+    def add(attribute: str, time: float, value: Any, size: int) -> None:
+        nonlocal waiting
+        layer.SetTimeSample(attribute, time, value)
+        waiting += size
+        if waiting > _SAVED and file_format == "usdc":
+            layer.Save()
+            waiting = 0
+
+    try:
+        layer = Sdf.Layer.New(Sdf.FileFormat.FindById(file_format), str(path))
+        yield layer, add
         layer.Save()
     except BaseException as error:
         path.unlink(missing_ok=True)
         if isinstance(error, Tf.ErrorException):
-            raise as_os_error(error) from error
+            raise _as_os_error(error) from error
         raise
 
 
@@ -289,7 +314,7 @@ def _to_text(rows) -> str:
     return ", ".join([row] * len(rows)).format(*rows.reshape(-1).tolist())
 
 
-def as_os_error(error) -> Exception:
+def _as_os_error(error) -> Exception:
     """Returns the system's error, such as a full disk, in an error of OpenUSD; the error itself without one."""
     for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         if os.strerror(number) in str(error):

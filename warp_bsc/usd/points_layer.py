@@ -15,7 +15,7 @@ import numpy as np
 
 from .._atomic_file import OutputFile
 from .layer import just_before, layer_metadata
-from .layer_writer import as_os_error
+from .layer_writer import new_layer
 from .scene import Scene
 from .segment import Segment
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from .meshes import UsdMesh  # which imports pxr
 
 __all__ = ["MovedFrame", "PointsLayer"]
-
-_SAVED = 1 << 25  # bytes of samples that the layer holds in memory before it saves them
 
 
 @dataclass(frozen=True)
@@ -112,25 +110,11 @@ class PointsLayer:
             OSError: If the file cannot be written.
             ValueError: If the scene cannot be read again.
         """
-        from pxr import Sdf, Tf  # noqa: PLC0415 (slow)
-
         path = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
-        try:
-            layer = Sdf.Layer.New(Sdf.FileFormat.FindById(self._format), str(path))
+        with new_layer(path, self._format) as (layer, add):
             self._describe(layer, facts)
-            waiting = 0
             for name in self._moved:
-                for size in self._write_mesh(layer, name):
-                    waiting += size
-                    if waiting > _SAVED and self._format == "usdc":
-                        layer.Save()
-                        waiting = 0
-            layer.Save()
-        except BaseException as error:
-            path.unlink(missing_ok=True)
-            if isinstance(error, Tf.ErrorException):
-                raise as_os_error(error) from error
-            raise
+                self._write_mesh(layer, name, add)
         self.file.adopt(path)
         self.file.commit()
 
@@ -162,8 +146,8 @@ class PointsLayer:
         source = Path(source).as_posix()
         layer.subLayerPaths.append(source if source.startswith("../") else f"./{source}")
 
-    def _write_mesh(self, layer, name) -> Iterator[int]:
-        """Writes the samples of one mesh, and yields their sizes [bytes]."""
+    def _write_mesh(self, layer, name, add) -> None:
+        """Writes the samples of one mesh by ``add``."""
         from pxr import Sdf, Vt  # noqa: PLC0415 (slow)
 
         mesh = self._scene.prim_of(name)
@@ -188,8 +172,7 @@ class PointsLayer:
                 if not spec.attributes.get(attribute):
                     Sdf.AttributeSpec(spec, attribute, Sdf.ValueTypeNames.Find(kind))
                 array = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(value, np.float32))
-                layer.SetTimeSample(f"{mesh.path}.{attribute}", code, array)
-                yield value.nbytes
+                add(f"{mesh.path}.{attribute}", code, array, value.nbytes)
 
     def _times(self, mesh: "UsdMesh") -> list[tuple[float, bool]]:
         """Returns the times at which a mesh gets points, and whether the moment just before each is meant."""
