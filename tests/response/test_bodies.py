@@ -104,7 +104,7 @@ def test_a_ball_dropped_on_a_pinned_sheet(device):
         wanted[:] = momenta(model, state_out)
 
     inner.step = recorded_step
-    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, substeps=None))
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5))
     lowest, hits = 0.0, 0
     for _ in range(60):
         rollout.step()
@@ -127,7 +127,7 @@ def test_a_box_at_rest_on_a_sheet(rate, steps, device):
     inertia = (1e-4, 1.2e-4, 1.4e-4)
     add_body(builder, "box", (0.013, 0.007, 0.0305), mass=0.1, inertia=inertia, hx=0.05, hy=0.04, hz=0.03)
     model = finalize(builder, [6 * [0.0]], device)
-    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), friction=0.5, substeps=None))
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), friction=0.5))
     rollout.find_collisions = lambda before, after: []  # once at the end is enough here
     for step in range(steps):
         rollout.step(1.0 / rate)
@@ -230,7 +230,7 @@ def test_bodies_that_cannot_be_moved_keep_every_bit(why, device):
     model = finalize(builder, [[0.0, 0.0, -4.0, 0.0, 0.0, 0.0]], device)
     if why == "kinematic":
         model.body_flags.fill_(int(newton.BodyFlags.KINEMATIC))
-    solver = bsc.SolverCCD(Changed(model, change), bodies="left" if why == "left" else "pushed", substeps=None)
+    solver = bsc.SolverCCD(Changed(model, change), bodies="left" if why == "left" else "pushed")
     rollout = Rollout(model, solver)
     start, end = rollout.states
     for _ in range(3):
@@ -284,7 +284,7 @@ def test_steps_with_bodies_in_a_graph_are_those_without(inner, device):
     for in_graph in (True, False):
         model = ball_and_sheet(device, fixed=True, n=6)
         inner_solver = free(model) if inner == "free" else SOLVERS[inner](model)
-        solver = bsc.SolverCCD(inner_solver, substeps=None)
+        solver = bsc.SolverCCD(inner_solver)
         states = model.state(), model.state()
 
         def run(solver=solver, states=states, model=model):
@@ -372,7 +372,7 @@ def test_cloth_pushes_no_box_into_the_ground(tilt, device):
         wanted.append(lowest_vertex(rollout, state_out))
 
     inner.step = recorded_step
-    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5, substeps=None))
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=0.5))
     pushed = 0
     for _ in range(12):
         before = lowest_vertex(rollout, rollout.states[0])

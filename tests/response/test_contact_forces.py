@@ -87,7 +87,7 @@ def test_pads_feel_the_weight_of_what_they_grip_and_its_velocity_is_its_motion(d
         builder.add_shape_box(-1, xform=pad, hx=0.01, hy=0.005, hz=0.01, cfg=cfg)
     builder.color()
     model = builder.finalize(device=device)
-    options = {"report_contacts": True, "min_distance": 0.002, "substeps": None, "friction": 1.0}
+    options = {"report_contacts": True, "min_distance": 0.002, "friction": 1.0}
     solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), **options)
     mass, dt, (state, end), rows = model.particle_mass.numpy(), 1.0 / 240.0, (model.state() for _ in range(2)), []
     for _ in range(80):
@@ -222,7 +222,7 @@ def test_velocities_that_paths_gave_are_of_no_pair(device):
     for i in range(builder.particle_count):
         builder.particle_qd[i] = wp.vec3(0.0, 0.0, 3.0 * (-1.0) ** i)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), substeps=None, max_iterations=0, report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), max_iterations=0, report_contacts=True)
     largest, unpaired = check_momentum(model, solver, 6, lambda state, i: place_plates(state, 0.05 - 0.01 * i))
     totals = solver.report.totals
     assert totals.truncated_steps > 0 and totals.frozen_steps > 0
@@ -298,7 +298,7 @@ def test_members_of_worlds():
 @pytest.mark.filterwarnings("ignore:a step strained")
 def test_contacts_beyond_the_capacity_are_counted_and_summed_up(device):
     model = bullet(60, device=device)
-    few, all_listed = (bsc.SolverCCD(Changed(model), substeps=None, report_contacts=n) for n in (5, True))
+    few, all_listed = (bsc.SolverCCD(Changed(model), report_contacts=n) for n in (5, True))
     state, control = model.state(), model.control()
     state.particle_q.assign(
         state.particle_q.numpy() - np.float32((0.0, 0.0, 0.09)) * (np.arange(model.particle_count) > 288)[:, None]
@@ -317,7 +317,7 @@ def test_impulses_that_are_too_large_for_a_sum_are_flagged(mass, complete, devic
     model = ramp(device, 0.0)
     model.particle_mass.fill_(mass)
     model.particle_inv_mass.fill_(1.0 / mass)
-    solver = bsc.SolverCCD(SOLVERS["semi_implicit"](model), substeps=None, report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS["semi_implicit"](model), report_contacts=True)
     step_forces(model, solver, 1.0 / 100.0, 3)
     assert len(solver.report.contacts.numpy()["toi"])
     assert solver.report.impulses_complete == solver.report.contacts.complete == complete

@@ -255,7 +255,7 @@ def test_worlds_are_alone_and_may_take_no_part(device):
             state.particle_q.assign((state.particle_q.numpy() + by).astype(np.float32))
 
         options = {"inversions": "prevented", "report_worlds": True, "separation": 2e-4}
-        solver = bsc.SolverCCD(Changed(model, change), substeps=None, **options)
+        solver = bsc.SolverCCD(Changed(model, change), **options)
         start, end, ends = model.state(), model.state(), []
         for mask in masks:
             taken = None if mask is None else wp.array([*mask, True], dtype=bool, device=device)

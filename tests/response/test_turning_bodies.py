@@ -14,10 +14,10 @@ from warp_bsc.response.state import motion as motion_module
 DT = 1.0 / 60.0
 STAGES = {
     "monitor": (bsc.CollisionMonitor, {}),
-    "whole steps": (bsc.SolverCCD, {"substeps": None}),
+    "whole steps": (bsc.SolverCCD, {}),
     "substeps": (bsc.SolverCCD, {"substeps": 4}),
     "default": (bsc.SolverCCD, {}),
-    "distance": (bsc.SolverCCD, {"substeps": None, "min_distance": 0.002}),
+    "distance": (bsc.SolverCCD, {"min_distance": 0.002}),
     "monitored distance": (bsc.CollisionMonitor, {"min_distance": 0.002}),
 }
 each_stage = pytest.mark.parametrize(("make", "options"), STAGES.values(), ids=STAGES)
@@ -130,7 +130,7 @@ def test_the_search_of_a_gpu_finds_them_too(tiny, options, device, monkeypatch):
     monitor = hierarchy_stage(model, monkeypatch, make=bsc.CollisionMonitor, **options)
     report = step_once(monitor, model)[0]
     assert report.remaining == plain.remaining > 0 and not report.certified and not report.undetected
-    solver = hierarchy_stage(model, monkeypatch, substeps=None, **options)
+    solver = hierarchy_stage(model, monkeypatch, **options)
     report, start, end = step_once(solver, model)
     ends = [wp.empty(solver.mesh.vertex_count, dtype=wp.vec3, device=device) for _ in range(2)]
     for state, x in zip((start, end), ends, strict=True):
@@ -191,7 +191,7 @@ def test_random_bars_push_a_cloth_off_their_arcs(options, device):
         turn *= np.radians(rng.uniform(5.0, 150.0)) / np.linalg.norm(turn)
         end_of_bar = rng.uniform(-0.05, 0.05, 3), Rotation.from_rotvec(turn).as_quat()
         solver = bsc.SolverCCD(
-            Changed(model, lambda state, pose=end_of_bar: set_pose(state, *pose)), substeps=None, **options
+            Changed(model, lambda state, pose=end_of_bar: set_pose(state, *pose)), **options
         )
         finder, count = bsc.CollisionDetector(solver.mesh), model.particle_count
         x = np.concatenate([model.particle_q.numpy(), solver.mesh.shape_vertices.position]).astype(np.float64)
@@ -217,7 +217,7 @@ def test_a_dynamic_blade_is_stopped(device):
     model = blade_and_strip(device, kinematic=False)
     model.particle_inv_mass.zero_()
     model.particle_mass.zero_()
-    solver = bsc.SolverCCD(Changed(model, turned(0.5 * np.pi)), substeps=None)
+    solver = bsc.SolverCCD(Changed(model, turned(0.5 * np.pi)))
     report, _start, end = step_once(solver, model)
     assert report.hits > 0 and report.certified
     np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
@@ -233,7 +233,7 @@ def test_a_dynamic_blade_is_stopped(device):
 def test_a_strip_without_a_way_out_is_reported(device):
     """A blade that the program moves through a strip and a wall behind it: the step says that it lacks both."""
     model = blade_and_strip(device, has_wall=True)
-    solver = bsc.SolverCCD(Changed(model, turned(0.5 * np.pi)), substeps=None)
+    solver = bsc.SolverCCD(Changed(model, turned(0.5 * np.pi)))
     with pytest.warns(UserWarning, match="not certified.*shape"):
         report, *_ = step_once(solver, model)
         assert not report.certified and report.remaining > 0

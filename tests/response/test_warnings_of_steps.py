@@ -49,7 +49,7 @@ READS = ["certified", "hits", "strain", "frozen", "totals", "gradients", "uncert
 @pytest.mark.parametrize("read", READS)
 def test_a_step_in_a_graph_warns_where_a_number_is_read(read, device):
     model = lost_patch(device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=None)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model))
     states = model.state(), model.state()
     with wp.ScopedCapture(device) as capture:
         solver.step(*states, None, None, DT)
@@ -62,7 +62,7 @@ def test_a_step_in_a_graph_warns_where_a_number_is_read(read, device):
 def test_a_read_waits_for_the_step_before_it_warns(device, monkeypatch):
     """The totals of a step arrive on the host with the first number that is read, as on a GPU that is busy."""
     model = lost_patch(device)
-    solver = bsc.SolverCCD(Changed(model), substeps=None)
+    solver = bsc.SolverCCD(Changed(model))
     results, copy = list(solver._work.results), solver.report.copy_totals
     certified = results[Result.CERTIFIED]
 
@@ -80,7 +80,7 @@ def test_a_read_waits_for_the_step_before_it_warns(device, monkeypatch):
 
 def test_a_replay_of_captured_steps_warns_where_it_is_called(device):
     model = lost_patch(device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=None)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model))
     states = model.state(), model.state()
     steps = bsc.CapturedSteps(lambda: solver.step(*states, None, None, DT), solver, [states[0]])
     with pytest.warns(UserWarning, match="not certified") as said:

@@ -230,7 +230,7 @@ def test_a_world_with_a_position_that_is_not_finite_is_not_certified(device):
     assert solver.report.worlds.certified.numpy().tolist() == [True, False]
 
 
-@pytest.mark.parametrize("options", [{"substeps": None}, {"substeps": 4}, {}])
+@pytest.mark.parametrize("options", [{}, {"substeps": 4}, {}])
 def test_a_velocity_that_is_not_finite_leaves_its_world_alone_uncertified(options, device):
     """In whole steps and in substeps; one warning names the particle."""
     worlds, lost = 4, 2
@@ -295,7 +295,7 @@ def test_strain_and_what_is_inside_by_world(device):
     for i in range(count, 2 * count):
         builder.particle_q[i] = wp.vec3(*builder.particle_q[i]) - wp.vec3(0.0, 0.0, 0.1)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), substeps=None, report_worlds=True)
+    solver = bsc.SolverCCD(Changed(model), report_worlds=True)
     with pytest.warns(UserWarning, match="edges pass through faces at the start"):
         solver.step(model.state(), model.state(), model.control(), None, DT)
         assert solver.report.crossings > 0
@@ -315,7 +315,7 @@ def test_frozen_and_truncated_vertices_are_counted_by_world(device):
     for i in range(world.particle_count, builder.particle_count):
         builder.particle_qd[i] = wp.vec3(0.0, 0.0, 3.0 * (-1.0) ** i)
     model = builder.finalize(device=device)
-    options = {"substeps": None, "max_iterations": 0, "report_worlds": True, "report_contacts": True}
+    options = {"max_iterations": 0, "report_worlds": True, "report_contacts": True}
     solver = bsc.SolverCCD(Changed(model), **options)
     state, end, cut = model.state(), model.state(), 0
     for i in range(6):
@@ -365,12 +365,12 @@ def filtered_worlds(seeds, device):
 @pytest.mark.parametrize(
     "tree, options",
     [
-        ("packets", {"substeps": None}),
+        ("packets", {}),
         ("packets", {"substeps": 2}),
         ("packets", None),
         ("faces", {"substeps": 2}),
         ("faces", None),
-        ("faces without queues", {"substeps": None}),
+        ("faces without queues", {}),
     ],
 )
 def test_filtered_pairs_by_world_are_those_of_each_world_alone(tree, options, monkeypatch, device):
@@ -471,7 +471,7 @@ def test_a_world_moves_alike_beside_some_that_are_turned_or_tangled(others, devi
             builder.add_world(cloth_on_a_sphere(*place))
         model = builder.finalize(device=device)
         model.particle_grid, model.particle_max_radius = None, 0.0  # XPBD's own contacts of particles know no worlds
-        solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=10), substeps=None)
+        solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=10))
         state, end, hits = model.state(), model.state(), 0
         for _ in range(16):
             solver.step(state, end, model.control(), None, DT)

@@ -146,7 +146,7 @@ class Stress:
         if implicit:
             solver = SolverImplicit(self._model, min_distance=distance)
         else:
-            solver = bsc.SolverCCD(self._inner, min_distance=distance, substeps=None)
+            solver = bsc.SolverCCD(self._inner, min_distance=distance)
         self._rollout = (
             Rollout(self._model, solver) if distance is None else DistanceRollout(self._model, solver, distance)
         )

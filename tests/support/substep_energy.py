@@ -176,7 +176,7 @@ class Scene:
         height = 0.01 + self._radius if on_top else low + size + 2.0 * self._radius
         self._add_cloth((-0.3, -0.3, height), 0.6, int(rng.integers(4, 7)))
 
-    def make_solver(self, *, stage=True, substeps=None):
+    def make_solver(self, *, stage=True):
         """Returns the inner solver, behind the stage if asked."""
         settings, model = self._settings, self.model
         match settings.inner:
@@ -233,7 +233,7 @@ class Scene:
                 total += 0.5 * spin @ model.body_inertia.numpy()[body] @ spin
         return float(total), float(elastic)
 
-    def run(self, *, stage=True, substeps=None, duration=0.4):
+    def run(self, *, stage=True, duration=0.4):
         """Returns how far the energy rises, as a share of that at the start, without and with elastic energy.
 
         With that, the stage's report.

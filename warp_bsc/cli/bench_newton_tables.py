@@ -69,8 +69,8 @@ def print_example_runs(console: Console, runs: list[ExampleRun], *, device: wp.D
             sizes[name] = run.measured
     if sizes:
         console.print()
-        stage = ("Steps", "In sub-\nsteps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
-        caption = "Steps: all, in substeps, not certified, with paths truncated, with vertices frozen."
+        stage = ("Steps", "Uncer-\ntified", "Trun-\ncated", "Frozen")
+        caption = "Steps: all, not certified, with paths truncated, with vertices frozen."
         table = make_table("Example", "Partic-\nles", "Trian-\ngles", "Frames", *stage, caption=caption)
         for name, took in sizes.items():
             counts = [took.particles, took.triangles, took.frames, *(asdict(took.stage).values() if took.stage else ())]

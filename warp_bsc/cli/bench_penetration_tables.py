@@ -92,8 +92,6 @@ def _print_scene(console: Console, scene: str, runs: Sequence[PenetrationRun]) -
             notes.append(f"{title}: not run: {run.problem}")
         elif took.uncertified_steps:
             notes.append(f"{title}: {count(took.uncertified_steps, 'step')} of {took.steps:,} not certified")
-        if took and took.substepped_steps and took.collisions:
-            notes.append(f"{title}: {count(took.substepped_steps, 'step')} in substeps, whose way is not straight")
     console.print(table)
     sizes = next((run.measured for run in runs if run.measured), None)
     if sizes:

@@ -33,9 +33,8 @@ measure what each configuration of a solver and the collision stage makes of
 them: the largest stretch of an edge, at the end and at most; the speed at rest;
 the energy that is gained behind VBD, where nothing does work, with that of
 elastic strain; the edges that cross faces at the end, and the pairs that meet
-on the straight way of a step, found in exact arithmetic; the substeps of a
-step, and its time, on a GPU in a CUDA graph; and the steps that were not
-certified. The balls take steps of 1/120 s.
+on the straight way of a step, found in exact arithmetic; the time of a step, on
+a GPU in a CUDA graph; and the steps that were not certified. The balls take steps of 1/120 s.
 The configurations:
   plain           the solver with Newton's contacts
   self-contact    the same with VBD's own contacts between particles
@@ -43,7 +42,7 @@ The configurations:
   stage+contacts  the same with Newton's contacts
   implicit        SolverImplicit with default arguments, in place of VBD
   converged       the same with as many Newton steps as a step needs
-  reference       SolverCCD without substeps, at a small step: slow
+  reference       SolverCCD at a small step: slow
 Ropes have particle_radius, without which nothing collides with springs. The
 semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations, unless
 --rate is given. A scene that the solver cannot run is a row, and a line below

@@ -20,11 +20,10 @@ _HEADERS = (
     "Energy\ngained\n[J]",
     "Cross-\nings",
     "Pairs\nmeet",
-    "Sub-\nsteps",
     "A step:\nmedian\n[ms]",
     "\nmean\n[ms]",
 )
-_WIDTHS = 14, 7, 7, 6, 7, 6, 6, 5, 7, 6  # 80 columns with the gaps
+_WIDTHS = 14, 7, 7, 6, 7, 6, 6, 7, 6
 
 
 def print_response_runs(console: Console, runs: Sequence[ResponseRun], *, device: wp.Device, partial: bool) -> None:
@@ -112,7 +111,6 @@ def _make_cells(took: ResponseMeasurement | None) -> list[str]:
         show(took.energy_gained, ",.4f"),
         f"{took.crossings:,}",
         show(took.collisions, ","),
-        show(took.substeps, ".1f"),
         show_digits(took.median, 2),
         show_digits(took.mean, 2),
     ]
