@@ -308,13 +308,9 @@ def test_coefficients_may_be_arrays_that_each_step_reads(device):
     ends = []
     for value in (0.0, 0.7):
         friction = wp.zeros(model.particle_count, dtype=float, device=device)
-        solver = bsc.SolverCCD(
-            newton.solvers.SolverXPBD(model, iterations=0), friction=friction, restitution=0.5
-        )
+        solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=friction, restitution=0.5)
         friction.fill_(value)  # after the constructor has checked it
-        number = bsc.SolverCCD(
-            newton.solvers.SolverXPBD(model, iterations=0), friction=value, restitution=0.5
-        )
+        number = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=value, restitution=0.5)
         for stage in (solver, number):
             rollout = Rollout(model, stage)
             velocities = rollout.states[0].particle_qd.numpy()

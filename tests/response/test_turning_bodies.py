@@ -190,9 +190,7 @@ def test_random_bars_push_a_cloth_off_their_arcs(options, device):
         turn = rng.standard_normal(3)
         turn *= np.radians(rng.uniform(5.0, 150.0)) / np.linalg.norm(turn)
         end_of_bar = rng.uniform(-0.05, 0.05, 3), Rotation.from_rotvec(turn).as_quat()
-        solver = bsc.SolverCCD(
-            Changed(model, lambda state, pose=end_of_bar: set_pose(state, *pose)), **options
-        )
+        solver = bsc.SolverCCD(Changed(model, lambda state, pose=end_of_bar: set_pose(state, *pose)), **options)
         finder, count = bsc.CollisionDetector(solver.mesh), model.particle_count
         x = np.concatenate([model.particle_q.numpy(), solver.mesh.shape_vertices.position]).astype(np.float64)
         if len(finder.find_intersections(x)):

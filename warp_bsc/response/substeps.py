@@ -14,7 +14,7 @@ from newton import BodyFlags
 
 from .._private_names.of_warp import paused_tape
 from .state.mesh import host_array
-from .state.motion import ModelMotion, StateArrays, arrays_of, continues, takes_part
+from .state.motion import ModelMotion, StateArrays, arrays_of, continues, find_misplaced_bodies, takes_part
 from .state.structs import Motion
 
 wp.set_module_options({"enable_backward": False})
@@ -52,28 +52,28 @@ def _find_way(
     """
     i = wp.tid()
     if i < way.x0.shape[0]:
-        x, world = start.particle_q[i], motion.world[i]
-        way.x0[i] = x
-        way.x1[i] = x
+        way.x0[i] = start.particle_q[i]
+        way.x1[i] = start.particle_q[i]
+        world = motion.world[i]
         if last and (not mask or takes_part(mask, world)) and continues(motion, world) and wp.isfinite(last[i]):
             way.x0[i] = last[i]
     if i < way.is_moved.shape[0]:
-        pose, world = start.body_q[i], body_world[i]
-        way.pose0[i] = pose
-        way.pose1[i] = pose
-        if not mask or takes_part(mask, world):
+        way.pose0[i] = start.body_q[i]
+        way.pose1[i] = start.body_q[i]
+        of_body = body_world[i]
+        if not mask or takes_part(mask, of_body):
             if way.ends_in_out:
                 way.pose1[i] = end.body_q[i]
-            if last and continues(motion, world) and wp.isfinite(wp.transform_get_translation(last_body_q[i])):
+            if last and continues(motion, of_body) and wp.isfinite(wp.transform_get_translation(last_body_q[i])):
                 way.pose0[i] = last_body_q[i]
 
 
 @wp.func
 def _pose_on(before: wp.transform, after: wp.transform, share: float) -> wp.transform:
-    if share == 1.0 or before == after:
-        return after
     p0, p1 = wp.transform_get_translation(before), wp.transform_get_translation(after)
     q0, q1 = wp.transform_get_rotation(before), wp.transform_get_rotation(after)
+    if share == 1.0 or (wp.length_sq(p1 - p0) == 0.0 and wp.length_sq(q1 - q0) == 0.0):
+        return after
     if wp.dot(q0, q1) < 0.0:
         q1 = -q1
     return wp.transform(p0 + share * (p1 - p0), wp.quat_slerp(q0, q1, share))
@@ -84,7 +84,7 @@ def _go_on(motion: Motion, way: _Way, i: int, number: int, start: StateArrays, e
     """Writes where what a program moves is in a substep: after it, but at its start if a program writes poses there."""
     k = wp.tid()
     share = float(i + 1) / float(number)
-    if k < way.x0.shape[0] and motion.inverse_mass[k] == 0.0 and way.x0[k] != way.x1[k]:
+    if k < way.x0.shape[0] and motion.inverse_mass[k] == 0.0:
         start.particle_q[k] = wp.where(i + 1 == number, way.x1[k], way.x0[k] + share * (way.x1[k] - way.x0[k]))
     if k < way.is_moved.shape[0] and way.is_moved[k]:
         pose = _pose_on(way.pose0[k], way.pose1[k], share)
@@ -119,11 +119,14 @@ class Substeps:
         self._way, particles, bodies = _Way(), model.particle_count, model.body_count
         self._way.x0, self._way.x1 = (wp.zeros(particles, dtype=wp.vec3, device=device) for _ in range(2))
         self._way.pose0, self._way.pose1, self._last_body_q = (
-            wp.full(bodies, wp.transform(wp.vec3(wp.nan), wp.quat_identity()), device=device) for _ in range(3)
+            wp.zeros(bodies, dtype=wp.transform, device=device) for _ in range(3)
         )
         moved = np.zeros(0, dtype=bool)
         if bodies:
             kinematic = (host_array(model.body_flags) & BodyFlags.KINEMATIC) != 0
+            poses = host_array(model.body_q).copy()
+            poses[find_misplaced_bodies(model)] = np.nan  # which start the first step where its state has them
+            self._last_body_q.assign(poses)
             moved = kinematic | (host_array(model.body_inv_mass) == 0.0) | leaves_bodies
         self._way.is_moved = wp.array(moved, dtype=bool, device=device)
         self._way.ends_in_out = leaves_bodies

@@ -239,7 +239,7 @@ def _jump(
         x1[particle_count + i] = x
 
 
-def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
+def find_misplaced_bodies(model: newton.Model) -> np.ndarray:
     """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
     if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
         return np.empty(0, dtype=int)
@@ -345,7 +345,7 @@ class ModelMotion:
         """
         self._last = last
         positions, planes = self.vertices.x0.numpy().copy(), self.planes.end.numpy().copy()
-        misplaced = _find_misplaced_bodies(self.mesh.model)
+        misplaced = find_misplaced_bodies(self.mesh.model)
         first = self.mesh.model.particle_count
         positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
         planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan
