@@ -10,7 +10,6 @@ from filtered_models import judge
 from newton_scenes import DT, SOLVERS, Changed, Rollout, add_patch, bullet
 from test_bodies import add_body, boxes, free
 from test_bodies import finalize as finalize_bodies
-from test_inner_contacts import finalized
 from test_search import stage
 
 import warp_bsc as bsc
@@ -18,6 +17,13 @@ from warp_bsc.response.state.mesh import ModelMesh
 
 ITSELF = bsc.CollisionFilter(particle_group=2, particle_mask=1)
 """Cloth does not collide with cloth."""
+
+
+def finalized(builder, device):
+    builder.color()
+    model = builder.finalize(device=device)
+    model.particle_mu = 0.5
+    return model
 
 
 @pytest.fixture(autouse=True)
