@@ -1,6 +1,5 @@
 """What the stage uses of Warp and Newton beyond their public interfaces, in installed versions and without it."""
 
-import contextlib
 import warnings
 
 import newton
@@ -143,24 +142,6 @@ def test_vbd_has_the_poses_from_which_velocities_follow(device, monkeypatch):
     monkeypatch.delattr(solver, "body_q_prev")
     with pytest.raises(RuntimeError, match=r"no SolverVBD.body_q_prev.*cannot push bodies"):
         of_newton.body_q_prev(solver)
-
-
-def test_style3d_takes_substeps_in_a_graph(device):
-    """Also on a GPU, where its steps allocate memory, a graph takes a given number of substeps."""
-    model, ends = sheet_above_sphere(device), []
-    for in_graph in (False, True):
-        solver = bsc.SolverCCD(SolverStyle3D(model), substeps=2)
-        start, end = model.state(), model.state()
-        solver.step(start, end, model.control(), None, DT)
-        solver.reset(start)
-        with wp.ScopedCapture(device) if in_graph else contextlib.nullcontext() as capture:
-            solver.step(start, end, model.control(), None, DT)
-        if in_graph:
-            wp.capture_launch(capture.graph)
-        assert solver.report.certified
-        assert solver.report.hits > 0
-        ends.append(end.particle_q.numpy())
-    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-7 if device.is_cuda else 0.0)  # its sums are atomic on a GPU
 
 
 def test_style3d_has_contacts_of_its_own(device, monkeypatch):

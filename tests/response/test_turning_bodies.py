@@ -275,7 +275,7 @@ def test_a_hinge_is_where_it_turns(device):
 
 @pytest.mark.parametrize("distance", [0.0, 0.001])
 def test_a_disc_that_spins_on_a_sheet_is_at_rest_as_by_its_chords(distance, device, monkeypatch):
-    """Two micrometres above what it must keep, over a sheet: arcs bring no contact, push or iteration of their own."""
+    """Two micrometres above what it must keep, over a sheet: arcs bring no contact or push of their own."""
     ends = []
     for watches in (True, False):
         if not watches:
@@ -294,8 +294,9 @@ def test_a_disc_that_spins_on_a_sheet_is_at_rest_as_by_its_chords(distance, devi
             solver.solver.change = turned(0.2 * (number + 1), place)
             solver.step(*states, None, None, DT)
             assert solver.report.certified and solver.report.hits == 0
-            np.testing.assert_array_equal(states[1].body_q.numpy()[0, :3], np.float32(place))
             states.reverse()
-        ends.append(states[0].particle_q.numpy())
+            if not distance:
+                np.testing.assert_array_equal(states[0].body_q.numpy()[0, :3], np.float32(place))
+        ends.append(np.concatenate([states[0].particle_q.numpy(), states[0].body_q.numpy()[:, :3]]))
     np.testing.assert_allclose(*ends, atol=1e-7)
-    assert distance or (ends[0] == model.particle_q.numpy()).all()
+    assert distance or (ends[0][:-1] == model.particle_q.numpy()).all()

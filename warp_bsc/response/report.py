@@ -296,6 +296,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         listed, invalid = ((outcome & int(bit)) != 0 for bit in (UNCERTIFIED, INVALID))
         for elements in (self._mesh.faces, self._mesh.edges):
             listed[elements[invalid[elements].any(axis=1)]] = True
+        self.warn()
         return listed
 
     @property

@@ -97,6 +97,22 @@ def _go_on(motion: Motion, way: _Way, i: int, number: int, start: StateArrays, e
                 end.body_q[k] = pose
 
 
+@wp.kernel
+def _remember_poses(
+    # in
+    motion: Motion,
+    body_world: wp.array[int],
+    mask: wp.array[wp.bool],
+    end: StateArrays,
+    # out
+    last_body_q: wp.array[wp.transform],
+):
+    """Keeps where bodies end a step, of worlds that take part in it."""
+    body = wp.tid()
+    if body < last_body_q.shape[0] and (not mask or takes_part(mask, body_world[body])):
+        last_body_q[body] = end.body_q[body]
+
+
 class Substeps:
     """Takes steps in a number of smaller ones.
 
@@ -161,9 +177,9 @@ class Substeps:
                 for name, array in forces.items():  # the inner solver adds its own to those of the start
                     wp.copy(getattr(end, name), array)
             start = end
-        if not on_tape and state_out.body_q is not None:
-            with paused_tape():
-                wp.copy(self._last_body_q, state_out.body_q)
+        if not on_tape:
+            inputs = [self._model.body_world, mask, arrays_of(state_out)]
+            self._launch(_remember_poses, inputs, [self._last_body_q])
 
     def _begin(self, state_in, state_out, start, mask):
         """Copies the state at the start, and finds the way of what a program has moved."""
