@@ -77,8 +77,8 @@ def test_tables(capsys, monkeypatch, measured):
         ["cloth_hanging", "--width", "9", "plain", "11.5", "1,701.8", "2,000.0", "0", "1,234", "fail"],
         ["cloth_hanging", "--width", "9", "stage", "not", "run"],
         ["cloth_hanging", "--width", "9", "implicit", "not", "run"],
-        ["cloth_twist", "1,485", "2,816", "6", "60", "4", "1", "2", "3"],
-        ["cloth_twist,", "implicit", "1,485", "2,816", "6", "60", "0", "0", "0", "0"],
+        ["cloth_twist", "1,485", "2,816", "6", "60", "1", "2", "3"],
+        ["cloth_twist,", "implicit", "1,485", "2,816", "6", "60", "0", "0", "0"],
         ["cloth_hanging", "--width", "9", "1,485", "2,816", "6"],
     ]
     assert notes == [

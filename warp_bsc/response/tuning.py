@@ -118,8 +118,6 @@ SLOWEST_SLIP = wp.constant(0.01)
 # rigid shapes
 SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
-SHAPE_SAGITTA = 0.01
-"""Depth of faces of a round shape below its surface, as a share of its radius, at most."""
 
 # capacities
 PAIRS_PER_FACE = 32

@@ -52,13 +52,6 @@ def moves_with_body(motion: Motion, vertex: int) -> bool:
 
 
 @wp.func
-def predicted_position(motion: Motion, vertex: int) -> wp.vec3:
-    """Returns the predicted position of a vertex of a body that the response can move [m]."""
-    bodies = motion.bodies
-    return wp.transform_point(bodies.end[bodies.of_vertex[vertex]], bodies.position[vertex - bodies.particle_count])
-
-
-@wp.func
 def predicted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
     """Returns the predicted velocity of a vertex of a body, whose predicted position is ``x1`` [m/s]."""
     body = motion.bodies.of_vertex[vertex]
