@@ -57,12 +57,12 @@ class SolverCCD(CollisionStage):
     :meth:`reset`, and with ``requires_grad``. A body that ``joint_q`` of the model puts elsewhere than ``body_q``
     starts the first step where the state has it.
 
-    The certificate covers the motion from the stored state at the start to the stored state at the end: particles move
-    straight, and bodies turn evenly, the shorter way, so that their vertices move on arcs, see ``state.turns``. A
-    body that the response can move turns about its centre of mass, others about the axis of their screw. With
-    ``requires_grad`` the response resolves contacts of straight paths, and a step in which only an arc collides is not
-    certified. A body whose predicted pose or velocity is not finite is left to the inner solver, and the step is not
-    certified.
+    The certificate covers the motion from the stored state at the start to the stored state at the end, of a step with
+    ``substeps`` the motion in each of them: particles move straight, and bodies turn evenly, the shorter way, so that
+    their vertices move on arcs, see ``state.turns``. A body that the response can move turns about its centre of mass,
+    others about the axis of their screw. With ``requires_grad`` the response resolves contacts of straight paths, and a
+    step in which only an arc collides is not certified. A body whose predicted pose or velocity is not finite is left
+    to the inner solver, and the step is not certified.
 
     With ``min_distance`` or ``particle_radius`` the certificate is of distances: a pair that started farther apart
     stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-30 of that distance

@@ -136,7 +136,7 @@ class CollisionStage(CouplingHooks):
                 solver steps them all the same, as solvers of Newton know no mask: what it keeps of them beside the
                 state, such as multipliers of its own contacts, may change. Custom attributes of the state are the inner
                 solver's in all worlds.
-            options: As for the inner solver.
+            options: As for the inner solver; with substeps, observables are of the last one.
 
         Raises:
             TypeError: If ``dt`` is no number, or ``world_mask`` no array of bool.
