@@ -51,7 +51,7 @@ nitpick_ignore_regex = [
     # types of annotations, and words that stand where a type may
     (r"py:class", r"(warp_bsc\..*|[^.]*|(state\.structs|contacts\.rules|inside)\.\w+)"),
     # modules behind those that the reference cites
-    (r"py:mod", r"(substeps\.inner_contacts|contacts\.search|adjoint\.(restore|kernels)|polish|polynomials)"),
+    (r"py:mod", r"(contacts\.search|adjoint\.(restore|kernels)|polish|polynomials)"),
     (r"py:(func|meth)", r"(decide|face_order\.order_faces|.*\.ProximityFinder\.find)"),
 ]
 toc_object_entries_show_parents = "hide"

@@ -220,7 +220,7 @@ class ClothWorlds:
         inner = newton.solvers.SolverVBD(
             model, iterations=10, integrate_with_external_rigid_solver=True, particle_enable_self_contact=False
         )
-        self.solver = bsc.SolverCCD(inner, substeps=None, report_contacts=True, report_worlds=True)
+        self.solver = bsc.SolverCCD(inner, report_contacts=True, report_worlds=True)
         self.states = [model.state(), model.state()]
         with wp.ScopedDevice(self.device):
             self._actions = wp.zeros((count, 2), dtype=float)

@@ -57,7 +57,7 @@ def press():
     add_cloth(builder, 24, 0.5, (0.0, 0.0, 0.005), 0.3)
     builder.color()
     model = builder.finalize()
-    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), substeps=None, report_contacts=True)
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), report_contacts=True)
     states = [model.state(), model.state()]
     for height in np.append(np.full(15, 0.08), np.linspace(0.08, 0.03, 25)):
         pose = np.array([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]])

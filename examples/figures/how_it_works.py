@@ -129,7 +129,7 @@ def draw_step(path):
     builder.add_cloth_grid(**place, **size)
     builder.color()
     model = builder.finalize(device="cpu")
-    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), substeps=None)
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10))
     plain = newton.solvers.SolverVBD(model, iterations=10)
     cuts = []
     for each in (plain, solver):

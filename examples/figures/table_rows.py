@@ -187,7 +187,7 @@ def _newton_steps(plain: Found | None, stage: Found | None, implicit: Found | No
         return ""
     steps = stage["stage"]
     words = [f"{steps['steps'] - steps['uncertified_steps']:,} of {steps['steps']:,} certified"]
-    if steps["substepped_steps"]:
+    if steps.get("substepped_steps"):  # of versions whose stage chose substeps
         words.append(f"{steps['substepped_steps']:,} in substeps")
     words.append(f"{steps['truncated_steps'] or 'none'} truncated")
     if steps["frozen_steps"]:
@@ -204,23 +204,6 @@ def _newton_tests(took: Found) -> str:
     if all(end is None for end in ends):
         return "none"
     return "ok" if all(end in (None, "ok") for end in ends) else "fail"
-
-
-def substeps(found: Found) -> Rows:
-    """Steps in substeps: stretch, distance from the reference, stress and time."""
-    columns = list(dict.fromkeys((run["rate"], run["substeps"]) for run in found["runs"]))
-    rows = [("", *(f"1/{rate} s, {_quoted(count)}" for rate, count in columns))]
-    titles = {
-        ("drape", "largest stretch [%]"): "a cloth drapes over a sphere: stretch [%]",
-        ("drape", "distance [mm]"): "distance from the reference [mm]",
-        ("drape", "time [s]"): "time [s]",
-        ("sleeve", "largest stretch [%]"): "a cylinder moves into a sleeve a third narrower: stretch [%]",
-        ("blocks", "stress on the lower plate [Pa]"): "two plates press two blocks to half their height: stress [Pa]",
-    }
-    for (scene, quantity), title in titles.items():
-        measured = {(run["rate"], run["substeps"]): run["measured"] for run in found["runs"] if run["scene"] == scene}
-        rows.append((title, *(digits(measured[column][quantity]) for column in columns)))
-    return rows
 
 
 _SCENES_IN_CONTACT = {
@@ -259,7 +242,7 @@ def response(found: Found, reference: Found) -> Rows:
 
 def _response_cell(run: Found) -> str:
     took, distance = run["measured"], run.get("from_converged")
-    mean = "" if took["substeps"] is None else f" ({_three(took['milliseconds']['mean'])})"
+    mean = "" if took["uncertified_steps"] is None else f" ({_three(took['milliseconds']['mean'])})"
     parts = [_stretch_and_speed(took), f"{_three(took['milliseconds']['median'])}{mean} ms", *_what_passed(took)]
     if run["configuration"] == "implicit" and distance is not None:
         parts.append(f"{digits(distance)} mm from the converged run")
@@ -281,27 +264,6 @@ def _what_passed(took: Found) -> list[str]:
 
 def _three(value: float) -> str:
     return f"{value:,.0f}" if value >= 99.5 else f"{value:#.3g}"
-
-
-def response_by_rate(*measurements: Found) -> Rows:
-    """Scenes in contact in steps of several lengths, with Newton's contacts, the stage and both."""
-    titles = {
-        "plain": "Newton's contacts, no stage",
-        "stage": "the stage alone",
-        "stage+contacts": "both, as by default with contacts passed on",
-    }
-    rows = [("scene, step", *titles.values())]
-    runs: dict[tuple[str, int], dict[str, Found]] = {}
-    for run in (run for found in measurements for run in found["runs"]):
-        runs.setdefault((run["scene"], run["measured"]["rate"]), {})[run["configuration"]] = run["measured"]
-    for scene, rate in sorted(runs):
-        cells = []
-        for took in (runs[scene, rate][name] for name in titles):
-            gained = f"{digits(1e3 * took['energy_gained'])} mJ"
-            time = f"{digits(took['milliseconds']['mean'])} ms"
-            cells.append("; ".join([_stretches(took), gained, time, *_what_passed(took)]))
-        rows.append((f"{scene}, 1/{rate} s", *cells))
-    return rows
 
 
 def implicit_accuracy(found: Found) -> Rows:
@@ -362,8 +324,7 @@ def worlds_throughput(found: Found) -> Rows:
     titles = {
         "VBD": "VBD, Newton's contacts",
         "VBD, self-contact": "with VBD's self-contact",
-        "SolverCCD(VBD), default": "`SolverCCD`, default",
-        "SolverCCD(VBD), substeps=None": "`SolverCCD`, `substeps=None`",
+        "SolverCCD(VBD)": "`SolverCCD`",
     }
     clock = "processor" if not found["record"]["gpus"] else "clock"
     cells = {
@@ -392,10 +353,6 @@ def inverting_steps(*measurements: Found) -> Rows:
             cells.append(f"{run['inverted']:,}{many} ({_three(run['milliseconds'])} ms){cut}")
         rows.append((f"{scenes.get(scene, scene)}, {steps:,}", *cells))
     return rows
-
-
-def _quoted(count: int | str | None) -> str:
-    return "none" if count is None else f'`"{count}"`' if isinstance(count, str) else str(count)
 
 
 def penetration(*measurements: Found) -> Rows:

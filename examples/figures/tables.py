@@ -60,7 +60,6 @@ class Table:
 
 _PENETRATION = tuple(f"penetration_{scene}" for scene in SCENES)
 _INVERTING = tuple(f"inverting_steps_{name}" for name in ("scenes", "hanging", "dropping"))
-_SHORT = tuple(f"response_short_{rate}" for rate in (120, 180, 240, 480, 960))
 
 
 TABLES = {
@@ -92,10 +91,8 @@ TABLES = {
     "replay_sizes": Table(("replay_sizes",), table_rows.replay_sizes),
     "response_cpu": Table(("response_cpu", "response_gpu"), table_rows.response),
     "response_gpu": Table(("response_gpu",), lambda found: table_rows.response(found, found)),
-    "response_short": Table(_SHORT, table_rows.response_by_rate),
     "response_style3d_cpu": Table(("response_style3d_cpu", "response_style3d_gpu"), table_rows.response),
     "response_style3d_gpu": Table(("response_style3d_gpu",), lambda found: table_rows.response(found, found)),
-    "substeps": Table(("substeps_cpu",), table_rows.substeps),
     "touching": Table(("touching",), table_rows.touching),
     "worlds_throughput_cpu": Table(("worlds_throughput_cpu",), table_rows.worlds_throughput),
 }

@@ -84,7 +84,7 @@ def test_commit_of_the_checkout_and_whether_it_is_changed(tmp_path, monkeypatch)
         (["warp-bsc", "bench", "--json", "out.json", "--device", "cpu"], "warp-bsc bench --device cpu"),
         (["warp-bsc", "bench", "--json", "--figure=a.png", "--quick"], "warp-bsc bench --quick"),
         (["warp-bsc", "bench", "newton", "a --b c"], "warp-bsc bench newton 'a --b c'"),
-        ([str(ROOT / "examples" / "substeps.py"), "--json", "x"], "python examples/substeps.py"),
+        ([str(ROOT / "examples" / "cloth_env.py"), "--json", "x"], "python examples/cloth_env.py"),
         (["warp-bsc", "replay", str(ROOT / "assets" / "a.usd")], "warp-bsc replay assets/a.usd"),
     ],
 )

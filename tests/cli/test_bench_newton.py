@@ -31,8 +31,8 @@ def measurement(**others):
 
 RUNS = {
     ("cloth_twist", "plain"): measurement(),
-    ("cloth_twist", "stage"): measurement(most_crossings=0, stage=StageTotals(60, 4, 1, 2, 3)),
-    ("cloth_twist", "implicit"): measurement(most_crossings=0, stage=StageTotals(60, 0, 0, 0, 0)),
+    ("cloth_twist", "stage"): measurement(most_crossings=0, stage=StageTotals(60, 1, 2, 3)),
+    ("cloth_twist", "implicit"): measurement(most_crossings=0, stage=StageTotals(60, 0, 0, 0)),
     ("cloth_hanging --width 9", "plain"): measurement(
         test_final="particles are low [red]", test_post_step="deep", first_frame_not_finite=4
     ),
@@ -77,8 +77,8 @@ def test_tables(capsys, monkeypatch, measured):
         ["cloth_hanging", "--width", "9", "plain", "11.5", "1,701.8", "2,000.0", "0", "1,234", "fail"],
         ["cloth_hanging", "--width", "9", "stage", "not", "run"],
         ["cloth_hanging", "--width", "9", "implicit", "not", "run"],
-        ["cloth_twist", "1,485", "2,816", "6", "60", "4", "1", "2", "3"],
-        ["cloth_twist,", "implicit", "1,485", "2,816", "6", "60", "0", "0", "0", "0"],
+        ["cloth_twist", "1,485", "2,816", "6", "60", "1", "2", "3"],
+        ["cloth_twist,", "implicit", "1,485", "2,816", "6", "60", "0", "0", "0"],
         ["cloth_hanging", "--width", "9", "1,485", "2,816", "6"],
     ]
     assert notes == [
@@ -106,7 +106,7 @@ def test_json(capsys, tmp_path, measured):
     assert milliseconds.pop("frames") == [10.0, 12.0, 11.0, 2000.0]
     assert milliseconds == pytest.approx({"median": 11.5, "percentile_95": 1701.8, "worst": 2000.0})
     assert first["problem"] is first["measured"]["stage"] is last["measured"] is None
-    totals = {"steps": 60, "substepped_steps": 4, "uncertified_steps": 1, "truncated_steps": 2, "frozen_steps": 3}
+    totals = {"steps": 60, "uncertified_steps": 1, "truncated_steps": 2, "frozen_steps": 3}
     assert second["measured"]["stage"] == totals
     assert last["problem"].startswith("not applicable: ")
     options = {"device": "cpu", "frames": 6, "check_every": 2, "download": True}

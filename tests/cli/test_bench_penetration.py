@@ -25,7 +25,6 @@ def measurement(**others):
         "speed_kept": 0.3084,
         "stretch": 251313.04,
         "uncertified_steps": None,
-        "substepped_steps": None,
         "milliseconds": (10.0, 12.5),
     }
     return PenetrationMeasurement(**values | others)
@@ -40,7 +39,6 @@ RUNS = {
         speed_kept=None,
         stretch=1.25,
         uncertified_steps=1,
-        substepped_steps=4,
     ),
     "libuipc": "a reason [red]",
 }
@@ -82,7 +80,6 @@ def test_tables(capsys, monkeypatch, measured):
     assert "A patch is shot at a held sheet, at 20 m/s: 370 particles, 640 triangles, 3 frames" in lines
     assert "libuipc: not run: a reason [red]" in lines
     assert "SolverCCD(VBD): 1 step of 30 not certified" in lines
-    assert "SolverCCD(VBD): 4 steps in substeps, whose way is not straight" in lines
     assert f"VBD: newton 1.2.3; {SIMULATORS['vbd'].settings}; claims nothing of penetration." in lines
     assert any(line.startswith("SolverCCD(VBD): newton 1.2.3; default arguments") for line in lines)
     assert not any("Interrupted" in line for line in lines)

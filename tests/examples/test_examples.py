@@ -289,42 +289,6 @@ def test_bullet_passes_without_stage():
         example.test_final()
 
 
-def test_self_contact_of_newton_limits_speed_and_the_stage_does_not(monkeypatch, capsys):
-    program = load_module(FOLDER / "speed_limit.py")
-    monkeypatch.setattr(sys, "argv", ["speed_limit.py", "--device", str(wp.get_device())])
-    program.main()
-    rows = re.findall("│" + r" +([\d.]+) +│" * 5, capsys.readouterr().out)
-    assert [tuple(map(float, row)) for row in rows] == [(v, 0.89, v, v, v) for v in (1.0, 10.0, 60.0)]
-    assert pytest.approx(0.8925) == program.LIMIT
-
-
-@pytest.mark.slow
-def test_a_cylinder_widens_a_sleeve():
-    """No vertex is frozen where the cylinder comes, and none is stretched as if it were."""
-    program = load_module(FOLDER / "substeps.py")
-    scene = program.Sleeve()
-    scene.duration = 0.2
-    run = program.Run(scene, 1.0 / 120.0, None).simulate()
-    report = run.solver.report
-    assert report.totals.uncertified_steps == report.totals.frozen_steps == report.totals.truncated_steps == 0
-    assert 0.3 < run.stretch() < 1.0 and report.hits > 50
-
-
-def test_the_substeps_of_scenes_are_measured(monkeypatch, capsys):
-    program = load_module(FOLDER / "substeps.py")
-    for scene in program.SCENES.values():
-        monkeypatch.setattr(scene, "duration", 1.0 / 120.0)
-    monkeypatch.setattr(program, "REFERENCE", 1.0 / 480.0)
-    monkeypatch.setattr(program, "STEPS", (1.0 / 240.0, 1.0 / 120.0))
-    options = ["--scenes", "drape", "blocks", "--substeps", "2", "--device", str(wp.get_device())]
-    monkeypatch.setattr(sys, "argv", ["substeps.py", *options])
-    program.main()
-    rows = re.findall(r"│ (1/\d+) +│ (\d+|-|auto) +│(?: [\d.e+…-]+ +│)+ (\d+) +│ [\d.]+ +│", capsys.readouterr().out)
-    steps = [("1/480", "-"), ("1/240", "-"), ("1/240", "-"), ("1/240", "2"), ("1/240", "auto")]
-    steps += [("1/120", "-"), ("1/120", "4"), ("1/120", "auto")]
-    assert rows == [(*step, "0") for step in 2 * steps]  # all certified
-
-
 def path_of(name):
     return FOLDER / "paper" / f"example_{name}.py"
 

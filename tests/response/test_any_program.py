@@ -194,7 +194,7 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
     model = builder.finalize(device=device)
     rollout = Rollout(
         model,
-        bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap)), max_iterations=iterations, substeps=None),
+        bsc.SolverCCD(Changed(model, lambda state: place_plates(state, gap)), max_iterations=iterations),
     )
     certified, uncertified = [], 0
     for next_gap in gaps:
@@ -262,7 +262,7 @@ def test_worlds_do_not_notice_each_other(trouble, device):
         middle = np.arange(model.particle_count // 3, 2 * model.particle_count // 3)
         patch = middle[-81:]
         most = {} if trouble == "jammed" else {"max_iterations": 2}  # as many as the other worlds need
-        rollout = Rollout(model, bsc.SolverCCD(Changed(model), substeps=None, **most))
+        rollout = Rollout(model, bsc.SolverCCD(Changed(model), **most))
         state = rollout.states[0]
         if calm:
             write_rows(state.particle_qd, patch, 0.0)

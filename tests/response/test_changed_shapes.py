@@ -135,9 +135,9 @@ def sheets_over_balls(device, radius, at=(0.0, 0.0, -0.05)):
 def test_steps_after_a_change_are_those_of_a_stage_of_the_changed_model(graph, device):
     """Bit by bit, in the world whose ball grew and in the one whose ball stayed; also in a graph captured before."""
     expected = Rollout(sheets_over_balls(device, (0.02, 0.06)), None)
-    expected.solver = bsc.SolverCCD(Changed(expected.model), substeps=None)  # as in graphs of a GPU behind Changed
+    expected.solver = bsc.SolverCCD(Changed(expected.model))  # as in graphs of a GPU behind Changed
     model = sheets_over_balls(device, (0.02, 0.02))
-    stage, states = bsc.SolverCCD(Changed(model), substeps=None), (model.state(), model.state())
+    stage, states = bsc.SolverCCD(Changed(model)), (model.state(), model.state())
 
     def step():
         if graph == "within":
@@ -196,7 +196,7 @@ def test_a_body_that_moves_while_its_shape_changes_is_swept_with_the_new_shape(d
         ball = builder.add_body(xform=pose(0.0, 0.0, 0.1), is_kinematic=True)
         builder.add_shape_sphere(ball, radius=radius)
         model = builder.finalize(device=device)
-        rollout = Rollout(model, bsc.SolverCCD(Changed(model), substeps=None))
+        rollout = Rollout(model, bsc.SolverCCD(Changed(model)))
         rollout.step()
         change(model, scale={0: (0.05, 0.0, 0.0)})
         rollout.solver.notify_model_changed(SHAPES_CHANGED)

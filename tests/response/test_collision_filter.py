@@ -10,15 +10,20 @@ from filtered_models import judge
 from newton_scenes import DT, SOLVERS, Changed, Rollout, add_patch, bullet
 from test_bodies import add_body, boxes, free
 from test_bodies import finalize as finalize_bodies
-from test_inner_contacts import finalized
 from test_search import stage
 
 import warp_bsc as bsc
 from warp_bsc.response.state.mesh import ModelMesh
-from warp_bsc.response.substeps.inner_contacts import InnerContacts
 
 ITSELF = bsc.CollisionFilter(particle_group=2, particle_mask=1)
 """Cloth does not collide with cloth."""
+
+
+def finalized(builder, device):
+    builder.color()
+    model = builder.finalize(device=device)
+    model.particle_mu = 0.5
+    return model
 
 
 @pytest.fixture(autouse=True)
@@ -98,22 +103,6 @@ def test_a_contact_layer_does_not_push_filtered_pairs(device):
         layer.step(start, end, None, None, DT)
         speeds.append(end.particle_qd.numpy()[:, 2].reshape(2, 9).min(axis=1) > -0.9)
     assert np.array(speeds).tolist() == [[True, True], [False, True], [True, False], [False, False]]
-
-
-def test_contacts_of_filtered_pairs_go_to_the_inner_solver(device):
-    builder = newton.ModelBuilder()
-    builder.add_ground_plane()
-    builder.add_shape_box(-1, xform=wp.transform((1.0, 0.0, 0.1), wp.quat_identity()), hx=0.1, hy=0.1, hz=0.1)
-    for at in ((0.0, 0.0, 0.001), (1.0, 0.0, 0.201)):
-        add_patch(builder, 2, 0.02, at)
-    model = finalized(builder, device)
-    contacts = newton.CollisionPipeline(model).contacts()
-    newton.CollisionPipeline(model).collide(model.state(), contacts)
-    for shape_mask, expected in ((-1, []), ([0, -1], range(9)), ([-1, 0], range(9, 18))):
-        mesh = ModelMesh(model, collision_filter=bsc.CollisionFilter(shape_mask=shape_mask))
-        kept = InnerContacts(mesh, moves_bodies=False).take_out(contacts, model.state(), leaves_bodies=True)
-        particles = kept.soft_contact_particle.numpy()[: kept.soft_contact_count.numpy()[0]]
-        assert sorted(particles.tolist()) == list(expected)
 
 
 def test_filtered_solids_hold_nothing(device):

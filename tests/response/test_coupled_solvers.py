@@ -88,7 +88,7 @@ def fall(model, solver, steps):
 def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, iterations, device):
     """The impulses of the response on the proxy reach the solver that owns the body, with ``lagged`` a step later."""
     model, steps = ball_over_sheet(device, mass), 40
-    alone = bsc.SolverCCD(SOLVERS[inner](model), substeps=None)
+    alone = bsc.SolverCCD(SOLVERS[inner](model))
     expected, _ = fall(model, alone, steps)
     solver, stage = with_proxy(model, inner, iterations, mode=mode)
     poses, state = fall(model, solver, steps)

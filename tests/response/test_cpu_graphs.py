@@ -177,7 +177,7 @@ def test_a_step_in_a_graph_is_the_step_without(inner):
     ends = []
     for in_graph in (True, False):
         model = bullet(60.0, device=CPU)
-        solver = bsc.SolverCCD(SOLVERS[inner](model), substeps=None)
+        solver = bsc.SolverCCD(SOLVERS[inner](model))
         states, control = (model.state(), model.state()), model.control()
 
         def step(solver=solver, states=states, control=control):
@@ -231,7 +231,7 @@ def test_a_replay_without_room_is_taken_back():
     ends, retaken = [], []
     for runner in (CapturedOnCpu, bsc.CapturedSteps):
         model = bullet(60.0, device=CPU)
-        solver = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=None)
+        solver = bsc.SolverCCD(SOLVERS["xpbd"](model))
         states, control = (model.state(), model.state()), model.control()
         replays = wp.zeros(1, dtype=int, device=CPU)
 

@@ -365,7 +365,7 @@ def test_layers_that_fall_together_follow_each_other(device):
         at = (0.004 * layer, 0.003 * layer, gap * (layer + 0.5))
         add_patch(builder, 4, 0.028, at, velocity=(0.0, 0.0, -fall / DT))
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), substeps=None))
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
     start = rollout.positions
     rollout.step()
     report = rollout.solver.report
@@ -386,7 +386,7 @@ def test_edges_on_edges_push_nothing_aside(device):
     heights = np.random.default_rng(0).uniform(-0.15 * gap, 0.15 * gap, len(builder.particle_q))
     builder.particle_q = [(x, y, z + height) for (x, y, z), height in zip(builder.particle_q, heights, strict=True)]
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), substeps=None))
+    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
     start = rollout.positions
     rollout.step()
     assert rollout.solver.report.certified and rollout.solver.report.hits > 1000 and rollout.collisions == 0
@@ -406,7 +406,7 @@ def test_what_ends_exactly_in_contact_is_divided(z, start, device):
     model = builder.finalize(device=device)
     ends = model.particle_q.numpy().copy()
     ends[:9, 2] = z
-    solver = bsc.SolverCCD(Changed(model, lambda state: state.particle_q.assign(ends)), substeps=None, max_iterations=0)
+    solver = bsc.SolverCCD(Changed(model, lambda state: state.particle_q.assign(ends)), max_iterations=0)
     state, end = model.state(), model.state()
     solver.step(state, end, None, None, DT)
     assert solver.report.certified and solver.report.hits and not solver.report.frozen
@@ -443,7 +443,7 @@ def test_what_is_pressed_onto_the_ground_does_not_come_ever_nearer(device):
         x[9:, 2] = height
         state.particle_q.assign(x)
 
-    solver = bsc.SolverCCD(Changed(model, press), substeps=None)
+    solver = bsc.SolverCCD(Changed(model, press))
     state, end = model.state(), model.state()
     for _ in range(150):
         height = max(0.8 * height, 5e-6)

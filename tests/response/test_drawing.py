@@ -37,7 +37,7 @@ class Recorder(ViewerNull):
 def shot(device, **options):
     """Steps a patch until it has hit a sheet; returns the stage, and the state at the end."""
     model = bullet(30, device=device)
-    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=None, **options)
+    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), **options)
     state, end = model.state(), model.state()
     for _ in range(3):
         solver.step(state, end, model.control(), None, DT)
@@ -98,7 +98,7 @@ def squeezed(device, times=1):
     for i in range(builder.particle_count):
         builder.particle_qd[i] = wp.vec3(0.0, 0.0, 3.0 * (-1.0) ** i)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), substeps=None, max_iterations=0, report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), max_iterations=0, report_contacts=True)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for _ in range(times):
@@ -160,7 +160,7 @@ def test_table_by_shape(device):
         add_patch(builder, 4, 0.05, (x, 0.0, 0.001))
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=None, report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), report_contacts=True)
     state, end = model.state(), model.state()
     solver.step(state, end, None, None, 1e-6)
     assert solver.report.table().splitlines()[1] == "no contact had an impulse"

@@ -64,7 +64,6 @@ def test_each_pair_slides_by_its_friction_and_a_graph_reads_the_table_again(devi
         friction=0.2,
         friction_table=bsc.FrictionTable(table, **materials),
         bodies="separated",
-        substeps=None,
     )
     states, control = [model.state(), model.state()], model.control()
 

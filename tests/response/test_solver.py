@@ -152,7 +152,8 @@ def test_momenta_of_free_bodies_are_conserved(friction, sideways, device):
     add_patch(builder, 8, 0.05, (0.13, 0.11, 0.05), velocity=(0.0, -0.5 * sideways, -2.0))
     builder.color()
     model = builder.finalize(device=device)
-    rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=friction))
+    inner = newton.solvers.SolverXPBD(model, iterations=0)
+    rollout = Rollout(model, bsc.SolverCCD(inner, friction=friction, substeps=16))
     linear, angular = rollout.momenta()
     met = 0
     for _ in range(8):
@@ -308,13 +309,9 @@ def test_coefficients_may_be_arrays_that_each_step_reads(device):
     ends = []
     for value in (0.0, 0.7):
         friction = wp.zeros(model.particle_count, dtype=float, device=device)
-        solver = bsc.SolverCCD(
-            newton.solvers.SolverXPBD(model, iterations=0), friction=friction, restitution=0.5, substeps=None
-        )
+        solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=friction, restitution=0.5)
         friction.fill_(value)  # after the constructor has checked it
-        number = bsc.SolverCCD(
-            newton.solvers.SolverXPBD(model, iterations=0), friction=value, restitution=0.5, substeps=None
-        )
+        number = bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0), friction=value, restitution=0.5)
         for stage in (solver, number):
             rollout = Rollout(model, stage)
             velocities = rollout.states[0].particle_qd.numpy()

@@ -1,19 +1,16 @@
 """What the stage uses of Warp and Newton beyond their public interfaces, in installed versions and without it."""
 
-import contextlib
-import re
 import warnings
 
 import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton.solvers import SolverBase, SolverStyle3D, SolverVBD, SolverXPBD
+from newton.solvers import SolverStyle3D, SolverVBD, SolverXPBD
 from newton_scenes import DT, SOLVERS
 
 import warp_bsc as bsc
 from warp_bsc._private_names import of_newton, of_warp, versions
-from warp_bsc.response.substeps.inner_contacts import _SoftContacts
 
 
 @wp.struct
@@ -119,36 +116,6 @@ def test_structs_have_their_type_and_their_fields(monkeypatch):
         of_warp.struct_fields(Pair)
 
 
-def test_self_contact_cuts_in_the_method_of_its_name(device):
-    """Without self-contact, the method cuts nothing; in a solver, another one takes its place."""
-    solver = vbd_with_self_contact(sheet_above_sphere(device, speed=60.0))
-    lengths, truncate = [], of_newton.vbd_truncation(solver)
-    for cuts in (True, False):
-        solver.particle_enable_self_contact = cuts
-        solver.particle_displacements.fill_(wp.vec3(0.0, 0.0, 1.0))
-        truncate(solver.model.state(), None)
-        lengths.append(solver.particle_displacements.numpy()[:, 2].max())
-    assert lengths[0] < 0.01 and lengths[1] == 1.0
-    solver.particle_enable_self_contact, calls = True, []
-    for _ in range(2):
-        with of_newton.vbd_truncation_replaced(solver, lambda *given: calls.append(given)):
-            step(solver, solver.model)
-        assert of_newton.vbd_truncation(solver) == truncate and "_penetration_free_truncation" not in vars(solver)
-    assert len(calls) >= 2 * 3
-
-
-def test_without_that_method_the_speed_limit_stays_and_a_warning_says_so(device, monkeypatch):
-    model = sheet_above_sphere(device)
-    monkeypatch.delattr(SolverVBD, "_penetration_free_truncation")
-    inner = vbd_with_self_contact(model)
-    with pytest.warns(UserWarning, match=r"no SolverVBD._penetration_free_truncation.*limits the speed"):
-        solver = bsc.SolverCCD(inner)
-    assert not solver.report.speed_limit_lifted
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        bsc.SolverCCD(inner, lift_speed_limit=False)
-
-
 def test_vbd_says_whether_it_moves_bodies(device, monkeypatch):
     model = sheet_above_sphere(device, body=True)
     kinds = {external: SolverVBD(model, integrate_with_external_rigid_solver=external) for external in (True, False)}
@@ -177,101 +144,6 @@ def test_vbd_has_the_poses_from_which_velocities_follow(device, monkeypatch):
         of_newton.body_q_prev(solver)
 
 
-@pytest.mark.parametrize("kind", [SolverVBD, SolverStyle3D])
-def test_which_steps_allocate(kind, device):
-    model = sheet_above_sphere(device)
-    solver = kind(model)
-    allocates = kind is SolverStyle3D and device.is_cuda
-    assert of_newton.may_allocate(solver) is allocates
-    if kind is SolverStyle3D:
-        solver.collision = None  # as in steps with substeps
-    states, control = [model.state(), model.state()], model.control()
-    for _ in range(2):  # the first steps may
-        solver.step(*states, control, None, DT)
-    totals = []
-    for run in (lambda: None, lambda: solver.step(*states, control, None, DT), lambda: wp.zeros(1, device=device)):
-        with wp.ScopedMemoryTracker(report_func=(reports := []).append):  # which counts on from the last report
-            run()
-        totals.append(re.findall(r"Total allocations:\s*([^P]*)", "".join(reports)))
-    assert totals[0] != totals[2]
-    assert (totals[0] != totals[1]) is allocates
-
-
-@pytest.mark.parametrize("kind", ["rigid", "soft"])
-def test_which_contacts_have_room(kind, device, monkeypatch):
-    model = sheet_above_sphere(device, body=True)
-    solver, smaller = SolverVBD(model), newton.CollisionPipeline(model).contacts()
-    larger = newton.CollisionPipeline(model, **{f"{kind}_contact_max": 5000}).contacts()
-    states, control = [model.state(), model.state()], model.control()
-    assert of_newton.has_room(solver, None)
-    solver.step(*states, control, smaller, DT)
-    assert of_newton.has_room(solver, smaller)
-    assert not of_newton.has_room(solver, larger)
-    solver.step(*states, control, larger, DT)
-    assert of_newton.has_room(solver, smaller) and of_newton.has_room(solver, larger)
-    monkeypatch.delattr(solver, "body_body_contact_penalty_k" if kind == "rigid" else "body_particle_contact_penalty_k")
-    assert not of_newton.has_room(solver, smaller)
-
-
-def test_style3d_takes_substeps_in_a_graph(device):
-    """Also on a GPU, where its steps allocate memory, a graph takes a given number of substeps."""
-    model, ends = sheet_above_sphere(device), []
-    for in_graph in (False, True):
-        solver = bsc.SolverCCD(SolverStyle3D(model), substeps=2)
-        start, end = model.state(), model.state()
-        solver.step(start, end, model.control(), None, DT)
-        solver.reset(start)
-        with wp.ScopedCapture(device) if in_graph else contextlib.nullcontext() as capture:
-            solver.step(start, end, model.control(), None, DT)
-        if in_graph:
-            wp.capture_launch(capture.graph)
-        assert solver.report.certified
-        assert solver.report.hits > 0
-        ends.append(end.particle_q.numpy())
-    np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-7 if device.is_cuda else 0.0)  # its sums are atomic on a GPU
-
-
-def test_steps_of_other_solvers_may_allocate(device):
-    class Derived(SolverVBD):
-        pass
-
-    model = sheet_above_sphere(device)
-    with_pipeline = SolverVBD(model, collision_pipeline=newton.CollisionPipeline(model))
-    assert all(map(of_newton.may_allocate, (SolverXPBD(model), Derived(model), with_pipeline)))
-
-
-@pytest.mark.parametrize("kind", [SolverVBD, SolverStyle3D, SolverXPBD])
-def test_attributes_hold_all_that_a_step_changes(kind, device):
-    """A step after which arrays and attributes of the solver are restored can be repeated, bit by bit on a CPU."""
-    model = sheet_above_sphere(device, body=kind is SolverVBD)
-    solver = kind(model)
-    if kind is SolverStyle3D:
-        solver.collision = None  # as in steps with substeps
-    attributes = of_newton.attributes_of(solver)
-    kept = dict(attributes)
-    arrays = {name: wp.clone(value) for name, value in kept.items() if isinstance(value, wp.array) and value.size}
-    ends = []
-    for _ in range(2):
-        ends.append(step(solver, model))
-        attributes.update(kept)
-        for name, array in arrays.items():
-            wp.copy(kept[name], array)
-    for name in ("particle_q", "particle_qd", *(["body_q", "body_qd"] if model.body_count else [])):
-        first, second = (getattr(end, name).numpy() for end in ends)
-        assert np.isfinite(first).all()
-        in_any_order = device.is_cuda and kind is not SolverVBD  # the others add up floats by atomic operations
-        np.testing.assert_allclose(first, second, rtol=1e-5 if in_any_order else 0.0, atol=1e-9 * in_any_order)
-
-
-def test_a_solver_with_slots_takes_no_substeps(device):
-    class Slotted(SolverBase):
-        __slots__ = ("clock",)
-
-    model = sheet_above_sphere(device)
-    with pytest.raises(RuntimeError, match="Slotted has slots, clock, which substeps cannot restore"):
-        of_newton.attributes_of(Slotted(model))
-
-
 def test_style3d_has_contacts_of_its_own(device, monkeypatch):
     model = sheet_above_sphere(device)
     solver = SolverStyle3D(model)
@@ -284,43 +156,15 @@ def test_style3d_has_contacts_of_its_own(device, monkeypatch):
     with of_newton.with_contacts(SolverXPBD(model), None):
         pass
     monkeypatch.delattr(solver, "collision")
-    with pytest.raises(RuntimeError, match=r"no SolverStyle3D.collision.*omit substeps"):
+    with pytest.raises(RuntimeError, match=r"no SolverStyle3D.collision.*rest in two places"):
         of_newton.with_contacts(solver, None).__enter__()
 
 
-def test_soft_contacts_have_arrays_and_counters(device):
+def test_soft_contacts_say_whether_they_are_of_surfaces(device, monkeypatch):
     contacts = contacts_of(sheet_above_sphere(device))
-    names = of_warp.struct_fields(_SoftContacts)
-    arrays = of_newton.soft_contact_arrays(contacts, names)
-    assert set(names) - arrays.keys() == {"features"} and contacts._soft_contact_mesh_features is None
-    assert {name for name in vars(contacts) if name.startswith("soft_contact_")} == {
-        *(f"soft_contact_{name}" for name in arrays),
-        *("soft_contact_count", "soft_contact_max", "soft_contact_tids"),  # the last is not of contacts but of threads
-    }
-    counters = wp.clone(contacts.contact_counters)
-    count, overflow = of_newton.soft_contact_counters(contacts, counters)
-    assert count.numpy()[0] == contacts.soft_contact_count.numpy()[0] > 0 and overflow.numpy()[0] == 0
-    others = {name: wp.zeros_like(array) for name, array in arrays.items()}
-    packed = of_newton.contacts_with(contacts, counters, others)
-    assert packed.soft_contact_normal is others["normal"] is not contacts.soft_contact_normal
-    assert packed.soft_contact_count.ptr == counters[1:2].ptr != contacts.soft_contact_count.ptr
-    assert packed._soft_contact_source_overflow.ptr == counters[3:4].ptr
-    assert packed.rigid_contact_shape0 is contacts.rigid_contact_shape0
-
-
-@pytest.mark.parametrize(
-    "name", ["_soft_contact_mesh_features", "_soft_contact_source_overflow", "soft_contact_normal"]
-)
-def test_without_them_contacts_are_refused_in_steps_with_substeps(name, device, monkeypatch):
-    model = sheet_above_sphere(device)
-    contacts, solver = contacts_of(model), bsc.SolverCCD(SOLVERS["vbd"](model), substeps=2)
-    monkeypatch.delattr(contacts, name)
-    with pytest.raises(RuntimeError, match=rf"newton .* has no Contacts.{name}.*cannot be left out"):
-        step(solver, model, contacts, 1.0 / 60.0)
-
-
-def test_counters_in_another_order_are_refused(device):
-    contacts = contacts_of(sheet_above_sphere(device))
-    contacts.soft_contact_count = contacts.contact_counters[2:3]
-    with pytest.raises(RuntimeError, match=r"no Contacts.soft_contact_count as number 1 of Contacts.contact_counters"):
-        of_newton.soft_contact_counters(contacts, contacts.contact_counters)
+    assert not of_newton.has_surface_contacts(contacts)
+    contacts._soft_contact_mesh_features = wp.zeros(1, dtype=wp.vec3i, device=device)
+    assert of_newton.has_surface_contacts(contacts)
+    monkeypatch.delattr(contacts, "_soft_contact_mesh_features")
+    with pytest.raises(RuntimeError, match=r"no Contacts._soft_contact_mesh_features.*no gradients"):
+        of_newton.has_surface_contacts(contacts)

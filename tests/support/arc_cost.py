@@ -107,7 +107,7 @@ def steps(model, turn, count, on_arcs):
     device = model.device
     chords = contextlib.nullcontext() if on_arcs else mock.patch.object(motion, "BodyTurns", lambda mesh: None)
     with chords:
-        solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=None)
+        solver = bsc.SolverCCD(SOLVERS["vbd"](model))
     states, number = [model.state(), model.state()], wp.zeros(1, dtype=int, device=device)
 
     def two_steps():

@@ -49,9 +49,9 @@ def energies(model, state):
 class Steps:
     """Steps of a pile behind VBD, in CUDA graphs on a GPU after the first two."""
 
-    def __init__(self, model, substeps):
-        """Prepares steps with ``substeps`` of the stage."""
-        self.solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), substeps=substeps)
+    def __init__(self, model):
+        """Prepares steps."""
+        self.solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10))
         self.states, self.control, self._graphs = [model.state(), model.state()], model.control(), []
         self.device, self.times, self._steps = model.device, [], 0
 
@@ -78,10 +78,10 @@ class Steps:
         self._steps += 1
 
 
-def rest(sheets, steps, *, substeps="auto", device="cpu", cells=CELLS, show=print):
+def rest(sheets, steps, *, device="cpu", cells=CELLS, show=print):
     """Steps a pile, and returns its total energy after each step [J] and its steps; ``show`` gets some lines."""
     model = pile(sheets, device, cells)
-    pile_steps, totals = Steps(model, substeps), []
+    pile_steps, totals = Steps(model), []
     for step in range(steps):
         pile_steps.take()
         motion, membranes = energies(model, pile_steps.states[0])
@@ -102,13 +102,11 @@ def main():
     parser.add_argument("--sheets", type=int, default=50)
     parser.add_argument("--cells", type=int, default=CELLS, help="cells along each side of a sheet")
     parser.add_argument("--steps", type=int, default=110)
-    parser.add_argument("--substeps", choices=("auto", "none"), default="auto")
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore", "a step strained")
     wp.config.quiet = True
-    substeps = "auto" if arguments.substeps == "auto" else None
-    options = {"substeps": substeps, "device": arguments.device, "cells": arguments.cells}
+    options = {"device": arguments.device, "cells": arguments.cells}
     totals, steps = rest(arguments.sheets, arguments.steps, **options, show=lambda line: print(line, flush=True))
     milliseconds = 1e3 * np.array(steps.times)
     print(f"gained at most {gained(totals):.4f} J, begun with {totals[0]:.4f} J; {steps.solver.report.totals}")

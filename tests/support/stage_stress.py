@@ -1,8 +1,8 @@
 """Random steps of the collision stage, judged by exact detection.
 
 Half of them are single steps from random positions to random ones, most of them degenerate. The others are those of
-simulations: the scenes of ``substep_energy.py``, with VBD, XPBD and Style3D, in whole steps and in substeps, with
-contacts passed on and not. With ``--implicit`` all steps are those of ``SolverImplicit``.
+simulations: the scenes of ``random_scenes.py``, with VBD, XPBD and Style3D, with contacts passed on and not. With
+``--implicit`` all steps are those of ``SolverImplicit``.
 
 ``python tests/support/stage_stress.py --steps 10000`` prints a line for each kind of scene, and the seed of each step
 that a certificate was wrong about. The exit status is then 1.
@@ -18,10 +18,10 @@ import newton
 import numpy as np
 import warp as wp
 from newton_scenes import DT, DistanceRollout, Rollout
+from random_scenes import KINDS, Settings
+from random_scenes import Scene as Simulation
 from rich.console import Console
 from rich.table import Table
-from substep_energy import KINDS, Settings
-from substep_energy import Scene as Simulation
 
 import warp_bsc as bsc
 from warp_bsc.implicit.solver_implicit import SolverImplicit
@@ -146,7 +146,7 @@ class Stress:
         if implicit:
             solver = SolverImplicit(self._model, min_distance=distance)
         else:
-            solver = bsc.SolverCCD(self._inner, min_distance=distance, substeps=None)
+            solver = bsc.SolverCCD(self._inner, min_distance=distance)
         self._rollout = (
             Rollout(self._model, solver) if distance is None else DistanceRollout(self._model, solver, distance)
         )
@@ -216,7 +216,7 @@ def simulate(seed: int, judged: dict[str, Judged], most: int, device, *, implici
     """Judges the steps of a simulation, and returns whether all certificates were right.
 
     Args:
-        seed: Seed of the simulation; every third one is of whole steps.
+        seed: Seed of the simulation.
         judged: Counts of steps so far, by kind of scene.
         most: Most steps.
         device: Warp device.
@@ -225,10 +225,7 @@ def simulate(seed: int, judged: dict[str, Judged], most: int, device, *, implici
     settings = Settings.draw(seed)
     simulation, counts = Simulation(settings, device), judged[settings.kind]
     with contextlib.redirect_stdout(io.StringIO()):  # Style3D prints how long it prepared
-        if implicit:
-            solver = SolverImplicit(simulation.model)
-        else:
-            solver = simulation.make_solver(substeps=settings.substeps if seed % 3 else None)
+        solver = SolverImplicit(simulation.model) if implicit else simulation.make_solver()
     rollout, pipeline = Rollout(simulation.model, solver), newton.CollisionPipeline(simulation.model)
     contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
     wrong = 0

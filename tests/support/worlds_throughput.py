@@ -59,8 +59,7 @@ def vbd(model, self_contact=False):
 SOLVERS = {
     "VBD": vbd,
     "VBD, self-contact": lambda model: vbd(model, self_contact=True),
-    "SolverCCD(VBD), default": lambda model: bsc.SolverCCD(vbd(model)),
-    "SolverCCD(VBD), substeps=None": lambda model: bsc.SolverCCD(vbd(model), substeps=None),
+    "SolverCCD(VBD)": lambda model: bsc.SolverCCD(vbd(model)),
 }
 
 

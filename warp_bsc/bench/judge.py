@@ -11,7 +11,7 @@ import warp as wp
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..response.state.mesh import ModelMesh, host_array
-from ..response.substeps.strain import edges_at_rest
+from ..response.strain import edges_at_rest
 from .response_simulation import largest_stretch
 
 __all__ = ["Judge", "Judgement"]

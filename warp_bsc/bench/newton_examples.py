@@ -100,14 +100,12 @@ class StageTotals:
 
     Attributes:
         steps: Steps.
-        substepped_steps: Steps that were taken in substeps.
         uncertified_steps: Steps that were not certified.
         truncated_steps: Steps in which a path was truncated.
         frozen_steps: Steps in which a vertex was frozen.
     """
 
     steps: int
-    substepped_steps: int
     uncertified_steps: int
     truncated_steps: int
     frozen_steps: int

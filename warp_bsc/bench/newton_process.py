@@ -108,7 +108,7 @@ class _StagedType(type):
     """The type of solver classes whose instances come with the collision stage behind them.
 
     They are subclasses of Newton's, so that examples may read their attributes and derive from them. What they make is
-    of Newton's class itself, as a user's solver is: the stage takes no substeps in CUDA graphs behind others.
+    of Newton's class itself, as a user's solver is.
     """
 
     stages: list[Any]

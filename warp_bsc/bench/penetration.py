@@ -151,7 +151,6 @@ class PenetrationMeasurement:
             flies for a step.
         stretch: Largest elongation of an edge beyond its length at rest, of all frame ends [%].
         uncertified_steps: Steps that were not certified; None without a stage.
-        substepped_steps: Steps that the stage took in substeps, whose way is not straight; None without a stage.
         milliseconds: Median and mean time of a step but the first :data:`WARM_UP` [ms].
     """
 
@@ -169,7 +168,6 @@ class PenetrationMeasurement:
     speed_kept: float | None
     stretch: float
     uncertified_steps: int | None
-    substepped_steps: int | None
     milliseconds: tuple[float, float]
 
 
@@ -261,7 +259,6 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
         speed_kept=_speed_kept(built, states, simulator.rate),
         stretch=judgement.stretch,
         uncertified_steps=trajectory.uncertified_steps,
-        substepped_steps=trajectory.substepped_steps,
         milliseconds=(float(np.median(timed)), float(np.mean(timed))),
     )
 

@@ -7,7 +7,7 @@ import newton
 import numpy as np
 
 from ..response.state.mesh import host_array
-from ..response.substeps.strain import edges_at_rest
+from ..response.strain import edges_at_rest
 from .penetration_scenes import PenetrationScene
 from .penetration_states import Trajectory
 from .response_simulation import NotFinite, Simulation, largest_stretch
@@ -90,7 +90,6 @@ def simulate_newton(
         states.positions,
         simulation.milliseconds,
         uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
-        substepped_steps=sum(count > 1 for count in simulation.substeps) if stage else None,
     )
 
 

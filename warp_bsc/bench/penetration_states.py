@@ -23,13 +23,11 @@ class Trajectory:
         states: Positions of the particles at the start and after each step [m], each of shape [particle_count, 3].
         milliseconds: Time of each step [ms].
         uncertified_steps: Steps that the stage did not certify; None without a stage.
-        substepped_steps: Steps that the stage took in substeps; None without a stage.
     """
 
     states: list[np.ndarray]
     milliseconds: list[float]
     uncertified_steps: int | None = None
-    substepped_steps: int | None = None
 
 
 @dataclass(frozen=True)

@@ -58,8 +58,7 @@ CONFIGURATIONS = ("plain", "self-contact", "stage", "stage+contacts", "implicit"
 ``plain``: the solver with Newton's contacts. ``self-contact``: the same with VBD's own contacts between particles.
 ``stage``: :class:`warp_bsc.SolverCCD` with default arguments, without contacts of Newton. ``stage+contacts``: the same
 with them. ``implicit``: :class:`warp_bsc.SolverImplicit` with default arguments, in place of VBD, whose energies it
-has. ``converged``: the same with as many Newton steps as a step needs. ``reference``: :class:`warp_bsc.SolverCCD`
-without substeps, without contacts of Newton, at a small step.
+has. ``converged``: the same with as many Newton steps as a step needs. ``reference``: ``stage`` at a small step.
 """
 
 SOLVERS = ("vbd", "xpbd", "style3d", "semi-implicit")
@@ -78,7 +77,7 @@ WARM_UP = 2
 EARLY_STEPS = 48
 """Steps after which positions are compared with those of :data:`CONVERGED`."""
 
-_STAGES: dict[str, dict[str, Any]] = {"stage": {}, "stage+contacts": {}, REFERENCE: {"substeps": None}}
+_STAGES: dict[str, dict[str, Any]] = {"stage": {}, "stage+contacts": {}, REFERENCE: {}}
 """Arguments of the stage by configuration."""
 
 _IMPLICIT: dict[str, dict[str, Any]] = {"implicit": {}, CONVERGED: {"max_iterations": 200}}
@@ -121,7 +120,6 @@ class ResponseMeasurement:
         collisions: Vertex-face and edge-edge pairs that meet on the straight way of a step, at least one of them not of
             a rigid shape, in all steps together; None for the reference, which has too many.
         uncertified_steps: Steps that were not certified; None without a stage.
-        substeps: Mean number of substeps of a step, 1 for a step that was not taken in substeps; None without a stage.
         milliseconds: Time of each step but the first :data:`WARM_UP` [ms], with Newton's contacts; two steps are timed
             together.
         early: Positions after :data:`EARLY_STEPS` steps [m], shape [particle_count, 3]; None if there are fewer steps.
@@ -140,7 +138,6 @@ class ResponseMeasurement:
     crossings: int
     collisions: int | None
     uncertified_steps: int | None
-    substeps: float | None
     milliseconds: list[float]
     early: np.ndarray | None = field(default=None, repr=False)
     spread: Spread | None = None
@@ -310,7 +307,6 @@ def _measure(
         crossings=simulation.count_crossings(),
         collisions=sum(simulation.collisions) if configuration != REFERENCE else None,
         uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
-        substeps=float(np.mean(simulation.substeps)) if stage else None,
         milliseconds=simulation.milliseconds[WARM_UP:],
         early=samples.early,
     )

@@ -13,7 +13,7 @@ import warp as wp
 from ..implicit.solver_implicit import SolverImplicit
 from ..response.solver_ccd import SolverCCD
 from ..response.state.mesh import host_array
-from ..response.substeps.strain import edges_at_rest
+from ..response.strain import edges_at_rest
 from .crossings import CrossingCounter
 from .elastic_energy import ElasticEnergy
 from .response_scenes import Scene
@@ -128,7 +128,6 @@ class Simulation:
         stage: The stage, which :class:`.SolverImplicit` is itself; None without one.
         samples: What was measured of each state.
         milliseconds: Time of each step [ms]; two steps are timed together.
-        substeps: Substeps of each step, 1 for a step that was not taken in substeps.
         collisions: Pairs that meet on straight ways in each step, see :class:`.crossings.CrossingCounter`; empty if
             they are not counted.
     """
@@ -185,9 +184,9 @@ class Simulation:
         self._states, self._control = (model.state(), model.state()), model.control()
         # VBD that does not move bodies reads their poses at the start and at the end; the others copy them
         self._poses_in_both = solver != "vbd"
-        self._ends = [(model.state(), wp.zeros(1, dtype=int)) for _ in self._states]  # copies of both ends of a pair
+        self._ends = [model.state() for _ in self._states]  # copies of both ends of a pair
         self._graph: wp.Graph | None = None
-        self.samples, self.milliseconds, self.substeps = samples or Samples(model, early_steps), [], []
+        self.samples, self.milliseconds = samples or Samples(model, early_steps), []
         self._counts_collisions, self.collisions = counts_collisions, []
 
     def run(self, seconds: float, progress: Callable[[int, int], None]) -> int:
@@ -211,10 +210,9 @@ class Simulation:
                 if self._counts_collisions:
                     self._counter.begin(self._states[0])
             self.milliseconds += [0.5 * self._take_pair()] * 2
-            for i, (state, taken) in enumerate(self._ends):
+            for i, state in enumerate(self._ends):
                 if not samples.add(state):
                     raise NotFinite(f"positions are not finite after step {step + i + 1} of {steps}")
-                self.substeps.append(max(1, int(taken.numpy()[0])))
                 if self._counts_collisions:
                     self.collisions.append(self._counter.count_collisions(state))
         progress(steps, steps)
@@ -252,7 +250,7 @@ class Simulation:
     def _step_twice(self):
         """Takes two steps, and copies the state at the end of each: some solvers overwrite that at their start."""
         first, second = self._states
-        for start, end, (copy, substeps) in zip((first, second), (second, first), self._ends, strict=True):
+        for start, end, copy in zip((first, second), (second, first), self._ends, strict=True):
             self._mover.move(start, end)
             start.clear_forces()
             if self._pipeline and self._contacts:
@@ -261,8 +259,6 @@ class Simulation:
             for name in ("particle_q", "particle_qd", "body_q", "body_qd"):
                 if getattr(end, name) is not None:
                     wp.copy(getattr(copy, name), getattr(end, name))
-            if self.stage:
-                wp.copy(substeps, self.stage.report.last_substeps)
 
     def _reset(self, worlds: Sequence[int]):
         """Puts the particles of worlds where the model has them, as a trainer does."""

@@ -61,7 +61,6 @@ _SIZES = (
     Column("Trian-\ngles", "triangles"),
     Column("Frames", "frames"),
     Column("Steps", "stage.steps"),
-    Column("In sub-\nsteps", "stage.substepped_steps"),
     Column("Uncer-\ntified", "stage.uncertified_steps"),
     Column("Trun-\ncated", "stage.truncated_steps"),
     Column("Frozen", "stage.frozen_steps"),
@@ -108,7 +107,7 @@ def _show(console: Console, runs: list[ExampleRun]) -> None:
             sizes[name] = run.measured
     if sizes:
         console.print()
-        caption = "Steps: all, in substeps, not certified, with paths truncated, with vertices frozen."
+        caption = "Steps: all, not certified, with paths truncated, with vertices frozen."
         print_table(console, "Example", _SIZES, sizes.items(), caption=caption)
 
 

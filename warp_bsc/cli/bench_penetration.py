@@ -110,8 +110,6 @@ def _show_scene(console: Console, scene: str, runs: list[PenetrationRun]) -> Non
             continue
         if took.uncertified_steps:
             say(console, f"{title}: {count(took.uncertified_steps, 'step')} of {took.steps:,} not certified")
-        if took.substepped_steps and took.collisions:
-            say(console, f"{title}: {count(took.substepped_steps, 'step')} in substeps, whose way is not straight")
 
 
 def _measurement_to_dict(took: PenetrationMeasurement) -> dict[str, Any]:

@@ -34,9 +34,8 @@ measure what each configuration of a solver and the collision stage makes of
 them: the largest stretch of an edge, at the end and at most; the speed at rest;
 the energy that is gained behind VBD, where nothing does work, with that of
 elastic strain; the edges that cross faces at the end, and the pairs that meet
-on the straight way of a step, found in exact arithmetic; the substeps of a
-step, and its time, on a GPU in a CUDA graph; and the steps that were not
-certified. The balls take steps of 1/120 s.
+on the straight way of a step, found in exact arithmetic; the time of a step, on
+a GPU in a CUDA graph; and the steps that were not certified. The balls take steps of 1/120 s.
 The configurations:
   plain           the solver with Newton's contacts
   self-contact    the same with VBD's own contacts between particles
@@ -44,7 +43,7 @@ The configurations:
   stage+contacts  the same with Newton's contacts
   implicit        SolverImplicit with default arguments, in place of VBD
   converged       the same with as many Newton steps as a step needs
-  reference       SolverCCD without substeps, at a small step: slow
+  reference       SolverCCD at a small step: slow
 Ropes have particle_radius, without which nothing collides with springs. The
 semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations, unless
 --rate is given. A scene that the solver cannot run is a row, and a line below
@@ -77,7 +76,6 @@ _COLUMNS = (
     Column("Energy\ngained\n[J]", "energy_gained", ",.4f", width=7),
     Column("Cross-\nings", "crossings", width=6),
     Column("Pairs\nmeet", "collisions", width=6),
-    Column("Sub-\nsteps", "substeps", ".1f", width=5),
     Column("A step:\nmedian\n[ms]", "median", functools.partial(_digits, 2), width=7),
     Column("\nmean\n[ms]", "mean", functools.partial(_digits, 2), width=6),
 )  # 80 columns with the first one and the gaps

@@ -11,7 +11,7 @@ from newton.solvers import SolverVBD
 
 from .._arguments import check_instance, checked_integer, checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import displacements_since_detection, soft_contact_arrays
+from .._private_names.of_newton import displacements_since_detection, has_surface_contacts
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from ..response.adjoint.between_steps import BetweenSteps
@@ -198,7 +198,7 @@ class SolverImplicitAdjoint(WrappedSolver):
             "truncation before shapes (rigid_soft_enable_dat)": solver.rigid_soft_enable_dat,
             "penalties of contacts that grow (rigid_avbd_linear_beta)": solver.rigid_contact_k_start_value >= 0.0,
             "contacts with features of meshes": (
-                contacts is not None and bool(contacts.soft_contact_max and soft_contact_arrays(contacts, ["features"]))
+                contacts is not None and contacts.soft_contact_max > 0 and has_surface_contacts(contacts)
             ),
         }
         for reason, applies in reasons.items():
@@ -226,10 +226,7 @@ class SolverImplicitAdjoint(WrappedSolver):
             self._first = id(tape.launches[0])
 
     def _cuts(self):
-        """Returns what :func:`.displacements_since_detection` does, now, as the stage replaces it for its step.
-
-        None without self-contact or polish.
-        """
+        """Returns what :func:`.displacements_since_detection` does; None without self-contact or polish."""
         solver = self.solver
         assert isinstance(solver, SolverVBD)
         has_cuts = self._polish is not None and solver.particle_enable_self_contact

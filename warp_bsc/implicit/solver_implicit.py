@@ -185,7 +185,6 @@ class SolverImplicit(SolverCCD):
             particle_radius = _radii_of_strands(model)
         super().__init__(
             _Inertia(model, moves_bodies=moves),
-            substeps=None,
             bodies="separated" if moves and _dynamic_bodies(model).any() else "left",
             contact_layer=False,
             restitution=0.0,
@@ -215,7 +214,7 @@ class SolverImplicit(SolverCCD):
         if tape is not None and self.model.requires_grad:
             raise NotImplementedError("a step of SolverImplicit on a tape carries no gradients yet: step outside it")
 
-    def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
+    def _finish_step(self, state_in, state_out, contacts, dt, tape):
         end = arrays_of(state_out)
         solve = functools.partial(self._solve, end, dt)
         run_on_host(functools.partial(self._resolve, end, dt, solve, self._mask), self.mesh.device)

@@ -73,7 +73,7 @@ class CollisionMonitor(CollisionStage):
         if report_worlds:
             self._count_worlds()
 
-    def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
+    def _finish_step(self, state_in, state_out, contacts, dt, tape):
         end = arrays_of(state_out)
         mask = self._mask
         run_on_host(lambda: self._inspect(end, dt, mask), self.mesh.device)
@@ -85,6 +85,4 @@ class CollisionMonitor(CollisionStage):
             self._motion.set_end(end, dt)
             with self._masked(mask):
                 inspect(self._work)
-                if self._counter is not None:
-                    self._counter.count()
                 self._count_step()

@@ -15,7 +15,6 @@ from .._arguments import (
     checked_flag,
     checked_integer,
     checked_number,
-    given,
 )
 from .._private_names.of_newton import has_external_rigid_solver
 from .schedule import MAX_ITERATIONS
@@ -46,13 +45,12 @@ class StageOptions:
     friction_table: FrictionTable | None
     reads_friction: bool
     restitution: wp.array
-    substeps: int | Literal["auto"] | None
+    substeps: int
     bodies: Bodies
     distances: KeptDistances
     collision_filter: CollisionFilter | None
     inversions: Inversions
     contact_layer: bool
-    lift_speed_limit: bool
     max_iterations: int
     report_contacts: int
     report_worlds: bool
@@ -66,14 +64,13 @@ class StageOptions:
         friction=None,
         friction_table=None,
         restitution=None,
-        substeps: int | Literal["auto"] | None = "auto",
+        substeps=1,
         bodies="pushed",
         min_distance=None,
         particle_radius=None,
         collision_filter=None,
         inversions="left",
         contact_layer=True,
-        lift_speed_limit=True,
         max_iterations=MAX_ITERATIONS,
         report_contacts: bool | int = False,
         report_worlds=False,
@@ -82,7 +79,7 @@ class StageOptions:
         if separation is not None:
             separation = checked_distance(separation, "separation", zero=False)
             checked_number(separation, "separation", 0.0, MAX_FLOAT)
-        substeps = checked_substeps(substeps)
+        substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)
         return cls(
             separation=separation,
             friction=checked_friction(friction, model),
@@ -95,9 +92,8 @@ class StageOptions:
             collision_filter=checked_filter(collision_filter, model),
             inversions=cast(Inversions, checked_choice(inversions, "inversions", get_args(Inversions))),
             contact_layer=checked_flag(contact_layer, "contact_layer"),
-            lift_speed_limit=checked_flag(lift_speed_limit, "lift_speed_limit"),
             max_iterations=checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS),
-            report_contacts=checked_capacity(report_contacts, model),
+            report_contacts=checked_capacity(report_contacts, model, substeps),
             report_worlds=checked_flag(report_worlds, "report_worlds"),
         )
 
@@ -142,22 +138,11 @@ def particle_edge_lengths(mesh: ModelMesh) -> np.ndarray:
     return np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
 
 
-def checked_substeps(substeps) -> int | Literal["auto"] | None:
-    """Returns the argument ``substeps``: None, "auto" or a number of substeps."""
-    if substeps is None or (isinstance(substeps, str) and substeps == "auto"):
-        return substeps
-    if isinstance(substeps, str):
-        raise ValueError(f"substeps takes 2 substeps or more, or 'auto', not {given(substeps)}")
-    try:
-        return checked_integer(substeps, "substeps", 2, MAX_SUBSTEPS)
-    except ValueError as error:
-        raise ValueError(f"{error}: pass None for none, 2 to {MAX_SUBSTEPS}, or 'auto'") from None
-
-
-def checked_capacity(report_contacts, model: newton.Model) -> int:
+def checked_capacity(report_contacts, model: newton.Model, substeps: int) -> int:
     """Returns the argument ``report_contacts`` as a number of contacts, 0 for none."""
     if report_contacts is True or report_contacts is False:
-        return max(MIN_CONTACTS, CONTACTS_PER_PARTICLE * model.particle_count) if report_contacts else 0
+        capacity = substeps * max(MIN_CONTACTS, CONTACTS_PER_PARTICLE * model.particle_count)
+        return min(capacity, MAX_CONTACTS) if report_contacts else 0
     return checked_integer(report_contacts, "report_contacts", 1, MAX_CONTACTS)
 
 

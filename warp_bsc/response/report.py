@@ -16,10 +16,11 @@ from .report_totals import GradientTotals, Penetrated, StepTotals, Totals
 from .report_views import ReportViews
 from .schedule import Result, views_of
 from .state.motion import SET_STEPS
-from .state.structs import FROZEN, TRUNCATED
+from .state.structs import FROZEN, INVALID, NOT_FINITE, TRUNCATED, UNCERTIFIED
 from .state.workspace import Workspace
 from .tuning import MAX_STRAIN
 from .worlds.world_report import WorldsOfReport
+from .write_back import StepResults
 
 _CROSSINGS_WARNING = (
     "edges pass through faces at the start of a step, and their contacts are left to the solver: "
@@ -42,23 +43,25 @@ class SolverReport(ReportViews, WorldsOfReport):
 
     Of steps that are not certified, are not finite, strain, cross or invert something it warns once each.
 
-    :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step.
+    :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step. In a step with
+    substeps, numbers are sums over these, but for :attr:`crossings` and :attr:`inverted`, the most at the start of one.
+    It is certified if all of them are; a vertex counts as truncated, frozen, not finite or uncertified if it is in any.
 
     Without a response (:class:`.monitor.CollisionMonitor`) the motion that the inner solver predicted is the motion
     that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
     or frozen.
 
     Attributes:
-        speed_limit_lifted: Whether the inner solver is VBD with self-contact, whose limit is lifted where it brakes.
-        substeps_omitted: Why ``substeps="auto"`` takes no substeps here; None if it can, or was not given.
+        step_results: What the last step did, on the device, which the other attributes read.
     """
 
     def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
         self._motion, self._work, self._responds = work.motion, work, responds
-        self.speed_limit_lifted = False
-        self.substeps_omitted: str | None = None
-        self.last_substeps = wp.zeros(1, dtype=int, device=work.device)
+        self.step_results = StepResults()
+        self.step_results.results = wp.zeros(len(Result), dtype=int, device=work.device)
+        self.step_results.of_vertices = wp.zeros_like(work.vertices.outcome)
+        self.step_results.of_bodies = wp.zeros(work.body_count, dtype=int, device=work.device)
         self.last_strain = wp.zeros(work.worlds, dtype=float, device=work.device)  # by world
         self.set_steps = wp.zeros(work.body_count, dtype=int, device=work.device)  # of bodies, see find_set_bodies
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
@@ -68,7 +71,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.thickness: wp.array[wp.float64] | None = None  # of that layer [m]
         self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
-        self.span: tuple | None = None  # start and end of the last step, in seconds, or events on a GPU
+        self.spans: list[tuple] = []  # start and end of each substep of the last step, in seconds, or events on a GPU
 
     def copy_totals(self) -> None:
         """Copies the totals to the host, without waiting for the device, also in a CUDA graph."""
@@ -129,6 +132,10 @@ class SolverReport(ReportViews, WorldsOfReport):
         self.warn()
         return value
 
+    def _read_result(self, result):
+        """Returns one of the results of the last step, and warns."""
+        return self._read(self.step_results.results[result : result + 1])
+
     def _set_bodies_warning(self):
         labels, bodies = self._mesh.model.body_label, np.flatnonzero(self.set_steps.numpy() == SET_STEPS)
         return set_bodies_warning([f"body {body} ({labels[body]!r})" for body in bodies])
@@ -138,20 +145,13 @@ class SolverReport(ReportViews, WorldsOfReport):
         return revoked_warning(self._mesh.model, passed if len(passed) else self.coupled.bodies)
 
     def _strain_warning(self):
-        advice = f"give it more iterations, {self._shorter_steps}"
-        if self.substeps_omitted is not None:
-            advice += f" (substeps='auto' takes none: {self.substeps_omitted})"
         cause = "its solver does not see the contacts, or its iterations are too few for the step"
+        advice = f"give it more iterations, {self._shorter_steps}, or step cloth and soft bodies by SolverImplicit"
         return f"a step strained an edge by more than {float(MAX_STRAIN):.0%}, as {cause}: {advice}"
 
     @property
     def _shorter_steps(self):
-        """Advice that the program has not taken yet; where gradients are asked for, substeps are a number."""
-        if self.totals.substepped_steps:
-            return "take shorter steps" + (", or more substeps" if self._mesh.model.requires_grad else "")
-        if self._mesh.model.requires_grad:
-            return "take shorter steps, or pass substeps=4"
-        return "take shorter steps" + ("" if self.substeps_omitted else ", or pass substeps='auto'")
+        return "take shorter steps, or raise substeps"
 
     @property
     def certified(self) -> bool:
@@ -165,12 +165,12 @@ class SolverReport(ReportViews, WorldsOfReport):
         step. :attr:`uncertified_vertices` lists the particles concerned. Behind a coupled
         solver, a step is not certified until its end in the state of the program is seen, see :class:`.CouplingHooks`.
         """
-        return bool(self._read(self._work.results[Result.CERTIFIED]))
+        return bool(self._read_result(Result.CERTIFIED))
 
     @property
     def hits(self) -> int:
         """Contacts of the motion that the inner solver predicted in the last step, without those excluded."""
-        return self._read(self._work.results[Result.FIRST_HITS])
+        return self._read_result(Result.FIRST_HITS)
 
     @property
     def remaining(self) -> int:
@@ -178,7 +178,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         With a response, they could not be resolved, because kinematic vertices leave no space.
         """
-        return self._read(self._work.results[Result.REMAINING])
+        return self._read_result(Result.REMAINING)
 
     @property
     def excluded(self) -> int:
@@ -186,7 +186,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
         """
-        return self._read(self._work.results[Result.EXCLUDED])
+        return self._read_result(Result.EXCLUDED)
 
     @property
     def filtered(self) -> int:
@@ -198,7 +198,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         so do contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from colliding. In a
         CUDA graph the number is a lower bound if its queues are too small. :attr:`worlds` has the numbers by world.
         """
-        return self._read(self._work.results[Result.FILTERED])
+        return self._read_result(Result.FILTERED)
 
     @property
     def body_contacts(self) -> int:
@@ -208,7 +208,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
         the response moves no bodies, and counts nothing that it keeps apart (``bodies="separated"``).
         """
-        return self._read(self._work.results[Result.BODY_CONTACTS])
+        return self._read_result(Result.BODY_CONTACTS)
 
     @property
     def crossings(self) -> int:
@@ -218,7 +218,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         graph the number is a lower bound if there are more candidates than its queues hold. Behind a coupled solver,
         it is at least that of the state of the program at the start of the last step whose end was seen.
         """
-        crossings = self._read(self._work.results[Result.CROSSINGS])
+        crossings = self._read_result(Result.CROSSINGS)
         return crossings if self.coupled is None else max(crossings, self.coupled.crossings)
 
     @property
@@ -248,16 +248,18 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _read_inversions(self, result):
         if self._work.tetrahedra is None:
             raise RuntimeError(_NOT_WATCHED)
-        return self._read(self._work.results[result])
+        return self._read_result(result)
 
     @property
     def not_finite(self) -> int:
         """Particles whose position or velocity was not finite after the inner solver in the last step, or a substep.
 
-        They stood where they were at the start, and the step is not certified. Without a response they are left as the
+        They stood where they were at its start, and the step is not certified. Without a response they are left as the
         inner solver made them.
         """
-        return self._read(self._work.results[Result.NOT_FINITE])
+        count = int(np.count_nonzero(self._find_vertices(NOT_FINITE)[: self._mesh.model.particle_count]))
+        self.warn()
+        return count
 
     @property
     def uncertified_vertices(self) -> np.ndarray:
@@ -283,28 +285,19 @@ class SolverReport(ReportViews, WorldsOfReport):
         if self.certified or not model.body_count:
             return np.empty(0, dtype=np.int32)
         first = model.particle_count
-        listed = (self._work.vertices.changed.numpy() != 0) | (self._motion.vertices.is_not_finite.numpy() != 0)
-        bodies = np.unique(self._mesh.shape_vertices.body[listed[first:]])
+        bodies = np.unique(self._mesh.shape_vertices.body[self._find_vertices(UNCERTIFIED)[first:]])
         if self.coupled is not None:
             bodies = np.union1d(bodies, self.coupled.find_bodies())
         return bodies[bodies >= 0].astype(np.int32)
 
     def _find_uncertified(self):
         """Returns which vertices of the mesh the certificate of the last step lacks, bool, shape [vertex_count]."""
-        if self.certified:
-            return np.zeros(self._mesh.vertex_count, dtype=bool)
-        if self.undetected:
-            return np.arange(self._mesh.vertex_count) < self._mesh.model.particle_count
-        vertices = self._work.vertices
-        listed = vertices.changed.numpy() != 0  # those in a contact of the last detection
-        x0, x1 = (x.numpy() for x in (self._motion.vertices.x0, vertices.x1))
-        invalid = ~(np.isfinite(x0) & np.isfinite(x1)).all(axis=1)
-        replaced = self._motion.vertices.is_not_finite.numpy() != 0
-        first = self._mesh.model.particle_count if self._responds else 0  # a response leaves particles where they were
-        invalid[first:] |= replaced[first:]
+        outcome = self.step_results.of_vertices.numpy()
+        listed, invalid = ((outcome & int(bit)) != 0 for bit in (UNCERTIFIED, INVALID))
         for elements in (self._mesh.faces, self._mesh.edges):
             listed[elements[invalid[elements].any(axis=1)]] = True
-        return listed | invalid | replaced
+        self.warn()
+        return listed
 
     @property
     def undetected(self) -> bool:
@@ -313,12 +306,12 @@ class SolverReport(ReportViews, WorldsOfReport):
         This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
         :class:`.captured_steps.CapturedSteps`. Without a tape, a search without buffers completes the detection.
         """
-        return bool(self._read(self._work.results[Result.UNDETECTED]))
+        return bool(self._read_result(Result.UNDETECTED))
 
     @property
     def iterations(self) -> int:
         """Iterations of detection and projection, division or truncation in the last step; 0 without a response."""
-        return self._read(self._work.results[Result.ITERATIONS])
+        return self._read_result(Result.ITERATIONS)
 
     @property
     def truncated(self) -> int:
@@ -365,7 +358,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         :attr:`crossings` has it; nor is a surface that a program puts wholly on the other side of another between two
         steps, unless it is inside a solid then. Computed on each access, on the host.
         """
-        crossed = self._read(self._work.results[Result.NEW_CROSSINGS])
+        crossed = self._read_result(Result.NEW_CROSSINGS)
         inside = len(np.unique(self.inside.particles))
         return Penetrated(self.remaining, crossed, inside, self.totals.penetrated_steps)
 
@@ -385,17 +378,13 @@ class SolverReport(ReportViews, WorldsOfReport):
     def milliseconds(self) -> float | None:
         """Time of the last step that was not captured [ms]; None if there was none.
 
-        Without the inner solver, except for its substeps.
+        Without the inner solver.
         """
-        if self.span is None:
+        if not self.spans:
             return None
-        start, end = self.span
-        return wp.get_event_elapsed_time(start, end) if isinstance(start, wp.Event) else 1e3 * (end - start)
-
-    @property
-    def substeps(self) -> int:
-        """Substeps of the last step, the most of all worlds; 0 if it was not taken in substeps."""
-        return self._read(self.last_substeps)
+        if isinstance(self.spans[0][0], wp.Event):
+            return sum(wp.get_event_elapsed_time(start, end) for start, end in self.spans)
+        return 1e3 * sum(end - start for start, end in self.spans)
 
     @property
     def strain(self) -> float:
@@ -403,7 +392,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
         That is the elongation of an edge of a triangle or a spring beyond its length at rest, or a quarter of its
         compression, and the change of length of an edge in a soft body, as a share of its length at rest. Of a step in
-        substeps, it is that of a substep.
+        substeps, it is the largest of a substep.
         """
         return self._read(self.last_strain)
 
@@ -443,14 +432,8 @@ class SolverReport(ReportViews, WorldsOfReport):
             line += f" ({totals.revoked_steps} only in the state of the program)"
         if totals.unseen_steps:
             line += f", {totals.unseen_steps} whose end in the state of the program was not seen"
-        if totals.substepped_steps:
-            line += f", {totals.substepped_steps} in substeps"
-        if self.substeps_omitted is not None and totals.strained_steps:
-            line += f", none in substeps ({self.substeps_omitted})"
         if totals.strained_steps:
             line += f", {totals.strained_steps} that strained an edge by more than {float(MAX_STRAIN):.0%}"
-        if self.speed_limit_lifted:
-            line += ", VBD's speed limit lifted where it brakes"
         if totals.inverting_steps:
             line += f", {totals.inverting_steps} that inverted tetrahedra"
         if self.crossings:
@@ -486,17 +469,16 @@ class SolverReport(ReportViews, WorldsOfReport):
         return self._work.vertices.x1.numpy()
 
     def _find_vertices(self, bit):
-        vertices, mesh = self._work.vertices, self._mesh
-        found = (vertices.outcome.numpy() & int(bit)) != 0
-        if vertices.bodies.outcome:
+        results, mesh = self.step_results, self._mesh
+        found = (results.of_vertices.numpy() & int(bit)) != 0
+        if len(results.of_bodies):
             body = mesh.shape_vertices.body
-            of_bodies = np.append((vertices.bodies.outcome.numpy() & int(bit)) != 0, False)  # last: of no body
+            of_bodies = np.append((results.of_bodies.numpy() & int(bit)) != 0, False)  # last: of no body
             found[mesh.model.particle_count :] |= of_bodies[body]
         return found
 
     def _count_vertices(self, bit):
-        vertices = self._work.vertices
-        counts = [vertices.outcome] + ([vertices.bodies.outcome] if vertices.bodies.outcome else [])
-        count = sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in counts)
+        outcomes = self.step_results.of_vertices, self.step_results.of_bodies
+        count = sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in outcomes)
         self.warn()
         return count

@@ -10,7 +10,6 @@ class StepTotals:
     """Totals over all steps so far on the device, see :class:`Totals`; each field is an array of one element."""
 
     steps: wp.array[wp.int64]
-    substepped_steps: wp.array[wp.int64]
     uncertified_steps: wp.array[wp.int64]
     undetected_steps: wp.array[wp.int64]
     truncated_steps: wp.array[wp.int64]
@@ -37,8 +36,7 @@ class Totals:
     """Totals over all steps so far.
 
     Attributes:
-        steps: Steps.
-        substepped_steps: Steps that were taken in substeps, see :mod:`.substeps.substeps`.
+        steps: Steps. One that is taken in substeps is one step, of which its substeps count together.
         uncertified_steps: Steps that were not certified.
         undetected_steps: Steps that froze all vertices because their detection was incomplete, see
             :attr:`.report.SolverReport.undetected`.
@@ -62,7 +60,6 @@ class Totals:
     """
 
     steps: int
-    substepped_steps: int
     uncertified_steps: int
     undetected_steps: int
     truncated_steps: int

@@ -1,6 +1,5 @@
 """The collision stage for Newton: a solver that wraps another one, and makes its motion free of collisions."""
 
-import contextlib
 import functools
 from typing import Literal
 
@@ -11,13 +10,13 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, has_room, may_allocate, with_contacts
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, with_contacts
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
 from .forces.contact_forces import ContactForces
-from .integration.vbd_speed_limit import SpeedLimit, has_self_contact, has_speed_limit
+from .integration.style3d_contacts import Style3DContacts
 from .integration.wrapped_solver import innermost
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
@@ -29,20 +28,19 @@ from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
 from .step import resolve, resolve_inversions
-from .substeps.inner_contacts import InnerContacts
-from .substeps.small_steps import SmallSteps
-from .substeps.strain import StrainMeter
-from .substeps.style3d_contacts import Style3DContacts
-from .substeps.substeps import Substeps, reason_to_omit_substeps
-from .tuning import SUBSTEPS
+from .strain import StrainMeter
+from .substeps import Substeps
+from .worlds.world_mask import checked_mask
 from .write_back import count_record, write_back
 
-_COUPLED = "a coupled solver steps the stage"
 _PASSED_ON = "the inner solver has all contacts that were passed on"
 
 
 class SolverCCD(CollisionStage):
     """Lets another solver step, then makes the motion that it predicted free of collisions.
+
+    For cloth and soft bodies take :class:`warp_bsc.SolverImplicit`, which sees its contacts; this stage goes behind
+    whatever solver there is: one step of that solver, then the contacts of its motion are detected and resolved.
 
     Cloth and the surfaces of soft bodies do not pass through each other, themselves, or rigid shapes that collide with
     particles. Particles push dynamic bodies back, see ``bodies``. All other attributes are those of the inner solver.
@@ -59,12 +57,12 @@ class SolverCCD(CollisionStage):
     :meth:`reset`, and with ``requires_grad``. A body that ``joint_q`` of the model puts elsewhere than ``body_q``
     starts the first step where the state has it.
 
-    The certificate covers the motion from the stored state at the start to the stored state at the end: particles move
-    straight, and bodies turn evenly, the shorter way, so that their vertices move on arcs, see ``state.turns``. A
-    body that the response can move turns about its centre of mass, others about the axis of their screw. With
-    ``requires_grad`` the response resolves contacts of straight paths, and a step in which only an arc collides is not
-    certified. A body whose predicted pose or velocity is not finite is left to the inner solver, and the step is not
-    certified.
+    The certificate covers the motion from the stored state at the start to the stored state at the end, of a step with
+    ``substeps`` the motion in each of them: particles move straight, and bodies turn evenly, the shorter way, so that
+    their vertices move on arcs, see ``state.turns``. A body that the response can move turns about its centre of mass,
+    others about the axis of their screw. With ``requires_grad`` the response resolves contacts of straight paths, and a
+    step in which only an arc collides is not certified. A body whose predicted pose or velocity is not finite is left
+    to the inner solver, and the step is not certified.
 
     With ``min_distance`` or ``particle_radius`` the certificate is of distances: a pair that started farther apart
     stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-20 of that distance
@@ -87,10 +85,9 @@ class SolverCCD(CollisionStage):
     put a new one behind a solver of the same model.
 
     Limitations:
-        The stage follows the inner solver, which does not see the contacts, except for Style3D. Without ``substeps``,
-        steps must be short against the time of sound through an element. With ``substeps="auto"``, whole steps in
-        which nothing has touched yet are the inner solver's, however far it stretches cloth in them; after a contact,
-        steps are taken in substeps until a whole step strains no element by more than 1%, also if nothing touches.
+        The stage follows the inner solver, which does not see the contacts, except for Style3D: where something pushes,
+        steps must be short against the time of sound through an element, or contacts stretch elements. Shorter steps,
+        or ``substeps``, stretch them less; ``report.strain`` says by how much they do.
 
     Attributes:
         solver: The inner solver, or the contact layer around it.
@@ -99,7 +96,7 @@ class SolverCCD(CollisionStage):
         separation: Distance that contacts are moved apart [m].
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
-        substeps: Substeps of a step that collides, ``"auto"``, or None.
+        substeps: Steps of the inner solver in a step, each with its contacts.
         max_iterations: Iterations of detect and project.
     """
 
@@ -113,14 +110,13 @@ class SolverCCD(CollisionStage):
         friction: float | wp.array[float] | None = None,
         friction_table: FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
-        substeps: int | Literal["auto"] | None = "auto",
+        substeps: int = 1,
         bodies: Literal["pushed", "separated", "left"] = "pushed",
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         inversions: Literal["left", "reported", "prevented"] = "left",
         contact_layer: bool = True,
-        lift_speed_limit: bool = True,
         max_iterations: int = MAX_ITERATIONS,
         report_contacts: bool | int = False,
         report_worlds: bool = False,
@@ -138,19 +134,9 @@ class SolverCCD(CollisionStage):
                 :class:`.state.friction_table.FrictionTable`. None for none.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
-            substeps: Substeps of the inner solver in a step that collides, so that it reacts to the contacts, see
-                :mod:`.substeps.substeps`: ``"auto"``, 2 to 1024, or None for none. With ``"auto"``, a step whose
-                contacts strain cloth, soft bodies or springs by more than 2% is taken in 16 or 32 substeps, and the
-                next ones in 2 to 32 while they need it. It takes none behind Style3D, whose iterations see the contacts
-                instead, see :mod:`.substeps.style3d_contacts`, where gradients are asked for, in coupled solvers, and
-                in CUDA graphs behind solvers whose steps allocate; ``report.substeps_omitted`` says why. If the model
-                requires gradients, and behind a contact layer, a number makes as many steps of each, each with its
-                contacts and one of its own in the report, see :mod:`.substeps.small_steps`. In steps that may have
-                substeps, and behind Style3D, the stage resolves contacts of particles with shapes alone, also if
-                ``contacts`` are passed to :meth:`step`: cloth rests at the shape, or with ``particle_radius`` at that
-                distance. Not so in short steps, in which weight moves what is at rest by no more than 1% of the median
-                edge length: ``SolverVBD`` gets all of ``contacts``, see :mod:`.substeps.inner_contacts`. If an edge is
-                strained by more than 20% in a step, or a substep, the stage warns once.
+            substeps: Number of smaller steps of equal length in a step, 1 to 1024, each a step of the inner solver with
+                the response to its contacts, see :mod:`.substeps`. The report is of all of them together. Coupled
+                solvers raise NotImplementedError for more than one, as their entries take substeps themselves.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
                 coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the
@@ -184,17 +170,12 @@ class SolverCCD(CollisionStage):
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
-            lift_speed_limit: Whether VBD with self-contact moves particles as its forces say in the steps in which it
-                would brake something, so that the stage alone keeps them apart. Otherwise VBD cuts the path of every
-                particle in every step, see :mod:`.integration.vbd_speed_limit`. If its iterations are too few for the
-                step, VBD does not hold heavy bodies, and only the limit brakes them: they sink faster without it,
-                behind the stage or not. Has no effect on other solvers; ``report.speed_limit_lifted`` is true where it
-                has.
             max_iterations: Iterations of detect and project, 0 to 40; what still collides then is divided, see
                 :mod:`.schedule`. Fewer bound the time of a step, and leave more vertices with cut paths.
             report_contacts: Whether ``report`` has the contacts of each step and their impulses, see
                 :class:`.forces.contact_report.ContactReport`. A number is that of the contacts that are listed at most;
-                True stands for 8 for each particle, and at least 4,096. Sums have the contacts beyond that too.
+                True stands for 8 for each particle, and at least 4,096, in each substep. Sums have the contacts beyond
+                that too.
             report_worlds: Whether ``report.worlds`` has results by world, :class:`.worlds.world_report.Worlds`.
 
         Raises:
@@ -216,7 +197,6 @@ class SolverCCD(CollisionStage):
             collision_filter=collision_filter,
             inversions=inversions,
             contact_layer=contact_layer,
-            lift_speed_limit=lift_speed_limit,
             max_iterations=max_iterations,
             report_contacts=report_contacts,
             report_worlds=report_worlds,
@@ -252,53 +232,31 @@ class SolverCCD(CollisionStage):
             )
         if isinstance(self.solver, ContactLayer):
             self.report.layerless_steps, self.report.thickness = self.solver.skipped, self.solver.thickness_values
-        lifts = options.lift_speed_limit
-        self._speed_limit = SpeedLimit(integrator) if lifts and has_speed_limit(integrator) else None
-        self.report.speed_limit_lifted = self._speed_limit is not None
         self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
-        self._substepping: tuple[Substeps, InnerContacts] | None = None
-        self._in_substeps: Substeps | None = None  # of the step in progress, if it may have some
-        self._has_springs = isinstance(integrator, SolverVBD)  # as contacts: XPBD makes velocities of their depth
-        if self.substeps == "auto":
-            self.report.substeps_omitted = reason_to_omit_substeps(solver)
-        self._inner_rows: Style3DContacts | None = None
-        if self.substeps == "auto" and self.report.substeps_omitted is None and isinstance(inner, SolverStyle3D):
-            self.report.substeps_omitted = "SolverStyle3D sees the contacts in its iterations"
-            self._inner_rows = Style3DContacts(self._work)
-        self._small_steps: SmallSteps | None = None
-        if isinstance(self.substeps, int) and (self.model.requires_grad or isinstance(self.solver, ContactLayer)):
-            self._small_steps = SmallSteps(self.model, self.substeps)
-            self.report.last_substeps.fill_(self.substeps)
-        elif self.substeps is not None and self.report.substeps_omitted is None:
-            choices = SUBSTEPS if self.substeps == "auto" else (self.substeps,)
-            substeps_of_steps = Substeps(self._step_solver, solver, self._work, self._meter, choices)
-            self._substepping = substeps_of_steps, InnerContacts(mesh, moves_bodies=motion.moves_bodies)
-            self.report.last_substeps, self.report.last_strain = substeps_of_steps.substeps, substeps_of_steps.strain
+        # in place of its own; a contact layer pushes itself, and a recorded step has the contacts of Style3D
+        sees_contacts = isinstance(solver, SolverStyle3D) and not self.model.requires_grad
+        self._inner_rows = Style3DContacts(self._work) if sees_contacts else None
+        self._substeps: Substeps | None = None
+        self._part = 0, 1  # number of the substep in progress, and of substeps in a step
+        if self.substeps > 1:
+            leaves_bodies = has_external_rigid_solver(integrator) or isinstance(integrator, SolverStyle3D)
+            self._substeps = Substeps(motion, self.substeps, leaves_bodies=leaves_bodies)
         self._forces: ContactForces | None = None
         if options.report_contacts:
-            in_substeps = self._substepping is not None
-            self._forces = ContactForces(self._work, options.report_contacts, in_substeps=in_substeps)
+            self._forces = ContactForces(self._work, options.report_contacts)
             self.report.keep_contacts(self._forces.rows, self._forces.published, self._forces.shapes_of_worlds)
-            if self._substepping is not None:
-                self._substepping[0].forces = self._forces
         self._pushes_before: str | None = None  # in all steps
         if self._inner_rows is not None:
             self._pushes_before = "SolverStyle3D pushes in its iterations"
         elif isinstance(self.solver, ContactLayer):
             self._pushes_before = "the contact layer pushes before the stage"
-        elif has_self_contact(integrator):
+        elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
             self._pushes_before = "SolverVBD has self-contact"
         self.report.impulses_elsewhere = self._pushes_before
         if options.report_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
-            if self._substepping is not None:
-                self._substepping[0].taken = wp.zeros(self._work.worlds, dtype=int, device=mesh.device)
-
-    @property
-    def _predicted_substeps(self):
-        return None if self._substepping is None else self._substepping[0].predicted
 
     @one_at_a_time
     def step(
@@ -314,18 +272,24 @@ class SolverCCD(CollisionStage):
 
         On a tape, minimum distances raise NotImplementedError only if there are particles without faces and springs.
         """
-        if self._small_steps is None:
+        if self._substeps is None:
             super().step(state_in, state_out, control, contacts, dt, **options)
             return
         checked_number(dt, "dt", 0.0, above=True)
         with paused_tape() as tape:
             self._check_tape(tape, state_in, state_out)
 
-        def step(start, end, small_dt):
+        def step(start, end, small_dt, i):
+            self._part = i, self.substeps
             super(SolverCCD, self).step(start, end, control, contacts, small_dt, **options)
 
         on_tape = tape is not None and self.model.requires_grad
-        self._small_steps.take(step, state_in, state_out, dt, on_tape=on_tape)
+        if on_tape and self.model.body_count and has_external_rigid_solver(innermost(self.solver)):
+            raise NotImplementedError(
+                "on a tape, a step with substeps has no gradients with respect to bodies that another solver moves"
+            )
+        mask = checked_mask(options.get("world_mask"), self.model)
+        self._substeps.take(step, state_in, state_out, dt, mask=mask, on_tape=on_tape)
 
     def _check_tape(self, tape, state_in, state_out):
         if tape is None or not self.model.requires_grad:
@@ -340,77 +304,43 @@ class SolverCCD(CollisionStage):
         if self._work.ends is not None:
             raise NotImplementedError("inversions='prevented' has no gradients: on a tape, pass 'reported' or 'left'")
 
-    def _begin_step(self, state, contacts, dt):
-        self._in_substeps, self._inner_contacts = None, None
+    def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
+        """Prepares for a coupled simulation, see :class:`.integration.coupling_interface.CouplingHooks`.
+
+        Raises:
+            NotImplementedError: If a step has substeps: proxies would not follow them.
+        """
+        if self._substeps is not None:
+            raise NotImplementedError(
+                f"substeps={self.substeps} of SolverCCD in a coupled solver: give them to its SolverCoupled.Entry"
+            )
+        super().coupling_notify_iteration_restarts(enabled)
+        self._inner_rows = None  # which would push proxies without a feedback
+
+    def _begin_step(self, state):
         if self._forces is not None:
             self._forces.begin(arrays_of(state), remembers=not self.model.requires_grad)
-        if self._coupled is not None and self._inner_rows is not None:
-            self._inner_rows, self.report.substeps_omitted = None, _COUPLED
-        if self._substepping is None:
-            return contacts
-        in_substeps, inner_contacts = self._substepping
-        if self.substeps == "auto":
-            self.report.substeps_omitted = self._reason_to_omit_substeps(in_substeps)
-            if self.report.substeps_omitted is not None:
-                return contacts
-        self._in_substeps = in_substeps
-        in_substeps.begin(state)
-        if self._has_springs and inner_contacts.is_short(dt):
-            return contacts
-        self._inner_contacts = inner_contacts
-        external = has_external_rigid_solver(self.solver)
-        return inner_contacts.take_out(contacts, state, leaves_bodies=self._coupled is not None or not external)
-
-    def _reason_to_omit_substeps(self, in_substeps):
-        """Returns why ``"auto"`` takes no substeps in the step that begins; None if it may."""
-        device = self.mesh.device
-        if self._coupled is not None:
-            return _COUPLED
-        if device.is_cuda and device.is_capturing and in_substeps.may_allocate:
-            return f"{type(self.solver).__name__} may allocate memory, in a graph"
-        return None
 
     def _step_inner(self, *arguments, **options):
-        if self._inner_rows is not None:
-            state_in, dt = arguments[0], arguments[-1]
-            with paused_tape():
-                run_on_host(functools.partial(self._inner_rows.find, state_in, dt), self.mesh.device)
-        if self._in_substeps is None:
-            self._step_solver(*arguments, **options)
-        else:
-            self._in_substeps.take_whole_step(*arguments, can_branch=self._can_branch(*arguments), **options)
+        if self._inner_rows is None:
+            super()._step_inner(*arguments, **options)
+            return
+        state_in, dt = arguments[0], arguments[-1]
+        with paused_tape():
+            run_on_host(functools.partial(self._inner_rows.find, state_in, dt), self.mesh.device)
+        with with_contacts(self.solver, self._inner_rows):
+            super()._step_inner(*arguments, **options)
 
-    def _step_solver(self, *arguments, **options):
-        step = functools.partial(self.solver.step, *arguments, **options)
-        with contextlib.ExitStack() as stack:
-            if self._coupled is None and (self._substepping is not None or self._inner_rows is not None):
-                stack.enter_context(with_contacts(self.solver, self._inner_rows))
-            if self._speed_limit is None:
-                step()
-            else:
-                state_in, dt = arguments[0], arguments[-1]
-                self._speed_limit.step(step, state_in, dt, can_branch=self._can_branch(*arguments))
-
-    def _can_branch(self, state_in, state_out, control, contacts, dt):
-        """Returns whether the body of a condition may step the inner solver: not if it allocates memory in a graph."""
-        allocates = may_allocate(self.solver) or not has_room(self.solver, contacts)
-        return not (self.mesh.device.is_capturing and allocates)
-
-    def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
+    def _finish_step(self, state_in, state_out, contacts, dt, tape):
         device, end = self.mesh.device, arrays_of(state_out)
-        mask = self._mask
-        has_all = passed is contacts is not None and contacts.soft_contact_max > 0
-        self.report.impulses_elsewhere = self._pushes_before or (_PASSED_ON if has_all else None)
-        if self._in_substeps is not None:
-            if self._inner_contacts is not None:
-                self._inner_contacts.unpack(getattr(options.get("observables"), "contact_f", None), contacts)
-            solve = functools.partial(self._in_substeps.resolve, state_out, control, passed, dt)
-            run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
-        elif is_recorded(tape, state_out):
+        mask, part = self._mask, self._part
+        has_some = contacts is not None and contacts.soft_contact_max > 0
+        self.report.impulses_elsewhere = self._pushes_before or (_PASSED_ON if has_some else None)
+        if is_recorded(tape, state_out):
             self._record(arrays_of(state_in), end, dt, tape)
         else:
             solve = functools.partial(resolve, self._work, dt)
-            run_on_host(lambda: self._resolve(end, dt, solve, mask), device)
+            run_on_host(lambda: self._resolve(end, dt, solve, mask, part), device)
 
     def _record(self, start, end, dt, tape):
         """Resolves the motion to a state, and changes it; a tape records the adjoint."""
@@ -422,10 +352,11 @@ class SolverCCD(CollisionStage):
         read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
         recorded: RecordedStep | None = None
+        part = self._part
 
         def forward():
             nonlocal recorded
-            self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder))
+            self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder), part=part)
             recorded = None
             if device.is_capturing or self._work.has_changed():
                 recorded = RecordedStep(self._work, dt)
@@ -440,9 +371,12 @@ class SolverCCD(CollisionStage):
         tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
     @one_at_a_time
-    def _resolve(self, end, dt, solve, mask=None):
-        """Solves the motion from the start of the step to its end, as it was predicted, and changes the end."""
-        with self._timed():
+    def _resolve(self, end, dt, solve, mask=None, part=(0, 1)):
+        """Solves the motion from the start of the step to its end, as it was predicted, and changes the end.
+
+        A ``part`` is the number of a substep, from 0, and how many there are.
+        """
+        with self._timed(part[0]):
             if self._reads_friction:
                 self._motion.friction.read()
             self._motion.set_end(end, dt)
@@ -450,50 +384,28 @@ class SolverCCD(CollisionStage):
                 self._forces.end(end, mask)
             with self._masked(mask):
                 solve()
-                if self._in_substeps is None:
-                    if self._substepping is not None:
-                        self._substepping[0].substeps.zero_()
+                if part[0] == 0:
                     self.report.last_strain.zero_()
-                    self._measure_strain()
+                self._measure_strain()
                 resolve_inversions(self._work, dt)
                 check_arcs(self._work)
-                self._write_end(end)
+                self._write_end(end, part)
 
     def _measure_strain(self):
         """Measures the strain by contacts of a whole step, for the report."""
         measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
         wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
 
-    def _write_end(self, end):
-        """Writes the resolved motion to the arrays of a state, and counts the step."""
+    def _write_end(self, end, part):
+        """Writes the resolved motion to the arrays of a state, and counts the step, or this part of it."""
         size = max(self.mesh.vertex_count, self.model.body_count)
         poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
         outputs = [end, poses, self._work.status]
         self._work.launch(write_back, size, [self._work.vertices], outputs)
         if self._forces is not None:
-            self._forces.publish()
-        if self._counter is not None:
-            self._counter.count(None if self._in_substeps is None else self._in_substeps.taken)
-        self._count_step()
-
-    @one_at_a_time
-    def notify_model_changed(self, flags: int) -> None:
-        """Notifies the inner solver, and reads masses, gravity and shapes again, see :class:`.stage.CollisionStage`."""
-        super().notify_model_changed(flags)
-        if self._substepping is not None and flags & newton.ModelFlags.MODEL_PROPERTIES:
-            self._substepping[1].read_gravity()
+            self._forces.publish(*part)
+        self._count_step(*part)
 
     def _follow_shapes(self):
         self._motion.friction.read_shapes(self.model)
         super()._follow_shapes()
-        if self._substepping is not None:
-            self._substepping[1].read_shapes()
-
-    def update_contacts(self, contacts, state=None):
-        """Delegates to the inner solver, for the contacts that it got."""
-        inner = self._inner_contacts
-        if inner is None:
-            super().update_contacts(contacts, state)
-        else:
-            super().update_contacts(inner.packed(contacts), state)
-            inner.unpack(contacts.force, contacts)

@@ -27,7 +27,7 @@ from .state.workspace import Workspace
 from .step import prepare
 from .worlds.count_worlds import WorldCounter
 from .worlds.world_mask import WorldMask, checked_mask
-from .write_back import count_outrun, count_step
+from .write_back import count_outrun, count_step, merge_step, note_crossings
 
 
 def is_recorded(tape: wp.Tape | None, state_out: newton.State) -> bool:
@@ -56,7 +56,7 @@ class CollisionStage(CouplingHooks):
         responds: bool = True,
     ):
         """Allocates the workspace of steps, and makes the report."""
-        self.mesh, self._motion, model = motion.mesh, motion, self.model
+        self.mesh, self._motion, self._responds, model = motion.mesh, motion, responds, self.model
         options = {"max_iterations": max_iterations, "responds": responds}
         self._work = Workspace(motion, separation=separation, restitution=restitution, **options)
         motion.set_start(arrays_of(model))
@@ -96,14 +96,15 @@ class CollisionStage(CouplingHooks):
         if not has_elements_of_other_entries(self.mesh):
             return None
         worlds = None if self._counter is None else self._counter.worlds.certified
-        self.report.coupled = CoupledCheck(self._work, self.report.device_totals, worlds)
+        results = self.report.step_results.results
+        self.report.coupled = CoupledCheck(self._work, results, self.report.device_totals, worlds)
         return self.report.coupled
 
     def _count_worlds(self, max_impulse: wp.array | None = None):
         """Makes the report have results by world."""
         find_inside = self.report.find_inside_by_world()
         published = {"strain": self.report.last_strain, "find_inside": find_inside, "max_impulse": max_impulse}
-        self._counter = WorldCounter(self._work, **published)
+        self._counter = WorldCounter(self._work, self.report.step_results, **published)
         self.report.keep_worlds(self._counter.worlds)
 
     @one_at_a_time
@@ -121,14 +122,13 @@ class CollisionStage(CouplingHooks):
         """Steps the inner solver, and detects the collisions of its motion.
 
         :class:`.solver_ccd.SolverCCD` then changes positions and velocities of the particles and bodies that collide.
-        What is said of tapes and substeps holds for it alone.
+        What is said of tapes holds for it alone.
 
         Args:
             state_in: The state at the start; the inner solver may change it.
             state_out: The state at the end. May be the same, except on a tape.
             control: As for the inner solver.
-            contacts: As for the inner solver. In steps that may have substeps, but for short ones of VBD, it gets only
-                those that the stage does not resolve, see :mod:`.substeps.inner_contacts`.
+            contacts: As for the inner solver, which gets them as they are.
             dt: Length of the step [s], more than 0.
             world_mask: Which worlds take part in the step, and as the last entry whether everything that is in all
                 worlds does, shape [world_count + 1], as of :meth:`reset`; None for all. The others end the step in the
@@ -136,7 +136,7 @@ class CollisionStage(CouplingHooks):
                 solver steps them all the same, as solvers of Newton know no mask: what it keeps of them beside the
                 state, such as multipliers of its own contacts, may change. Custom attributes of the state are the inner
                 solver's in all worlds.
-            options: As for the inner solver.
+            options: As for the inner solver; with substeps, observables are of the last one.
 
         Raises:
             TypeError: If ``dt`` is no number, or ``world_mask`` no array of bool.
@@ -160,13 +160,13 @@ class CollisionStage(CouplingHooks):
             self._mask = mask
             if mask is not None:
                 self._world_mask.begin(start)
-            passed = self._begin_step(state_in, contacts, dt)
+            self._begin_step(state_in)
         with self._watched(tape, state_in, state_out):
-            self._step_inner(state_in, state_out, control, passed, dt, **options)
+            self._step_inner(state_in, state_out, control, contacts, dt, **options)
             with paused_tape():
                 if mask is not None:
                     self._world_mask.restore(mask, state_out)
-                self._finish_step(state_in, state_out, control, contacts, passed, dt, options, tape)
+                self._finish_step(state_in, state_out, contacts, dt, tape)
         with paused_tape():
             if self._coupled is not None:
                 self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
@@ -195,37 +195,40 @@ class CollisionStage(CouplingHooks):
         """
         if self.mesh.device.is_capturing:
             raise RuntimeError("world_mask needs memory: step once with one before capturing")
-        return WorldMask(self.solver, self._work, self._motion, self._predicted_substeps)
+        return WorldMask(self.solver, self._work, self._motion)
 
     def _masked(self, mask):
         """Lets the stage look at the worlds alone that take part, at all if there is no mask."""
         return contextlib.nullcontext() if mask is None else self._world_mask.applied(mask)
 
-    @property
-    def _predicted_substeps(self):
-        """Predicted number of substeps of each world; None if steps have none."""
-        return None
-
     def _check_tape(self, tape, state_in, state_out):
         """Raises an error if the step cannot be recorded on a tape."""
 
-    def _begin_step(self, state, contacts, dt):
-        """Prepares for a step of the inner solver, and returns its contacts."""
-        return contacts
+    def _begin_step(self, state):
+        """Prepares for a step of the inner solver from a state."""
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""
         self.solver.step(*arguments, **options)
 
-    def _finish_step(self, state_in, state_out, control, contacts, passed, dt, options, tape):
-        """Detects the collisions of the step after the inner solver, which was passed contacts of the program."""
+    def _finish_step(self, state_in, state_out, contacts, dt, tape):
+        """Detects the collisions of the step after the inner solver, which was passed contacts."""
         raise NotImplementedError
 
-    def _count_step(self):
-        work, report = self._work, self.report
-        if report.thickness is not None:
-            work.launch(count_outrun, 1, [work.status], [report.device_totals])
-        work.launch(count_step, 1, [work.status, report.last_substeps, report.last_strain], [report.device_totals])
+    def _count_step(self, substep=0, substeps=1):
+        """Adds a substep to the results of its step, which the last one adds to the totals."""
+        work, report, first = self._work, self.report, substep == 0
+        found = report.step_results
+        size = max(self.mesh.vertex_count, work.body_count, len(found.results))
+        inputs = [work.step, work.status, work.particle_count, self._responds, first]
+        work.launch(merge_step, size, inputs, [found])
+        work.launch(note_crossings, 1, [work.status])
+        if self._counter is not None:
+            self._counter.count(first=first)
+        if substep == substeps - 1:
+            if report.thickness is not None:
+                work.launch(count_outrun, 1, [found.results], [report.device_totals])
+            work.launch(count_step, 1, [found.results, report.last_strain], [report.device_totals])
         wp.copy(work.last_crossings, work.crossings_of_edges)
         report.copy_totals()
 
@@ -234,8 +237,8 @@ class CollisionStage(CouplingHooks):
         self._work.loop[Loop.RECOUNT].fill_(1)
 
     @contextlib.contextmanager
-    def _timed(self):
-        """Measures the time of a step for the report; does nothing while capturing."""
+    def _timed(self, substep=0):
+        """Measures the time of a step, or a substep, for the report; does nothing while capturing."""
         device = self.mesh.device
         if device.is_capturing:
             yield
@@ -248,7 +251,7 @@ class CollisionStage(CouplingHooks):
 
         start = now()
         yield
-        self.report.span = start, now()
+        self.report.spans = [*self.report.spans[:substep], (start, now())]
 
     @one_at_a_time
     def notify_model_changed(self, flags: int) -> None:

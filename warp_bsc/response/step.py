@@ -110,9 +110,9 @@ def _cut_paths(work):
     work.launch(decide_cut, 1, [False, work.status])
 
 
-def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
+def add_proximities(work: Workspace) -> None:
     """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
-    wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work, in_substeps=in_substeps)
+    wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
 
 
 def prepare(work: Workspace) -> None:

@@ -100,48 +100,13 @@ PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
 """Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
 points jump, and vertices hold them."""
 
-# VBD's speed limit
-FAST_PATH = 0.9
-"""Path of a triangle in a step from which it is fast, as a share of the longest that VBD's self-contact leaves a
-particle: what is cut to the longest is fast in the next step. With 0.75, and particles for triangles, cloth that jams
-trembles, as few that do suffice to lift the limit."""
-
-# substeps
-SUBSTEPS = (2, 4, 8, 16, 32)
-"""Numbers of substeps that ``"auto"`` chooses from; a CUDA graph contains the substep of each."""
-STRAIN = wp.constant(0.01)
-"""Strain by contacts that ``"auto"`` leaves to a substep: elongation of an edge of cloth beyond its length at rest, or
-change of the length of an edge in a soft body, as a share of that length."""
-WHOLE_STRAIN = wp.constant(0.02)
-"""Strain up to which ``"auto"`` takes no substeps: piles, whose layers never quite rest, stay below."""
-WEIGHT_STRAIN = 0.01
-"""Way of what weight moves from rest in a step, as a share of the median edge length, up to which VBD gets all
-contacts that a program passes on; with twice as much, cloth hops on their springs."""
-SUBSTEP_ITERATIONS = 2
-"""Fewest iterations of the inner solver in a substep."""
-SUBSTEP_STRAIN = wp.constant(1.5)
-"""Strain by contacts in all substeps of a step, as a multiple of that in the step as a whole."""
-MAX_MISSED = wp.constant(20.0)
-"""Most strain after the substeps, as a multiple of that left to one, with which they are repeated."""
-IMPACT_SUBSTEPS = wp.constant(16)
-"""Fewest substeps with which a world begins to take some: with 4, the impact of a drape leaves ten times the energy."""
-KEPT, CALM_STEPS = wp.constant(0.5), wp.constant(16)
-"""Share of the substeps of a step that its strain asks for; and steps with less after which there are half as many, and
-in which a world that takes fewer, or none, is on trial."""
-MAX_REPEATS = wp.constant(2)
-"""Most times that substeps are repeated in a step, with more of them or with contacts that they missed."""
-LOWERED, LASTING = wp.constant(0.8), wp.constant(1.25)
-"""Share of the strain after the substeps to which repeating them has to lower it, or it lasts; and multiple of what
-lasts up to which neither substeps nor repeats are taken for it: where folds are pressed, more of them do not help."""
-FORGOTTEN = wp.constant(0.05)
-"""Share of what lasts that is forgotten in a step with less."""
+# strain
 MAX_STRAIN = wp.constant(0.2)
 """Largest strain by contacts of which the stage does not warn."""
 COMPRESSION = wp.constant(0.25)
 """What compression of cloth counts, as a share of the same elongation."""
 SOLID = wp.constant(1.0 / 3.0)
-"""The same of the strain of a soft body: an element that is wedged keeps its strain in any number of substeps, and the
-more there are, the more it moves."""
+"""The same of the strain of a soft body."""
 
 # contacts inside the solve of Style3D
 INNER_STIFFNESS = wp.constant(200.0)
@@ -153,8 +118,6 @@ SLOWEST_SLIP = wp.constant(0.01)
 # rigid shapes
 SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
-SHAPE_SAGITTA = 0.01
-"""Depth of faces of a round shape below its surface, as a share of its radius, at most."""
 
 # capacities
 PAIRS_PER_FACE = 32

@@ -1,6 +1,7 @@
 """Steps SolverCCD behind a solver that moves particles to given positions."""
 
 import warnings
+from typing import Any
 
 import newton
 import numpy as np
@@ -30,7 +31,7 @@ class Playback:
         builder.add_triangles(*mesh.faces.astype(np.int64).T.tolist())
         model = builder.finalize(device=mesh.device)
         self._given = _Given(model)
-        options = {"friction": 0.0, "restitution": 0.0, "substeps": None, "min_distance": min_distance}
+        options: dict[str, Any] = {"friction": 0.0, "restitution": 0.0, "min_distance": min_distance}
         if mesh.group is not None and mesh.mask is not None:
             options["collision_filter"] = CollisionFilter(mesh.group, mesh.mask)
         self._stage = SolverCCD(self._given, **options)

@@ -143,7 +143,7 @@ def drop_proximities(
         count[0] = kept[0]
 
 
-def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
+def add_proximities(work: Workspace) -> None:
     """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
 
     In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
@@ -152,16 +152,14 @@ def add_proximities(work: Workspace, *, in_substeps: bool = False) -> None:
     those of other elements, and none with another face between them, if nothing crosses: neighbours in a stack hold
     what is behind them.
 
-    In a CUDA graph, none are added if not all fit. Contacts behind other faces keep their constraints ``in_substeps``,
-    which are not detected one by one.
+    In a CUDA graph, none are added if not all fit.
     """
     nearest, ends = work.nearest, work.vertices.x1
     wp.copy(work.kept, work.constraints.count)
     if nearest is not None:
         nearest.fill_(np.inf)
         _find_nearest(work)
-        if not in_substeps:
-            work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
+        work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
         ends = work.clipped
         work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)

@@ -19,7 +19,7 @@ class Contacts:
     A contact is of two elements: of a vertex and a face, or a point and an edge or a point; of two edges; or of a
     vertex and an infinite plane. Impulses and the normal act on the first; on the second they are the opposite. Divide
     by the length of the step to get the mean force. A pair may have several rows, if it was in contact along several
-    normals.
+    normals, or in several substeps.
 
     Attributes:
         count: Number of contacts, int, shape [1]; more than the capacity if not all fit.
@@ -35,8 +35,8 @@ class Contacts:
             the start, and was held apart before it met; float.
         point: The contact point on the first at the end of the step [m], vec3.
         normal: The unit normal, from the second to the first, vec3.
-        velocity: Velocity of the first relative to the second before the contact, as the inner solver predicted it, in
-            the first substep with an impulse [m/s], vec3.
+        velocity: Velocity of the first relative to the second before the contact, as the inner solver predicted it
+            [m/s], vec3.
         normal_impulse: Impulse along the normal [N s], float.
         tangential_impulse: Impulse of friction [N s], vec3.
     """
@@ -65,9 +65,8 @@ class Contacts:
     def complete(self) -> bool:
         """Whether all contacts of the last step are listed. Synchronizes with the device.
 
-        If there are more than fit, sums have the others too. If constraints of a CUDA graph did not fit in a step in
-        substeps, or an impulse or a sum is too large to be held, sums lack these as well;
-        :attr:`ContactReport.impulses_complete` is false then.
+        If there are more than fit, sums have the others too. If an impulse or a sum is too large to be held, sums lack
+        it; :attr:`ContactReport.impulses_complete` is false then.
         """
         return int(self.count.numpy()[0]) <= self.capacity and int(self._lost.numpy()[0]) == 0
 

@@ -12,10 +12,10 @@ from ..state.fixed_sum import sum_of, sums_of
 from ..state.motion import StateArrays, continues, takes_part
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.poses import in_world
-from ..state.structs import ContactKind, Motion, Step, body_of, can_move, constraint_count, has_final_velocity
-from ..state.vectors import ONE, ZERO, relative, to_double, to_single
-from .structs import Centres, KeptImpulses, Sides, Unpaired
-from .sums import add_impulse, body_of_vertex, clear_kept
+from ..state.structs import Motion, Step, body_of, can_move, has_final_velocity
+from ..state.vectors import ONE, ZERO, to_double, to_single
+from .structs import Centres, Sides, Unpaired
+from .sums import body_of_vertex
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +46,7 @@ def end_centres(state: StateArrays, sides: Sides, mask: wp.array[wp.bool], centr
 
 
 @wp.func
-def _body_of_side(sides: Sides, corners: wp.vec4i, plane: int, side: int) -> int:
+def body_of_side(sides: Sides, corners: wp.vec4i, plane: int, side: int) -> int:
     """Returns the body of one side of a contact, -1 for none."""
     if side == 1 and plane >= 0:
         return sides.plane_body[plane]
@@ -71,7 +71,7 @@ def torque_on(
     vertex.
     """
     x = step.vertices.x1
-    body = _body_of_side(sides, corners, plane, side)
+    body = body_of_side(sides, corners, plane, side)
     if body < 0:
         return wp.vec3d()
     centre = (ONE - share) * centres.start[body] + share * centres.end[body]
@@ -87,7 +87,7 @@ def torque_on(
 
 
 @wp.func
-def _time_at_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float64:
+def time_at_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) -> wp.float64:
     """Returns when a vertex enters the solid of a plane, in [0, 1]."""
     before, _error = signed_distance(planes.start[i], motion.x0[vertex])
     after, _error_after = signed_distance(planes.end[i], motion.x1[vertex])
@@ -95,7 +95,7 @@ def _time_at_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int) ->
 
 
 @wp.func
-def _responds(step: Step, i: int) -> bool:
+def responds(step: Step, i: int) -> bool:
     """Returns whether a constraint changed a velocity, which it does not where a path gave those on both sides.
 
     Its multiplier is no impulse then: each sweep adds to it, without effect.
@@ -112,88 +112,6 @@ def _responds(step: Step, i: int) -> bool:
             if moves and outcome != 0 and not has_final_velocity(outcome):
                 return True
     return False
-
-
-@wp.func
-def _keep_impulse(
-    step: Step,
-    planes: MovingPlanes,
-    sides: Sides,
-    centres: Centres,
-    substeps: int,
-    remaining: wp.array[int],
-    of_constraints: KeptImpulses,
-    of_planes: KeptImpulses,
-    unpaired: Unpaired,
-    lost: wp.array[int],
-    i: int,
-):
-    constraints, motion = step.constraints, step.motion
-    impulse = constraints.velocity_multiplier[i]
-    if wp.length_sq(impulse) == ZERO:
-        return
-    done = ZERO
-    if remaining:
-        done = wp.float64(substeps - remaining[0])
-    share = (done + ONE) / wp.float64(substeps)
-    kept = of_constraints
-    place = i
-    toi = constraints.toi[i]
-    corners, weights, normal = constraints.vertices[i], constraints.weights[i], constraints.normal[i]
-    plane = wp.where(constraints.kind[i] == ContactKind.PLANE, constraints.plane[i], -1)
-    if not _responds(step, i):
-        for j in range(4):
-            if corners[j] < sides.particle_count and weights[j] != ZERO:
-                add_impulse(unpaired.idle_of_particles, corners[j], 0, weights[j] * impulse, lost)
-        for side in range(2):
-            body = _body_of_side(sides, corners, plane, side)
-            if can_move(motion, body):
-                torque = torque_on(step, sides, centres, share, corners, weights, plane, side, impulse)
-                add_impulse(unpaired.idle_of_bodies, body, 0, wp.where(side == 0, impulse, -impulse), lost)
-                add_impulse(unpaired.idle_of_bodies, body, 3, torque, lost)
-        return
-    if plane >= 0:
-        toi = (done + _time_at_plane(motion, planes, plane, corners[0])) / wp.float64(substeps)
-        if remaining:
-            kept = of_planes
-            place = corners[0] * sides.planes_per_world + sides.plane_slot[plane]
-    if wp.length_sq(kept.impulse[place]) == ZERO:
-        kept.velocity[place] = to_single(relative(weights, corners, motion.velocity))
-        kept.toi[place] = toi
-    kept.impulse[place] += impulse
-    kept.along[place] += wp.dot(impulse, normal)
-    kept.normal[place] = normal
-    if kept.torque:
-        for side in range(2):
-            torque = torque_on(step, sides, centres, share, corners, weights, plane, side, impulse)
-            kept.torque[place, side] = kept.torque[place, side] + torque
-
-
-@wp.kernel
-def keep_impulses(
-    # in
-    step: Step,
-    planes: MovingPlanes,
-    sides: Sides,
-    centres: Centres,
-    substeps: int,
-    remaining: wp.array[int],
-    # in and out
-    of_constraints: KeptImpulses,
-    of_planes: KeptImpulses,
-    unpaired: Unpaired,
-    lost: wp.array[int],
-    threads: int,
-):
-    """Adds the impulses of constraints in a substep, or without ``remaining``, after the step, to those that are kept.
-
-    Constraints of planes are made anew in each substep, one for a vertex and a plane: theirs are kept by these.
-    """
-    count = constraint_count(step)
-    if wp.tid() == 0:
-        of_constraints.count[0] = wp.max(of_constraints.count[0], count)
-    for i in range(wp.tid(), count, threads):
-        _keep_impulse(step, planes, sides, centres, substeps, remaining, of_constraints, of_planes, unpaired, lost, i)
 
 
 @wp.func
@@ -228,32 +146,3 @@ def keep_unpaired(step: Step, unpaired: Unpaired):
         angular = _unpaired(wp.spatial_bottom(predicted), wp.spatial_bottom(resolved), turn, outcome)
         unpaired.of_bodies[i, 0] += wp.float64(bodies.mass[i]) * linear
         unpaired.of_bodies[i, 1] += in_world(bodies.inertia[i], moved.pose[i]) * angular
-
-
-@wp.kernel
-def restart_worlds(
-    # in
-    step: Step,
-    restarts: wp.array[int],
-    sides: Sides,
-    # out
-    of_constraints: KeptImpulses,
-    of_planes: KeptImpulses,
-    unpaired: Unpaired,
-    threads: int,
-):
-    """Clears what is kept of worlds that repeat their substeps."""
-    motion, constraints = step.motion, step.constraints
-    for i in range(wp.tid(), wp.min(constraint_count(step), of_constraints.impulse.shape[0]), threads):
-        if restarts[motion.world[constraints.vertices[i][0]]] == 1:
-            clear_kept(of_constraints, i)
-    for slot in range(wp.tid(), of_planes.impulse.shape[0], threads):
-        if restarts[motion.world[slot / sides.planes_per_world]] == 1:
-            clear_kept(of_planes, slot)
-    for particle in range(wp.tid(), unpaired.of_particles.shape[0], threads):
-        if restarts[motion.world[particle]] == 1:
-            unpaired.of_particles[particle] = wp.vec3d()
-    for body in range(wp.tid(), unpaired.of_bodies.shape[0], threads):
-        if restarts[wp.max(sides.body_world[body], 0)] == 1:
-            unpaired.of_bodies[body, 0] = wp.vec3d()
-            unpaired.of_bodies[body, 1] = wp.vec3d()

@@ -4,12 +4,15 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_int
 from ..state.planes import MovingPlanes
-from ..state.structs import ContactKind, Step
-from ..state.vectors import ONE, ZERO, to_double, to_single
-from .structs import ContactRows, ImpulseSums, KeptImpulses, PublishedImpulses, Sides, Unpaired
-from .sums import add_impulse, body_of_vertex, clear_kept, shape_of, take_impulse
+from ..state.structs import ContactKind, Step, can_move, constraint_count
+from ..state.vectors import ONE, ZERO, relative, to_double, to_single
+from .keep import body_of_side, responds, time_at_plane, torque_on
+from .structs import Centres, ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
+from .sums import add_impulse, body_of_vertex, shape_of, take_impulse
 
 wp.set_module_options({"enable_backward": False})
+
+_Torques = wp.types.matrix(shape=(2, 3), dtype=wp.float64)
 
 
 @wp.func
@@ -93,46 +96,6 @@ def publish_contact(
 
 
 @wp.func
-def _publish(
-    # in
-    step: Step,
-    sides: Sides,
-    kept: KeptImpulses,
-    i: int,
-    kind: int,
-    corners: wp.vec4i,
-    weights: wp.vec4d,
-    plane: int,
-    # out
-    sums: ImpulseSums,
-    rows: ContactRows,
-):
-    """Publishes a contact, and clears what was kept."""
-    first, second = wp.vec3d(), wp.vec3d()
-    if kept.torque:
-        first = kept.torque[i, 0]
-        second = kept.torque[i, 1]
-    publish_contact(
-        step,
-        sides,
-        kind,
-        corners,
-        weights,
-        plane,
-        kept.impulse[i],
-        kept.along[i],
-        kept.normal[i],
-        first,
-        second,
-        kept.velocity[i],
-        kept.toi[i],
-        sums,
-        rows,
-    )
-    clear_kept(kept, i)
-
-
-@wp.func
 def _kind_of(kind: int) -> int:
     """Returns the kind of a contact as it is published: a proximity is a contact once it pushes."""
     if kind == ContactKind.VERTEX_FACE_PROXIMITY:
@@ -142,55 +105,121 @@ def _kind_of(kind: int) -> int:
     return kind
 
 
-@wp.kernel
-def publish_contacts(step: Step, sides: Sides, kept: KeptImpulses, sums: ImpulseSums, rows: ContactRows, threads: int):
-    """Adds the impulses of constraints to all sums, and writes a row for each that has one."""
-    constraints = step.constraints
-    for i in range(wp.tid(), kept.count[0], threads):
-        if wp.length_sq(kept.impulse[i]) > ZERO:
-            if i < constraints.count[0]:
-                kind, corners, weights = _kind_of(constraints.kind[i]), constraints.vertices[i], constraints.weights[i]
-                _publish(step, sides, kept, i, kind, corners, weights, constraints.plane[i], sums, rows)
-            else:  # constraints of a CUDA graph did not fit, and were dropped
-                wp.atomic_add(rows.lost, 0, 1)
-                clear_kept(kept, i)
-
-
-@wp.kernel
-def publish_contacts_of_planes(
-    step: Step, planes: MovingPlanes, sides: Sides, kept: KeptImpulses, sums: ImpulseSums, rows: ContactRows
+@wp.func
+def _add_idle(
+    step: Step,
+    sides: Sides,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    plane: int,
+    impulse: wp.vec3d,
+    torques: _Torques,
+    unpaired: Unpaired,
+    lost: wp.array[int],
 ):
-    """Does the same for the impulses that planes had in substeps; thread i has vertex i."""
-    vertex = wp.tid()
-    world = step.motion.world[vertex]
-    weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
-    for place in range(planes.of_worlds.shape[1]):
-        plane = planes.of_worlds[world, place]
-        if plane >= 0:
-            i = vertex * sides.planes_per_world + sides.plane_slot[plane]
-            if wp.length_sq(kept.impulse[i]) > ZERO:
-                _publish(step, sides, kept, i, int(ContactKind.PLANE), wp.vec4i(vertex), weights, plane, sums, rows)
+    """Adds the multiplier of a contact that changed no velocity to those that no pair has."""
+    for j in range(4):
+        if corners[j] < sides.particle_count and weights[j] != ZERO:
+            add_impulse(unpaired.idle_of_particles, corners[j], 0, weights[j] * impulse, lost)
+    for side in range(2):
+        body = body_of_side(sides, corners, plane, side)
+        if can_move(step.motion, body):
+            add_impulse(unpaired.idle_of_bodies, body, 0, wp.where(side == 0, impulse, -impulse), lost)
+            add_impulse(unpaired.idle_of_bodies, body, 3, torques[side], lost)
 
 
 @wp.kernel
-def publish_sums(unpaired: Unpaired, sums: ImpulseSums, published: PublishedImpulses):
-    """Writes all sums, with the changes that no pair has, and clears them for the next step."""
+def publish_contacts(
+    # in
+    step: Step,
+    planes: MovingPlanes,
+    sides: Sides,
+    centres: Centres,
+    substep: int,
+    substeps: int,
+    # in and out
+    unpaired: Unpaired,
+    sums: ImpulseSums,
+    rows: ContactRows,
+    threads: int,
+):
+    """Adds the impulses of constraints to all sums, and writes a row for each that has one."""
+    constraints, motion = step.constraints, step.motion
+    for i in range(wp.tid(), constraint_count(step), threads):
+        impulse = constraints.velocity_multiplier[i] + wp.vec3d()
+        if wp.length_sq(impulse) > ZERO:
+            corners, weights, normal = constraints.vertices[i], constraints.weights[i], constraints.normal[i]
+            plane = wp.where(constraints.kind[i] == ContactKind.PLANE, constraints.plane[i], -1)
+            torques = _Torques()
+            for side in range(2):
+                torques[side] = torque_on(step, sides, centres, ONE, corners, weights, plane, side, impulse)
+            if responds(step, i):
+                toi = wp.float64(constraints.toi[i])
+                if plane >= 0:
+                    toi = time_at_plane(motion, planes, plane, corners[0])
+                toi = (wp.float64(substep) + toi) / wp.float64(substeps)
+                velocity = to_single(relative(weights, corners, motion.velocity))
+                along = wp.dot(impulse, normal)
+                kind = _kind_of(constraints.kind[i])
+                publish_contact(
+                    step,
+                    sides,
+                    kind,
+                    corners,
+                    weights,
+                    plane,
+                    impulse,
+                    along,
+                    normal,
+                    torques[0],
+                    torques[1],
+                    velocity,
+                    toi,
+                    sums,
+                    rows,
+                )
+            else:
+                _add_idle(step, sides, corners, weights, plane, impulse, torques, unpaired, rows.lost)
+
+
+@wp.func
+def _clear(published: PublishedImpulses, i: int):
+    if i < published.particle.shape[0]:
+        published.unpaired_particle[i] = wp.vec3()
+        published.particle[i] = wp.vec3()
+    if i < published.body.shape[0]:
+        published.unpaired_body[i] = wp.spatial_vector()
+        published.body[i] = wp.spatial_vector()
+    if i < published.shape.shape[0]:
+        published.shape[i] = wp.vec3()
+    if i < published.pair.shape[0]:
+        published.pair[i] = wp.vec3()
+
+
+@wp.kernel
+def publish_sums(unpaired: Unpaired, first: bool, sums: ImpulseSums, published: PublishedImpulses):
+    """Adds all sums to those of the step, of which this is the ``first`` substep or not, and clears them.
+
+    They have the changes that no pair has too.
+    """
     i = wp.tid()
+    if first:
+        _clear(published, i)
     if i < published.particle.shape[0]:
         alone = unpaired.of_particles[i] + take_impulse(unpaired.idle_of_particles, i, 0)
-        published.unpaired_particle[i] = to_single(alone)
-        published.particle[i] = to_single(take_impulse(sums.of_particles, i, 0) + alone)
+        published.unpaired_particle[i] += to_single(alone)
+        published.particle[i] += to_single(take_impulse(sums.of_particles, i, 0) + alone)
         unpaired.of_particles[i] = wp.vec3d()
     if i < published.body.shape[0]:
         linear = unpaired.of_bodies[i, 0] + take_impulse(unpaired.idle_of_bodies, i, 0)
         angular = unpaired.of_bodies[i, 1] + take_impulse(unpaired.idle_of_bodies, i, 3)
-        published.unpaired_body[i] = wp.spatial_vector(to_single(linear), to_single(angular))
+        published.unpaired_body[i] += wp.spatial_vector(to_single(linear), to_single(angular))
         linear += take_impulse(sums.of_bodies, i, 0)
         angular += take_impulse(sums.of_bodies, i, 3)
-        published.body[i] = wp.spatial_vector(to_single(linear), to_single(angular))
+        published.body[i] += wp.spatial_vector(to_single(linear), to_single(angular))
         unpaired.of_bodies[i, 0] = wp.vec3d()
         unpaired.of_bodies[i, 1] = wp.vec3d()
     if i < published.shape.shape[0]:
-        published.shape[i] = to_single(take_impulse(sums.of_shapes, i, 0))
+        published.shape[i] += to_single(take_impulse(sums.of_shapes, i, 0))
     if i < published.pair.shape[0]:
-        published.pair[i] = to_single(take_impulse(sums.of_pairs, i, 0))
+        published.pair[i] += to_single(take_impulse(sums.of_pairs, i, 0))

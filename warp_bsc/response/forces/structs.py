@@ -1,4 +1,4 @@
-"""Arrays of contact forces as structs: impulses kept while a step is solved, their sums, and the rows of contacts."""
+"""Arrays of contact forces as structs: what no pair has, sums of impulses, and the rows of contacts."""
 
 import warp as wp
 
@@ -14,28 +14,13 @@ class Sides:
     body_world: wp.array[int]
     plane_shape: wp.array[int]
     plane_body: wp.array[int]
-    plane_slot: wp.array[int]  # number of a plane among those of a world
-    planes_per_world: int
     local_shape: wp.array[int]  # number of a shape among those of a world, see ContactReport.shapes_of_worlds
     max_local: int  # the number that stands for particles, one more than the largest of a shape
 
 
 @wp.struct
-class KeptImpulses:
-    """Impulses on the first of two contact points by the second, summed over the substeps of a step."""
-
-    count: wp.array[int]  # the places, from the first on, at which there may be some
-    impulse: wp.array[wp.vec3d]  # [N s]
-    along: wp.array[wp.float64]  # the part along the normal [N s]
-    normal: wp.array[wp.vec3d]
-    velocity: wp.array[wp.vec3]  # predicted velocity of the first point relative to the second [m/s]
-    toi: wp.array[wp.float64]  # time of impact, in [0, 1] of the step
-    torque: wp.array2d[wp.vec3d]  # on bodies of both sides about their centres of mass [N m s]; empty without bodies
-
-
-@wp.struct
 class Unpaired:
-    """Changes of momentum that no pair of contact points has, summed over the substeps of a step."""
+    """Changes of momentum that no pair of contact points has."""
 
     of_particles: wp.array[wp.vec3d]  # [N s]
     of_bodies: wp.array2d[wp.vec3d]  # [N s], and about the centre of mass [N m s]
@@ -67,7 +52,7 @@ class ContactRows:
     """The contacts of a step; see :class:`.contact_report.Contacts`, which has the same arrays."""
 
     count: wp.array[int]  # of contacts, whether they fit or not
-    lost: wp.array[int]  # contacts whose impulses of substeps no sum has, and what was too large for a sum
+    lost: wp.array[int]  # what was too large for a sum
     kind: wp.array[int]
     vertices: wp.array[wp.vec4i]
     weights: wp.array[wp.vec4]

@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from ..state.vectors import ZERO
-from .structs import KeptImpulses, Sides
+from .structs import Sides
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,13 +51,3 @@ def body_of_vertex(sides: Sides, vertex: int) -> int:
     if vertex < sides.particle_count:
         return -1
     return sides.body[vertex - sides.particle_count]
-
-
-@wp.func
-def clear_kept(kept: KeptImpulses, i: int):
-    """Clears what is kept of a contact."""
-    kept.impulse[i] = wp.vec3d()
-    kept.along[i] = ZERO
-    if kept.torque:
-        kept.torque[i, 0] = wp.vec3d()
-        kept.torque[i, 1] = wp.vec3d()

@@ -55,15 +55,15 @@ def _is_lost(lost: wp.array[int], world: int) -> bool:
 
 
 @wp.kernel
-def _await(status: SolveStatus, worlds: wp.array[wp.bool], step: _Step, totals: StepTotals):
+def _await(results: wp.array[int], worlds: wp.array[wp.bool], step: _Step, totals: StepTotals):
     """Takes the certificate from a step whose end is not seen yet; of several passes over a step, from the last."""
     i = wp.tid()
     if i < worlds.shape[0]:
         step.certified_worlds[i] = worlds[i]
         worlds[i] = False
     if i == 0:
-        step.certified[0] = status.results[Result.CERTIFIED]
-        status.results[Result.CERTIFIED] = 0
+        step.certified[0] = results[Result.CERTIFIED]
+        results[Result.CERTIFIED] = 0
         totals.unseen_steps[0] += wp.int64(1 - step.awaits[0])
         step.awaits[0] = 1
 
@@ -115,8 +115,9 @@ def _write_end(
 def _conclude(
     # in
     seen: SolveStatus,
+    crossings: wp.array[int],
     # in and out
-    status: SolveStatus,
+    results: wp.array[int],
     worlds: wp.array[wp.bool],
     step: _Step,
     totals: StepTotals,
@@ -127,22 +128,22 @@ def _conclude(
     """
     i = wp.tid()
     if i < worlds.shape[0]:
-        free = seen.of_worlds.remaining[i] == 0 and seen.crossings[i] <= status.crossings[i] and step.lost[i] == 0
+        free = seen.of_worlds.remaining[i] == 0 and seen.crossings[i] <= crossings[i] and step.lost[i] == 0
         worlds[i] = step.certified_worlds[i] and free and seen.results[Result.UNDETECTED] == 0
     if i == 0:
         is_lost = step.lost[step.lost.shape[0] - 1] == 1
         is_free = seen.results[Result.CERTIFIED] == 1
-        is_free = is_free and seen.results[Result.CROSSINGS] <= status.results[Result.CROSSINGS]
-        is_free = is_free and seen.results[Result.EXCLUDED] <= status.results[Result.EXCLUDED]
+        is_free = is_free and seen.results[Result.CROSSINGS] <= results[Result.CROSSINGS]
+        is_free = is_free and seen.results[Result.EXCLUDED] <= results[Result.EXCLUDED]
         if not is_free or not is_lost:
             totals.unseen_steps[0] -= wp.int64(1)
         if not is_free:
             totals.uncertified_steps[0] += wp.int64(step.certified[0])
             totals.revoked_steps[0] += wp.int64(step.certified[0])
-            if status.results[Result.NEW_CROSSINGS] == 0:  # a step that has some is counted
+            if results[Result.NEW_CROSSINGS] == 0:  # a step that has some is counted
                 totals.penetrated_steps[0] += wp.int64(step.certified[0])
         elif not is_lost:
-            status.results[Result.CERTIFIED] = step.certified[0]
+            results[Result.CERTIFIED] = step.certified[0]
         step.awaits[0] = 0
 
 
@@ -154,9 +155,9 @@ class CoupledCheck:
         bodies: The bodies of other entries, sorted, int32, shape [n].
     """
 
-    def __init__(self, work: Workspace, totals: StepTotals, worlds: wp.array[wp.bool] | None):
-        """Allocates a detection of its own, for a stage with a workspace, totals and certificates by world."""
-        self._of_stage, self._totals, self._worlds = work, totals, worlds
+    def __init__(self, work: Workspace, results: wp.array[int], totals: StepTotals, worlds: wp.array[wp.bool] | None):
+        """Allocates a detection of its own, for a stage with a workspace, results, totals and certificates by world."""
+        self._of_stage, self._results, self._totals, self._worlds = work, results, totals, worlds
         self.mesh, model, device = work.mesh, work.mesh.model, work.device
         self._motion = motion = ModelMotion(self.mesh, work.motion.friction, watches_turns=True)
         options = {"separation": work.step.separation, "restitution": work.step.restitution, "responds": False}
@@ -190,7 +191,7 @@ class CoupledCheck:
     def end(self) -> None:
         """Takes the certificate from the step that has ended, until its end is seen."""
         work = self._of_stage
-        work.launch(_await, work.worlds, [work.status, self._worlds, self._step, self._totals])
+        work.launch(_await, work.worlds, [self._results, self._worlds, self._step, self._totals])
 
     def see(self, given: StateArrays, own: StateArrays, *, begins: bool) -> None:
         """Checks the step that awaits it, given the state of the program; keeps the start of a step that ``begins``.
@@ -216,8 +217,7 @@ class CoupledCheck:
         size = max(size, len(others.bodies))
         self._work.launch(_write_end, size, [arrays_of(self._start), given, own, others, step.lost, end])
         self._inspect()
-        status = self._of_stage.status
-        inputs = [self._work.status, status, self._worlds, step, self._totals]
+        inputs = [self._work.status, self._of_stage.status.crossings, self._results, self._worlds, step, self._totals]
         self._work.launch(_conclude, self._work.worlds, inputs)
 
     def _inspect(self):

@@ -12,7 +12,6 @@ from ..state.motion import ModelMotion, arrays_of, continues
 from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
-from ..substeps.inner_contacts import InnerContacts
 from .wrapped_solver import WrappedSolver
 
 wp.set_module_options({"enable_backward": False})
@@ -122,7 +121,6 @@ class CouplingHooks(WrappedSolver):
 
     _motion: ModelMotion
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
-    _inner_contacts: InnerContacts | None = None  # None where the inner solver gets all contacts
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Delegates to the inner solver, and prepares for a coupled simulation.
@@ -163,8 +161,6 @@ class CouplingHooks(WrappedSolver):
         self._harvest(*kind, particle_local_to_proxy_global, out_particle_f, options)
 
     def _harvest(self, hook, impulses, kernel, proxy, forces, options):
-        if self._inner_contacts is not None and options["contacts"] is not None:
-            options["contacts"] = self._inner_contacts.packed(options["contacts"])
         self._hook(hook)(proxy, forces, **options)
         if self._coupled is not None and not _is_default(self.solver, hook):  # which includes changes of velocities
             added = getattr(self._coupled, impulses)

@@ -28,14 +28,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, in_substep: bool, i: int):
+def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, i: int):
     """Adds a constraint to the active set for positions, if it is violated, or may pull something back.
 
     Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities that planes divide
-    afterwards, but for those at rest, which friction holds in place, and in substeps, which planes follow only at their
-    end: projection knows nothing of elasticity, and in a stack it stretches layers, which then spring back. Edges at
-    rest near each other are left to planes too, unless they are too near: a stack has four times as many as of vertices
-    and faces, which hold it as well.
+    afterwards, but for those at rest, which friction holds in place: projection knows nothing of elasticity, and in a
+    stack it stretches layers, which then spring back. Edges at rest near each other are left to planes too, unless they
+    are too near: a stack has four times as many as of vertices and faces, which hold it as well.
     """
     motion, constraints = step.motion, step.constraints
     corners = constraints.vertices[i]
@@ -43,9 +42,8 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
     kind = constraints.kind[i]
     if kind > ContactKind.PLANE and is_dividing(status, world, status.loop[Loop.ITERATION]):
         if constraints.pace[i] != Pace.RESTING:
-            if not in_substep:
-                return
-        elif kind == ContactKind.EDGE_EDGE_PROXIMITY:
+            return
+        if kind == ContactKind.EDGE_EDGE_PROXIMITY:
             kept = min_distance_of(step, i)
             start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
             if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
@@ -77,12 +75,10 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
 
 
 @wp.kernel
-def activate_position_constraints(
-    step: Step, status: SolveStatus, tolerance: wp.float64, in_substep: bool, threads: int
-):
+def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, threads: int):
     """Fills the active set for positions."""
     for i in range(wp.tid(), constraint_count(step), threads):
-        _activate_constraint(step, status, tolerance, in_substep, i)
+        _activate_constraint(step, status, tolerance, i)
 
 
 @wp.func
@@ -140,20 +136,12 @@ def _sweep(
     record: StepRecord,
     particle_count: int,
     tolerance: wp.float64,
-    in_substep: bool,
     batches: int,
     sweeps_per_batch: int,
     threads: int,
 ):
-    """Makes batches of sweeps in one launch, see :mod:`.cluster`.
-
-    With ``in_substep``, multipliers have moved vertices before the first sweep.
-    """
+    """Makes batches of sweeps in one launch, see :mod:`.cluster`."""
     thread = wp.tid()
-    if in_substep:
-        for vertex in range(thread, particle_count, threads):
-            _update_vertex(step, status, record, True, vertex)
-        wait_for_others()
     if thread == 0:
         begin_sweeps(status)
     wait_for_others()
@@ -162,7 +150,7 @@ def _sweep(
     batch = int(0)
     while more == 1 and batch < batches:
         for i in range(thread, count, threads):
-            _activate_constraint(step, status, tolerance, in_substep, i)
+            _activate_constraint(step, status, tolerance, i)
         wait_for_others()
         active_count = int(step.constraints.active_count[0])
         for sweep in range(sweeps_per_batch):
@@ -176,22 +164,13 @@ def _sweep(
         batch += 1
 
 
-def project(work: Workspace, tolerance: float = 1.0, *, in_substep: bool = False) -> None:
-    """Moves vertices and bodies apart at the end of the step, until their constraints are met.
-
-    Args:
-        work: The workspace.
-        tolerance: Share of the tolerance of a whole step.
-        in_substep: Whether this is one of the substeps of a step, whose constraints begin with multipliers: their sums
-            have still to move vertices and bodies.
-    """
+def project(work: Workspace) -> None:
+    """Moves vertices and bodies apart at the end of the step, until their constraints are met."""
     if work.sweeping_threads:
         batches = int(MAX_SWEEPS) // int(SWEEPS_PER_BATCH)
-        work.sweep_at_once(_sweep, [tolerance * work.tolerance, in_substep, batches, int(SWEEPS_PER_BATCH)])
+        work.sweep_at_once(_sweep, [work.tolerance, batches, int(SWEEPS_PER_BATCH)])
         return
-    if in_substep:
-        _update(work, last=True)
-    work.repeat_sweeps(lambda: _activate(work, tolerance, in_substep), project_positions, _update)
+    work.repeat_sweeps(lambda: _activate(work), project_positions, _update)
 
 
 def leave_planes(work: Workspace) -> None:
@@ -201,15 +180,14 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     if work.sweeping_threads:
-        work.sweep_at_once(_sweep, [work.tolerance, False, 1, 1])
+        work.sweep_at_once(_sweep, [work.tolerance, 1, 1])
         return
     work.launch(start_sweeps, 1, [work.status])
-    work.sweep(1, lambda: _activate(work, 1.0, False), project_positions, _update)
+    work.sweep(1, lambda: _activate(work), project_positions, _update)
 
 
-def _activate(work, tolerance, in_substep):
-    inputs = [work.status, tolerance * work.tolerance, in_substep]
-    work.launch_over_constraints(activate_position_constraints, *inputs)
+def _activate(work):
+    work.launch_over_constraints(activate_position_constraints, work.status, work.tolerance)
 
 
 def _update(work, last):

@@ -52,13 +52,6 @@ def moves_with_body(motion: Motion, vertex: int) -> bool:
 
 
 @wp.func
-def predicted_position(motion: Motion, vertex: int) -> wp.vec3:
-    """Returns the predicted position of a vertex of a body that the response can move [m]."""
-    bodies = motion.bodies
-    return wp.transform_point(bodies.end[bodies.of_vertex[vertex]], bodies.position[vertex - bodies.particle_count])
-
-
-@wp.func
 def predicted_velocity(motion: Motion, vertex: int, x1: wp.vec3) -> wp.vec3:
     """Returns the predicted velocity of a vertex of a body, whose predicted position is ``x1`` [m/s]."""
     body = motion.bodies.of_vertex[vertex]
@@ -239,7 +232,7 @@ def _jump(
         x1[particle_count + i] = x
 
 
-def _find_misplaced_bodies(model: newton.Model) -> np.ndarray:
+def find_misplaced_bodies(model: newton.Model) -> np.ndarray:
     """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
     if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
         return np.empty(0, dtype=int)
@@ -345,7 +338,7 @@ class ModelMotion:
         """
         self._last = last
         positions, planes = self.vertices.x0.numpy().copy(), self.planes.end.numpy().copy()
-        misplaced = _find_misplaced_bodies(self.mesh.model)
+        misplaced = find_misplaced_bodies(self.mesh.model)
         first = self.mesh.model.particle_count
         positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
         planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan

@@ -33,6 +33,8 @@ PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED = (wp.constant(
 """Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity; dividing planes moved it;
 its path was cut; it was frozen at its start; it was left there because its prediction was not finite; its velocity is
 that of its path, as it was divided from contacts without constraints, or moved to prevent inversions."""
+UNCERTIFIED, INVALID = (wp.constant(bit) for bit in (64, 128))
+"""Bits of the outcome of a vertex in a report: the certificate lacks it; and all elements that have it."""
 NEVER = wp.constant(wp.int64(2**63 - 1))
 """In place of the packed contact of a vertex without one, see :attr:`Vertices.first_contact`."""
 SUMS, MOMENTS, MASS, HELD = (wp.constant(i) for i in (15, 11, 3, 14))

@@ -8,6 +8,7 @@ import warp as wp
 from ..schedule import Result, SolveStatus
 from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, Step, allocate
 from ..state.workspace import Workspace
+from ..write_back import StepResults
 from .world_report import Worlds
 
 wp.set_module_options({"enable_backward": False})
@@ -21,23 +22,45 @@ class _Arrays:
     truncated: wp.array[int]
     frozen: wp.array[int]
     not_finite: wp.array[int]
-    substeps: wp.array[int]
+    hits: wp.array[int]
+    remaining: wp.array[int]
+    filtered: wp.array[int]
+    crossings: wp.array[int]
+    inversions: wp.array[int]  # empty if they are not looked at, and what follows
+    inverted: wp.array[int]
 
 
 @wp.kernel
-def _begin(status: SolveStatus, prevents_inversions: bool, taken: wp.array[int], out: _Arrays):
-    """Writes what follows from the contacts of each world, and clears the counts of vertices."""
+def _begin(status: SolveStatus, prevents_inversions: bool, first: bool, out: _Arrays):
+    """Writes what follows from the contacts of each world, and clears the counts of vertices.
+
+    If it is not the ``first`` substep of a step, it adds to what the others did, as :func:`..write_back.merge_step`.
+    """
     world = wp.tid()
-    detected = status.results[Result.UNDETECTED] == 0
-    out.certified[world] = detected and status.of_worlds.remaining[world] == 0
-    if prevents_inversions and status.of_worlds.inverting[world] > 0:
+    found = status.of_worlds
+    if first:
+        out.certified[world] = True
+        out.hits[world] = 0
+        out.remaining[world] = 0
+        out.filtered[world] = 0
+        out.crossings[world] = 0
+    if status.results[Result.UNDETECTED] != 0 or found.remaining[world] > 0:
         out.certified[world] = False
+    out.hits[world] += found.hits[world]
+    out.remaining[world] += found.remaining[world]
+    out.filtered[world] += found.filtered[world]
+    out.crossings[world] = wp.max(out.crossings[world], status.crossings[world])
+    if out.inversions:
+        if first:
+            out.inversions[world] = 0
+            out.inverted[world] = 0
+        if prevents_inversions and found.inverting[world] > 0:
+            out.certified[world] = False
+        out.inversions[world] += found.inverting[world]
+        out.inverted[world] = wp.max(out.inverted[world], found.inverted[world])
     out.truncated[world] = 0
     out.frozen[world] = 0
     out.not_finite[world] = 0
-    out.substeps[world] = 0
-    if taken:
-        out.substeps[world] = taken[world]
 
 
 @wp.func
@@ -55,6 +78,7 @@ def _count_vertices(
     step: Step,
     particle_count: int,
     not_finite: wp.array[wp.int64],
+    results: StepResults,
     # out
     out: _Arrays,
 ):
@@ -64,8 +88,8 @@ def _count_vertices(
     """
     i = wp.tid()
     motion, vertices = step.motion, step.vertices
-    if i < vertices.outcome.shape[0]:
-        outcome = vertices.outcome[i]
+    if i < results.of_vertices.shape[0]:
+        outcome = results.of_vertices[i]
         world = motion.world[i]
         _count(outcome, world, out)
         lost = outcome & NOT_FINITE != 0
@@ -74,12 +98,12 @@ def _count_vertices(
         invalid = not_finite[0] > wp.int64(0) and not (wp.isfinite(motion.x0[i]) and wp.isfinite(vertices.x1[i]))
         if lost or invalid:
             out.certified[world] = False
-    if i < vertices.bodies.outcome.shape[0]:
+    if i < results.of_bodies.shape[0]:
         world = motion.bodies.world[i]
         if world < 0 and out.frozen.shape[0] == 1:
             world = 0
         if world >= 0:  # a body that is in all of several worlds is never moved
-            _count(vertices.bodies.outcome[i], world, out)
+            _count(results.of_bodies[i], world, out)
 
 
 class WorldCounter:
@@ -92,25 +116,24 @@ class WorldCounter:
     def __init__(
         self,
         work: Workspace,
+        results: StepResults,
         *,
         strain: wp.array[float],
         find_inside: Callable[[], np.ndarray],
         max_impulse: wp.array[float] | None = None,
     ):
         """Allocates the results, and makes detections count by world; what is given is published with them."""
-        self._work = work
-        found = work.count_worlds()
-        self._out = allocate(_Arrays, work.worlds, work.device)
-        arrays = {name: getattr(self._out, name) for name in _Arrays.vars}
-        counts = {name: getattr(found, name) for name in ("hits", "remaining", "filtered")}
-        counts["crossings"] = work.status.crossings
-        if work.tetrahedra is not None:
-            counts |= {"inversions": found.inverting, "inverted": found.inverted}
-        self.worlds = Worlds(**arrays, **counts, strain=strain, _find_inside=find_inside, _max_impulse=max_impulse)
+        self._work, self._results = work, results
+        work.count_worlds()
+        inverting = 0 if work.tetrahedra is None else work.worlds
+        sizes = {"inversions": inverting, "inverted": inverting}
+        self._out = allocate(_Arrays, work.worlds, work.device, **sizes)
+        arrays = {name: getattr(self._out, name) for name in _Arrays.vars if inverting or name not in sizes}
+        self.worlds = Worlds(**arrays, strain=strain, _find_inside=find_inside, _max_impulse=max_impulse)
 
-    def count(self, taken: wp.array[int] | None = None) -> None:
-        """Writes the results of a step, given the substeps that each world took, None for none."""
+    def count(self, *, first: bool) -> None:
+        """Writes the results of a step, or adds those of a substep that is not the ``first`` one."""
         work = self._work
-        work.launch(_begin, work.worlds, [work.status, work.ends is not None, taken], [self._out])
-        inputs = [work.step, work.particle_count, work.detector.counters.array]
+        work.launch(_begin, work.worlds, [work.status, work.ends is not None, first], [self._out])
+        inputs = [work.step, work.particle_count, work.detector.counters.array, self._results]
         work.launch(_count_vertices, max(work.mesh.vertex_count, work.body_count), inputs, [self._out])

@@ -58,7 +58,6 @@ class _Held:
     last: wp.array[wp.vec3]  # where vertices ended the last step
     planes: wp.array[wp.vec4d]
     interrupted: wp.array[int]
-    number: wp.array[int]  # of substeps, as predicted; empty if steps have none
     inverse_mass: wp.array[float]  # 0 in these worlds
     body_inverse_mass: wp.array[float]
     active: wp.array[int]  # 1 of vertices in other worlds
@@ -74,17 +73,12 @@ def _hold(
     motion: Motion,
     plane_start: wp.array[wp.vec4d],
     plane_end: wp.array[wp.vec4d],
-    number: wp.array[int],
     held: _Held,
 ):
     """Lets vertices and planes of worlds that take no part stand where the last step left them, without mass."""
     i = wp.tid()
     if i < motion.interrupted.shape[0]:
         held.interrupted[i] = motion.interrupted[i]
-    if i < number.shape[0]:
-        held.number[i] = number[i]
-        if not takes_part(mask, i):
-            number[i] = 0
     if i < plane_start.shape[0] and not takes_part(mask, plane_world[i]):
         plane_start[i] = held.planes[i]
         plane_end[i] = held.planes[i]
@@ -114,16 +108,12 @@ def _release(
     # out
     last: wp.array[wp.vec3],
     interrupted: wp.array[int],
-    number: wp.array[int],
 ):
     """Restores what the next step of worlds that took no part begins with."""
     i = wp.tid()
     if i < interrupted.shape[0]:
-        is_out = not takes_part(mask, wp.where(i == interrupted.shape[0] - 1, -1, i))
-        if is_out:
+        if not takes_part(mask, wp.where(i == interrupted.shape[0] - 1, -1, i)):
             interrupted[i] = held.interrupted[i]
-        if i < number.shape[0] and is_out:
-            number[i] = held.number[i]
     if last and i < last.shape[0] and not takes_part(mask, world[i]):
         last[i] = held.last[i]
 
@@ -135,25 +125,17 @@ class WorldMask:
     back. The stage takes their elements to stand, and to have no mass, so that it looks at no pair of them.
     """
 
-    def __init__(self, solver: SolverBase, work: Workspace, motion: ModelMotion, number: wp.array[int] | None):
-        """Allocates buffers.
-
-        Args:
-            solver: The inner solver.
-            work: The workspace of steps.
-            motion: The motion of whole steps.
-            number: Predicted number of substeps of each world; None if steps have none.
-        """
+    def __init__(self, solver: SolverBase, work: Workspace, motion: ModelMotion):
+        """Allocates buffers for the inner solver, the workspace of steps, and their motion."""
         self._solver, self._work, self._motion = solver, work, motion
         model, device = motion.mesh.model, work.device
-        self._number = wp.zeros(0, dtype=int, device=device) if number is None else number
         self._last = motion.last
         self._held = held = _Held()
         of_vertices = motion.vertices
         if self._last is not None:
             held.last = wp.empty_like(self._last)
         held.planes, held.interrupted = wp.empty_like(motion.planes.end), wp.empty_like(of_vertices.interrupted)
-        held.number, held.inverse_mass = wp.empty_like(self._number), wp.empty_like(of_vertices.inverse_mass)
+        held.inverse_mass = wp.empty_like(of_vertices.inverse_mass)
         held.active = wp.zeros(len(held.inverse_mass), dtype=int, device=device)
         if motion.moves_bodies:
             held.body_inverse_mass = wp.empty_like(of_vertices.bodies.inverse_mass)
@@ -204,7 +186,7 @@ class WorldMask:
         vertices, planes, world = motion.vertices, motion.planes, motion.vertices.world
         masses, body_masses = vertices.inverse_mass, vertices.bodies.inverse_mass
         size = max(len(vertices.x0), len(planes.start), len(vertices.interrupted), motion.mesh.model.body_count)
-        outputs = [vertices, planes.start, planes.end, self._number, held]
+        outputs = [vertices, planes.start, planes.end, held]
         work.launch(_hold, size, [mask, masses, planes.world], outputs)
         vertices.inverse_mass = held.inverse_mass
         if motion.moves_bodies:
@@ -215,7 +197,7 @@ class WorldMask:
         finally:
             vertices.inverse_mass, vertices.bodies.inverse_mass = masses, body_masses
             work.motion, work.active, work.unmasked = motion, None, None
-        outputs = [self._last, vertices.interrupted, self._number]
+        outputs = [self._last, vertices.interrupted]
         work.launch(_release, max(len(world), len(vertices.interrupted)), [mask, world, held], outputs)
 
 

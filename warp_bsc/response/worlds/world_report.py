@@ -25,7 +25,6 @@ class Worlds:
         truncated: Vertices and bodies whose paths were truncated, int.
         frozen: Vertices and bodies that were frozen, int.
         not_finite: Particles whose predicted position or velocity was not finite, int.
-        substeps: Substeps of the step, 0 if it was not taken in substeps, int.
         crossings: Edges that cross faces at the start, int.
         strain: Largest strain by contacts, float.
         inversions: Tetrahedra that the motion inverts, int; None if the stage was not asked to count them.
@@ -42,7 +41,6 @@ class Worlds:
     truncated: wp.array[int]
     frozen: wp.array[int]
     not_finite: wp.array[int]
-    substeps: wp.array[int]
     crossings: wp.array[int]
     strain: wp.array[float]
     _find_inside: Callable[[], np.ndarray]

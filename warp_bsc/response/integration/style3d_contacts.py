@@ -3,7 +3,7 @@
 Before a step, the contacts of particles that fly on are detected. They and the proximities become constraints, planes
 at the times of impact, which Style3D gets in place of contacts of its own: forces that push, with friction, and their
 derivatives. The motion that Style3D predicts therefore nearly meets the contacts, and its whole step is in equilibrium
-with them, so that it needs no substeps. What is left, the stage detects and resolves as ever.
+with them. What is left, the stage detects and resolves as ever.
 
 On the CPU, where threads of the detection find contacts in any order, constraints are sorted once a step by a hash of
 all that their forces depend on: forces are added up in the same order in equal steps, bit for bit. On a GPU they are
@@ -23,9 +23,36 @@ from ..state.vectors import ZERO, to_double, to_single
 from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts
 from ..tuning import INNER_STIFFNESS, SLOWEST_SLIP
-from . import kernels
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _fly_on(
+    # in
+    start: StateArrays,
+    particle_f: wp.array[wp.vec3],
+    particle_world: wp.array[int],
+    gravity: wp.array[wp.vec3],
+    dt: float,
+    # out
+    motion: Motion,
+):
+    """Predicts the motion of particles by their velocities, gravity and forces."""
+    i = wp.tid()
+    x1 = start.particle_q[i] + wp.vec3()
+    velocity = start.particle_qd[i] + wp.vec3()
+    if motion.inverse_mass[i] > 0.0:
+        world = particle_world[i]
+        acceleration = gravity[wp.where(world < 0, gravity.shape[0] - 1, world)]
+        if particle_f:
+            acceleration += motion.inverse_mass[i] * particle_f[i]
+        velocity += dt * acceleration
+        x1 += dt * velocity
+    finite = wp.isfinite(x1) and wp.isfinite(velocity)
+    motion.x1[i] = wp.where(finite, x1, motion.x0[i])
+    motion.velocity[i] = wp.where(finite, velocity, wp.vec3())
+    motion.is_not_finite[i] = wp.where(finite, 0, 1)
 
 
 @wp.func
@@ -186,11 +213,6 @@ class Style3DContacts:
         self._flight = ModelMotion(mesh, work.motion.friction)
         self._last = wp.clone(work.vertices.x1)
         self._flight.remember(self._last)
-        self._end = StateArrays()
-        self._end.particle_q, self._end.particle_qd = (
-            wp.zeros(model.particle_count, dtype=wp.vec3, device=device) for _ in range(2)
-        )
-        self._flies = wp.ones(work.worlds, dtype=int, device=device)
         self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
         self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
         self._keys: wp.array[wp.uint64] | None = None
@@ -204,8 +226,8 @@ class Style3DContacts:
             wp.copy(self._last, work.vertices.x1)
             flight.set_start(start)
             flight.set_end(start, dt)
-            inputs = [start, state.particle_f, model.particle_world, model.gravity, dt, self._flies]
-            work.launch(kernels.extrapolate, model.particle_count, inputs, [flight.vertices, self._end])
+            inputs = [start, state.particle_f, model.particle_world, model.gravity, dt]
+            work.launch(_fly_on, model.particle_count, inputs, [flight.vertices])
             find_contacts(work)
             add_proximities(work)
             self._sort()

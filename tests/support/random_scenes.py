@@ -1,13 +1,5 @@
-"""Energy of random scenes in substeps, whatever contacts the program passes on.
+"""Random scenes of cloth, soft bodies and rigid bodies on the ground, with a solver."""
 
-``python tests/support/substep_energy.py --count 200`` prints a line for each scene whose kinetic and potential energy
-rises above that at the start by more than 1%, with its seed. It exits with status 1 if that of the inner solver alone
-does not. It also says in how many scenes the energy rises with that of elastic strain, and in how many of these more
-than in whole steps.
-"""
-
-import argparse
-import sys
 from dataclasses import dataclass
 
 import newton
@@ -16,13 +8,10 @@ import warp as wp
 
 import warp_bsc as bsc
 
-__all__ = ["RISE", "Scene", "Settings"]
+__all__ = ["KINDS", "Scene", "Settings"]
 
-RISE = 0.01
-"""Rise of the energy that discrete steps may make, as a share of that at the start."""
 GRAVITY = 9.81
 KINDS = "drape", "block", "pile", "bodies"
-NUMBERS = 2, 4, 8, 16, 32, "auto"
 
 
 @dataclass(frozen=True)
@@ -34,7 +23,6 @@ class Settings:
         kind: One of ``KINDS``.
         inner: The inner solver: ``"vbd"``, ``"xpbd"`` or ``"style3d"``, the last one for drapes and piles.
         contacts: Whether the program passes Newton's contacts on.
-        substeps: Number of substeps, or ``"auto"``.
         rate: Steps a second.
     """
 
@@ -42,7 +30,6 @@ class Settings:
     kind: str
     inner: str
     contacts: bool
-    substeps: int | str
     rate: int
 
     @classmethod
@@ -51,19 +38,17 @@ class Settings:
         rng = np.random.default_rng(seed)
         kind = KINDS[rng.integers(len(KINDS))]
         inners = ["vbd", "vbd", "xpbd", "style3d"] if kind in ("drape", "pile") else ["vbd", "xpbd"]
-        substeps = NUMBERS[rng.integers(len(NUMBERS))]
         return cls(
             seed,
             kind,
             inners[rng.integers(len(inners))],
             bool(rng.integers(2)),
-            substeps if rng.integers(2) else "auto",
             int(rng.choice([60, 120])),
         )
 
     def __str__(self):
         contacts = "contacts passed on" if self.contacts else "no contacts passed on"
-        return f"{self.kind}, {self.inner}, {contacts}, substeps={self.substeps!r}, 1/{self.rate} s"
+        return f"{self.kind}, {self.inner}, {contacts}, 1/{self.rate} s"
 
 
 class Scene:
@@ -176,8 +161,8 @@ class Scene:
         height = 0.01 + self._radius if on_top else low + size + 2.0 * self._radius
         self._add_cloth((-0.3, -0.3, height), 0.6, int(rng.integers(4, 7)))
 
-    def make_solver(self, *, stage=True, substeps=None):
-        """Returns the inner solver, behind the stage if asked."""
+    def make_solver(self):
+        """Returns the stage behind the inner solver."""
         settings, model = self._settings, self.model
         match settings.inner:
             case "vbd":
@@ -188,116 +173,6 @@ class Scene:
             case _:
                 config = newton.solvers.SolverStyle3D.Config(iterations=5)
                 solver = newton.solvers.SolverStyle3D(model, config=config)
-        if not stage:
-            return solver
         # without Newton's contacts, nobody but the stage keeps bodies on the ground
         bodies = "separated" if model.body_count and not settings.contacts else "pushed"
-        return bsc.SolverCCD(solver, substeps=substeps, bodies=bodies)
-
-    def elastic_energy(self, x):
-        """Returns the energy of stretched triangles (St. Venant-Kirchhoff, as in VBD) or springs [J]."""
-        model = self.model
-        if self._settings.inner == "xpbd":
-            ends = x[model.spring_indices.numpy().reshape(-1, 2)]
-            extension = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) - model.spring_rest_length.numpy()
-            return 0.5 * model.spring_stiffness.numpy() @ extension**2
-        corners = x[model.tri_indices.numpy().reshape(-1, 3)]
-        sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=2)
-        gradient = sides @ model.tri_poses.numpy().astype(np.float64)
-        strain = 0.5 * (gradient.transpose(0, 2, 1) @ gradient - np.eye(2))
-        mu, lam = model.tri_materials.numpy()[:, :2].T
-        density = mu * (strain**2).sum(axis=(1, 2)) + 0.5 * lam * np.trace(strain, axis1=1, axis2=2) ** 2
-        return model.tri_areas.numpy() @ density
-
-    def energy(self, state):
-        """Returns the kinetic energy of particles and bodies with their potential energy above the ground, and elastic.
-
-        Both in J. Nothing is strained at the start, so that neither the first nor the sum can rise. The elastic energy
-        is that of cloth behind VBD and XPBD, 0 of blocks and behind Style3D.
-        """
-        model, total, elastic = self.model, 0.0, 0.0
-        if model.particle_count:
-            x, v = (array.numpy().astype(np.float64) for array in (state.particle_q, state.particle_qd))
-            total += model.particle_mass.numpy() @ (0.5 * (v * v).sum(axis=1) + GRAVITY * x[:, 2])
-            if self._settings.kind != "block" and self._settings.inner != "style3d":
-                elastic = self.elastic_energy(x)
-        if model.body_count:
-            q, qd = (array.numpy().astype(np.float64) for array in (state.body_q, state.body_qd))
-            for body in range(model.body_count):
-                mass, com = model.body_mass.numpy()[body], model.body_com.numpy()[body]
-                rotation = np.array(wp.quat_to_matrix(wp.quat(*q[body, 3:]))).reshape(3, 3)
-                center = q[body, :3] + rotation @ com
-                spin = rotation.T @ qd[body, 3:]
-                linear = qd[body, :3]
-                total += mass * (0.5 * linear @ linear + GRAVITY * center[2])
-                total += 0.5 * spin @ model.body_inertia.numpy()[body] @ spin
-        return float(total), float(elastic)
-
-    def run(self, *, stage=True, substeps=None, duration=0.4):
-        """Returns how far the energy rises, as a share of that at the start, without and with elastic energy.
-
-        With that, the stage's report.
-
-        Args:
-            stage: Whether the stage is behind the inner solver.
-            substeps: As for ``SolverCCD``.
-            duration: How long [s].
-        """
-        model, settings = self.model, self._settings
-        solver = self.make_solver(stage=stage, substeps=substeps)
-        pipeline = newton.CollisionPipeline(model)
-        # Style3D needs contacts, if only none
-        contacts = pipeline.contacts() if settings.contacts or settings.inner == "style3d" else None
-        start, end, control = model.state(), model.state(), model.control()
-        energies = [self.energy(start)]
-        for _ in range(round(duration * settings.rate)):
-            start.clear_forces()
-            if settings.contacts:
-                pipeline.collide(start, contacts)
-            solver.step(start, end, control, contacts, 1.0 / settings.rate)
-            start, end = end, start
-            energies.append(self.energy(start))
-        energies = np.array(energies)
-        energies[:, 1] += energies[:, 0]
-        rise = np.max(energies, axis=0) / energies[0] - 1.0 if np.isfinite(energies).all() else np.full(2, np.inf)
-        return *rise.tolist(), getattr(solver, "report", None)
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=200, help="number of scenes")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first scene; the next one has the next")
-    parser.add_argument("--device", default=None)
-    arguments = parser.parse_args()
-    wp.config.quiet = True
-    rising, worse, strained, more_strained, coupled, uncertified = 6 * [0]
-    for seed in range(arguments.seed, arguments.seed + arguments.count):
-        settings = Settings.draw(seed)
-        scene = Scene(settings, arguments.device)
-        rise, with_elastic, report = scene.run(substeps=settings.substeps)
-        coupled += report.totals.substepped_steps
-        uncertified += report.totals.uncertified_steps > 0
-        if with_elastic <= RISE:
-            continue
-        whole, whole_with_elastic, _ = scene.run()
-        strained += 1
-        more_strained += with_elastic > whole_with_elastic + RISE
-        if rise > RISE:
-            plain, _, _ = scene.run(stage=False)
-            rising += 1
-            worse += plain <= RISE
-            print(
-                f"--seed {seed} --count 1 ({settings}): energy rises by {rise:.1%}, without substeps by {whole:.1%}, "
-                f"of the inner solver alone by {plain:.1%}; {report}",
-                flush=True,
-            )
-    print(
-        f"{arguments.count} scenes, {coupled} steps in substeps, {uncertified} scenes with uncertified steps. Kinetic "
-        f"and potential energy rise by more than {RISE:.0%} in {rising}, in {worse} of which that of the inner solver "
-        f"does not; with elastic energy in {strained}, in {more_strained} of which more than in whole steps"
-    )
-    return 1 if worse else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        return bsc.SolverCCD(solver, bodies=bodies)

@@ -1,1 +1,0 @@
-"""Steps that are taken again in substeps of the inner solver."""
