@@ -30,6 +30,8 @@ _STALLED = wp.constant(wp.float64(1e-3))
 """Share of displacements by which it goes on at least; it ends early, and safe, where it does not."""
 _FLOOR = wp.constant(wp.float64(0.03))
 """Gap, as a share of the reach, below which a pair hardly comes nearer: the barrier would be too steep to solve for."""
+FORCE_AT_FLOOR = 38.1660556541341
+"""Force of the barrier at that gap, in the product of its stiffness and its reach."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
 

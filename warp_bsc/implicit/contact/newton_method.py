@@ -147,6 +147,7 @@ class NewtonMethod:
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
+        self._settings.load = wp.zeros(vertices, dtype=float, device=device)
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)
         if len(solved):
@@ -352,6 +353,8 @@ class NewtonMethod:
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
+        inputs = [self._derivatives, self._rows, unknowns, progress.active]
+        self._launch(steps.find_loads, self._count, inputs, [self._settings.load])
         self._find_near(progress.active)
         self._assemble(progress.active, True)
         self._solve_linear(progress.active)

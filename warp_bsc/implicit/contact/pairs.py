@@ -53,6 +53,7 @@ class BarrierSettings:
         reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
         recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
+        load: Of each vertex: force of its elements, where the Newton step begins [N].
         smoothing: Length below which friction is smoothed [m].
         units: Units of energy in a joule, in each world.
     """
@@ -62,6 +63,7 @@ class BarrierSettings:
     reach_of_bodies: wp.array[float]
     recovery: wp.float64
     elasticity: wp.array[float]
+    load: wp.array[float]
     smoothing: wp.float64
     units: wp.array[wp.float64]
 
@@ -112,8 +114,14 @@ def _compliance(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.fl
 
 
 @wp.func
-def stiffness_of_pair(motion: Motion, settings: BarrierSettings, corners: wp.vec4i, is_edges: bool) -> wp.float64:
-    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart."""
+def stiffness_of_pair(
+    motion: Motion, settings: BarrierSettings, corners: wp.vec4i, is_edges: bool, reach: wp.float64
+) -> wp.float64:
+    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
+
+    It is more where elements push harder than that carries at the gap below which a pair hardly comes nearer: what is
+    taut would otherwise be stuck there.
+    """
     first = _compliance(motion, settings, corners[0])
     second = _compliance(motion, settings, corners[2]) + _compliance(motion, settings, corners[3])
     if is_edges:
@@ -121,13 +129,18 @@ def stiffness_of_pair(motion: Motion, settings: BarrierSettings, corners: wp.vec
         second = HALF * second
     else:
         second = (second + _compliance(motion, settings, corners[1])) / wp.float64(3.0)
-    return ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF))
+    load = float(0.0)
+    for j in range(4):
+        load = wp.max(load, settings.load[corners[j]])
+    needed = wp.float64(load) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
+    return wp.max(ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
 
 
 @wp.func
-def stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.float64:
-    """Returns the stiffness of a barrier between a particle and a plane [N/m], see :func:`_stiffness`."""
-    return ONE / (_compliance(motion, settings, vertex) * wp.float64(barrier.CURVATURE_AT_HALF))
+def stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int, reach: wp.float64) -> wp.float64:
+    """Returns the stiffness of a barrier between a vertex and a plane [N/m], as :func:`stiffness_of_pair`."""
+    needed = wp.float64(settings.load[vertex]) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
+    return wp.max(ONE / (_compliance(motion, settings, vertex) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
 
 
 @wp.func

@@ -314,6 +314,23 @@ def assemble(
 
 
 @wp.kernel
+def find_loads(
+    # in
+    derivatives: Derivatives,
+    rows: Rows,
+    unknowns: Unknowns,
+    active: wp.array[int],
+    # out
+    load: wp.array[float],
+):
+    """Writes the forces of elements on vertices that are solved for, in active worlds."""
+    u = wp.tid()
+    if unknowns.particle[u] >= 0 and active[unknowns.world[u]] != 0:
+        force = sum_of_corners(rows, derivatives, u)
+        load[unknowns.particle[u]] = wp.where(unknowns.is_free[u] != 0, wp.length(force), 0.0)
+
+
+@wp.kernel
 def find_remaining(
     # in
     motion: Motion,
