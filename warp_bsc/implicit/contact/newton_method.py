@@ -353,7 +353,7 @@ class NewtonMethod:
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.x, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
-        inputs = [self._derivatives, self._rows, unknowns, progress.active]
+        inputs = [self._derivatives, self._rows, unknowns, progress]
         self._launch(steps.find_loads, self._count, inputs, [self._settings.load])
         self._find_near(progress.active)
         self._assemble(progress.active, True)

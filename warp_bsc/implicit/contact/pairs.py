@@ -53,7 +53,7 @@ class BarrierSettings:
         reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
         recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
-        load: Of each vertex: force of its elements, where the Newton step begins [N].
+        load: Of each vertex: about the force of its elements, and more [N].
         smoothing: Length below which friction is smoothed [m].
         units: Units of energy in a joule, in each world.
     """

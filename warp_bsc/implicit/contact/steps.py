@@ -106,6 +106,7 @@ def begin_step(
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
         progress.remaining[v] = 0.0
+        progress.late[v] = 0
         plane_share[v] = 0.0
     if v >= trial.x.shape[0]:
         return
@@ -319,15 +320,24 @@ def find_loads(
     derivatives: Derivatives,
     rows: Rows,
     unknowns: Unknowns,
-    active: wp.array[int],
-    # out
+    progress: Progress,
+    # in and out
     load: wp.array[float],
 ):
-    """Writes the forces of elements on vertices that are solved for, in active worlds."""
+    """Writes the forces of elements on vertices that are solved for, in active worlds.
+
+    That of an earlier Newton step of the step is kept where it is about right: barriers that change converge slowly.
+    """
     u = wp.tid()
-    if unknowns.particle[u] >= 0 and active[unknowns.world[u]] != 0:
-        force = sum_of_corners(rows, derivatives, u)
-        load[unknowns.particle[u]] = wp.where(unknowns.is_free[u] != 0, wp.length(force), 0.0)
+    world, p = unknowns.world[u], unknowns.particle[u]
+    if p < 0 or progress.active[world] == 0:
+        return
+    if unknowns.is_free[u] == 0:
+        load[p] = 0.0
+        return
+    force = wp.length(sum_of_corners(rows, derivatives, u))
+    if progress.steps[world] == 0 or force > 2.0 * load[p] or force < 0.25 * load[p]:
+        load[p] = force
 
 
 @wp.kernel
@@ -654,7 +664,7 @@ def decide_step(
 ):
     """Ends worlds whose unknowns hardly change, or that have taken all their Newton steps.
 
-    Where something that a program moves has not arrived, there may be more of them.
+    They are counted from when what a program moves arrives, if it does.
     """
     w = wp.tid()
     if progress.active[w] == 0:
@@ -664,10 +674,12 @@ def decide_step(
     progress.steps[w] = progress.steps[w] + 1
     arrived = scale == 1.0 or progress.remaining[w] == 0.0
     steps = progress.steps[w]
-    ends = arrived and (progress.change[w] <= least_change or steps >= max_steps)
+    if progress.remaining[w] > 0.0:
+        progress.late[w] = steps - 1
+    ends = arrived and (progress.change[w] <= least_change or steps - progress.late[w] >= max_steps)
     if scale == 0.0 and arrived:
         ends = True
-    if ends or steps >= max_late_steps:
+    if ends or (steps >= max_late_steps and not arrived):
         progress.active[w] = 0
         return
     goes_on[0] = 1
