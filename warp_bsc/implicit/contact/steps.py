@@ -194,6 +194,61 @@ def begin_hold(
     if progress.active[w] != 0 and progress.bound[w] < 1.0:
         ahead[w] = 1
         progress.bound[w] = 1.0
+        progress.held[w] = 1
+
+
+@wp.func
+def _falls(progress: Progress, w: int) -> bool:
+    """Returns whether the energy of a world is lower at the displaced positions, as far as rounding tells."""
+    before = wp.float64(progress.energy[w])
+    return wp.float64(progress.trial[w]) <= before + _NOISE * wp.abs(before) + wp.float64(progress.noise[w])
+
+
+@wp.kernel
+def find_rises(
+    # in
+    progress: Progress,
+    # out
+    rises: wp.array[int],
+    any_rises: wp.array[int],
+):
+    """Says in which worlds the energy rises on displacements that are solved with pairs held."""
+    w = wp.tid()
+    rises[w] = 0
+    if progress.active[w] != 0 and progress.held[w] != 0 and progress.remaining[w] == 0.0 and not _falls(progress, w):
+        rises[w] = 1
+        any_rises[0] = 1
+
+
+@wp.kernel
+def begin_release(
+    # in
+    unknowns: Unknowns,
+    rises: wp.array[int],
+    first: wp.array[wp.vec3],
+    # in and out
+    progress: Progress,
+    solution: wp.array[wp.vec3],
+):
+    """Lets worlds in which the energy rises search along the solution without pairs held instead."""
+    i = wp.tid()
+    if i < solution.shape[0] and rises[unknowns.world[i]] != 0:
+        solution[i] = first[i]
+    if i < rises.shape[0]:
+        progress.searches[i] = rises[i]
+        if rises[i] != 0:
+            progress.scale[i] = 1.0
+            progress.trial[i] = wp.int64(0)
+
+
+@wp.kernel
+def end_release(
+    # in and out
+    progress: Progress,
+):
+    """Lets all worlds search again."""
+    w = wp.tid()
+    progress.searches[w] = progress.active[w]
 
 
 @wp.func
@@ -523,6 +578,7 @@ def begin_newton_step(
     progress.remaining[w] = 0.0
     progress.noise[w] = wp.int64(0)
     progress.cuts[w] = 0
+    progress.held[w] = 0
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
     progress.energy[w] = wp.int64(0)
@@ -605,9 +661,7 @@ def decide_search(
     if progress.active[w] == 0 or progress.searches[w] == 0:
         progress.trial[w] = wp.int64(0)
         return
-    before = wp.float64(progress.energy[w])
-    allowed = before + _NOISE * wp.abs(before) + wp.float64(progress.noise[w])
-    falls = wp.float64(progress.trial[w]) <= allowed
+    falls = _falls(progress, w)
     progress.trial[w] = wp.int64(0)
     if falls or progress.remaining[w] > 0.0:
         progress.searches[w] = 0

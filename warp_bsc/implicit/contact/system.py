@@ -52,6 +52,7 @@ class Progress:
         noise: How far the energy of what touches bodies may be off, as their vertices are rounded, in units.
         change: Largest displacement of an unknown [m].
         remaining: Largest way of what a program moves that is left [m].
+        held: 1 if pairs are held in the solve.
         late: Newton steps that began before what a program moves had arrived, but for the first of them.
     """
 
@@ -67,6 +68,7 @@ class Progress:
     noise: wp.array[wp.int64]
     change: wp.array[float]
     remaining: wp.array[float]
+    held: wp.array[int]
     late: wp.array[int]
 
 
