@@ -53,7 +53,7 @@ def _pair_energy(
     if gap < reach:
         value = wp.float64(1.0e30)
         if gap > ZERO:
-            stiffness = stiffness_of_pair(motion, settings, corners, queue.kind == EDGE_EDGE, reach)
+            stiffness = stiffness_of_pair(motion, settings, trial, corners, queue.kind == EDGE_EDGE, reach)
             value = stiffness * barrier.barrier_energy(gap, reach)
         add_energy(energy, world, value, settings.units)
 

@@ -114,7 +114,7 @@ def _find_near(
     if gap >= reach or not gap > ZERO:
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    stiffness = stiffness_of_pair(motion, settings, corners, queue.kind == EDGE_EDGE, reach)
+    stiffness = stiffness_of_pair(motion, settings, trial, corners, queue.kind == EDGE_EDGE, reach)
     pair = queue.pairs[i]
     key = key_of_pair(0, queue.kind, pair[0], pair[1])
     friction = pair_friction(motion, corners)

@@ -148,6 +148,9 @@ class NewtonMethod:
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
+        is_of_face = np.zeros(vertices)
+        is_of_face[mesh.faces.ravel()] = 1
+        self._settings.is_of_face = array(is_of_face)
         self._settings.load = wp.zeros(vertices, dtype=float, device=device)
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)

@@ -18,6 +18,8 @@ _KEPT = wp.constant(wp.float64(1.0 - 2.0**-30))
 """Share of its distance at the start that a pair keeps which starts within its minimum distance."""
 _LEAST_GAP = wp.constant(wp.float64(1e-6))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
+_PARALLEL = wp.constant(wp.float64(1e-3))
+"""Square of the sine of the angle below which edges are nearly parallel."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
@@ -53,6 +55,7 @@ class BarrierSettings:
         reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
         recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
+        is_of_face: 1 of each vertex of a face.
         load: Of each vertex: about the force of its elements, and more [N].
         smoothing: Length below which friction is smoothed [m].
         units: Units of energy in a joule, in each world.
@@ -63,6 +66,7 @@ class BarrierSettings:
     reach_of_bodies: wp.array[float]
     recovery: wp.float64
     elasticity: wp.array[float]
+    is_of_face: wp.array[int]
     load: wp.array[float]
     smoothing: wp.float64
     units: wp.array[wp.float64]
@@ -115,12 +119,13 @@ def _compliance(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.fl
 
 @wp.func
 def stiffness_of_pair(
-    motion: Motion, settings: BarrierSettings, corners: wp.vec4i, is_edges: bool, reach: wp.float64
+    motion: Motion, settings: BarrierSettings, trial: Trial, corners: wp.vec4i, is_edges: bool, reach: wp.float64
 ) -> wp.float64:
     """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
 
     It is more where elements push harder than that carries at the gap below which a pair hardly comes nearer: what is
-    taut would otherwise be stuck there.
+    taut would otherwise be stuck there. It is less of edges of faces that are nearly parallel where the Newton step
+    begins, whose closest points jump from end to end: their ends are near these faces, which push as well.
     """
     first = _compliance(motion, settings, corners[0])
     second = _compliance(motion, settings, corners[2]) + _compliance(motion, settings, corners[3])
@@ -129,11 +134,19 @@ def stiffness_of_pair(
         second = HALF * second
     else:
         second = (second + _compliance(motion, settings, corners[1])) / wp.float64(3.0)
-    load = float(0.0)
+    load, of_faces = float(0.0), int(1)
     for j in range(4):
         load = wp.max(load, settings.load[corners[j]])
+        of_faces = of_faces & settings.is_of_face[corners[j]]
     needed = wp.float64(load) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
-    return wp.max(ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
+    stiffness = wp.max(ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
+    if is_edges and of_faces != 0:
+        a, b, c, d = corners_of(trial.x, corners)
+        u, v = b - a, d - c
+        scaled = wp.length_sq(wp.cross(u, v)) / (_PARALLEL * wp.length_sq(u) * wp.length_sq(v))
+        if scaled < ONE:
+            stiffness *= scaled * (wp.float64(2.0) - scaled)
+    return stiffness
 
 
 @wp.func
