@@ -14,6 +14,7 @@ from newton_scenes import SOFT, add_patch, bullet
 import warp_bsc as bsc
 from warp_bsc.bench.response_scenes import build_scene
 from warp_bsc.bench.response_simulation import Simulation, energy_gained
+from warp_bsc.response.state.motion import arrays_of
 
 DT, GRAVITY = 1.0 / 60.0, 9.81
 
@@ -303,6 +304,27 @@ def test_it_cannot_be_copied_taped_or_used_by_two_threads(device):
 def test_a_model_without_particles_is_refused(device):
     with pytest.raises(ValueError, match="model: it has neither particles nor bodies"):
         bsc.SolverImplicit(newton.ModelBuilder().finalize(device=device))
+
+
+def test_a_step_whose_straight_way_has_contacts_ends_at_an_earlier_newton_step(device):
+    """At the last one to which the straight way has none, here as if it had them to all but the second."""
+    model = ramp(device)
+    solver, end = bsc.SolverImplicit(model, max_iterations=5), model.state()
+    solver.step(model.state(), end, None, None, DT)
+    method, found = solver._newton, solver._work.status.contact_iteration
+    assert solver.report.newton_steps == 5 and solver.report.certified
+    path, count = method._trial.path.numpy(), model.particle_count
+    assert np.array_equal(path[4, :count], end.particle_q.numpy())
+    ends = []
+
+    def detect():
+        ends.append(end.particle_q.numpy())
+        found.fill_(-1 if len(ends) == 3 else 0)
+
+    found.zero_()
+    method.retreat(arrays_of(end), detect)
+    np.testing.assert_array_equal(ends, path[[3, 2, 1], :count])
+    assert not np.array_equal(path[1], path[2]) and not solver.report.converged
 
 
 def test_a_drape_gains_no_energy(device):

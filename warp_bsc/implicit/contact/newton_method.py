@@ -4,6 +4,8 @@ Each Newton step solves for displacements by conjugate gradients, takes the shar
 together, and less of it where the energy does not fall. Conditions are on the device, as in :mod:`...response.step`.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -128,7 +130,7 @@ class NewtonMethod:
         self._vectors = allocate(Vectors, self._count, device)
         self._first = wp.zeros(self._count, dtype=wp.vec3, device=device)  # solution before pairs are held
         self.progress = allocate(Progress, work.worlds, device)
-        self._trial = allocate(Trial, vertices, device)
+        self._trial = allocate(Trial, vertices, device, path=(int(steps.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
@@ -138,7 +140,8 @@ class NewtonMethod:
         self._whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
         self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
         self._any_leaves = self._leaves[work.worlds :]
-        self._meets = wp.zeros(1, dtype=int, device=device)
+        self._meets, self._goes_back = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self._place = wp.zeros(work.worlds, dtype=int, device=device)
         self._flags = wp.zeros(4, dtype=int, device=device)
         self._goes_on, self._search, self._cuts, self._rises = (self._flags[k : k + 1] for k in range(4))
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
@@ -228,12 +231,23 @@ class NewtonMethod:
         self._begin(end, dt)
         self._find_end(end)
 
-    def retreat(self, end: StateArrays) -> None:
-        """Ends the step earlier in worlds in which the workspace found contacts, see :func:`.steps.retreat`."""
+    def retreat(self, end: StateArrays, detect: Callable[[], None]) -> None:
+        """Ends the step earlier in worlds in which the workspace found contacts, where ``detect`` finds none then."""
+        self._go_back(end, detect, begins=True)
+        wp.capture_while(self._goes_back, self._go_back, end=end, detect=detect, begins=False)
+
+    def _go_back(self, end, detect, begins):
         work = self._work
-        inputs = [self._trial, self._unknowns, self._dt, work.status.contact_iteration]
-        outputs = [work.step.motion, end, self._results[0].converged]
-        self._launch(steps.retreat, self._mesh.vertex_count, inputs, outputs)
+        self._goes_back.zero_()
+        inputs = [self.progress, work.status.contact_iteration, begins]
+        outputs = [self._place, self._results[0].converged, self._ahead, self._goes_back]
+        self._launch(steps.go_back, work.worlds, inputs, outputs)
+        wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
+
+    def _move_back(self, end, detect):
+        inputs = [self._trial, self._unknowns, self._dt, self._ahead, self._place]
+        self._launch(steps.retreat, self._mesh.vertex_count, inputs, [self._work.step.motion, end])
+        detect()
 
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""

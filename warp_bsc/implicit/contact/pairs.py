@@ -83,7 +83,8 @@ class Trial:
         holder: Vertex whose share each vertex takes: itself, or the first of its body.
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
         moved: Positions after displacements.
-        first: Positions after the first Newton step of the step, to which the straight way is free.
+        path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, vertices];
+            the last are those after the last of more.
     """
 
     x: wp.array[wp.vec3]
@@ -92,7 +93,7 @@ class Trial:
     holder: wp.array[int]
     bend: wp.array[float]
     moved: wp.array[wp.vec3]
-    first: wp.array[wp.vec3]
+    path: wp.array2d[wp.vec3]
 
 
 @wp.func

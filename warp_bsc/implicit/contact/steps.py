@@ -29,6 +29,8 @@ wp.set_module_options({"enable_backward": False})
 
 _NOISE = wp.constant(wp.float64(1e-9))
 """Rise of energy that may be rounding, as a share of it."""
+PATH = wp.constant(8)
+"""Newton steps of which positions are kept."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
@@ -698,8 +700,7 @@ def take(
     else:
         trial.x[v] = body_vertex(bodies.pose, motion, v)
         unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
-    if progress.steps[world] == 0:
-        trial.first[v] = trial.x[v]
+    trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
     if not given:
         wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))
 
@@ -769,27 +770,52 @@ def finish(
 
 
 @wp.kernel
+def go_back(
+    # in
+    progress: Progress,
+    contact_iteration: wp.array[int],
+    begins: bool,
+    # in and out
+    place: wp.array[int],
+    # out
+    converged: wp.array[wp.bool],
+    goes_back: wp.array[int],
+    any_goes_back: wp.array[int],
+):
+    """Lets worlds whose straight way has contacts end a Newton step earlier, down to the first.
+
+    It ``begins`` with the last one. They are not converged. A push out of a contact that the solve knows nothing of would give vertices much energy.
+    """
+    w = wp.tid()
+    goes_back[w] = 0
+    if begins:
+        place[w] = wp.min(progress.steps[w], PATH) - 1
+    if contact_iteration[w] >= 0 and place[w] >= 0:
+        converged[w] = False
+        if place[w] > 0:
+            place[w] = place[w] - 1
+            goes_back[w] = 1
+            any_goes_back[0] = 1
+
+
+@wp.kernel
 def retreat(
     # in
     trial: Trial,
     unknowns: Unknowns,
     dt: float,
-    contact_iteration: wp.array[int],
+    goes_back: wp.array[int],
+    place: wp.array[int],
     # in and out
     motion: Motion,
     end: StateArrays,
-    converged: wp.array[wp.bool],
 ):
-    """Ends the step of worlds whose straight way has contacts where their first Newton step led, straight and free.
-
-    It is not converged. A push out of a contact that the solve knows nothing of would give vertices much energy.
-    """
+    """Ends the step of worlds that go back where an earlier Newton step led."""
     v = wp.tid()
     world = motion.world[v]
-    if contact_iteration[world] < 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
+    if goes_back[world] == 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
         return
-    converged[world] = False
-    x = trial.first[v]
+    x = trial.path[place[world], v]
     velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
     end.particle_q[v] = x
     end.particle_qd[v] = velocity
