@@ -784,7 +784,8 @@ def go_back(
 ):
     """Lets worlds whose straight way has contacts end a Newton step earlier, down to the first.
 
-    It ``begins`` with the last one. They are not converged. A push out of a contact that the solve knows nothing of would give vertices much energy.
+    It ``begins`` at the last one. They are not converged. A push out of a contact that the solve knows nothing of would
+    give vertices much energy.
     """
     w = wp.tid()
     goes_back[w] = 0
