@@ -14,6 +14,7 @@ from newton_scenes import SOFT, add_patch, bullet
 import warp_bsc as bsc
 from warp_bsc.bench.response_scenes import build_scene
 from warp_bsc.bench.response_simulation import Simulation, energy_gained
+from warp_bsc.response.state.motion import arrays_of
 
 DT, GRAVITY = 1.0 / 60.0, 9.81
 
@@ -305,6 +306,27 @@ def test_a_model_without_particles_is_refused(device):
         bsc.SolverImplicit(newton.ModelBuilder().finalize(device=device))
 
 
+def test_a_step_whose_straight_way_has_contacts_ends_at_an_earlier_newton_step(device):
+    """At the last one to which the straight way has none, here as if it had them to all but the first."""
+    model = ramp(device)
+    solver, end = bsc.SolverImplicit(model, max_iterations=3), model.state()
+    solver.step(model.state(), end, None, None, DT)
+    method, found = solver._newton, solver._work.status.contact_iteration
+    assert solver.report.newton_steps == 3 and solver.report.certified
+    path, count = method._trial.path.numpy().copy(), model.particle_count
+    assert np.array_equal(path[2, :count], end.particle_q.numpy())
+    ends = []
+
+    def detect():
+        ends.append(end.particle_q.numpy().copy())
+        found.fill_(-1 if len(ends) == 2 else 0)
+
+    found.zero_()
+    method.retreat(arrays_of(end), detect)
+    np.testing.assert_array_equal(ends, path[[1, 0], :count])
+    assert not np.array_equal(path[0], path[1]) and not solver.report.converged
+
+
 def test_a_drape_gains_no_energy(device):
     """Where the straight way of a solve meets something, its end is not pushed out of it, which would give energy."""
     with wp.ScopedDevice(device):
@@ -313,3 +335,21 @@ def test_a_drape_gains_no_energy(device):
     samples = simulation.samples
     assert energy_gained(np.array(samples.energy)) < 1e-3
     assert max(samples.stretch) < 0.04 and simulation.count_crossings() == 0
+
+
+def test_a_kinematic_ball_at_40_metres_a_second_stretches_cloth_as_little_as_it_must(device):
+    """Each step ends near its least energy: barriers hold taut cloth, and Newton steps follow on the ball's arrival."""
+    with wp.ScopedDevice(device):
+        simulation = Simulation(build_scene("ball", "vbd"), "implicit", 120)
+    inner, changes = simulation._solver, []
+    step = inner.step
+
+    def watched(*args):
+        step(*args)
+        changes.append(inner.report.last_change)
+        assert inner.report.arrived and inner.report.certified
+
+    inner.step = watched
+    simulation.run(6.0 / 120.0, lambda step, steps: None)
+    assert max(simulation.samples.stretch) < 0.12 and simulation.count_crossings() == 0
+    assert changes[0] < 0.1 and changes[-1] < 2e-3

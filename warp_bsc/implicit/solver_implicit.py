@@ -228,7 +228,9 @@ class SolverImplicit(SolverCCD):
         resolve_contacts(work, dt)
 
     def _retreat(self, end):
-        self._newton.retreat(end)
+        self._newton.retreat(end, self._detect)
+
+    def _detect(self):
         begin(self._work)
         detect_contacts(self._work)
 

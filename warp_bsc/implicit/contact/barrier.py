@@ -29,6 +29,8 @@ _STALLED = wp.constant(wp.float64(1e-3))
 """Share of displacements by which it goes on at least; it ends early, and safe, where it does not."""
 FLOOR = wp.constant(wp.float64(0.03))
 """Share of the reach of a barrier below which it is too steep to solve for in one step."""
+FORCE_AT_FLOOR = 38.1660556541341
+"""Force of the barrier at that gap, in the product of its stiffness and its reach."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
 

@@ -115,7 +115,7 @@ def _hold_pair(
         return
     is_first = bool(False)
     for j in range(4):
-        is_first = is_first or share <= limit[corners[j]]
+        is_first = is_first or (share <= limit[corners[j]] and is_solved(unknowns, corners[j]))
     if not is_first:
         return
     a, b, c, d = corners_of(trial.x, corners)

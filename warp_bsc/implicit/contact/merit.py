@@ -53,7 +53,7 @@ def _pair_energy(
     if gap < reach:
         value = wp.float64(1.0e30)
         if gap > ZERO:
-            stiffness = stiffness_of_pair(motion, settings, corners, queue.kind == EDGE_EDGE)
+            stiffness = stiffness_of_pair(motion, settings, trial, corners, queue.kind == EDGE_EDGE, reach)
             value = stiffness * barrier.barrier_energy(gap, reach)
         add_energy(energy, world, value, settings.units)
 
@@ -144,5 +144,5 @@ def add_plane_energies(
         if gap < reach:
             value = wp.float64(1.0e30)
             if gap > ZERO:
-                value = stiffness_at_plane(motion, settings, vertex) * barrier.barrier_energy(gap, reach)
+                value = stiffness_at_plane(motion, settings, vertex, reach) * barrier.barrier_energy(gap, reach)
             add_energy(energy, world, value, settings.units)

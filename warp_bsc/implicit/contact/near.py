@@ -114,7 +114,7 @@ def _find_near(
     if gap >= reach or not gap > ZERO:
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    stiffness = stiffness_of_pair(motion, settings, corners, queue.kind == EDGE_EDGE)
+    stiffness = stiffness_of_pair(motion, settings, trial, corners, queue.kind == EDGE_EDGE, reach)
     pair = queue.pairs[i]
     key = key_of_pair(0, queue.kind, pair[0], pair[1])
     friction = pair_friction(motion, corners)
@@ -192,7 +192,7 @@ def find_near_planes(
         if gap >= reach or not gap > ZERO:
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
-        stiffness = stiffness_at_plane(motion, settings, vertex)
+        stiffness = stiffness_at_plane(motion, settings, vertex, reach)
         key = key_of_pair(1, 0, vertex, i)
         there, _error_there = signed_distance(planes.end[i], trial.exact[vertex])
         since, _since_error = signed_distance(planes.start[i], trial.exact[vertex])

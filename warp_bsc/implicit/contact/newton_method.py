@@ -4,6 +4,8 @@ Each Newton step solves for displacements by conjugate gradients, takes the shar
 together, and less of it where the energy does not fall. Conditions are on the device, as in :mod:`...response.step`.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import warp as wp
 
@@ -126,8 +128,9 @@ class NewtonMethod:
         self._element_count = sum(map(len, of_elements))
         self._derivatives = make_derivatives(of_elements, device)
         self._vectors = allocate(Vectors, self._count, device)
+        self._first = wp.zeros(self._count, dtype=wp.vec3, device=device)  # solution before pairs are held
         self.progress = allocate(Progress, work.worlds, device)
-        self._trial = allocate(Trial, vertices, device)
+        self._trial = allocate(Trial, vertices, device, path=(int(steps.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
@@ -137,9 +140,10 @@ class NewtonMethod:
         self._whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
         self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
         self._any_leaves = self._leaves[work.worlds :]
-        self._meets = wp.zeros(1, dtype=int, device=device)
-        self._flags = wp.zeros(3, dtype=int, device=device)
-        self._goes_on, self._search, self._cuts = (self._flags[k : k + 1] for k in range(3))
+        self._meets, self._goes_back = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self._place = wp.zeros(work.worlds, dtype=int, device=device)
+        self._flags = wp.zeros(4, dtype=int, device=device)
+        self._goes_on, self._search, self._cuts, self._rises = (self._flags[k : k + 1] for k in range(4))
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
         self._ahead = wp.zeros(work.worlds, dtype=int, device=device)
         self._convex = wp.ones(work.worlds, dtype=int, device=device)
@@ -147,6 +151,10 @@ class NewtonMethod:
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
+        is_of_face = np.zeros(vertices)
+        is_of_face[mesh.faces.ravel()] = 1
+        self._settings.is_of_face = array(is_of_face)
+        self._settings.load = wp.zeros(vertices, dtype=float, device=device)
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)
         if len(solved):
@@ -223,12 +231,23 @@ class NewtonMethod:
         self._begin(end, dt)
         self._find_end(end)
 
-    def retreat(self, end: StateArrays) -> None:
-        """Ends the step earlier in worlds in which the workspace found contacts, see :func:`.steps.retreat`."""
+    def retreat(self, end: StateArrays, detect: Callable[[], None]) -> None:
+        """Ends the step earlier in worlds in which the workspace found contacts, where ``detect`` finds none then."""
+        self._go_back(end, detect, begins=True)
+        wp.capture_while(self._goes_back, self._go_back, end=end, detect=detect, begins=False)
+
+    def _go_back(self, end, detect, begins):
         work = self._work
-        inputs = [self._trial, self._unknowns, self._dt, work.status.contact_iteration]
-        outputs = [work.step.motion, end, self._results[0].converged]
-        self._launch(steps.retreat, self._mesh.vertex_count, inputs, outputs)
+        self._goes_back.zero_()
+        inputs = [self.progress, work.status.contact_iteration, begins]
+        outputs = [self._place, self._results[0].converged, self._ahead, self._goes_back]
+        self._launch(steps.go_back, work.worlds, inputs, outputs)
+        wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
+
+    def _move_back(self, end, detect):
+        inputs = [self._trial, self._unknowns, self._dt, self._ahead, self._place]
+        self._launch(steps.retreat, self._mesh.vertex_count, inputs, [self._work.step.motion, end])
+        detect()
 
     def prepare(self, state: StateArrays) -> None:
         """Does all that a step does, in no world, to allocate buffers and load kernels, which a CUDA graph cannot."""
@@ -353,6 +372,8 @@ class NewtonMethod:
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.exact, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
+        inputs = [self._derivatives, self._rows, unknowns, progress]
+        self._launch(steps.find_loads, self._count, inputs, [self._settings.load])
         self._find_near(progress.active)
         self._assemble(progress.active, True)
         self._solve_linear(progress.active)
@@ -361,12 +382,24 @@ class NewtonMethod:
         self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(False, progress.energy)
         self._add_energies(True, progress.trial)
+        self._launch(steps.find_rises, work.worlds, [progress], [self._ahead, self._rises])
+        wp.capture_if(self._rises, self._release)
         wp.capture_if(self._cuts, self._truncate)
         self._launch(steps.decide_search, work.worlds, [], [progress, self._search])
         wp.capture_while(self._search, self._try)
         self._take()
         inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
         self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
+
+    def _release(self):
+        """Takes the first solution of the Newton step where held pairs have made it one on which the energy rises."""
+        work, progress, unknowns, rises = self._work, self.progress, self._unknowns, self._ahead
+        inputs, outputs = [unknowns, rises, self._first], [progress, self._vectors.solution]
+        self._launch(steps.begin_release, max(self._count, work.worlds), inputs, outputs)
+        self._displace(rises)
+        self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
+        self._add_energies(True, progress.trial)
+        self._launch(steps.end_release, work.worlds, [], [progress])
 
     def _truncate(self):
         """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
@@ -409,24 +442,28 @@ class NewtonMethod:
 
     def _hold_ahead(self, solves):
         """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
-        work, trial = self._work, self._trial
-        active = self._ahead if solves else self.progress.active
-        motion, unknowns, vectors = work.step.motion, self._unknowns, self._vectors
-        self._launch_over_bodies(bodies.displace_bodies, [motion, unknowns, self.progress, vectors.solution])
-        inputs = [motion, unknowns, vectors, self._lower, self._upper, self._bodies, active]
         if not solves:
             self._leaves.zero_()
-        outputs = [trial, self.progress, self._limit, self._leaves]
-        self._launch(steps.displace, self._mesh.vertex_count, inputs, outputs)
-        self._bound(active)
+        self._displace(self._ahead if solves else self.progress.active)
         if solves < _PREDICTIONS:
             self._meets.zero_()
-            self._launch(steps.find_meeting, work.worlds, [self.progress], [self._meets])
+            self._launch(steps.find_meeting, self._work.worlds, [self.progress], [self._meets])
             wp.capture_if(self._meets, self._hold, solves=solves)
+
+    def _displace(self, active):
+        """Writes the displacements of a solve, and bounds them."""
+        motion, unknowns, vectors, progress = self._work.step.motion, self._unknowns, self._vectors, self.progress
+        self._launch_over_bodies(bodies.displace_bodies, [motion, unknowns, progress, vectors.solution])
+        inputs = [motion, unknowns, vectors, self._lower, self._upper, self._bodies, active]
+        outputs = [self._trial, progress, self._limit, self._leaves]
+        self._launch(steps.displace, self._mesh.vertex_count, inputs, outputs)
+        self._bound(active)
 
     def _hold(self, solves):
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         unknowns, ahead = self._unknowns, self._ahead
+        if not solves:
+            wp.copy(self._first, self._vectors.solution)
         self._launch(steps.begin_hold, work.worlds, [False], [self.progress, ahead])
         work.launch_over_entries(held.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]

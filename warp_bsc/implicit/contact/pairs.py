@@ -18,6 +18,8 @@ _WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
 """Share of its distance at the start that only pairs keep which start within their minimum distance."""
 _LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
+_PARALLEL = wp.constant(wp.float64(1e-3))
+"""Square of the sine of the angle below which edges are nearly parallel."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
@@ -55,6 +57,8 @@ class BarrierSettings:
         reach_of_bodies: Of each vertex of a body: gap from which it pushes other shapes [m]; infinite for others.
         recovery: By how much more than its gap at the start a pair gets a gap by its barrier [m].
         elasticity: Of each vertex: stiffness of the solid around it against a push [N/m].
+        is_of_face: 1 of each vertex of a face.
+        load: Of each vertex: about the force of its elements, and more [N].
         smoothing: Length below which friction is smoothed [m].
         units: Units of energy in a joule, in each world.
     """
@@ -64,6 +68,8 @@ class BarrierSettings:
     reach_of_bodies: wp.array[float]
     recovery: wp.float64
     elasticity: wp.array[float]
+    is_of_face: wp.array[int]
+    load: wp.array[float]
     smoothing: wp.float64
     units: wp.array[wp.float64]
 
@@ -80,7 +86,8 @@ class Trial:
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
         exact: Positions without rounding, which for friction is a large part of the way [m].
         moved: The same after displacements.
-        first: Positions after the first Newton step of the step, to which the straight way is free.
+        path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, vertices];
+            the last are those after the last of more.
     """
 
     x: wp.array[wp.vec3]
@@ -90,7 +97,7 @@ class Trial:
     bend: wp.array[float]
     exact: wp.array[wp.vec3d]
     moved: wp.array[wp.vec3d]
-    first: wp.array[wp.vec3]
+    path: wp.array2d[wp.vec3]
 
 
 @wp.func
@@ -117,8 +124,15 @@ def _compliance(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.fl
 
 
 @wp.func
-def stiffness_of_pair(motion: Motion, settings: BarrierSettings, corners: wp.vec4i, is_edges: bool) -> wp.float64:
-    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart."""
+def stiffness_of_pair(
+    motion: Motion, settings: BarrierSettings, trial: Trial, corners: wp.vec4i, is_edges: bool, reach: wp.float64
+) -> wp.float64:
+    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
+
+    It is more where elements push harder than that carries at the gap below which a pair hardly comes nearer: what is
+    taut would otherwise be stuck there. It is less of edges of faces that are nearly parallel where the Newton step
+    begins, whose closest points jump from end to end: their ends are near these faces, which push as well.
+    """
     first = _compliance(motion, settings, corners[0])
     second = _compliance(motion, settings, corners[2]) + _compliance(motion, settings, corners[3])
     if is_edges:
@@ -126,13 +140,26 @@ def stiffness_of_pair(motion: Motion, settings: BarrierSettings, corners: wp.vec
         second = HALF * second
     else:
         second = (second + _compliance(motion, settings, corners[1])) / wp.float64(3.0)
-    return ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF))
+    load, of_faces = float(0.0), int(1)
+    for j in range(4):
+        load = wp.max(load, settings.load[corners[j]])
+        of_faces = of_faces & settings.is_of_face[corners[j]]
+    needed = wp.float64(load) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
+    stiffness = wp.max(ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
+    if is_edges and of_faces != 0:
+        a, b, c, d = corners_of(trial.x, corners)
+        u, v = b - a, d - c
+        scaled = wp.length_sq(wp.cross(u, v)) / (_PARALLEL * wp.length_sq(u) * wp.length_sq(v))
+        if scaled < ONE:
+            stiffness *= scaled * (wp.float64(2.0) - scaled)
+    return stiffness
 
 
 @wp.func
-def stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.float64:
-    """Returns the stiffness of a barrier between a particle and a plane [N/m], see :func:`_stiffness`."""
-    return ONE / (_compliance(motion, settings, vertex) * wp.float64(barrier.CURVATURE_AT_HALF))
+def stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int, reach: wp.float64) -> wp.float64:
+    """Returns the stiffness of a barrier between a vertex and a plane [N/m], as :func:`stiffness_of_pair`."""
+    needed = wp.float64(settings.load[vertex]) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
+    return wp.max(ONE / (_compliance(motion, settings, vertex) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
 
 
 @wp.func

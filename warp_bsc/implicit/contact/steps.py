@@ -37,6 +37,8 @@ wp.set_module_options({"enable_backward": False})
 
 _NOISE = wp.constant(wp.float64(1e-9))
 """Rise of energy that may be rounding, as a share of it."""
+PATH = wp.constant(8)
+"""Newton steps of which positions are kept."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
@@ -115,6 +117,7 @@ def begin_step(
         progress.change[v] = 0.0
         progress.remaining[v] = 0.0
         progress.plain[v] = 0
+        progress.late[v] = 0
         plane_share[v] = 0.0
     if v >= trial.x.shape[0]:
         return
@@ -211,6 +214,61 @@ def begin_hold(
     if _may_hold(progress, w) or (always and progress.active[w] != 0):
         ahead[w] = 1
         progress.bound[w] = 1.0
+        progress.held[w] = int(not always)
+
+
+@wp.func
+def _falls(progress: Progress, w: int) -> bool:
+    """Returns whether the energy of a world is lower at the displaced positions, as far as rounding tells."""
+    before = wp.float64(progress.energy[w])
+    return wp.float64(progress.trial[w]) <= before + _NOISE * wp.abs(before)
+
+
+@wp.kernel
+def find_rises(
+    # in
+    progress: Progress,
+    # out
+    rises: wp.array[int],
+    any_rises: wp.array[int],
+):
+    """Says in which worlds the energy rises on displacements that are solved with pairs held."""
+    w = wp.tid()
+    rises[w] = 0
+    if progress.active[w] != 0 and progress.held[w] != 0 and progress.remaining[w] == 0.0 and not _falls(progress, w):
+        rises[w] = 1
+        any_rises[0] = 1
+
+
+@wp.kernel
+def begin_release(
+    # in
+    unknowns: Unknowns,
+    rises: wp.array[int],
+    first: wp.array[wp.vec3],
+    # in and out
+    progress: Progress,
+    solution: wp.array[wp.vec3],
+):
+    """Lets worlds in which the energy rises search along the solution without pairs held instead."""
+    i = wp.tid()
+    if i < solution.shape[0] and rises[unknowns.world[i]] != 0:
+        solution[i] = first[i]
+    if i < rises.shape[0]:
+        progress.searches[i] = rises[i]
+        if rises[i] != 0:
+            progress.scale[i] = 1.0
+            progress.trial[i] = wp.int64(0)
+
+
+@wp.kernel
+def end_release(
+    # in and out
+    progress: Progress,
+):
+    """Lets all worlds search again."""
+    w = wp.tid()
+    progress.searches[w] = progress.active[w]
 
 
 @wp.func
@@ -329,6 +387,32 @@ def assemble(
     vectors.inverse[u] = _inverse(block_of(matrix, rows.first[u]) + block, wp.min(wp.get_diag(inertia)))
     if begins:
         vectors.solution[u] = wp.vec3()
+
+
+@wp.kernel
+def find_loads(
+    # in
+    derivatives: Derivatives,
+    rows: Rows,
+    unknowns: Unknowns,
+    progress: Progress,
+    # in and out
+    load: wp.array[float],
+):
+    """Writes the forces of elements on vertices that are solved for, in active worlds.
+
+    That of an earlier Newton step of the step is kept where it is about right: barriers that change converge slowly.
+    """
+    u = wp.tid()
+    world, p = unknowns.world[u], unknowns.particle[u]
+    if p < 0 or progress.active[world] == 0:
+        return
+    if unknowns.is_free[u] == 0:
+        load[p] = 0.0
+        return
+    force = wp.length(sum_of_corners(rows, derivatives, u))
+    if progress.steps[world] == 0 or force > 2.0 * load[p] or force < 0.25 * load[p]:
+        load[p] = force
 
 
 @wp.kernel
@@ -513,6 +597,7 @@ def begin_newton_step(
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
     progress.cuts[w] = 0
+    progress.held[w] = 0
     progress.scale[w] = 1.0
     progress.bound[w] = 1.0
     progress.energy[w] = wp.int64(0)
@@ -593,9 +678,7 @@ def decide_search(
     if progress.active[w] == 0 or progress.searches[w] == 0:
         progress.trial[w] = wp.int64(0)
         return
-    before = wp.float64(progress.energy[w])
-    allowed = before + _NOISE * wp.abs(before)
-    falls = wp.float64(progress.trial[w]) <= allowed
+    falls = _falls(progress, w)
     progress.trial[w] = wp.int64(0)
     if falls or progress.remaining[w] > 0.0:
         progress.searches[w] = 0
@@ -635,8 +718,7 @@ def take(
         trial.x[v] = body_vertex(bodies.pose, motion, v)
         trial.exact[v] = exact_on_body(bodies.pose, bodies.low, motion, v)
         unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
-    if progress.steps[world] == 0:
-        trial.first[v] = trial.x[v]
+    trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
     if not given:
         wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))
 
@@ -655,7 +737,7 @@ def decide_step(
 ):
     """Ends worlds whose unknowns hardly change, or that have taken all their Newton steps.
 
-    Where something that a program moves has not arrived, there may be more of them.
+    They are counted from when what a program moves arrives, if it does.
     """
     w = wp.tid()
     if progress.active[w] == 0:
@@ -665,12 +747,14 @@ def decide_step(
     progress.steps[w] = progress.steps[w] + 1
     arrived = scale == 1.0 or progress.remaining[w] == 0.0
     steps = progress.steps[w]
-    ends = arrived and (progress.change[w] <= least_change or steps >= max_steps)
+    if progress.remaining[w] > 0.0:
+        progress.late[w] = steps - 1
+    ends = arrived and (progress.change[w] <= least_change or steps - progress.late[w] >= max_steps)
     stands = scale == 0.0
     if stands and arrived and progress.plain[w] != 0:
         ends = True
     progress.plain[w] = int(stands)
-    if ends or steps >= max_late_steps:
+    if ends or (steps >= max_late_steps and not arrived):
         progress.active[w] = 0
         return
     goes_on[0] = 1
@@ -707,27 +791,53 @@ def finish(
 
 
 @wp.kernel
+def go_back(
+    # in
+    progress: Progress,
+    contact_iteration: wp.array[int],
+    begins: bool,
+    # in and out
+    place: wp.array[int],
+    # out
+    converged: wp.array[wp.bool],
+    goes_back: wp.array[int],
+    any_goes_back: wp.array[int],
+):
+    """Lets worlds whose straight way has contacts end a Newton step earlier, down to the first.
+
+    It ``begins`` at the last one. They are not converged. A push out of a contact that the solve knows nothing of would
+    give vertices much energy.
+    """
+    w = wp.tid()
+    goes_back[w] = 0
+    if begins:
+        place[w] = wp.min(progress.steps[w], PATH) - 1
+    if contact_iteration[w] >= 0 and place[w] >= 0:
+        converged[w] = False
+        if place[w] > 0:
+            place[w] = place[w] - 1
+            goes_back[w] = 1
+            any_goes_back[0] = 1
+
+
+@wp.kernel
 def retreat(
     # in
     trial: Trial,
     unknowns: Unknowns,
     dt: float,
-    contact_iteration: wp.array[int],
+    goes_back: wp.array[int],
+    place: wp.array[int],
     # in and out
     motion: Motion,
     end: StateArrays,
-    converged: wp.array[wp.bool],
 ):
-    """Ends the step of worlds whose straight way has contacts where their first Newton step led, straight and free.
-
-    It is not converged. A push out of a contact that the solve knows nothing of would give vertices much energy.
-    """
+    """Ends the step of worlds that go back where an earlier Newton step led."""
     v = wp.tid()
     world = motion.world[v]
-    if contact_iteration[world] < 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
+    if goes_back[world] == 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
         return
-    converged[world] = False
-    x = trial.first[v]
+    x = trial.path[place[world], v]
     velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
     end.particle_q[v] = x
     end.particle_qd[v] = velocity

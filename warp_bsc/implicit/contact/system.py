@@ -52,6 +52,8 @@ class Progress:
         change: Largest displacement of an unknown [m].
         plain: 1 if the next Newton step holds nothing, as the energy did not fall by one that may have.
         remaining: Largest way of what a program moves that is left [m].
+        held: 1 if pairs are held in the solve.
+        late: Newton steps that began before what a program moves had arrived, but for the first of them.
     """
 
     active: wp.array[int]
@@ -66,6 +68,8 @@ class Progress:
     change: wp.array[float]
     plain: wp.array[int]
     remaining: wp.array[float]
+    held: wp.array[int]
+    late: wp.array[int]
 
 
 @wp.struct
