@@ -239,7 +239,7 @@ class NewtonMethod:
     def _go_back(self, end, detect, begins):
         work = self._work
         self._goes_back.zero_()
-        inputs = [self.progress, work.status.contact_iteration, begins]
+        inputs = [self.progress, self._unknowns, work.status.contact_iteration, begins]
         outputs = [self._place, self._results[0].converged, self._ahead, self._goes_back]
         self._launch(steps.go_back, work.worlds, inputs, outputs)
         wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)

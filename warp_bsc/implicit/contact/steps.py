@@ -790,10 +790,22 @@ def finish(
     vertices.velocity[v] = velocity
 
 
+@wp.func
+def _moves_bodies(unknowns: Unknowns, w: int) -> bool:
+    """Returns whether a body is solved for in a world, whose last unknowns are those of bodies."""
+    u = unknowns.of_worlds[w + 1] - 1
+    moves = bool(False)
+    while u >= unknowns.of_worlds[w] and unknowns.body[u] >= 0:
+        moves = moves or unknowns.is_free[u] != 0
+        u -= 1
+    return moves
+
+
 @wp.kernel
 def go_back(
     # in
     progress: Progress,
+    unknowns: Unknowns,
     contact_iteration: wp.array[int],
     begins: bool,
     # in and out
@@ -806,12 +818,12 @@ def go_back(
     """Lets worlds whose straight way has contacts end a Newton step earlier, down to the first.
 
     It ``begins`` at the last one. They are not converged. A push out of a contact that the solve knows nothing of would
-    give vertices much energy.
+    give vertices much energy. Worlds in which bodies are solved for stay, as the ways of bodies are not kept.
     """
     w = wp.tid()
     goes_back[w] = 0
     if begins:
-        place[w] = wp.min(progress.steps[w], PATH) - 1
+        place[w] = wp.where(_moves_bodies(unknowns, w), -1, wp.min(progress.steps[w], PATH) - 1)
     if contact_iteration[w] >= 0 and place[w] >= 0:
         converged[w] = False
         if place[w] > 0:
