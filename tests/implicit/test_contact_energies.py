@@ -8,6 +8,7 @@ from implicit_scenes import exact_hessians
 from newton_scenes import DT
 
 from warp_bsc.implicit.contact import elasticity
+from warp_bsc.implicit.contact.assembly import add_blocks
 from warp_bsc.implicit.contact.barrier import (
     CURVATURE_AT_HALF,
     barrier_curvature,
@@ -22,7 +23,6 @@ from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind
 from warp_bsc.implicit.contact.matrix import make_matrix
 from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
-from warp_bsc.implicit.contact.steps import add_blocks
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
 from warp_bsc.implicit.elastic import Elastic
 from warp_bsc.implicit.elements import with_gradient

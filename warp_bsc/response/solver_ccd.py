@@ -317,10 +317,6 @@ class SolverCCD(CollisionStage):
         super().coupling_notify_iteration_restarts(enabled)
         self._inner_rows = None  # which would push proxies without a feedback
 
-    def _begin_step(self, state):
-        if self._forces is not None:
-            self._forces.begin(arrays_of(state), remembers=not self.model.requires_grad)
-
     def _step_inner(self, *arguments, **options):
         if self._inner_rows is None:
             super()._step_inner(*arguments, **options)

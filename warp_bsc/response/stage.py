@@ -160,7 +160,6 @@ class CollisionStage(CouplingHooks):
             self._mask = mask
             if mask is not None:
                 self._world_mask.begin(start)
-            self._begin_step(state_in)
         with self._watched(tape, state_in, state_out):
             self._step_inner(state_in, state_out, control, contacts, dt, **options)
             with paused_tape():
@@ -203,9 +202,6 @@ class CollisionStage(CouplingHooks):
 
     def _check_tape(self, tape, state_in, state_out):
         """Raises an error if the step cannot be recorded on a tape."""
-
-    def _begin_step(self, state):
-        """Prepares for a step of the inner solver from a state."""
 
     def _step_inner(self, *arguments, **options):
         """Steps the inner solver."""

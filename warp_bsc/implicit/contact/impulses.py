@@ -5,9 +5,9 @@ import warp as wp
 from ...kernels.polynomials import EDGE_EDGE
 from ...response.forces.keep import torque_on
 from ...response.forces.publish import publish_contact
-from ...response.forces.structs import Centres, ContactRows, ImpulseSums, Sides
+from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.state.structs import ContactKind, Step
-from ...response.state.vectors import ONE, ZERO, to_double, to_single
+from ...response.state.vectors import ZERO, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Trial
 from .system import AT_PLANE, Contacts, contact_count, kind_of_key, second_of_key
@@ -24,7 +24,7 @@ def publish_contacts(
     goal: wp.array[wp.vec3],
     step: Step,
     sides: Sides,
-    centres: Centres,
+    centres: wp.array[wp.vec3d],
     # out
     sums: ImpulseSums,
     rows: ContactRows,
@@ -61,8 +61,8 @@ def publish_contacts(
             impulse,
             settings.dt * load,
             normal,
-            torque_on(step, sides, centres, ONE, corners, weights, plane, 0, impulse),
-            torque_on(step, sides, centres, ONE, corners, weights, plane, 1, impulse),
+            torque_on(step, sides, centres, corners, weights, plane, 0, impulse),
+            torque_on(step, sides, centres, corners, weights, plane, 1, impulse),
             to_single(predicted / settings.dt),
             ZERO,
             sums,

@@ -11,13 +11,13 @@ import warp as wp
 
 from ...detection.launch import retry_until_fits
 from ...response.contacts.queue import queues_of
-from ...response.forces.structs import Centres, ContactRows, ImpulseSums, Sides
+from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
 from ...response.state.mesh import host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from . import bodies, bounds, contact_lists, held, merit, near, pairs, steps
+from . import assembly, bodies, bounds, contact_lists, decisions, held, merit, near, pairs, steps
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_solve_kernel, make_team
 from .elasticity import differentiate, elements_of_model, make_derivatives
@@ -130,7 +130,7 @@ class NewtonMethod:
         self._vectors = allocate(Vectors, self._count, device)
         self._first = wp.zeros(self._count, dtype=wp.vec3, device=device)  # solution before pairs are held
         self.progress = allocate(Progress, work.worlds, device)
-        self._trial = allocate(Trial, vertices, device, path=(int(steps.PATH), vertices))
+        self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
@@ -241,7 +241,7 @@ class NewtonMethod:
         self._goes_back.zero_()
         inputs = [self.progress, self._unknowns, work.status.contact_iteration, begins]
         outputs = [self._place, self._results[0].converged, self._ahead, self._goes_back]
-        self._launch(steps.go_back, work.worlds, inputs, outputs)
+        self._launch(decisions.go_back, work.worlds, inputs, outputs)
         wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
 
     def _move_back(self, end, detect):
@@ -368,38 +368,38 @@ class NewtonMethod:
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
         unknowns, vertices = self._unknowns, self._mesh.vertex_count
         dt = wp.float64(self._dt)
-        self._launch(steps.begin_newton_step, work.worlds, [], [progress])
+        self._launch(decisions.begin_newton_step, work.worlds, [], [progress])
         self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
         inputs = [self._elements, trial.exact, motion.x0, dt, motion.world, progress.active, self._convex]
         self._launch(differentiate, self._element_count, inputs, [self._derivatives])
         inputs = [self._derivatives, self._rows, unknowns, progress]
-        self._launch(steps.find_loads, self._count, inputs, [self._settings.load])
+        self._launch(assembly.find_loads, self._count, inputs, [self._settings.load])
         self._find_near(progress.active)
         self._assemble(progress.active, True)
         self._solve_linear(progress.active)
         self._hold_ahead(0)
         self._flags.zero_()
-        self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
+        self._launch(decisions.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(False, progress.energy)
         self._add_energies(True, progress.trial)
-        self._launch(steps.find_rises, work.worlds, [progress], [self._ahead, self._rises])
+        self._launch(decisions.find_rises, work.worlds, [progress], [self._ahead, self._rises])
         wp.capture_if(self._rises, self._release)
         wp.capture_if(self._cuts, self._truncate)
-        self._launch(steps.decide_search, work.worlds, [], [progress, self._search])
+        self._launch(decisions.decide_search, work.worlds, [], [progress, self._search])
         wp.capture_while(self._search, self._try)
         self._take()
         inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
-        self._launch(steps.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
+        self._launch(decisions.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
 
     def _release(self):
         """Takes the first solution of the Newton step where held pairs have made it one on which the energy rises."""
         work, progress, unknowns, rises = self._work, self.progress, self._unknowns, self._ahead
         inputs, outputs = [unknowns, rises, self._first], [progress, self._vectors.solution]
-        self._launch(steps.begin_release, max(self._count, work.worlds), inputs, outputs)
+        self._launch(decisions.begin_release, max(self._count, work.worlds), inputs, outputs)
         self._displace(rises)
-        self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
+        self._launch(decisions.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(True, progress.trial)
-        self._launch(steps.end_release, work.worlds, [], [progress])
+        self._launch(decisions.end_release, work.worlds, [], [progress])
 
     def _truncate(self):
         """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
@@ -409,11 +409,11 @@ class NewtonMethod:
         for _ in range(_TRUNCATIONS):
             self._bound(progress.searches)
             self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
-        self._launch(steps.begin_hold, work.worlds, [True], [progress, self._ahead])  # clears bounds
+        self._launch(decisions.begin_hold, work.worlds, [True], [progress, self._ahead])  # clears bounds
         self._bound(progress.searches)
-        self._launch(steps.take_bound, work.worlds, [], [progress, self._cuts])
+        self._launch(decisions.take_bound, work.worlds, [], [progress, self._cuts])
         self._add_energies(True, progress.trial_cut)
-        self._launch(steps.choose_truncation, work.worlds, [self._whole], [progress])
+        self._launch(decisions.choose_truncation, work.worlds, [self._whole], [progress])
         self._launch(steps.undo_truncation, vertices, [work.step.motion, progress], [self._trial])
 
     def _solve_linear(self, active):
@@ -435,10 +435,10 @@ class NewtonMethod:
         masses = [motion, self._bodies, wp.float64(self._dt), active]
         inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses]
         inputs += [self._rows, parts]
-        self._launch(steps.add_blocks, parts * len(self._row_of_block), inputs, [self._matrix])
+        self._launch(assembly.add_blocks, parts * len(self._row_of_block), inputs, [self._matrix])
         inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins]
         inputs += [self._rows, self._matrix, parts]
-        self._launch(steps.assemble, parts * self._count, inputs, [vectors])
+        self._launch(assembly.assemble, parts * self._count, inputs, [vectors])
 
     def _hold_ahead(self, solves):
         """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
@@ -447,7 +447,7 @@ class NewtonMethod:
         self._displace(self._ahead if solves else self.progress.active)
         if solves < _PREDICTIONS:
             self._meets.zero_()
-            self._launch(steps.find_meeting, self._work.worlds, [self.progress], [self._meets])
+            self._launch(decisions.find_meeting, self._work.worlds, [self.progress], [self._meets])
             wp.capture_if(self._meets, self._hold, solves=solves)
 
     def _displace(self, active):
@@ -464,7 +464,7 @@ class NewtonMethod:
         unknowns, ahead = self._unknowns, self._ahead
         if not solves:
             wp.copy(self._first, self._vectors.solution)
-        self._launch(steps.begin_hold, work.worlds, [False], [self.progress, ahead])
+        self._launch(decisions.begin_hold, work.worlds, [False], [self.progress, ahead])
         work.launch_over_entries(held.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
         inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
         self._over_candidates(held.hold_pairs, [motion], [*inputs, self._limit, *outputs])
@@ -475,7 +475,7 @@ class NewtonMethod:
         self._solve_linear(ahead)
         self._hold_ahead(solves + 1)
 
-    def publish(self, sides: Sides, centres: Centres, sums: ImpulseSums, rows: ContactRows) -> None:
+    def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
         inputs = [self._contacts, self._settings, self._trial, self._goal, self._work.step, sides, centres, sums, rows]
         self._work.launch_over_entries(publish_contacts, inputs)
@@ -505,7 +505,7 @@ class NewtonMethod:
         """Computes the energy at the displaced positions, and halves the shares of worlds where it has risen."""
         self._add_energies(True, self.progress.trial)
         self._search.zero_()
-        self._launch(steps.decide_search, self._work.worlds, [], [self.progress, self._search])
+        self._launch(decisions.decide_search, self._work.worlds, [], [self.progress, self._search])
 
     def _add_energies(self, displaced, energy):
         work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial

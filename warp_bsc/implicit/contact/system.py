@@ -50,7 +50,6 @@ class Progress:
         trial_cut: The same, with displacements of single vertices cut.
         cuts: 1 if those are cut.
         change: Largest displacement of an unknown [m].
-        plain: 1 if the next Newton step holds nothing, as the energy did not fall by one that may have.
         remaining: Largest way of what a program moves that is left [m].
         held: 1 if pairs are held in the solve.
         late: Newton steps that began before what a program moves had arrived, but for the first of them.
@@ -66,7 +65,6 @@ class Progress:
     trial_cut: wp.array[wp.int64]
     cuts: wp.array[int]
     change: wp.array[float]
-    plain: wp.array[int]
     remaining: wp.array[float]
     held: wp.array[int]
     late: wp.array[int]

@@ -10,7 +10,7 @@ from ..state.motion import StateArrays
 from ..state.structs import allocate
 from ..state.workspace import Workspace
 from . import keep, publish
-from .structs import Centres, ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
+from .structs import ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
 
 MAX_PAIRS = 2**20
 """Most entries of the matrices of pairs of shapes, over all worlds: they then take 38 MB."""
@@ -26,7 +26,7 @@ class ContactForces:
         more: Publishes the contacts that were in the solve, if there are some.
     """
 
-    more: Callable[[Sides, Centres, ImpulseSums, ContactRows], None] | None = None
+    more: Callable[[Sides, wp.array[wp.vec3d], ImpulseSums, ContactRows], None] | None = None
 
     def __init__(self, work: Workspace, capacity: int):
         """Allocates buffers for ``capacity`` contacts."""
@@ -42,8 +42,7 @@ class ContactForces:
         pairs = pairs if pairs <= MAX_PAIRS else 0
         sizes = {"of_bodies": (bodies, 2), "idle_of_particles": (particles, 3), "idle_of_bodies": (bodies, 6)}
         self._unpaired = allocate(Unpaired, particles, device, **sizes)
-        self._centres = allocate(Centres, bodies, device)
-        self._centres.end.fill_(wp.vec3d(np.nan))
+        self._centres = wp.zeros(bodies, dtype=wp.vec3d, device=device)
         sizes = {"of_particles": particles, "of_bodies": bodies, "of_shapes": shapes, "of_pairs": pairs}
         columns = {name: (size, 6 if name == "of_bodies" else 3) for name, size in sizes.items()}
         self._sums = allocate(ImpulseSums, worlds, device, **columns)
@@ -68,14 +67,9 @@ class ContactForces:
         sides.plane_shape, sides.plane_body = of_planes.shape, of_planes.body
         sides.local_shape = wp.array(local_shape, dtype=int, device=mesh.device)
 
-    def begin(self, start: StateArrays, *, remembers: bool) -> None:
-        """Takes the centres of mass at the start of a step; ``remembers`` says whether steps go on from the last."""
-        inputs = [start, self._work.motion.vertices, self._sides, remembers, self._centres]
-        self._work.launch(keep.start_centres, len(self._centres.end), inputs)
-
     def end(self, end: StateArrays, mask: wp.array[wp.bool] | None) -> None:
         """Takes the centres of mass at the predicted end of a step, of worlds that take part in it."""
-        self._work.launch(keep.end_centres, len(self._centres.end), [end, self._sides, mask, self._centres])
+        self._work.launch(keep.write_centres, len(self._centres), [end, self._sides, mask, self._centres])
 
     def publish(self, substep: int = 0, substeps: int = 1) -> None:
         """Publishes the contacts of the step and all sums; those of a substep beside those of the substeps before."""

@@ -9,12 +9,12 @@ momentum, belong to no pair, and are kept apart.
 import warp as wp
 
 from ..state.fixed_sum import sum_of, sums_of
-from ..state.motion import StateArrays, continues, takes_part
+from ..state.motion import StateArrays, takes_part
 from ..state.planes import MovingPlanes, signed_distance, time_of_entry
 from ..state.poses import in_world
 from ..state.structs import Motion, Step, body_of, can_move, has_final_velocity
-from ..state.vectors import ONE, ZERO, to_double, to_single
-from .structs import Centres, Sides, Unpaired
+from ..state.vectors import ZERO, to_double, to_single
+from .structs import Sides, Unpaired
 from .sums import body_of_vertex
 
 wp.set_module_options({"enable_backward": False})
@@ -26,23 +26,12 @@ def _centre_of(state: StateArrays, sides: Sides, body: int) -> wp.vec3d:
 
 
 @wp.kernel
-def start_centres(state: StateArrays, motion: Motion, sides: Sides, remembers: bool, centres: Centres):
-    """Writes the centres of mass of bodies at the start of a step.
-
-    Where the step goes on from the last one, they are where that ended, as vertices are that the response cannot move.
-    """
-    body = wp.tid()
-    goes_on = remembers and continues(motion, sides.body_world[body]) and wp.isfinite(centres.end[body])
-    centres.start[body] = wp.where(goes_on, centres.end[body], _centre_of(state, sides, body))
-
-
-@wp.kernel
-def end_centres(state: StateArrays, sides: Sides, mask: wp.array[wp.bool], centres: Centres):
+def write_centres(state: StateArrays, sides: Sides, mask: wp.array[wp.bool], centres: wp.array[wp.vec3d]):
     """Writes the centres of mass of bodies at the end of a step, as predicted; not where worlds take no part in it."""
     body = wp.tid()
     if mask and not takes_part(mask, sides.body_world[body]):
         return
-    centres.end[body] = _centre_of(state, sides, body)
+    centres[body] = _centre_of(state, sides, body)
 
 
 @wp.func
@@ -57,15 +46,14 @@ def body_of_side(sides: Sides, corners: wp.vec4i, plane: int, side: int) -> int:
 def torque_on(
     step: Step,
     sides: Sides,
-    centres: Centres,
-    share: wp.float64,
+    centres: wp.array[wp.vec3d],
     corners: wp.vec4i,
     weights: wp.vec4d,
     plane: int,
     side: int,
     impulse: wp.vec3d,
 ) -> wp.vec3d:
-    """Returns the torque of the impulse of a contact on the body of one of its sides; ``share`` of the step is over.
+    """Returns the torque of the impulse of a contact on the body of one of its sides.
 
     The impulse is that on the first side. A plane, -1 for none, is a side without vertices, and is touched at the
     vertex.
@@ -74,7 +62,7 @@ def torque_on(
     body = body_of_side(sides, corners, plane, side)
     if body < 0:
         return wp.vec3d()
-    centre = (ONE - share) * centres.start[body] + share * centres.end[body]
+    centre = centres[body] + wp.vec3d()
     if can_move(step.motion, body):
         centre = step.vertices.bodies.centre[body]
     if side == 1 and plane >= 0:

@@ -5,9 +5,9 @@ import warp as wp
 from ...kernels.pipeline.queues import take_slot_int
 from ..state.planes import MovingPlanes
 from ..state.structs import ContactKind, Step, can_move, constraint_count
-from ..state.vectors import ONE, ZERO, relative, to_double, to_single
+from ..state.vectors import ZERO, relative, to_double, to_single
 from .keep import body_of_side, responds, time_at_plane, torque_on
-from .structs import Centres, ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
+from .structs import ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
 from .sums import add_impulse, body_of_vertex, shape_of, take_impulse
 
 wp.set_module_options({"enable_backward": False})
@@ -134,7 +134,7 @@ def publish_contacts(
     step: Step,
     planes: MovingPlanes,
     sides: Sides,
-    centres: Centres,
+    centres: wp.array[wp.vec3d],
     substep: int,
     substeps: int,
     # in and out
@@ -152,7 +152,7 @@ def publish_contacts(
             plane = wp.where(constraints.kind[i] == ContactKind.PLANE, constraints.plane[i], -1)
             torques = _Torques()
             for side in range(2):
-                torques[side] = torque_on(step, sides, centres, ONE, corners, weights, plane, side, impulse)
+                torques[side] = torque_on(step, sides, centres, corners, weights, plane, side, impulse)
             if responds(step, i):
                 toi = wp.float64(constraints.toi[i])
                 if plane >= 0:

@@ -29,14 +29,6 @@ class Unpaired:
 
 
 @wp.struct
-class Centres:
-    """The centres of mass of bodies at the start of the step and at its end, as predicted [m]."""
-
-    start: wp.array[wp.vec3d]
-    end: wp.array[wp.vec3d]
-
-
-@wp.struct
 class ImpulseSums:
     """Sums of impulses in units of :mod:`.sums`, which are the same in any order of threads."""
 
