@@ -50,9 +50,9 @@ def _inertia(
     return pull, float(inertia) * wp.identity(n=3, dtype=float)
 
 
-@wp.kernel
-def add_blocks(
-    # in
+@wp.func
+def add_block(
+    i: int,
     derivatives: Derivatives,
     contacts: Contacts,
     unknowns: Unknowns,
@@ -62,19 +62,18 @@ def add_blocks(
     motion: Motion,
     bodies: SolvedBodies,
     dt: wp.float64,
-    active: wp.array[int],
+    progress: Progress,
     rows: Rows,
     parts: int,
-    # out
     matrix: Matrix,
 ):
-    """Adds up the blocks of elements, of contacts that do not couple, and of inertia, in active worlds.
+    """Adds up a block of elements, of contacts that do not couple, and of inertia, in worlds that solve.
 
     So many threads share a block, as here and there an unknown has very many contacts.
     """
-    k, part = wp.tid() // parts, wp.tid() % parts
+    k, part = i // parts, i % parts
     u, v = row_of_block[k], rows.column[k]
-    if active[unknowns.world[u]] == 0:
+    if progress.solving[unknowns.world[u]] == 0:
         return
     total = block_sum_of_parts(contact_block(contacts, unknowns, u, v, part, parts), parts)
     if part != 0:
@@ -86,9 +85,9 @@ def add_blocks(
     set_block(matrix, k, total)
 
 
-@wp.kernel
+@wp.func
 def assemble(
-    # in
+    i: int,
     derivatives: Derivatives,
     contacts: Contacts,
     unknowns: Unknowns,
@@ -97,21 +96,20 @@ def assemble(
     motion: Motion,
     bodies: SolvedBodies,
     dt: wp.float64,
-    active: wp.array[int],
+    progress: Progress,
     begins: bool,
     rows: Rows,
     matrix: Matrix,
     parts: int,
-    # in and out
     vectors: Vectors,
 ):
-    """Computes the gradient of the energy by each unknown, and what preconditions.
+    """Computes the gradient of the energy by an unknown, and what preconditions, in worlds that solve.
 
     The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
     ways. Later ones go on from where they are. So many threads share an unknown.
     """
-    u, part = wp.tid() // parts, wp.tid() % parts
-    if active[unknowns.world[u]] == 0:
+    u, part = i // parts, i % parts
+    if progress.solving[unknowns.world[u]] == 0:
         return
     if unknowns.is_free[u] == 0:
         if begins:
@@ -133,21 +131,19 @@ def assemble(
         vectors.solution[u] = wp.vec3()
 
 
-@wp.kernel
+@wp.func
 def find_loads(
-    # in
+    u: int,
     derivatives: Derivatives,
     rows: Rows,
     unknowns: Unknowns,
     progress: Progress,
-    # in and out
     load: wp.array[float],
 ):
     """Writes the forces of elements on vertices that are solved for, in active worlds.
 
     That of an earlier Newton step of the step is kept where it is about right: barriers that change converge slowly.
     """
-    u = wp.tid()
     world, p = unknowns.world[u], unknowns.particle[u]
     if p < 0 or progress.active[world] == 0:
         return

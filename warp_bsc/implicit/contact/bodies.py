@@ -130,6 +130,8 @@ def begin_bodies(
     bodies.inertia[body] = in_world(of_motion.inertia[body], goal)
     bodies.pose[body] = start
     bodies.low[body] = wp.vec3d()
+    bodies.moved[body] = start
+    bodies.low_moved[body] = wp.vec3d()
 
 
 @wp.func
@@ -206,28 +208,25 @@ def _is_active(bodies: SolvedBodies, unknowns: Unknowns, progress: Progress, bod
     return unknowns.is_free[u] != 0 and progress.active[unknowns.world[u]] != 0
 
 
-@wp.kernel
+@wp.func
 def move_bodies(
-    # in
+    body: int,
     motion: Motion,
     unknowns: Unknowns,
     progress: Progress,
     share: wp.array[float],
     solution: wp.array[wp.vec3],
-    displaced: bool,
     takes: bool,
-    # in and out
     bodies: SolvedBodies,
 ):
-    """Moves bodies by what they and their worlds take of their displacements, if ``displaced``; ``takes`` for good."""
-    body = wp.tid()
+    """Moves a body by what it and its world take of its displacement; ``takes`` for good."""
     if not _is_active(bodies, unknowns, progress, body):
         return
     u = bodies.unknown[body]
     taken = progress.scale[unknowns.world[u]] * share[bodies.first_vertex[body]]
     pose, low = bodies.pose[body], bodies.low[body] + wp.vec3d()
     bodies.moved[body] = pose
-    if displaced and taken > 0.0:
+    if taken > 0.0:
         centre, shift = centre_of(motion.bodies, body, pose), low + to_double(taken * solution[u])
         bodies.moved[body] = turned_pose(motion.bodies, body, pose, shift, to_double(taken * solution[u + 1]))
         low = centre + shift - centre_of(motion.bodies, body, bodies.moved[body])
@@ -237,18 +236,16 @@ def move_bodies(
         bodies.low[body] = low
 
 
-@wp.kernel
+@wp.func
 def displace_bodies(
-    # in
+    body: int,
     motion: Motion,
     unknowns: Unknowns,
     progress: Progress,
     solution: wp.array[wp.vec3],
-    # out
     bodies: SolvedBodies,
 ):
-    """Moves bodies by all of their displacements."""
-    body = wp.tid()
+    """Moves a body by all of its displacement."""
     if _is_active(bodies, unknowns, progress, body):
         u = bodies.unknown[body]
         shift, turn = bodies.low[body] + to_double(solution[u]), to_double(solution[u + 1])

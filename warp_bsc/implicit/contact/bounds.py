@@ -2,14 +2,13 @@
 
 import warp as wp
 
-from ...response.contacts.queue import has_pair, pair_count, vertices_of
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
-from .system import Progress
+from .system import Progress, kind_of_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,23 +30,16 @@ def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
 
 
 @wp.func
-def _bound(
-    motion: Motion,
-    candidates: Candidates,
-    trial: Trial,
-    progress: Progress,
-    active: wp.array[int],
-    limit: wp.array[float],
-    i: int,
+def bound_by_pair(
+    i: int, motion: Motion, candidates: Candidates, trial: Trial, progress: Progress, limit: wp.array[float]
 ):
+    """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world."""
     candidates.share[i] = 1.0
-    if candidates.reach[i] == 0.0:
-        return
-    queue = candidates.queue
-    corners = vertices_of(queue, i)
+    corners = candidates.corners[i]
     world = motion.world[corners[0]]
-    if active[world] == 0:
+    if progress.solving[world] == 0:
         return
+    kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.x, corners)
     scale = progress.scale[world]
     p = to_double(to_single(moved(trial, scale, corners[0]))) - a
@@ -58,17 +50,17 @@ def _bound(
     way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     kept = candidates.kept[i]
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
-    apart = barrier.distance_of_boxes(queue.kind, a, b, c, d) - kept
+    apart = barrier.distance_of_boxes(kind, a, b, c, d) - kept
     bends = _bends(trial, scale, corners)
     if way + bends[0] <= apart - barrier.least_gap(apart, reach, floor):
         return
-    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     least = barrier.least_gap(distance - kept, reach, floor)
     if way + bends[0] <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
-    share = float(barrier.safe_share(queue.kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
+    share = float(barrier.safe_share(kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
     candidates.share[i] = share
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
@@ -78,48 +70,20 @@ def _bound(
                 wp.atomic_min(limit, trial.holder[corners[j]], share)
 
 
-@wp.kernel
-def bound_by_pairs(
-    # in
-    motion: Motion,
-    first: Candidates,
-    second: Candidates,
-    trial: Trial,
-    active: wp.array[int],
-    # in and out
-    progress: Progress,
-    limit: wp.array[float],
-    threads: int,
-):
-    """Finds the share of displacements up to which no two elements meet: by vertex, and for all of a world."""
-    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
-        number = int(0)
-        while number < 2:
-            of = first
-            if number == 1:
-                of = second
-            if has_pair(of.queue, i):
-                _bound(motion, of, trial, progress, active, limit, i)
-            number += 1
-
-
-@wp.kernel
+@wp.func
 def bound_by_planes(
-    # in
+    vertex: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
     settings: BarrierSettings,
     trial: Trial,
-    active: wp.array[int],
-    # in and out
     progress: Progress,
     limit: wp.array[float],
 ):
-    """Finds the share of displacements up to which no particle meets an infinite plane, as :func:`bound_by_pairs`."""
-    vertex = wp.tid()
+    """Finds the share of displacements up to which a vertex meets no infinite plane, as :func:`bound_by_pair`."""
     world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or progress.solving[world] == 0:
         return
     scale, now = progress.scale[world], plane_share[world]
     for place in range(planes.of_worlds.shape[1]):

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from .system import Contacts, Unknowns, contact_count, unknown_of_corner
+from ...response.state.structs import Motion
+from .system import Contacts, Unknowns, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
 
@@ -10,33 +11,37 @@ _COUPLES = wp.constant(wp.int64(1 << 61))
 """What is added to the number of a contact that couples, so that it comes last."""
 
 
-@wp.kernel
-def count_entries(
-    # in
-    contacts: Contacts,
-    unknowns: Unknowns,
-    world: wp.array[int],
-    threads: int,
-):
-    """Counts the contacts of each unknown that is solved for, in ``end``, and those of each world that couple."""
-    for i in range(wp.tid(), contact_count(contacts), threads):
-        for j in range(4):
-            if contacts.weights[i][j] != 0.0:
-                vertex = contacts.corners[i][j]
-                u = unknown_of_corner(unknowns, vertex)
-                if u >= 0:
-                    if unknowns.is_free[u] != 0:
-                        wp.atomic_add(contacts.end, u, 1)
-                        if unknowns.of_vertex[vertex] < 0:
-                            wp.atomic_add(contacts.end, u + 1, 1)
-        if contacts.couples[i] != 0:
-            wp.atomic_add(contacts.coupled_end, world[contacts.corners[i][0]], 1)
+@wp.func
+def count_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns):
+    """Counts a contact in ``end`` of the unknowns that are solved for, and of its world if it couples."""
+    for j in range(4):
+        if contacts.weights[i][j] != 0.0:
+            vertex = contacts.corners[i][j]
+            u = unknown_of_corner(unknowns, vertex)
+            if u >= 0:
+                if unknowns.is_free[u] != 0:
+                    wp.atomic_add(contacts.end, u, 1)
+                    if unknowns.of_vertex[vertex] < 0:
+                        wp.atomic_add(contacts.end, u + 1, 1)
+    if contacts.couples[i] != 0:
+        wp.atomic_add(contacts.coupled_end, motion.world[contacts.corners[i][0]], 1)
 
 
-@wp.kernel
-def place_entries(contacts: Contacts, lacks: wp.array[int]):
+@wp.func
+def clear_lists(u: int, contacts: Contacts):
+    """Clears the lists of an unknown, and of the world of that number."""
+    if u == 0:
+        contacts.listed[0] = 0
+        contacts.listed[1] = 0
+    if u < contacts.coupled_end.shape[0]:
+        contacts.coupled_end[u] = 0
+    if u < contacts.end.shape[0]:
+        contacts.end[u] = 0
+
+
+@wp.func
+def place_entries(u: int, contacts: Contacts, lacks: wp.array[int]):
     """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them. So for each world."""
-    u = wp.tid()
     if u == 0 and contacts.count[0] > contacts.corners.shape[0]:
         lacks[0] = 1
     if u < contacts.coupled_first.shape[0]:
@@ -75,52 +80,39 @@ def _list_coupled(contacts: Contacts, unknowns: Unknowns, world: int, i: int):
     contacts.coupled_unknowns[n] = of_corners
 
 
-@wp.kernel
-def list_entries(
-    # in and out
-    contacts: Contacts,
-    # in
-    unknowns: Unknowns,
-    world: wp.array[int],
-    threads: int,
-):
-    """Lists the contacts of each unknown, behind its ``end``, which moves on, and those of each world that couple."""
-    for i in range(wp.tid(), contact_count(contacts), threads):
-        if contacts.couples[i] != 0:
-            _list_coupled(contacts, unknowns, world[contacts.corners[i][0]], i)
-        for j in range(4):
-            if contacts.weights[i][j] != 0.0:
-                vertex = contacts.corners[i][j]
-                u = unknown_of_corner(unknowns, vertex)
-                if u >= 0:
-                    if unknowns.is_free[u] != 0:
-                        _list_entry(contacts, u, 4 * i + j)
-                        if unknowns.of_vertex[vertex] < 0:
-                            _list_entry(contacts, u + 1, 4 * i + j)
+@wp.func
+def list_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns):
+    """Lists a contact for its unknowns, behind their ``end``, which moves on, and for its world if it couples."""
+    if contacts.couples[i] != 0:
+        _list_coupled(contacts, unknowns, motion.world[contacts.corners[i][0]], i)
+    for j in range(4):
+        if contacts.weights[i][j] != 0.0:
+            vertex = contacts.corners[i][j]
+            u = unknown_of_corner(unknowns, vertex)
+            if u >= 0:
+                if unknowns.is_free[u] != 0:
+                    _list_entry(contacts, u, 4 * i + j)
+                    if unknowns.of_vertex[vertex] < 0:
+                        _list_entry(contacts, u + 1, 4 * i + j)
 
 
-@wp.kernel
-def sort_entries(
-    # in and out
-    contacts: Contacts,
-    threads: int,
-):
-    """Orders the contacts of each unknown by their pair, so that sums do not depend on the order of threads.
+@wp.func
+def sort_entries(n: int, contacts: Contacts):
+    """Puts an entry of an unknown to its place by its pair, so that sums do not depend on the order of threads.
 
     Those that couple come last.
     """
-    for n in range(wp.tid(), contacts.listed[0], threads):
-        u, own, entry = contacts.row[n], contacts.order[n] + wp.int64(0), contacts.unsorted[n] + int(0)
-        first = contacts.first[u]
-        rank, single = int(0), int(0)
-        for m in range(first, contacts.end[u]):
-            other = contacts.order[m] + wp.int64(0)
-            single += wp.where(other < _COUPLES, 1, 0)
-            if other < own or (other == own and contacts.unsorted[m] < entry):
-                rank += 1
-        contacts.entries[first + rank] = entry
-        if own >= _COUPLES:
-            contacts.pulled[first + rank] = contacts.place_in_coupled[entry >> 2]
-            contacts.entry_weight[first + rank] = contacts.weights[entry >> 2][entry & 3]
-        if rank == 0:
-            contacts.middle[u] = first + single
+    u, own, entry = contacts.row[n], contacts.order[n] + wp.int64(0), contacts.unsorted[n] + int(0)
+    first = contacts.first[u]
+    rank, single = int(0), int(0)
+    for m in range(first, contacts.end[u]):
+        other = contacts.order[m] + wp.int64(0)
+        single += wp.where(other < _COUPLES, 1, 0)
+        if other < own or (other == own and contacts.unsorted[m] < entry):
+            rank += 1
+    contacts.entries[first + rank] = entry
+    if own >= _COUPLES:
+        contacts.pulled[first + rank] = contacts.place_in_coupled[entry >> 2]
+        contacts.entry_weight[first + rank] = contacts.weights[entry >> 2][entry & 3]
+    if rank == 0:
+        contacts.middle[u] = first + single

@@ -1,5 +1,7 @@
 """What each world does next in a Newton step: hold pairs, cut, search, end, or go back."""
 
+from enum import IntEnum
+
 import warp as wp
 
 from .system import Progress, Unknowns
@@ -13,19 +15,23 @@ PATH = wp.constant(8)
 _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
-@wp.kernel
-def take_bound(
-    # in and out
-    progress: Progress,
-    # out
-    cuts: wp.array[int],
-):
-    """Takes the share of each world down to its bound, and says whether one takes less than all."""
-    w = wp.tid()
+class Flag(IntEnum):
+    """What a phase of a Newton step finds in some world, for all threads."""
+
+    MEETS = 0
+    RISES = 1
+    CUTS = 2
+    SEARCHES = 3
+    GOES_ON = 4
+
+
+@wp.func
+def take_bound(w: int, progress: Progress, flags: wp.array[int]):
+    """Takes the share of a world down to its bound, and says whether it takes less than all."""
     progress.scale[w] = progress.scale[w] * progress.bound[w]
     progress.bound[w] = 1.0
     if may_cut(progress, w):
-        cuts[0] = 1
+        flags[Flag.CUTS] = 1
 
 
 @wp.func
@@ -40,34 +46,21 @@ def _may_hold(progress: Progress, w: int) -> bool:
     return progress.active[w] != 0 and progress.bound[w] < 1.0
 
 
-@wp.kernel
-def find_meeting(
-    # in
-    progress: Progress,
-    # out
-    meets: wp.array[int],
-):
+@wp.func
+def find_meeting(w: int, progress: Progress, flags: wp.array[int]):
     """Says whether something would meet in a world."""
-    w = wp.tid()
     if _may_hold(progress, w):
-        meets[0] = 1
+        flags[Flag.MEETS] = 1
 
 
-@wp.kernel
-def begin_hold(
-    # in
-    always: bool,
-    # in and out
-    progress: Progress,
-    ahead: wp.array[int],
-):
-    """Lets worlds in which something would meet solve once more, ``always`` all of them, and clears their bounds."""
-    w = wp.tid()
-    ahead[w] = 0
-    if _may_hold(progress, w) or (always and progress.active[w] != 0):
-        ahead[w] = 1
+@wp.func
+def begin_hold(w: int, progress: Progress):
+    """Lets a world in which something would meet solve once more, and clears its bound."""
+    progress.solving[w] = 0
+    if _may_hold(progress, w):
+        progress.solving[w] = 1
         progress.bound[w] = 1.0
-        progress.held[w] = int(not always)
+        progress.held[w] = 1
 
 
 @wp.func
@@ -77,81 +70,56 @@ def _falls(progress: Progress, w: int) -> bool:
     return wp.float64(progress.trial[w]) <= before + _NOISE * wp.abs(before)
 
 
-@wp.kernel
-def find_rises(
-    # in
-    progress: Progress,
-    # out
-    rises: wp.array[int],
-    any_rises: wp.array[int],
-):
-    """Says in which worlds the energy rises on displacements that are solved with pairs held."""
-    w = wp.tid()
-    rises[w] = 0
+@wp.func
+def find_rises(w: int, progress: Progress, flags: wp.array[int]):
+    """Lets a world be released in which the energy rises on displacements that are solved with pairs held."""
+    progress.solving[w] = 0
     if progress.active[w] != 0 and progress.held[w] != 0 and progress.remaining[w] == 0.0 and not _falls(progress, w):
-        rises[w] = 1
-        any_rises[0] = 1
+        progress.solving[w] = 1
+        flags[Flag.RISES] = 1
 
 
-@wp.kernel
-def begin_release(
-    # in
-    unknowns: Unknowns,
-    rises: wp.array[int],
-    first: wp.array[wp.vec3],
-    # in and out
-    progress: Progress,
-    solution: wp.array[wp.vec3],
-):
-    """Lets worlds in which the energy rises search along the solution without pairs held instead."""
-    i = wp.tid()
-    if i < solution.shape[0] and rises[unknowns.world[i]] != 0:
-        solution[i] = first[i]
-    if i < rises.shape[0]:
-        progress.searches[i] = rises[i]
-        if rises[i] != 0:
-            progress.scale[i] = 1.0
-            progress.trial[i] = wp.int64(0)
+@wp.func
+def begin_release(w: int, progress: Progress):
+    """Lets a world that is released search along its solution without pairs held, and no other."""
+    progress.searches[w] = progress.solving[w]
+    if progress.solving[w] != 0:
+        progress.scale[w] = 1.0
+        progress.trial[w] = wp.int64(0)
 
 
-@wp.kernel
-def end_release(
-    # in and out
-    progress: Progress,
-):
-    """Lets all worlds search again."""
-    w = wp.tid()
+@wp.func
+def end_release(w: int, progress: Progress):
+    """Lets a world search again."""
     progress.searches[w] = progress.active[w]
 
 
-@wp.kernel
-def choose_truncation(
-    # in
-    whole: wp.array[float],
-    # in and out
-    progress: Progress,
-):
-    """Keeps the cuts of single vertices in worlds whose energy is lower with them."""
-    w = wp.tid()
+@wp.func
+def take_cut(w: int, progress: Progress, flags: wp.array[int]):
+    """Keeps the energy of a world before single vertices were cut, and takes its bound after that."""
+    progress.uncut[w] = progress.trial[w]
+    progress.trial[w] = wp.int64(0)
+    take_bound(w, progress, flags)
+
+
+@wp.func
+def choose_truncation(w: int, whole: wp.array[float], progress: Progress):
+    """Keeps the cuts of single vertices in a world whose energy is lower with them."""
     if progress.active[w] == 0:
         return
-    cuts = progress.searches[w] != 0 and progress.trial_cut[w] < progress.trial[w]
-    if cuts:
-        progress.trial[w] = progress.trial_cut[w]
-    else:
+    cuts = progress.searches[w] != 0 and progress.trial[w] < progress.uncut[w]
+    if not cuts:
+        progress.trial[w] = progress.uncut[w]
         progress.scale[w] = whole[w]
     progress.cuts[w] = int(cuts)
     progress.searches[w] = 1
 
 
-@wp.kernel
-def begin_newton_step(
-    # in and out
-    progress: Progress,
-):
-    """Clears what a Newton step measures."""
-    w = wp.tid()
+@wp.func
+def begin_newton_step(w: int, progress: Progress):
+    """Clears what a Newton step measures of a world."""
     progress.searches[w] = progress.active[w]
+    progress.solving[w] = progress.active[w]
     if progress.active[w] == 0:
         return
     progress.change[w] = 0.0
@@ -162,18 +130,11 @@ def begin_newton_step(
     progress.bound[w] = 1.0
     progress.energy[w] = wp.int64(0)
     progress.trial[w] = wp.int64(0)
-    progress.trial_cut[w] = wp.int64(0)
 
 
-@wp.kernel
-def decide_search(
-    # in and out
-    progress: Progress,
-    # out
-    search: wp.array[int],
-):
-    """Halves the shares of worlds whose energy has not fallen enough; not while something a program moves is coming."""
-    w = wp.tid()
+@wp.func
+def decide_search(w: int, progress: Progress, flags: wp.array[int]):
+    """Halves the share of a world whose energy has not fallen enough; not while something a program moves is coming."""
     if progress.active[w] == 0 or progress.searches[w] == 0:
         progress.trial[w] = wp.int64(0)
         return
@@ -187,26 +148,23 @@ def decide_search(
         progress.scale[w] = 0.0
         progress.searches[w] = 0
         return
-    search[0] = 1
+    flags[Flag.SEARCHES] = 1
 
 
-@wp.kernel
+@wp.func
 def decide_step(
-    # in
+    w: int,
     least_change: float,
     max_steps: int,
     max_late_steps: int,
-    # in and out
     progress: Progress,
     plane_share: wp.array[float],
-    # out
-    goes_on: wp.array[int],
+    flags: wp.array[int],
 ):
-    """Ends worlds whose unknowns hardly change, or that have taken all their Newton steps.
+    """Ends a world whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one.
 
     They are counted from when what a program moves arrives, if it does.
     """
-    w = wp.tid()
     if progress.active[w] == 0:
         return
     scale = progress.scale[w]
@@ -221,8 +179,10 @@ def decide_step(
         ends = True
     if ends or (steps >= max_late_steps and not arrived):
         progress.active[w] = 0
+        progress.solving[w] = 0
         return
-    goes_on[0] = 1
+    flags[Flag.GOES_ON] = 1
+    begin_newton_step(w, progress)
 
 
 @wp.func

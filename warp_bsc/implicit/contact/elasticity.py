@@ -707,16 +707,30 @@ def differentiate(
     """
     i = wp.tid()
     kind = kind_of(elements, i)
+    in_world = world[first_vertex(elements, kind, i - elements.first[kind])]
+    if active[in_world] != 0:
+        differentiate_element(i, kind, elements, x, x0, dt, convex[in_world] != 0, out)
+
+
+@wp.func
+def differentiate_element(
+    i: int,
+    kind: int,
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    x0: wp.array[wp.vec3],
+    dt: wp.float64,
+    is_convex: bool,
+    out: Derivatives,
+):
+    """Computes the gradient and the Hessian of an element, as :func:`differentiate` does."""
     e = i - elements.first[kind]
-    in_world = world[first_vertex(elements, kind, e)]
-    if active[in_world] == 0:
-        return
     gradient = element_gradient(elements, kind, e, x, x0, dt)
     corner = first_corner(elements, kind, e)
     for j in range(element_size(kind)):
         out.gradient[corner + j] = to_single(gradient[j])
     if kind != ElementKind.BENDING:
-        store_hessian(elements, kind, e, x, x0, dt, convex[in_world] != 0, out.block)
+        store_hessian(elements, kind, e, x, x0, dt, is_convex, out.block)
         return
     turn, curvature = mat43d(), ZERO
     if has_energy(elements, kind, e, x):

@@ -3,14 +3,23 @@
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_int
-from ...response.contacts.queue import has_pair, pair_count, vertices_of
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at
-from .system import Contacts, Unknowns, contact_count, couples, displacement, is_solved, key_of_pair
+from .system import (
+    Contacts,
+    Progress,
+    Unknowns,
+    couples,
+    displacement,
+    is_solved,
+    key_in_group,
+    key_of_pair,
+    kind_of_key,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,49 +75,40 @@ def _hold(
     contacts.couples[slot] = couples(unknowns, corners, weights)
 
 
-@wp.kernel
+@wp.func
 def release_held(
-    # in
-    motion: Motion,
-    unknowns: Unknowns,
-    solution: wp.array[wp.vec3],
-    active: wp.array[int],
-    # in and out
-    contacts: Contacts,
-    threads: int,
+    i: int, motion: Motion, unknowns: Unknowns, solution: wp.array[wp.vec3], progress: Progress, contacts: Contacts
 ):
-    """Lets go the pairs that are held and that the solution would pull together: they are not in the way."""
-    for i in range(wp.tid(), contact_count(contacts), threads):
-        corners, weights, n = contacts.corners[i], contacts.weights[i], contacts.normal[i]
-        if contacts.key[i] >= _FIRST_HELD and active[motion.world[corners[0]]] != 0:
-            apart = wp.dot(n, contacts.gradient[i])
-            for j in range(4):
-                apart += weights[j] * wp.dot(contacts.hessian[i] * n, displacement(unknowns, corners[j], solution))
-            if apart > 0.0:
-                contacts.gradient[i] = wp.vec3()
-                contacts.hessian[i] = wp.mat33()
+    """Lets a pair go that is held and that the solution would pull together: it is not in the way."""
+    corners, weights, n = contacts.corners[i], contacts.weights[i], contacts.normal[i]
+    if contacts.key[i] >= _FIRST_HELD and progress.solving[motion.world[corners[0]]] != 0:
+        apart = wp.dot(n, contacts.gradient[i])
+        for j in range(4):
+            apart += weights[j] * wp.dot(contacts.hessian[i] * n, displacement(unknowns, corners[j], solution))
+        if apart > 0.0:
+            contacts.gradient[i] = wp.vec3()
+            contacts.hessian[i] = wp.mat33()
 
 
 @wp.func
-def _hold_pair(
+def hold_pair(
+    i: int,
     motion: Motion,
     candidates: Candidates,
     trial: Trial,
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
-    active: wp.array[int],
+    progress: Progress,
     limit: wp.array[float],
     group: int,
     contacts: Contacts,
-    i: int,
 ):
-    reach = wp.float64(candidates.reach[i])
-    if reach == ZERO:
-        return
-    queue = candidates.queue
-    corners = vertices_of(queue, i)
-    world = motion.world[corners[0]]
-    if active[world] == 0:
+    """Adds a contact that holds a candidate which would meet on the displacements, in worlds that solve.
+
+    Only one that is the first, by ``limit``, for one of its vertices: what would come later may not come at all.
+    """
+    corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
+    if progress.solving[motion.world[corners[0]]] == 0:
         return
     share = candidates.share[i] + float(0.0)
     if share >= 1.0:
@@ -118,58 +118,27 @@ def _hold_pair(
         is_first = is_first or (share <= limit[corners[j]] and is_solved(unknowns, corners[j]))
     if not is_first:
         return
+    key = candidates.key[i] + wp.int64(0)
+    kind = kind_of_key(key)
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
     time = wp.float64(share)
     kept = candidates.kept[i]
-    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     gap = distance - kept
     e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
-    weights, then = barrier.closest_weights_and_gap(queue.kind, e, f, g, h)
+    weights, then = barrier.closest_weights_and_gap(kind, e, f, g, h)
     if not then > ZERO:
         return
     normal = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / then
     goal = kept + barrier.goal_gap(gap, reach, wp.float64(candidates.floor[i]))
     now = wp.dot(normal, weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d)
-    pair = queue.pairs[i]
-    key = key_of_pair(group, queue.kind, pair[0], pair[1])
-    _hold(contacts, unknowns, trial, inverse, corners, weights, normal, goal - now, key)
+    _hold(contacts, unknowns, trial, inverse, corners, weights, normal, goal - now, key_in_group(group, key))
 
 
-@wp.kernel
-def hold_pairs(
-    # in
-    motion: Motion,
-    first: Candidates,
-    second: Candidates,
-    trial: Trial,
-    unknowns: Unknowns,
-    inverse: wp.array[wp.mat33],
-    active: wp.array[int],
-    limit: wp.array[float],
-    group: int,
-    # in and out
-    contacts: Contacts,
-    threads: int,
-):
-    """Adds contacts that hold candidates which would meet on the displacements, in active worlds.
-
-    Only those that are the first, by ``limit``, for one of their vertices: what would come later may not come at all.
-    """
-    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
-        number = int(0)
-        while number < 2:
-            of = first
-            if number == 1:
-                of = second
-            if has_pair(of.queue, i):
-                _hold_pair(motion, of, trial, unknowns, inverse, active, limit, group, contacts, i)
-            number += 1
-
-
-@wp.kernel
+@wp.func
 def hold_at_planes(
-    # in
+    vertex: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
@@ -177,15 +146,13 @@ def hold_at_planes(
     trial: Trial,
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
-    active: wp.array[int],
+    progress: Progress,
     group: int,
-    # in and out
     contacts: Contacts,
 ):
-    """Adds contacts that hold particles which would enter infinite planes, as :func:`hold_pairs`."""
-    vertex = wp.tid()
+    """Adds contacts that hold a vertex which would enter infinite planes, as :func:`hold_pair`."""
     world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or progress.solving[world] == 0:
         return
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]

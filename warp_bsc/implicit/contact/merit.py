@@ -3,17 +3,18 @@
 import warp as wp
 
 from ...kernels.polynomials import EDGE_EDGE
-from ...response.contacts.queue import has_pair, pair_count, vertices_of
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
-from .system import Contacts, Progress, contact_count
+from .system import Contacts, Progress, kind_of_key
 
 wp.set_module_options({"enable_backward": False})
 
+MEETS = wp.constant(wp.float64(1.0e30))
+"""Energy of what meets [J]."""
 _UNITS_LIMIT = wp.constant(wp.float64(2.0**52))
 """Most units of one energy: a thousand of them fit into a sum, and a speed of 900 m/s into one."""
 
@@ -27,112 +28,60 @@ def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units:
 
 
 @wp.func
-def _pair_energy(
-    motion: Motion,
-    candidates: Candidates,
-    settings: BarrierSettings,
-    trial: Trial,
-    progress: Progress,
-    displaced: bool,
-    energy: wp.array[wp.int64],
-    i: int,
+def add_pair_energy(
+    i: int, motion: Motion, candidates: Candidates, settings: BarrierSettings, trial: Trial, progress: Progress
 ):
-    reach = wp.float64(candidates.reach[i])
-    if reach == ZERO:
-        return
-    queue = candidates.queue
-    corners = vertices_of(queue, i)
+    """Adds the energy of the barrier of a candidate at the displaced positions, in worlds that search."""
+    corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = motion.world[corners[0]]
-    if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
+    if progress.searches[world] == 0:
         return
+    kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)
-    if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
+    if barrier.distance_of_boxes(kind, a, b, c, d) >= candidates.level[i] + reach:
         return
-    _weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     gap = distance - candidates.level[i]
     if gap < reach:
-        value = wp.float64(1.0e30)
+        value = MEETS
         if gap > ZERO:
-            stiffness = stiffness_of_pair(motion, settings, trial, corners, queue.kind == EDGE_EDGE, reach)
+            stiffness = stiffness_of_pair(motion, settings, trial, corners, kind == EDGE_EDGE, reach)
             value = stiffness * barrier.barrier_energy(gap, reach)
-        add_energy(energy, world, value, settings.units)
+        add_energy(progress.trial, world, value, settings.units)
 
 
-@wp.kernel
-def add_pair_energies(
-    # in
-    motion: Motion,
-    first: Candidates,
-    second: Candidates,
-    settings: BarrierSettings,
-    trial: Trial,
-    progress: Progress,
-    displaced: bool,
-    # in and out
-    energy: wp.array[wp.int64],
-    threads: int,
+@wp.func
+def add_friction_energy(
+    i: int, motion: Motion, contacts: Contacts, settings: BarrierSettings, trial: Trial, energy: wp.array[wp.int64]
 ):
-    """Adds the energies of barriers between elements, at positions or at the displaced ones."""
-    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
-        number = int(0)
-        while number < 2:
-            of = first
-            if number == 1:
-                of = second
-            if has_pair(of.queue, i):
-                _pair_energy(motion, of, settings, trial, progress, displaced, energy, i)
-            number += 1
+    """Adds the work of friction over ``trial.moved``, under the load and along the plane of a contact."""
+    corners, weights = contacts.corners[i], contacts.weights[i]
+    limit = contacts.friction[i] * contacts.load[i]
+    if limit > 0.0:
+        slid, normal = wp.vec3d(), to_double(contacts.normal[i])
+        for j in range(4):
+            v = corners[j]
+            slid += wp.float64(weights[j]) * (trial.moved[v] - to_double(motion.x0[v]))
+        slid -= wp.dot(slid, normal) * normal
+        value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
+        add_energy(energy, motion.world[corners[0]], value, settings.units)
 
 
-@wp.kernel
-def add_friction_energies(
-    # in
-    motion: Motion,
-    contacts: Contacts,
-    settings: BarrierSettings,
-    trial: Trial,
-    progress: Progress,
-    displaced: bool,
-    # in and out
-    energy: wp.array[wp.int64],
-    threads: int,
-):
-    """Adds the work of friction, under the loads and along the planes of the contacts."""
-    for i in range(wp.tid(), contact_count(contacts), threads):
-        corners, weights = contacts.corners[i], contacts.weights[i]
-        world = motion.world[corners[0]]
-        limit = contacts.friction[i] * contacts.load[i]
-        if limit > 0.0 and not (displaced and progress.searches[world] == 0):
-            slid, normal = wp.vec3d(), to_double(contacts.normal[i])
-            for j in range(4):
-                v = corners[j]
-                slid += wp.float64(weights[j]) * (trial.moved[v] - to_double(motion.x0[v]))
-            slid -= wp.dot(slid, normal) * normal
-            value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
-            add_energy(energy, world, value, settings.units)
-
-
-@wp.kernel
+@wp.func
 def add_plane_energies(
-    # in
+    vertex: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
     settings: BarrierSettings,
     trial: Trial,
     progress: Progress,
-    displaced: bool,
-    # in and out
-    energy: wp.array[wp.int64],
 ):
-    """Adds the energies of barriers at infinite planes."""
-    vertex = wp.tid()
+    """Adds the energies of a vertex at infinite planes at the displaced positions, in worlds that search."""
     world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or progress.active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or progress.searches[world] == 0:
         return
-    if displaced and progress.searches[world] == 0:
-        return
-    scale, now = wp.where(displaced, progress.scale[world], 0.0), plane_share[world]
+    scale, now = progress.scale[world], plane_share[world]
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]
         if i < 0:
@@ -142,7 +91,7 @@ def add_plane_energies(
         distance, _error = signed_distance(plane, trial.moved[vertex])
         gap = distance - level
         if gap < reach:
-            value = wp.float64(1.0e30)
+            value = MEETS
             if gap > ZERO:
                 value = stiffness_at_plane(motion, settings, vertex, reach) * barrier.barrier_energy(gap, reach)
-            add_energy(energy, world, value, settings.units)
+            add_energy(progress.trial, world, value, settings.units)

@@ -5,14 +5,14 @@ import warp as wp
 from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE
 from ...response.contacts.constraints import friction_on_plane, pair_friction
-from ...response.contacts.queue import has_pair, pair_count, vertices_of
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
+from .merit import MEETS, add_energy
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
-from .system import Contacts, Unknowns, couples, is_solved, key_of_pair, to_single_block
+from .system import Contacts, Progress, Unknowns, couples, is_solved, key_of_pair, kind_of_key, to_single_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,34 +89,36 @@ def _add_contact(
 
 
 @wp.func
-def _find_near(
+def find_near(
+    i: int,
     motion: Motion,
     candidates: Candidates,
     settings: BarrierSettings,
     trial: Trial,
     unknowns: Unknowns,
-    active: wp.array[int],
+    progress: Progress,
     contacts: Contacts,
-    i: int,
 ):
-    reach = wp.float64(candidates.reach[i])
-    if reach == ZERO:
+    """Adds a contact if a candidate is near each other, in worlds that solve, and its energy."""
+    corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
+    world = motion.world[corners[0]]
+    if progress.solving[world] == 0:
         return
-    queue = candidates.queue
-    corners = vertices_of(queue, i)
-    if active[motion.world[corners[0]]] == 0:
-        return
+    key = candidates.key[i] + wp.int64(0)
+    kind = kind_of_key(key)
     a, b, c, d = corners_of(trial.exact, corners)
-    if barrier.distance_of_boxes(queue.kind, a, b, c, d) >= candidates.level[i] + reach:
+    if barrier.distance_of_boxes(kind, a, b, c, d) >= candidates.level[i] + reach:
         return
-    weights, distance = barrier.closest_weights_and_gap(queue.kind, a, b, c, d)
+    weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     gap = distance - candidates.level[i]
-    if gap >= reach or not gap > ZERO:
+    if gap >= reach:
+        return
+    if not gap > ZERO:
+        add_energy(progress.energy, world, MEETS, settings.units)
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    stiffness = stiffness_of_pair(motion, settings, trial, corners, queue.kind == EDGE_EDGE, reach)
-    pair = queue.pairs[i]
-    key = key_of_pair(0, queue.kind, pair[0], pair[1])
+    stiffness = stiffness_of_pair(motion, settings, trial, corners, kind == EDGE_EDGE, reach)
+    add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
     friction = pair_friction(motion, corners)
     _add_contact(
         motion,
@@ -137,49 +139,21 @@ def _find_near(
     )
 
 
-@wp.kernel
-def find_near(
-    # in
-    motion: Motion,
-    first: Candidates,
-    second: Candidates,
-    settings: BarrierSettings,
-    trial: Trial,
-    unknowns: Unknowns,
-    active: wp.array[int],
-    # out
-    contacts: Contacts,
-    threads: int,
-):
-    """Adds contacts for the candidates that are near each other, in active worlds."""
-    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
-        number = int(0)
-        while number < 2:
-            of = first
-            if number == 1:
-                of = second
-            if has_pair(of.queue, i):
-                _find_near(motion, of, settings, trial, unknowns, active, contacts, i)
-            number += 1
-
-
-@wp.kernel
+@wp.func
 def find_near_planes(
-    # in
+    vertex: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
     settings: BarrierSettings,
     trial: Trial,
     unknowns: Unknowns,
-    active: wp.array[int],
-    # out
+    progress: Progress,
     contacts: Contacts,
 ):
-    """Adds contacts for the particles that are near infinite planes, in active worlds."""
-    vertex = wp.tid()
+    """Adds contacts for a vertex that is near infinite planes, in worlds that solve, and their energies."""
     world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or active[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0 or progress.solving[world] == 0:
         return
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]
@@ -189,10 +163,14 @@ def find_near_planes(
         distance, _error = signed_distance(plane, trial.exact[vertex])
         _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
         gap = distance - level
-        if gap >= reach or not gap > ZERO:
+        if gap >= reach:
+            continue
+        if not gap > ZERO:
+            add_energy(progress.energy, world, MEETS, settings.units)
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
         stiffness = stiffness_at_plane(motion, settings, vertex, reach)
+        add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
         key = key_of_pair(1, 0, vertex, i)
         there, _error_there = signed_distance(planes.end[i], trial.exact[vertex])
         since, _since_error = signed_distance(planes.start[i], trial.exact[vertex])

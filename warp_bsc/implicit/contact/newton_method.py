@@ -10,17 +10,19 @@ import numpy as np
 import warp as wp
 
 from ...detection.launch import retry_until_fits
-from ...response.contacts.queue import queues_of
+from ...response.contacts.queue import PairQueue, queues_of
 from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
 from ...response.state.mesh import host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from . import assembly, bodies, bounds, contact_lists, decisions, held, merit, near, pairs, steps
+from . import bodies, decisions, pairs, steps
+from .advance import THREADS, Flow, Phase, Problem, advance
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_solve_kernel, make_team
-from .elasticity import differentiate, elements_of_model, make_derivatives
+from .decisions import Flag
+from .elasticity import elements_of_model, make_derivatives
 from .impulses import publish_contacts
 from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
@@ -28,10 +30,6 @@ from .rows import make_rows
 from .step_report import StepResults, note_overflow, write_results
 from .system import Contacts, Progress, Unknowns
 
-_TRUNCATIONS = 4
-"""Passes in which the displacements of single vertices are cut, before those of their world are."""
-_PREDICTIONS = 2
-"""Solves of a Newton step after its first one, each of which holds what met in the one before."""
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with an element for each corner."""
 _PARTS = 8
@@ -123,30 +121,23 @@ class NewtonMethod:
             held = np.flatnonzero(first >= 0)
             holder[particles + held] = first_vertex[body_of_vertex[held]]
         self._rows = make_rows(of_elements, unknown, self._count, device)
-        self._row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
+        row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
-        self._element_count = sum(map(len, of_elements))
-        self._derivatives = make_derivatives(of_elements, device)
         self._vectors = allocate(Vectors, self._count, device)
-        self._first = wp.zeros(self._count, dtype=wp.vec3, device=device)  # solution before pairs are held
         self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
         )
-        self._limit = wp.full(vertices, 1.0, dtype=float, device=device)
+        limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
-        self._whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
+        whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
         self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
         self._any_leaves = self._leaves[work.worlds :]
-        self._meets, self._goes_back = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+        self._goes_back = wp.zeros(1, dtype=int, device=device)
         self._place = wp.zeros(work.worlds, dtype=int, device=device)
-        self._flags = wp.zeros(4, dtype=int, device=device)
-        self._goes_on, self._search, self._cuts, self._rises = (self._flags[k : k + 1] for k in range(4))
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
-        self._ahead = wp.zeros(work.worlds, dtype=int, device=device)
-        self._convex = wp.ones(work.worlds, dtype=int, device=device)
         self._settings = BarrierSettings()
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
@@ -177,10 +168,22 @@ class NewtonMethod:
         self._attachments = attachments_of_model(model)
         self._poses = None if self._attachments is None else wp.clone(model.body_q)
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
-        self._candidates: list[Candidates] = []
-        self._contacts = Contacts()
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
+        self._flow = allocate(Flow, 1, device, flags=len(Flag))
+        self._advancing = device.sm_count * THREADS if device.is_cuda else 1
+        p = self._problem = Problem()
+        p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
+        p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
+        p.vectors, p.unknowns, p.bodies = self._vectors, unknowns, self._bodies
+        p.trial, p.progress, p.flow = self._trial, self.progress, self._flow
+        p.goal, p.lower, p.upper, p.limit = self._goal, self._lower, self._upper, limit
+        p.plane_share, p.whole, p.leaves, p.lacks = self._plane_share, whole, self._leaves, self._lacks
+        p.first = wp.zeros(self._count, dtype=wp.vec3, device=device)
+        p.element_count = sum(map(len, of_elements))
+        p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
+        p.parts = _PARTS if device.is_cuda else 1
+        self._queues: list[PairQueue] = []
         self._retired: list[tuple] = []
         self._allocate(queues_of(work.detector, candidates=True))
 
@@ -240,12 +243,12 @@ class NewtonMethod:
         work = self._work
         self._goes_back.zero_()
         inputs = [self.progress, self._unknowns, work.status.contact_iteration, begins]
-        outputs = [self._place, self._results[0].converged, self._ahead, self._goes_back]
+        outputs = [self._place, self._results[0].converged, self.progress.solving, self._goes_back]
         self._launch(decisions.go_back, work.worlds, inputs, outputs)
         wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
 
     def _move_back(self, end, detect):
-        inputs = [self._trial, self._unknowns, self._dt, self._ahead, self._place]
+        inputs = [self._trial, self._unknowns, self._dt, self.progress.solving, self._place]
         self._launch(steps.retreat, self._mesh.vertex_count, inputs, [self._work.step.motion, end])
         detect()
 
@@ -277,6 +280,7 @@ class NewtonMethod:
             self._launch(attach, self._mesh.model.particle_count, inputs, outputs)
             wp.copy(self._poses, end.body_q)
         self.progress.active.zero_()
+        self._flow.arrived.zero_()
         self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
         inputs = [motion, self._margin, self._unknowns, self._bodies]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
@@ -292,10 +296,12 @@ class NewtonMethod:
         work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
         self._find_candidates()
         wp.capture_if(self._touching.any, self._part_touching)
-        self._goes_on.fill_(1)
-        wp.capture_while(self._goes_on, self._take_newton_step)
+        self._flow.phase.fill_(int(Phase.BEGIN))
+        self._flow.goes_on.fill_(1)
+        wp.capture_while(self._flow.goes_on, self._take_newton_steps)
         if self.keeps_contacts:
-            self._find_near(self.progress.steps)
+            self._flow.phase.fill_(int(Phase.PUBLISH))
+            self._advance()
         if len(self._bodies.unknown):
             self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
@@ -319,219 +325,69 @@ class NewtonMethod:
         retry_until_fits(find, detector, work.device)
         self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self._lacks])
         queues = queues_of(detector, candidates=True)
-        if [len(c.kept) for c in self._candidates] != [len(q.pairs) for q in queues]:
+        if [len(q.pairs) for q in self._queues] != [len(q.pairs) for q in queues]:
             self._allocate(queues)
         self._prepare_candidates()
 
     def _prepare_candidates(self):
+        self._problem.candidates.count.zero_()
         inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings]
-        self._over_candidates(pairs.prepare_candidates, inputs, [self._touching])
+        for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
+            queues = self._queues[k : k + 2]
+            outputs = [self._problem.candidates, self._touching]
+            self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, *outputs])
 
     def _part_touching(self):
         inputs = [self._work.step, self._settings, self._touching]
         self._launch(pairs.part_touching, self._mesh.model.particle_count, inputs, [self._trial, self._origin])
         self._prepare_candidates()
 
-    def _over_candidates(self, kernel, before, after=()):
-        """Launches a kernel over pairs of faces and edges, and then over those of points, if there are any."""
-        for k in range(0, len(self._candidates), 2):
-            self._work.launch_over_entries(kernel, [*before, *self._candidates[k : k + 2], *after])
-
     def _allocate(self, queues):
-        self._retired.append((self._candidates, self._contacts))  # a CUDA graph may still write to them
-        device, self._candidates = self._work.device, []
-        for queue in queues:
-            candidates = Candidates()
-            candidates.queue = queue
-            candidates.kept = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
-            candidates.level = wp.zeros(len(queue.pairs), dtype=wp.float64, device=device)
-            candidates.share = wp.zeros(len(queue.pairs), dtype=float, device=device)
-            candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
-            candidates.floor = wp.zeros(len(queue.pairs), dtype=float, device=device)
-            self._candidates.append(candidates)
-        capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
+        problem, device, self._queues = self._problem, self._work.device, queues
+        self._retired.append((problem.candidates, problem.contacts))  # a CUDA graph may still write to them
+        candidates = sum(len(q.pairs) for q in queues)
+        problem.candidates = allocate(Candidates, candidates, device, count=1)
+        capacity = candidates + self._work.max_penetrations
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
-        self._contacts = allocate(Contacts, capacity, device, **sizes)
+        self._contacts = problem.contacts = allocate(Contacts, capacity, device, **sizes)
 
-    def _bound(self, active):
-        """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
-        work, motion = self._work, self._work.step.motion
-        self._over_candidates(bounds.bound_by_pairs, [motion], [self._trial, active, self.progress, self._limit])
-        if work.max_penetrations:
-            inputs = [motion, work.motion.planes, self._plane_share, self._settings, self._trial, active]
-            self._launch(bounds.bound_by_planes, work.vertices_at_planes, inputs, [self.progress, self._limit])
-
-    def _take_newton_step(self):
+    def _take_newton_steps(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
-        work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
-        unknowns, vertices = self._unknowns, self._mesh.vertex_count
-        dt = wp.float64(self._dt)
-        self._launch(decisions.begin_newton_step, work.worlds, [], [progress])
-        self._launch(steps.find_remaining, vertices, [motion, unknowns], [trial, progress])
-        inputs = [self._elements, trial.exact, motion.x0, dt, motion.world, progress.active, self._convex]
-        self._launch(differentiate, self._element_count, inputs, [self._derivatives])
-        inputs = [self._derivatives, self._rows, unknowns, progress]
-        self._launch(assembly.find_loads, self._count, inputs, [self._settings.load])
-        self._find_near(progress.active)
-        self._assemble(progress.active, True)
-        self._solve_linear(progress.active)
-        self._hold_ahead(0)
-        self._flags.zero_()
-        self._launch(decisions.take_bound, work.worlds, [], [progress, self._cuts])
-        self._add_energies(False, progress.energy)
-        self._add_energies(True, progress.trial)
-        self._launch(decisions.find_rises, work.worlds, [progress], [self._ahead, self._rises])
-        wp.capture_if(self._rises, self._release)
-        wp.capture_if(self._cuts, self._truncate)
-        self._launch(decisions.decide_search, work.worlds, [], [progress, self._search])
-        wp.capture_while(self._search, self._try)
-        self._take()
-        inputs = [float(_LEAST_SPEED * self._dt), self.max_steps, max(LATE_STEPS, self.max_steps)]
-        self._launch(decisions.decide_step, work.worlds, inputs, [progress, self._plane_share, self._goes_on])
+        self._advance()
+        wp.capture_while(self._flow.solves_next, self._solve)
 
-    def _release(self):
-        """Takes the first solution of the Newton step where held pairs have made it one on which the energy rises."""
-        work, progress, unknowns, rises = self._work, self.progress, self._unknowns, self._ahead
-        inputs, outputs = [unknowns, rises, self._first], [progress, self._vectors.solution]
-        self._launch(decisions.begin_release, max(self._count, work.worlds), inputs, outputs)
-        self._displace(rises)
-        self._launch(decisions.take_bound, work.worlds, [], [progress, self._cuts])
-        self._add_energies(True, progress.trial)
-        self._launch(decisions.end_release, work.worlds, [], [progress])
-
-    def _truncate(self):
-        """Cuts the displacements of single vertices in place of those of their world, where energies are then lower."""
-        work, progress, vertices = self._work, self.progress, self._mesh.vertex_count
-        inputs, outputs = [self._unknowns, self._lower, self._upper], [self._trial, progress, self._whole, self._limit]
-        self._launch(steps.begin_truncation, max(vertices, work.worlds), inputs, outputs)
-        for _ in range(_TRUNCATIONS):
-            self._bound(progress.searches)
-            self._launch(steps.truncate, vertices, [self._unknowns], [self._limit, self._trial])
-        self._launch(decisions.begin_hold, work.worlds, [True], [progress, self._ahead])  # clears bounds
-        self._bound(progress.searches)
-        self._launch(decisions.take_bound, work.worlds, [], [progress, self._cuts])
-        self._add_energies(True, progress.trial_cut)
-        self._launch(decisions.choose_truncation, work.worlds, [self._whole], [progress])
-        self._launch(steps.undo_truncation, vertices, [work.step.motion, progress], [self._trial])
-
-    def _solve_linear(self, active):
+    def _solve(self):
         work, team = self._work, self._team
         if team.blocks > 1:
             team.arrived.zero_()
-        inputs = [self._matrix, self._contacts, self._unknowns, active, _TOLERANCE, _MAX_ITERATIONS, team]
+        inputs = [
+            self._matrix,
+            self._contacts,
+            self._unknowns,
+            self.progress.solving,
+            _TOLERANCE,
+            _MAX_ITERATIONS,
+            team,
+        ]
         outputs = [self._vectors, self.iterations]
         options = {"device": work.device, "block_dim": self._threads}
         wp.launch(
             self._solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options
         )
+        self._advance()
 
-    def _assemble(self, active, begins):
-        """Lists contacts by unknown, and computes the gradient and the Hessian; the first time it ``begins``."""
-        motion, contacts, unknowns, vectors = self._work.step.motion, self._contacts, self._unknowns, self._vectors
-        self._list_contacts()
-        parts = _PARTS if self._work.device.is_cuda else 1
-        masses = [motion, self._bodies, wp.float64(self._dt), active]
-        inputs = [self._derivatives, contacts, unknowns, self._row_of_block, self._trial, self._goal, *masses]
-        inputs += [self._rows, parts]
-        self._launch(assembly.add_blocks, parts * len(self._row_of_block), inputs, [self._matrix])
-        inputs = [self._derivatives, contacts, unknowns, self._trial, self._goal, *masses, begins]
-        inputs += [self._rows, self._matrix, parts]
-        self._launch(assembly.assemble, parts * self._count, inputs, [vectors])
-
-    def _hold_ahead(self, solves):
-        """Writes the displacements after a number of solves; holds what would meet on them, and solves again."""
-        if not solves:
-            self._leaves.zero_()
-        self._displace(self._ahead if solves else self.progress.active)
-        if solves < _PREDICTIONS:
-            self._meets.zero_()
-            self._launch(decisions.find_meeting, self._work.worlds, [self.progress], [self._meets])
-            wp.capture_if(self._meets, self._hold, solves=solves)
-
-    def _displace(self, active):
-        """Writes the displacements of a solve, and bounds them."""
-        motion, unknowns, vectors, progress = self._work.step.motion, self._unknowns, self._vectors, self.progress
-        self._launch_over_bodies(bodies.displace_bodies, [motion, unknowns, progress, vectors.solution])
-        inputs = [motion, unknowns, vectors, self._lower, self._upper, self._bodies, active]
-        outputs = [self._trial, progress, self._limit, self._leaves]
-        self._launch(steps.displace, self._mesh.vertex_count, inputs, outputs)
-        self._bound(active)
-
-    def _hold(self, solves):
-        work, motion, contacts = self._work, self._work.step.motion, self._contacts
-        unknowns, ahead = self._unknowns, self._ahead
-        if not solves:
-            wp.copy(self._first, self._vectors.solution)
-        self._launch(decisions.begin_hold, work.worlds, [False], [self.progress, ahead])
-        work.launch_over_entries(held.release_held, [motion, unknowns, self._vectors.solution, ahead, contacts])
-        inputs, outputs = [self._trial, unknowns, self._vectors.inverse, ahead], [2 + solves, contacts]
-        self._over_candidates(held.hold_pairs, [motion], [*inputs, self._limit, *outputs])
-        if work.max_penetrations:
-            inputs = [motion, work.motion.planes, self._plane_share, self._settings, *inputs]
-            self._launch(held.hold_at_planes, work.vertices_at_planes, [*inputs, 2 + solves], [contacts])
-        self._assemble(ahead, False)
-        self._solve_linear(ahead)
-        self._hold_ahead(solves + 1)
+    def _advance(self):
+        work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
+        inputs = [work.step.motion, work.motion.planes, self._settings, float(_LEAST_SPEED * self._dt), *steps_at_most]
+        options = {"device": work.device, "block_dim": THREADS}
+        wp.launch(advance, self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
         inputs = [self._contacts, self._settings, self._trial, self._goal, self._work.step, sides, centres, sums, rows]
         self._work.launch_over_entries(publish_contacts, inputs)
-
-    def _find_near(self, active):
-        """Finds what is near at the positions."""
-        work, motion, contacts = self._work, self._work.step.motion, self._contacts
-        contacts.count.zero_()
-        inputs = [self._settings, self._trial, self._unknowns, active, contacts]
-        self._over_candidates(near.find_near, [motion], inputs)
-        if work.max_penetrations:
-            inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(near.find_near_planes, work.vertices_at_planes, inputs[:-1], [contacts])
-
-    def _list_contacts(self):
-        work, contacts = self._work, self._contacts
-        contacts.listed.zero_()
-        contacts.end.zero_()
-        contacts.coupled_end.zero_()
-        inputs = [contacts, self._unknowns, self._mesh.device_world]
-        work.launch_over_entries(contact_lists.count_entries, inputs)
-        self._launch(contact_lists.place_entries, max(self._count, work.worlds), [], [contacts, self._lacks])
-        work.launch_over_entries(contact_lists.list_entries, inputs)
-        work.launch_over_entries(contact_lists.sort_entries, [contacts])
-
-    def _try(self):
-        """Computes the energy at the displaced positions, and halves the shares of worlds where it has risen."""
-        self._add_energies(True, self.progress.trial)
-        self._search.zero_()
-        self._launch(decisions.decide_search, self._work.worlds, [], [self.progress, self._search])
-
-    def _add_energies(self, displaced, energy):
-        work, motion, progress, trial = self._work, self._work.step.motion, self.progress, self._trial
-        self._move_bodies(displaced=displaced)
-        inputs = [motion, self._unknowns, self._bodies, progress, displaced]
-        self._launch(steps.write_moved, self._mesh.vertex_count, inputs, [trial])
-        inputs = [self._elements, self._element_count, motion, self._settings, trial, self._goal, self._unknowns]
-        inputs += [self._bodies, progress, displaced]
-        self._launch(steps.add_energies, self._element_count + self._count, inputs, [energy])
-        inputs = [self._settings, trial, progress, displaced, energy]
-        self._over_candidates(merit.add_pair_energies, [motion], inputs)
-        work.launch_over_entries(merit.add_friction_energies, [motion, self._contacts, *inputs])
-        if work.max_penetrations:
-            inputs = [motion, work.motion.planes, self._plane_share, *inputs]
-            self._launch(merit.add_plane_energies, work.vertices_at_planes, inputs[:-1], [energy])
-
-    def _take(self):
-        """Moves everything by what is taken of its displacements."""
-        motion, vertices = self._work.step.motion, self._mesh.vertex_count
-        self._move_bodies(takes=True)
-        inputs = [motion, self._unknowns, self._bodies]
-        self._launch(steps.take, vertices, inputs, [self.progress, self._trial])
-
-    def _move_bodies(self, *, displaced=True, takes=False):
-        inputs = [self._work.step.motion, self._unknowns, self.progress, self._trial.share, self._vectors.solution]
-        self._launch_over_bodies(bodies.move_bodies, [*inputs, displaced, takes])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ...detection.approach_phase import KEPT, distances_of_pair
+from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
@@ -11,6 +12,7 @@ from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_
 from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
 from . import barrier
+from .system import key_of_pair
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,18 +30,22 @@ _PARTED_ROUNDED = wp.constant(2.0**-20)
 
 @wp.struct
 class Candidates:
-    """Pairs of one kind that may come near each other in the step.
+    """Pairs of elements that may come near each other in the step, but for those that are excluded, in any order.
 
     Attributes:
-        queue: The pairs.
+        count: Number of pairs, shape [1].
+        corners: Vertices.
+        key: Number of the pair, see :func:`.system.key_of_pair`.
         kept: Distance that each pair keeps in any case [m].
         level: Distance at which its barrier is infinite [m], no more than that.
-        reach: Gap beyond the level from which its barrier pushes [m]; 0 of a pair that is excluded.
+        reach: Gap beyond the level from which its barrier pushes [m].
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet.
     """
 
-    queue: PairQueue
+    count: wp.array[int]
+    corners: wp.array[wp.vec4i]
+    key: wp.array[wp.int64]
     kept: wp.array[wp.float64]
     level: wp.array[wp.float64]
     reach: wp.array[float]
@@ -85,7 +91,7 @@ class Trial:
         holder: Vertex whose share each vertex takes: itself, or the first of its body.
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
         exact: Positions without rounding, which for friction is a large part of the way [m].
-        moved: The same after displacements.
+        moved: The same after displacements; where a Newton step begins, before them.
         path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, vertices];
             the last are those after the last of more.
     """
@@ -195,27 +201,24 @@ NO_FACE = wp.constant(2**31 - 1)
 @wp.func
 def _prepare(
     step: Step,
-    candidates: Candidates,
+    queue: PairQueue,
     settings: BarrierSettings,
     origin: wp.array[wp.vec3],
     crossings: wp.array[int],
+    candidates: Candidates,
     touching: Touching,
     i: int,
 ):
-    motion, queue = step.motion, candidates.queue
+    motion = step.motion
     corners = vertices_of(queue, i)
-    candidates.reach[i] = 0.0
-    candidates.kept[i] = ZERO
     if owner_of(motion, corners) != ContactClass.OURS:
         return
     a, b, c, d = corners_of(origin, corners)
     if not wp.isfinite(a + b + c + d):
         return
-    start = ZERO
+    start, kept = ZERO, ZERO
     if motion.distances.radius:
-        found, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
-        start = found
-        candidates.kept[i] = kept
+        start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
         start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
@@ -227,10 +230,14 @@ def _prepare(
     if crossings[motion.world[corners[0]]] > 0:
         if crossed_at_start(step, queue.kind, queue.pairs[i]):
             return
-    level, reach = _barrier_of(settings, start, candidates.kept[i], _reach_of(settings, corners))
-    candidates.level[i] = level
-    candidates.reach[i] = float(reach)
-    candidates.floor[i] = float(barrier.floor_gap(start - candidates.kept[i], reach))
+    level, reach = _barrier_of(settings, start, kept, _reach_of(settings, corners))
+    slot, pair = take_slot_int(candidates.count), queue.pairs[i]
+    candidates.corners[slot] = corners
+    candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
+    candidates.kept[slot] = kept
+    candidates.level[slot] = level
+    candidates.reach[slot] = float(reach)
+    candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
 
 
 @wp.kernel
@@ -240,22 +247,23 @@ def prepare_candidates(
     settings: BarrierSettings,
     origin: wp.array[wp.vec3],
     crossings: wp.array[int],
+    first: PairQueue,
+    second: PairQueue,
     # in and out
-    first: Candidates,
-    second: Candidates,
+    candidates: Candidates,
     # out
     touching: Touching,
     threads: int,
 ):
-    """Writes distances that candidates keep, and excludes those that touch or cross at the start of the step."""
-    for i in range(wp.tid(), wp.max(pair_count(first.queue), pair_count(second.queue)), threads):
+    """Adds the pairs of two queues to the candidates, but for those that touch or cross at the start of the step."""
+    for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
         number = int(0)
         while number < 2:
             of = first
             if number == 1:
                 of = second
-            if has_pair(of.queue, i):
-                _prepare(step, of, settings, origin, crossings, touching, i)
+            if has_pair(of, i):
+                _prepare(step, of, settings, origin, crossings, candidates, touching, i)
             number += 1
 
 
@@ -280,6 +288,7 @@ def part_touching(
     parted = x + off * wp.normalize(wp.cross(b - a, c - a))
     trial.x[v] = parted
     trial.exact[v] = to_double(parted)
+    trial.moved[v] = to_double(parted)
     origin[v] = parted
 
 

@@ -8,7 +8,6 @@ from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, inertial_energy
 from .conjugate_gradients import Vectors
 from .decisions import may_cut
-from .elasticity import Elements, element_energy, first_vertex, kind_of
 from .merit import add_energy
 from .pairs import BarrierSettings, Trial, moved
 from .system import Progress, Unknowns, displacement, is_solved, unknown_of_corner
@@ -97,6 +96,7 @@ def begin_step(
     x0, x1 = motion.x0[v], motion.x1[v]
     trial.x[v] = x0
     trial.exact[v] = to_double(x0)
+    trial.moved[v] = to_double(x0)
     trial.displaced[v] = wp.vec3()
     trial.share[v] = 1.0
     trial.bend[v] = 0.0
@@ -118,32 +118,28 @@ def begin_step(
     upper[v] = wp.max(x0, x1) + wp.vec3(pad)
 
 
-@wp.kernel
+@wp.func
 def truncate(
-    # in
+    v: int,
     unknowns: Unknowns,
-    # in and out
     limit: wp.array[float],
     trial: Trial,
 ):
     """Takes the shares of vertices that are solved for down to their bounds, and clears these."""
-    v = wp.tid()
     if trial.holder[v] == v and is_solved(unknowns, v):
         trial.share[v] = trial.share[v] * limit[v]
     limit[v] = 1.0
 
 
-@wp.kernel
+@wp.func
 def find_remaining(
-    # in
+    v: int,
     motion: Motion,
     unknowns: Unknowns,
-    # out
     trial: Trial,
     progress: Progress,
 ):
     """Writes the ways that are left of what a program moves, before a solve."""
-    v = wp.tid()
     world = motion.world[v]
     trial.share[v] = 1.0
     if progress.active[world] != 0 and not is_solved(unknowns, v) and wp.isfinite(trial.x[v]):
@@ -153,26 +149,23 @@ def find_remaining(
             wp.atomic_max(progress.remaining, world, wp.length(d))
 
 
-@wp.kernel
+@wp.func
 def displace(
-    # in
+    v: int,
     motion: Motion,
     unknowns: Unknowns,
     vectors: Vectors,
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
     bodies: SolvedBodies,
-    active: wp.array[int],
-    # out
     trial: Trial,
     progress: Progress,
     limit: wp.array[float],
     leaves: wp.array[int],
 ):
     """Writes the displacements of vertices after a solve, and whether some leave the boxes of the candidates."""
-    v = wp.tid()
     world = motion.world[v]
-    if active[world] == 0:
+    if progress.solving[world] == 0:
         return
     limit[v] = 1.0
     if not is_solved(unknowns, v):
@@ -239,26 +232,26 @@ def _share_within(x: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> flo
     return wp.max(share, 0.0)
 
 
-@wp.kernel
+@wp.func
 def begin_truncation(
-    # in
+    v: int,
     unknowns: Unknowns,
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
-    # in and out
     trial: Trial,
     progress: Progress,
     whole: wp.array[float],
     limit: wp.array[float],
 ):
     """Lets worlds that take less than all of their displacements try to cut those of single vertices instead."""
-    v = wp.tid()
     if v < progress.active.shape[0]:
         progress.searches[v] = 0
+        progress.solving[v] = 0
         if progress.active[v] != 0:
             whole[v] = progress.scale[v]
             if may_cut(progress, v):
                 progress.searches[v] = 1
+                progress.solving[v] = 1
             progress.scale[v] = 1.0
             progress.bound[v] = 1.0
     if v >= trial.x.shape[0]:
@@ -268,49 +261,32 @@ def begin_truncation(
         wp.atomic_min(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
 
 
-@wp.kernel
+@wp.func
 def undo_truncation(
-    # in
+    v: int,
     motion: Motion,
     progress: Progress,
-    # out
     trial: Trial,
 ):
     """Lets vertices take all that their world takes, where it cuts none."""
-    v = wp.tid()
     if progress.cuts[motion.world[v]] == 0:
         trial.share[v] = 1.0
 
 
-@wp.kernel
-def add_energies(
-    # in
-    elements: Elements,
-    element_count: int,
+@wp.func
+def add_inertia(
+    u: int,
     motion: Motion,
     settings: BarrierSettings,
     trial: Trial,
     goal: wp.array[wp.vec3],
     unknowns: Unknowns,
     bodies: SolvedBodies,
-    progress: Progress,
-    displaced: bool,
-    # in and out
+    world: int,
     energy: wp.array[wp.int64],
 ):
-    """Adds the energies of elements, and the inertia of particles, at positions or at the displaced ones."""
-    i = wp.tid()
-    if i < element_count:
-        kind = kind_of(elements, i)
-        world = motion.world[first_vertex(elements, kind, i - elements.first[kind])]
-        if progress.active[world] == 0 or (displaced and progress.searches[world] == 0):
-            return
-        value = element_energy(elements, i, kind, trial.moved, motion.x0, settings.dt)
-        add_energy(energy, world, value, settings.units)
-        return
-    u = i - element_count
-    world = unknowns.world[u]
-    if progress.active[world] == 0 or (displaced and progress.searches[world] == 0) or unknowns.is_free[u] == 0:
+    """Adds the energy of inertia of an unknown at ``trial.moved`` to that of its world."""
+    if unknowns.is_free[u] == 0:
         return
     p = unknowns.particle[u]
     if p < 0:
@@ -322,39 +298,34 @@ def add_energies(
     add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
 
 
-@wp.kernel
+@wp.func
 def write_moved(
-    # in
+    v: int,
     motion: Motion,
     unknowns: Unknowns,
     bodies: SolvedBodies,
     progress: Progress,
-    displaced: bool,
-    # out
     trial: Trial,
 ):
-    """Writes positions, or the displaced ones."""
-    v = wp.tid()
+    """Writes where a vertex is after its displacement."""
     world = motion.world[v]
     if progress.active[world] != 0:
-        x = moved(trial, wp.where(displaced, progress.scale[world], 0.0), v)
+        x = moved(trial, progress.scale[world], v)
         if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
             x = exact_on_body(bodies.moved, bodies.low_moved, motion, v)
         trial.moved[v] = x
 
 
-@wp.kernel
+@wp.func
 def take(
-    # in
+    v: int,
     motion: Motion,
     unknowns: Unknowns,
     bodies: SolvedBodies,
-    # in and out
     progress: Progress,
     trial: Trial,
 ):
     """Moves vertices by the shares of their worlds; what a program moves arrives exactly."""
-    v = wp.tid()
     world = motion.world[v]
     if progress.active[world] == 0:
         return
@@ -370,6 +341,7 @@ def take(
         trial.x[v] = body_vertex(bodies.pose, motion, v)
         trial.exact[v] = exact_on_body(bodies.pose, bodies.low, motion, v)
         unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
+    trial.moved[v] = trial.exact[v]
     trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
     if not given:
         wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))

@@ -41,13 +41,14 @@ class Progress:
 
     Attributes:
         active: 1 while a world takes another Newton step, shape [worlds], like all that follow.
+        solving: 1 while a world takes part in a solve, or in what follows from one.
         steps: Newton steps so far.
         scale: Share of the displacements that is taken.
         bound: Share of the displacements before two elements meet.
         searches: 1 while the share of the world is to be halved, as its energy has risen.
         energy: Energy at the positions, in units.
         trial: Energy at the displaced positions, in units.
-        trial_cut: The same, with displacements of single vertices cut.
+        uncut: The same, before displacements of single vertices are cut.
         cuts: 1 if those are cut.
         change: Largest displacement of an unknown [m].
         remaining: Largest way of what a program moves that is left [m].
@@ -56,13 +57,14 @@ class Progress:
     """
 
     active: wp.array[int]
+    solving: wp.array[int]
     steps: wp.array[int]
     scale: wp.array[float]
     bound: wp.array[float]
     searches: wp.array[int]
     energy: wp.array[wp.int64]
     trial: wp.array[wp.int64]
-    trial_cut: wp.array[wp.int64]
+    uncut: wp.array[wp.int64]
     cuts: wp.array[int]
     change: wp.array[float]
     remaining: wp.array[float]
@@ -249,6 +251,12 @@ def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int, part: int, 
 def key_of_pair(group: int, kind: int, first: int, second: int) -> wp.int64:
     """Returns a number of a pair, different for each pair of a kind, and for each group of contacts."""
     return (wp.int64(8 * group + kind) << wp.int64(56)) | (wp.int64(first) << wp.int64(28)) | wp.int64(second)
+
+
+@wp.func
+def key_in_group(group: int, key: wp.int64) -> wp.int64:
+    """Returns the number of a pair in a group of contacts, from its number in group 0."""
+    return key | (wp.int64(8 * group) << wp.int64(56))
 
 
 @wp.func

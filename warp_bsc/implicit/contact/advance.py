@@ -1,0 +1,473 @@
+"""Newton steps as one kernel: all that lies between two solves, phase after phase, read from top to bottom.
+
+All threads of the device take a share of each phase, and wait for each other behind it. What a phase finds in some
+world decides which comes next: without a launch, a host, or a condition of a CUDA graph in between.
+"""
+
+from enum import IntEnum
+
+import warp as wp
+
+from ...response.state.planes import MovingPlanes
+from ...response.state.structs import Motion
+from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merit, near, steps
+from .conjugate_gradients import Vectors
+from .decisions import Flag
+from .matrix import Matrix
+from .pairs import BarrierSettings, Candidates, Trial
+from .rows import Rows
+from .system import Contacts, Progress, Unknowns, contact_count
+
+wp.set_module_options({"enable_backward": False})
+
+THREADS = 256
+"""Threads of a block on a GPU."""
+_TRUNCATIONS = wp.constant(4)
+"""Passes in which the displacements of single vertices are cut, before those of their world are."""
+_PREDICTIONS = wp.constant(2)
+"""Solves of a Newton step after its first one, each of which holds what met in the one before."""
+
+
+class Phase(IntEnum):
+    """What all threads do until they wait for each other, or leave for what another kernel does."""
+
+    BEGIN = 0
+    DIFFERENTIATE = 1
+    LOADS = 2
+    RELEASE_HELD = 3
+    PAIRS = 4
+    COUNT = 5
+    PLACE = 6
+    LIST = 7
+    SORT = 8
+    BLOCKS = 9
+    ASSEMBLE = 10
+    DISPLACE = 11
+    MEETING = 12
+    HOLD = 13
+    TAKE_BOUND = 14
+    DISPLACED = 15
+    JUDGE = 16
+    JUDGED = 17
+    END_RELEASE = 18
+    BEGIN_CUTS = 19
+    CUT = 20
+    TAKE_CUT = 21
+    CHOOSE_CUTS = 22
+    UNDO_CUTS = 23
+    SEARCH = 24
+    TRY_OR_TAKE = 25
+    DECIDE = 26
+    NEXT = 27
+    PUBLISH = 28
+    SOLVE = 29
+    SEARCH_CANDIDATES = 30
+    END = 31
+
+
+class Task(IntEnum):
+    """What the phase over pairs does."""
+
+    FIND_NEAR = 0
+    HOLD = 1
+    BOUND = 2
+    ENERGY = 3
+
+
+@wp.struct
+class Flow:
+    """Where the Newton steps of all worlds are.
+
+    Attributes:
+        phase: The phase that comes next, shape [1].
+        solves: Solves of the Newton step so far, shape [1].
+        flags: What phases have found, see :class:`.decisions.Flag`.
+        solves_next: 1 if a solve comes next, shape [1].
+        goes_on: 1 if a solve or a search for candidates comes next, shape [1].
+        arrived: How often blocks of threads have waited, shape [1].
+    """
+
+    phase: wp.array[int]
+    solves: wp.array[int]
+    flags: wp.array[int]
+    solves_next: wp.array[int]
+    goes_on: wp.array[int]
+    arrived: wp.array[int]
+
+
+@wp.struct
+class Problem:
+    """What Newton steps read and write, see :class:`.newton_method.NewtonMethod`."""
+
+    elements: elasticity.Elements
+    derivatives: elasticity.Derivatives
+    rows: Rows
+    row_of_block: wp.array[int]
+    matrix: Matrix
+    vectors: Vectors
+    unknowns: Unknowns
+    bodies: bodies.SolvedBodies
+    candidates: Candidates
+    contacts: Contacts
+    trial: Trial
+    progress: Progress
+    flow: Flow
+    goal: wp.array[wp.vec3]
+    lower: wp.array[wp.vec3]
+    upper: wp.array[wp.vec3]
+    limit: wp.array[float]
+    plane_share: wp.array[float]
+    whole: wp.array[float]
+    first: wp.array[wp.vec3]
+    leaves: wp.array[int]
+    lacks: wp.array[int]
+    element_count: int
+    vertices_at_planes: int
+    parts: int
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+    if (gridDim.x > 1) {
+        if (threadIdx.x == 0) {
+            __threadfence();
+            const unsigned before = atomicAdd((unsigned*)arrived.data, 1u);
+            const unsigned all = (before / gridDim.x + 1u) * gridDim.x;
+            while ((int)(*(volatile unsigned*)arrived.data - all) < 0) {}
+            __threadfence();
+        }
+        __syncthreads();
+    }
+#endif
+"""
+)
+def wait_for_all(arrived: wp.array[int]):
+    """Waits until all threads of the launch are here, and sees what they have written; they must all be running."""
+    ...
+
+
+@wp.func
+def _over_pairs(
+    task: int, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings, solves: int, t: int, n: int
+):
+    group = 1 + solves
+    for i in range(t, p.candidates.count[0], n):
+        if task == Task.FIND_NEAR:
+            near.find_near(i, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
+        elif task == Task.HOLD:
+            held.hold_pair(
+                i,
+                motion,
+                p.candidates,
+                p.trial,
+                p.unknowns,
+                p.vectors.inverse,
+                p.progress,
+                p.limit,
+                group,
+                p.contacts,
+            )
+        elif task == Task.BOUND:
+            bounds.bound_by_pair(i, motion, p.candidates, p.trial, p.progress, p.limit)
+        else:
+            merit.add_pair_energy(i, motion, p.candidates, settings, p.trial, p.progress)
+    for v in range(t, p.vertices_at_planes, n):
+        if task == Task.FIND_NEAR:
+            near.find_near_planes(
+                v, motion, planes, p.plane_share, settings, p.trial, p.unknowns, p.progress, p.contacts
+            )
+        elif task == Task.HOLD:
+            held.hold_at_planes(
+                v,
+                motion,
+                planes,
+                p.plane_share,
+                settings,
+                p.trial,
+                p.unknowns,
+                p.vectors.inverse,
+                p.progress,
+                group,
+                p.contacts,
+            )
+        elif task == Task.BOUND:
+            bounds.bound_by_planes(v, motion, planes, p.plane_share, settings, p.trial, p.progress, p.limit)
+        else:
+            merit.add_plane_energies(v, motion, planes, p.plane_share, settings, p.trial, p.progress)
+
+
+@wp.func
+def _differentiate(i: int, p: Problem, motion: Motion, settings: BarrierSettings):
+    kind = elasticity.kind_of(p.elements, i)
+    world = motion.world[elasticity.first_vertex(p.elements, kind, i - p.elements.first[kind])]
+    if p.progress.solving[world] == 0:
+        return
+    elasticity.differentiate_element(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, True, p.derivatives)
+
+
+@wp.func
+def _add_element_energy(
+    i: int, p: Problem, motion: Motion, settings: BarrierSettings, mask: wp.array[int], energy: wp.array[wp.int64]
+):
+    kind = elasticity.kind_of(p.elements, i)
+    world = motion.world[elasticity.first_vertex(p.elements, kind, i - p.elements.first[kind])]
+    if mask[world] == 0:
+        return
+    value = elasticity.element_energy(p.elements, i, kind, p.trial.moved, motion.x0, settings.dt)
+    merit.add_energy(energy, world, value, settings.units)
+
+
+@wp.func
+def _add_inertia(
+    u: int, p: Problem, motion: Motion, settings: BarrierSettings, mask: wp.array[int], energy: wp.array[wp.int64]
+):
+    world = p.unknowns.world[u]
+    if mask[world] != 0:
+        steps.add_inertia(u, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, world, energy)
+
+
+@wp.kernel(launch_bounds=THREADS)
+def advance(
+    # in
+    motion: Motion,
+    planes: MovingPlanes,
+    settings: BarrierSettings,
+    least_change: float,
+    max_steps: int,
+    max_late_steps: int,
+    # in and out
+    p: Problem,
+    n: int,
+):
+    """Goes on with the Newton steps of all worlds until a solve, a search for candidates, or their end comes next."""
+    t = wp.tid()
+    progress, flags = p.progress, p.flow.flags
+    vertices, unknowns, worlds = p.trial.x.shape[0], p.vectors.solution.shape[0], p.progress.active.shape[0]
+    body_count = p.bodies.unknown.shape[0]
+    phase, solves = p.flow.phase[0] + int(0), p.flow.solves[0] + int(0)
+    # of the phase over pairs: what it does, and which phase follows; passes of cuts
+    task, then, passes = int(Task.BOUND), int(Phase.MEETING), int(0)
+    while phase < Phase.SOLVE:
+        if phase == Phase.BEGIN:
+            for w in range(t, worlds, n):
+                decisions.begin_newton_step(w, progress)
+            phase = int(Phase.DIFFERENTIATE)
+        elif phase == Phase.PUBLISH:  # what is near at the end
+            for w in range(t, worlds, n):
+                progress.solving[w] = progress.steps[w]
+            if t == 0:
+                p.contacts.count[0] = 0
+            task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
+        elif phase == Phase.DIFFERENTIATE:
+            solves = int(0)
+            for v in range(t, vertices, n):
+                steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
+            for i in range(t, p.element_count, n):
+                _differentiate(i, p, motion, settings)
+                _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)
+            phase = int(Phase.LOADS)
+        elif phase == Phase.LOADS:
+            if t == 0:
+                p.contacts.count[0] = 0
+            for u in range(t, unknowns, n):
+                assembly.find_loads(u, p.derivatives, p.rows, p.unknowns, progress, settings.load)
+                _add_inertia(u, p, motion, settings, progress.solving, progress.energy)
+            for u in range(t, wp.max(unknowns, worlds), n):
+                contact_lists.clear_lists(u, p.contacts)
+            task, then, phase = int(Task.FIND_NEAR), int(Phase.COUNT), int(Phase.PAIRS)
+        elif phase == Phase.RELEASE_HELD:
+            for i in range(t, contact_count(p.contacts), n):
+                held.release_held(i, motion, p.unknowns, p.vectors.solution, progress, p.contacts)
+            for u in range(t, wp.max(unknowns, worlds), n):
+                contact_lists.clear_lists(u, p.contacts)
+            task, then, phase = int(Task.HOLD), int(Phase.COUNT), int(Phase.PAIRS)
+        elif phase == Phase.PAIRS:
+            if task == Task.ENERGY:
+                if t == 0:
+                    flags[Flag.SEARCHES] = 0
+                for i in range(t, p.element_count, n):
+                    _add_element_energy(i, p, motion, settings, progress.searches, progress.trial)
+                for u in range(t, unknowns, n):
+                    _add_inertia(u, p, motion, settings, progress.searches, progress.trial)
+                for i in range(t, contact_count(p.contacts), n):
+                    if progress.searches[motion.world[p.contacts.corners[i][0]]] != 0:
+                        merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.trial)
+            _over_pairs(task, p, motion, planes, settings, solves, t, n)
+            phase = then
+        elif phase == Phase.COUNT:
+            for i in range(t, contact_count(p.contacts), n):
+                contact_lists.count_entries(i, motion, p.contacts, p.unknowns)
+                if solves == 0:
+                    merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.energy)
+            phase = int(Phase.PLACE)
+        elif phase == Phase.PLACE:
+            for u in range(t, wp.max(unknowns, worlds), n):
+                contact_lists.place_entries(u, p.contacts, p.lacks)
+            phase = int(Phase.LIST)
+        elif phase == Phase.LIST:
+            for i in range(t, contact_count(p.contacts), n):
+                contact_lists.list_entries(i, motion, p.contacts, p.unknowns)
+            phase = int(Phase.SORT)
+        elif phase == Phase.SORT:
+            for i in range(t, p.contacts.listed[0], n):
+                contact_lists.sort_entries(i, p.contacts)
+            phase = int(Phase.BLOCKS)
+        elif phase == Phase.BLOCKS:
+            for i in range(t, p.parts * p.row_of_block.shape[0], n):
+                assembly.add_block(
+                    i,
+                    p.derivatives,
+                    p.contacts,
+                    p.unknowns,
+                    p.row_of_block,
+                    p.trial,
+                    p.goal,
+                    motion,
+                    p.bodies,
+                    settings.dt,
+                    progress,
+                    p.rows,
+                    p.parts,
+                    p.matrix,
+                )
+            phase = int(Phase.ASSEMBLE)
+        elif phase == Phase.ASSEMBLE:
+            for i in range(t, p.parts * unknowns, n):
+                assembly.assemble(
+                    i,
+                    p.derivatives,
+                    p.contacts,
+                    p.unknowns,
+                    p.trial,
+                    p.goal,
+                    motion,
+                    p.bodies,
+                    settings.dt,
+                    progress,
+                    solves == 0,
+                    p.rows,
+                    p.matrix,
+                    p.parts,
+                    p.vectors,
+                )
+            for w in range(t, worlds + 1, n):
+                if solves == 0:
+                    p.leaves[w] = 0
+            if t == 0:
+                for k in range(flags.shape[0]):
+                    flags[k] = 0
+            phase = int(Phase.SOLVE)
+        elif phase == Phase.DISPLACE:  # after a solve
+            for b in range(t, body_count, n):
+                bodies.displace_bodies(b, motion, p.unknowns, progress, p.vectors.solution, p.bodies)
+            if body_count > 0:
+                wait_for_all(p.flow.arrived)
+            for v in range(t, vertices, n):
+                steps.displace(
+                    v, motion, p.unknowns, p.vectors, p.lower, p.upper, p.bodies, p.trial, progress, p.limit, p.leaves
+                )
+            task, phase = int(Task.BOUND), int(Phase.PAIRS)
+        elif phase == Phase.MEETING:
+            if solves < _PREDICTIONS:
+                for w in range(t, worlds, n):
+                    decisions.find_meeting(w, progress, flags)
+            phase = int(Phase.HOLD)
+        elif phase == Phase.HOLD:  # what would meet on the displacements, and solve again, or take these
+            if flags[Flag.MEETS] != 0 and solves < _PREDICTIONS:
+                for w in range(t, worlds, n):
+                    decisions.begin_hold(w, progress)
+                for u in range(t, unknowns, n):
+                    if solves == 0:
+                        p.first[u] = p.vectors.solution[u]
+                solves += 1
+                phase = int(Phase.RELEASE_HELD)
+            else:
+                for w in range(t, worlds, n):
+                    decisions.take_bound(w, progress, flags)
+                then, phase = int(Phase.JUDGE), int(Phase.DISPLACED)
+        elif phase == Phase.TAKE_BOUND:
+            for w in range(t, worlds, n):
+                decisions.take_bound(w, progress, flags)
+            then, phase = int(Phase.END_RELEASE), int(Phase.DISPLACED)
+        elif phase == Phase.DISPLACED or phase == Phase.TRY_OR_TAKE:
+            takes = phase == Phase.TRY_OR_TAKE and flags[Flag.SEARCHES] == 0
+            for b in range(t, body_count, n):
+                bodies.move_bodies(b, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, takes, p.bodies)
+            if body_count > 0:
+                wait_for_all(p.flow.arrived)
+            for v in range(t, vertices, n):
+                if takes:
+                    steps.take(v, motion, p.unknowns, p.bodies, progress, p.trial)
+                else:
+                    steps.write_moved(v, motion, p.unknowns, p.bodies, progress, p.trial)
+            if takes:
+                phase = int(Phase.DECIDE)
+            else:
+                if phase == Phase.TRY_OR_TAKE:
+                    then = int(Phase.SEARCH)
+                task, phase = int(Task.ENERGY), int(Phase.PAIRS)
+        elif phase == Phase.JUDGE:
+            for w in range(t, worlds, n):
+                decisions.find_rises(w, progress, flags)
+            phase = int(Phase.JUDGED)
+        elif phase == Phase.JUDGED or phase == Phase.END_RELEASE:
+            if phase == Phase.JUDGED and flags[Flag.RISES] != 0:  # take the first solution of these worlds
+                for w in range(t, worlds, n):
+                    decisions.begin_release(w, progress)
+                for u in range(t, unknowns, n):
+                    if progress.solving[p.unknowns.world[u]] != 0:
+                        p.vectors.solution[u] = p.first[u]
+                then, phase = int(Phase.TAKE_BOUND), int(Phase.DISPLACE)
+            else:
+                if phase == Phase.END_RELEASE:
+                    for w in range(t, worlds, n):
+                        decisions.end_release(w, progress)
+                phase = wp.where(flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.SEARCH))
+        elif phase == Phase.BEGIN_CUTS:  # of single vertices in place of their world, where energies are lower then
+            for v in range(t, wp.max(vertices, worlds), n):
+                steps.begin_truncation(v, p.unknowns, p.lower, p.upper, p.trial, progress, p.whole, p.limit)
+            passes, task, then, phase = int(0), int(Task.BOUND), int(Phase.CUT), int(Phase.PAIRS)
+        elif phase == Phase.CUT:
+            for v in range(t, vertices, n):
+                steps.truncate(v, p.unknowns, p.limit, p.trial)
+            passes += 1
+            if passes == _TRUNCATIONS:
+                for w in range(t, worlds, n):
+                    progress.bound[w] = 1.0
+                then = int(Phase.TAKE_CUT)
+            task, phase = int(Task.BOUND), int(Phase.PAIRS)
+        elif phase == Phase.TAKE_CUT:
+            for w in range(t, worlds, n):
+                decisions.take_cut(w, progress, flags)
+            then, phase = int(Phase.CHOOSE_CUTS), int(Phase.DISPLACED)
+        elif phase == Phase.CHOOSE_CUTS:
+            for w in range(t, worlds, n):
+                decisions.choose_truncation(w, p.whole, progress)
+            phase = int(Phase.UNDO_CUTS)
+        elif phase == Phase.UNDO_CUTS:
+            for v in range(t, vertices, n):
+                steps.undo_truncation(v, motion, progress, p.trial)
+            phase = int(Phase.SEARCH)
+        elif phase == Phase.SEARCH:
+            for w in range(t, worlds, n):
+                decisions.decide_search(w, progress, flags)
+            phase = int(Phase.TRY_OR_TAKE)
+        elif phase == Phase.DECIDE:
+            for w in range(t, worlds, n):
+                decisions.decide_step(w, least_change, max_steps, max_late_steps, progress, p.plane_share, flags)
+            phase = int(Phase.NEXT)
+        wait_for_all(p.flow.arrived)
+        if phase == Phase.NEXT:
+            phase = int(Phase.DIFFERENTIATE)
+            if flags[Flag.GOES_ON] == 0:
+                phase = int(Phase.END)
+            elif p.leaves[worlds] != 0:
+                phase = int(Phase.SEARCH_CANDIDATES)
+    if t == 0:
+        solves_next = int(phase == Phase.SOLVE)
+        p.flow.solves_next[0] = solves_next
+        p.flow.goes_on[0] = wp.where(phase == Phase.END, 0, 1)
+        p.flow.solves[0] = solves
+        p.flow.phase[0] = wp.where(solves_next != 0, int(Phase.DISPLACE), int(Phase.DIFFERENTIATE))
