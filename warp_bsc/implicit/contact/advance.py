@@ -12,11 +12,10 @@ from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
 from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merit, near, steps
 from .conjugate_gradients import Vectors
-from .decisions import Flag
 from .matrix import Matrix
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import Rows
-from .system import Contacts, Progress, Unknowns, contact_count
+from .system import Contacts, Flag, Progress, Unknowns, contact_count
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,20 +42,20 @@ class Phase(IntEnum):
     BLOCKS = 9
     ASSEMBLE = 10
     DISPLACE = 11
-    MEETING = 12
+    BOUNDED = 12
     HOLD = 13
     TAKE_BOUND = 14
     DISPLACED = 15
     JUDGE = 16
     JUDGED = 17
-    END_RELEASE = 18
-    BEGIN_CUTS = 19
-    CUT = 20
-    TAKE_CUT = 21
-    CHOOSE_CUTS = 22
-    UNDO_CUTS = 23
-    SEARCH = 24
-    TRY_OR_TAKE = 25
+    BEGIN_RELEASE = 18
+    END_RELEASE = 19
+    BEGIN_CUTS = 20
+    CUT = 21
+    TAKE_CUT = 22
+    CHOOSE_CUTS = 23
+    UNDO_CUTS = 24
+    TAKE = 25
     DECIDE = 26
     NEXT = 27
     PUBLISH = 28
@@ -81,7 +80,6 @@ class Flow:
     Attributes:
         phase: The phase that comes next, shape [1].
         solves: Solves of the Newton step so far, shape [1].
-        flags: What phases have found, see :class:`.decisions.Flag`.
         solves_next: 1 if a solve comes next, shape [1].
         goes_on: 1 if a solve or a search for candidates comes next, shape [1].
         arrived: How often blocks of threads have waited, shape [1].
@@ -89,7 +87,6 @@ class Flow:
 
     phase: wp.array[int]
     solves: wp.array[int]
-    flags: wp.array[int]
     solves_next: wp.array[int]
     goes_on: wp.array[int]
     arrived: wp.array[int]
@@ -243,12 +240,13 @@ def advance(
 ):
     """Goes on with the Newton steps of all worlds until a solve, a search for candidates, or their end comes next."""
     t = wp.tid()
-    progress, flags = p.progress, p.flow.flags
+    progress = p.progress
     vertices, unknowns, worlds = p.trial.x.shape[0], p.vectors.solution.shape[0], p.progress.active.shape[0]
     body_count = p.bodies.unknown.shape[0]
     phase, solves = p.flow.phase[0] + int(0), p.flow.solves[0] + int(0)
-    # of the phase over pairs: what it does, and which phase follows; passes of cuts
-    task, then, passes = int(Task.BOUND), int(Phase.MEETING), int(0)
+    # of the phase over pairs: what it does, and which phase follows
+    task, then = int(Task.BOUND), int(Phase.BOUNDED)
+    passes, releases = int(0), bool(False)
     while phase < Phase.SOLVE:
         if phase == Phase.BEGIN:
             for w in range(t, worlds, n):
@@ -286,7 +284,7 @@ def advance(
         elif phase == Phase.PAIRS:
             if task == Task.ENERGY:
                 if t == 0:
-                    flags[Flag.SEARCHES] = 0
+                    progress.flags[Flag.SEARCHES] = 0
                 for i in range(t, p.element_count, n):
                     _add_element_energy(i, p, motion, settings, progress.searches, progress.trial)
                 for u in range(t, unknowns, n):
@@ -355,9 +353,11 @@ def advance(
             for w in range(t, worlds + 1, n):
                 if solves == 0:
                     p.leaves[w] = 0
+                    if w < worlds:
+                        progress.searches[w] = progress.active[w]
             if t == 0:
-                for k in range(flags.shape[0]):
-                    flags[k] = 0
+                for k in range(progress.flags.shape[0]):
+                    progress.flags[k] = 0
             phase = int(Phase.SOLVE)
         elif phase == Phase.DISPLACE:  # after a solve
             for b in range(t, body_count, n):
@@ -368,63 +368,44 @@ def advance(
                 steps.displace(
                     v, motion, p.unknowns, p.vectors, p.lower, p.upper, p.bodies, p.trial, progress, p.limit, p.leaves
                 )
-            task, phase = int(Task.BOUND), int(Phase.PAIRS)
-        elif phase == Phase.MEETING:
-            if solves < _PREDICTIONS:
-                for w in range(t, worlds, n):
-                    decisions.find_meeting(w, progress, flags)
-            phase = int(Phase.HOLD)
-        elif phase == Phase.HOLD:  # what would meet on the displacements, and solve again, or take these
-            if flags[Flag.MEETS] != 0 and solves < _PREDICTIONS:
-                for w in range(t, worlds, n):
-                    decisions.begin_hold(w, progress)
-                for u in range(t, unknowns, n):
-                    if solves == 0:
-                        p.first[u] = p.vectors.solution[u]
-                solves += 1
-                phase = int(Phase.RELEASE_HELD)
-            else:
-                for w in range(t, worlds, n):
-                    decisions.take_bound(w, progress, flags)
-                then, phase = int(Phase.JUDGE), int(Phase.DISPLACED)
+            task, then, phase = int(Task.BOUND), int(Phase.BOUNDED), int(Phase.PAIRS)
+        elif phase == Phase.HOLD:  # what would meet on the displacements, and solve again
+            for w in range(t, worlds, n):
+                decisions.begin_hold(w, progress)
+            for u in range(t, unknowns, n):
+                if solves == 0:
+                    p.first[u] = p.vectors.solution[u]
+            solves += 1
+            phase = int(Phase.RELEASE_HELD)
         elif phase == Phase.TAKE_BOUND:
             for w in range(t, worlds, n):
-                decisions.take_bound(w, progress, flags)
-            then, phase = int(Phase.END_RELEASE), int(Phase.DISPLACED)
-        elif phase == Phase.DISPLACED or phase == Phase.TRY_OR_TAKE:
-            takes = phase == Phase.TRY_OR_TAKE and flags[Flag.SEARCHES] == 0
+                decisions.take_bound(w, progress)
+            phase = int(Phase.DISPLACED)
+        elif phase == Phase.DISPLACED:
             for b in range(t, body_count, n):
-                bodies.move_bodies(b, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, takes, p.bodies)
+                bodies.move_bodies(b, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, False, p.bodies)
             if body_count > 0:
                 wait_for_all(p.flow.arrived)
             for v in range(t, vertices, n):
-                if takes:
-                    steps.take(v, motion, p.unknowns, p.bodies, progress, p.trial)
-                else:
-                    steps.write_moved(v, motion, p.unknowns, p.bodies, progress, p.trial)
-            if takes:
-                phase = int(Phase.DECIDE)
-            else:
-                if phase == Phase.TRY_OR_TAKE:
-                    then = int(Phase.SEARCH)
-                task, phase = int(Task.ENERGY), int(Phase.PAIRS)
+                steps.write_moved(v, motion, p.unknowns, p.bodies, progress, p.trial)
+            if then == Phase.JUDGE and solves == 0:  # no pairs are held
+                then = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
+            task, phase = int(Task.ENERGY), int(Phase.PAIRS)
         elif phase == Phase.JUDGE:
             for w in range(t, worlds, n):
-                decisions.find_rises(w, progress, flags)
+                decisions.find_rises(w, progress)
             phase = int(Phase.JUDGED)
-        elif phase == Phase.JUDGED or phase == Phase.END_RELEASE:
-            if phase == Phase.JUDGED and flags[Flag.RISES] != 0:  # take the first solution of these worlds
-                for w in range(t, worlds, n):
-                    decisions.begin_release(w, progress)
-                for u in range(t, unknowns, n):
-                    if progress.solving[p.unknowns.world[u]] != 0:
-                        p.vectors.solution[u] = p.first[u]
-                then, phase = int(Phase.TAKE_BOUND), int(Phase.DISPLACE)
-            else:
-                if phase == Phase.END_RELEASE:
-                    for w in range(t, worlds, n):
-                        decisions.end_release(w, progress)
-                phase = wp.where(flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.SEARCH))
+        elif phase == Phase.BEGIN_RELEASE:
+            for w in range(t, worlds, n):
+                decisions.begin_release(w, progress)
+            for u in range(t, unknowns, n):
+                if progress.solving[p.unknowns.world[u]] != 0:
+                    p.vectors.solution[u] = p.first[u]
+            releases, phase = True, int(Phase.DISPLACE)
+        elif phase == Phase.END_RELEASE:
+            for w in range(t, worlds, n):
+                decisions.end_release(w, progress)
+            phase = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
         elif phase == Phase.BEGIN_CUTS:  # of single vertices in place of their world, where energies are lower then
             for v in range(t, wp.max(vertices, worlds), n):
                 steps.begin_truncation(v, p.unknowns, p.lower, p.upper, p.trial, progress, p.whole, p.limit)
@@ -440,7 +421,7 @@ def advance(
             task, phase = int(Task.BOUND), int(Phase.PAIRS)
         elif phase == Phase.TAKE_CUT:
             for w in range(t, worlds, n):
-                decisions.take_cut(w, progress, flags)
+                decisions.take_cut(w, progress)
             then, phase = int(Phase.CHOOSE_CUTS), int(Phase.DISPLACED)
         elif phase == Phase.CHOOSE_CUTS:
             for w in range(t, worlds, n):
@@ -449,19 +430,38 @@ def advance(
         elif phase == Phase.UNDO_CUTS:
             for v in range(t, vertices, n):
                 steps.undo_truncation(v, motion, progress, p.trial)
-            phase = int(Phase.SEARCH)
-        elif phase == Phase.SEARCH:
-            for w in range(t, worlds, n):
-                decisions.decide_search(w, progress, flags)
-            phase = int(Phase.TRY_OR_TAKE)
+            phase = int(Phase.TAKE)
+        elif phase == Phase.TAKE:
+            for b in range(t, body_count, n):
+                bodies.move_bodies(b, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, True, p.bodies)
+            if body_count > 0:
+                wait_for_all(p.flow.arrived)
+            for v in range(t, vertices, n):
+                steps.take(v, motion, p.unknowns, p.bodies, progress, p.trial)
+            phase = int(Phase.DECIDE)
         elif phase == Phase.DECIDE:
             for w in range(t, worlds, n):
-                decisions.decide_step(w, least_change, max_steps, max_late_steps, progress, p.plane_share, flags)
+                decisions.decide(w, least_change, max_steps, max_late_steps, progress, p.plane_share)
             phase = int(Phase.NEXT)
         wait_for_all(p.flow.arrived)
-        if phase == Phase.NEXT:
+        if phase == Phase.BOUNDED:
+            meets = progress.flags[Flag.MEETS] != 0
+            then, phase = int(Phase.JUDGE), int(Phase.DISPLACED)
+            if releases:
+                then, phase = int(Phase.END_RELEASE), int(Phase.TAKE_BOUND)
+            elif meets and solves < _PREDICTIONS:
+                phase = int(Phase.HOLD)
+            elif meets:
+                phase = int(Phase.TAKE_BOUND)
+        elif phase == Phase.JUDGED:
+            phase = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
+            if progress.flags[Flag.RISES] != 0:
+                phase = int(Phase.BEGIN_RELEASE)
+        elif phase == Phase.NEXT:
             phase = int(Phase.DIFFERENTIATE)
-            if flags[Flag.GOES_ON] == 0:
+            if progress.flags[Flag.SEARCHES] != 0:
+                then, phase = int(Phase.TAKE), int(Phase.DISPLACED)
+            elif progress.flags[Flag.GOES_ON] == 0:
                 phase = int(Phase.END)
             elif p.leaves[worlds] != 0:
                 phase = int(Phase.SEARCH_CANDIDATES)

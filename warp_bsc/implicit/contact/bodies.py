@@ -13,6 +13,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.poses import centre_of, in_world, point_of, turn_between, turned_pose
 from ...response.state.structs import Bodies, Motion
 from ...response.state.vectors import HALF, ONE, to_double, to_single
+from .decisions import takes
 from .system import Progress, Unknowns, to_single_block
 
 wp.set_module_options({"enable_backward": False})
@@ -216,13 +217,15 @@ def move_bodies(
     progress: Progress,
     share: wp.array[float],
     solution: wp.array[wp.vec3],
-    takes: bool,
+    is_taken: bool,
     bodies: SolvedBodies,
 ):
-    """Moves a body by what it and its world take of its displacement; ``takes`` for good."""
+    """Moves a body by what it and its world take of its displacement, for good if that ``is_taken``."""
     if not _is_active(bodies, unknowns, progress, body):
         return
     u = bodies.unknown[body]
+    if progress.searches[unknowns.world[u]] == 0:
+        return
     taken = progress.scale[unknowns.world[u]] * share[bodies.first_vertex[body]]
     pose, low = bodies.pose[body], bodies.low[body] + wp.vec3d()
     bodies.moved[body] = pose
@@ -231,7 +234,7 @@ def move_bodies(
         bodies.moved[body] = turned_pose(motion.bodies, body, pose, shift, to_double(taken * solution[u + 1]))
         low = centre + shift - centre_of(motion.bodies, body, bodies.moved[body])
     bodies.low_moved[body] = low
-    if takes:
+    if is_taken and takes(unknowns.world[u], progress):
         bodies.pose[body] = bodies.moved[body]
         bodies.low[body] = low
 

@@ -1,10 +1,8 @@
 """What each world does next in a Newton step: hold pairs, cut, search, end, or go back."""
 
-from enum import IntEnum
-
 import warp as wp
 
-from .system import Progress, Unknowns
+from .system import Flag, Progress, Unknowns
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,23 +13,13 @@ PATH = wp.constant(8)
 _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
-class Flag(IntEnum):
-    """What a phase of a Newton step finds in some world, for all threads."""
-
-    MEETS = 0
-    RISES = 1
-    CUTS = 2
-    SEARCHES = 3
-    GOES_ON = 4
-
-
 @wp.func
-def take_bound(w: int, progress: Progress, flags: wp.array[int]):
+def take_bound(w: int, progress: Progress):
     """Takes the share of a world down to its bound, and says whether it takes less than all."""
     progress.scale[w] = progress.scale[w] * progress.bound[w]
     progress.bound[w] = 1.0
     if may_cut(progress, w):
-        flags[Flag.CUTS] = 1
+        progress.flags[Flag.CUTS] = 1
 
 
 @wp.func
@@ -44,13 +32,6 @@ def may_cut(progress: Progress, w: int) -> bool:
 def _may_hold(progress: Progress, w: int) -> bool:
     """Returns whether something would meet in a world, and is to be held."""
     return progress.active[w] != 0 and progress.bound[w] < 1.0
-
-
-@wp.func
-def find_meeting(w: int, progress: Progress, flags: wp.array[int]):
-    """Says whether something would meet in a world."""
-    if _may_hold(progress, w):
-        flags[Flag.MEETS] = 1
 
 
 @wp.func
@@ -71,12 +52,12 @@ def _falls(progress: Progress, w: int) -> bool:
 
 
 @wp.func
-def find_rises(w: int, progress: Progress, flags: wp.array[int]):
+def find_rises(w: int, progress: Progress):
     """Lets a world be released in which the energy rises on displacements that are solved with pairs held."""
     progress.solving[w] = 0
     if progress.active[w] != 0 and progress.held[w] != 0 and progress.remaining[w] == 0.0 and not _falls(progress, w):
         progress.solving[w] = 1
-        flags[Flag.RISES] = 1
+        progress.flags[Flag.RISES] = 1
 
 
 @wp.func
@@ -95,11 +76,11 @@ def end_release(w: int, progress: Progress):
 
 
 @wp.func
-def take_cut(w: int, progress: Progress, flags: wp.array[int]):
+def take_cut(w: int, progress: Progress):
     """Keeps the energy of a world before single vertices were cut, and takes its bound after that."""
     progress.uncut[w] = progress.trial[w]
     progress.trial[w] = wp.int64(0)
-    take_bound(w, progress, flags)
+    take_bound(w, progress)
 
 
 @wp.func
@@ -118,7 +99,6 @@ def choose_truncation(w: int, whole: wp.array[float], progress: Progress):
 @wp.func
 def begin_newton_step(w: int, progress: Progress):
     """Clears what a Newton step measures of a world."""
-    progress.searches[w] = progress.active[w]
     progress.solving[w] = progress.active[w]
     if progress.active[w] == 0:
         return
@@ -133,40 +113,40 @@ def begin_newton_step(w: int, progress: Progress):
 
 
 @wp.func
-def decide_search(w: int, progress: Progress, flags: wp.array[int]):
-    """Halves the share of a world whose energy has not fallen enough; not while something a program moves is coming."""
-    if progress.active[w] == 0 or progress.searches[w] == 0:
-        progress.trial[w] = wp.int64(0)
-        return
-    falls = _falls(progress, w)
-    progress.trial[w] = wp.int64(0)
-    if falls or progress.remaining[w] > 0.0:
-        progress.searches[w] = 0
-        return
-    progress.scale[w] = 0.5 * progress.scale[w]
-    if progress.scale[w] < _LEAST_SCALE:
-        progress.scale[w] = 0.0
-        progress.searches[w] = 0
-        return
-    flags[Flag.SEARCHES] = 1
+def takes(w: int, progress: Progress) -> bool:
+    """Returns whether a world that searches takes its share: its energy falls, or what a program moves comes."""
+    return progress.searches[w] != 0 and (progress.remaining[w] > 0.0 or _falls(progress, w))
 
 
 @wp.func
-def decide_step(
+def decide(
+    w: int, least_change: float, max_steps: int, max_late_steps: int, progress: Progress, plane_share: wp.array[float]
+):
+    """Halves the share of a world that searches and has not taken it, or ends its Newton step."""
+    if takes(w, progress):
+        progress.searches[w] = 0
+        _end_step(w, least_change, max_steps, max_late_steps, progress, plane_share)
+    elif progress.searches[w] != 0:
+        progress.scale[w] = 0.5 * progress.scale[w]
+        if progress.scale[w] < _LEAST_SCALE:
+            progress.scale[w] = 0.0
+        progress.flags[Flag.SEARCHES] = 1
+    progress.trial[w] = wp.int64(0)
+
+
+@wp.func
+def _end_step(
     w: int,
     least_change: float,
     max_steps: int,
     max_late_steps: int,
     progress: Progress,
     plane_share: wp.array[float],
-    flags: wp.array[int],
 ):
     """Ends a world whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one.
 
     They are counted from when what a program moves arrives, if it does.
     """
-    if progress.active[w] == 0:
-        return
     scale = progress.scale[w]
     plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
     progress.steps[w] = progress.steps[w] + 1
@@ -181,7 +161,7 @@ def decide_step(
         progress.active[w] = 0
         progress.solving[w] = 0
         return
-    flags[Flag.GOES_ON] = 1
+    progress.flags[Flag.GOES_ON] = 1
     begin_newton_step(w, progress)
 
 

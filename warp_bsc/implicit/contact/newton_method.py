@@ -21,14 +21,13 @@ from . import bodies, decisions, pairs, steps
 from .advance import THREADS, Flow, Phase, Problem, advance
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_solve_kernel, make_team
-from .decisions import Flag
 from .elasticity import elements_of_model, make_derivatives
 from .impulses import publish_contacts
 from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import make_rows
 from .step_report import StepResults, note_overflow, write_results
-from .system import Contacts, Progress, Unknowns
+from .system import Contacts, Flag, Progress, Unknowns
 
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with an element for each corner."""
@@ -124,7 +123,7 @@ class NewtonMethod:
         row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
         self._vectors = allocate(Vectors, self._count, device)
-        self.progress = allocate(Progress, work.worlds, device)
+        self.progress = allocate(Progress, work.worlds, device, flags=len(Flag))
         self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
@@ -170,7 +169,7 @@ class NewtonMethod:
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
-        self._flow = allocate(Flow, 1, device, flags=len(Flag))
+        self._flow = allocate(Flow, 1, device)
         self._advancing = device.sm_count * THREADS if device.is_cuda else 1
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)

@@ -7,10 +7,10 @@ from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, inertial_energy
 from .conjugate_gradients import Vectors
-from .decisions import may_cut
+from .decisions import may_cut, takes
 from .merit import add_energy
 from .pairs import BarrierSettings, Trial, moved
-from .system import Progress, Unknowns, displacement, is_solved, unknown_of_corner
+from .system import Flag, Progress, Unknowns, displacement, is_solved, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
 
@@ -179,12 +179,14 @@ def displace(
     if not (wp.isfinite(d) and wp.isfinite(gradient)):  # as a start is not: its world stands
         trial.displaced[v] = wp.vec3()
         progress.bound[world] = 0.0
+        progress.flags[Flag.MEETS] = 1
         progress.change[world] = wp.inf
         return
     trial.displaced[v] = d
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
         wp.atomic_min(progress.bound, world, share)
+        progress.flags[Flag.MEETS] = 1
         leaves[world] = 1
         leaves[leaves.shape[0] - 1] = 1
 
@@ -309,7 +311,7 @@ def write_moved(
 ):
     """Writes where a vertex is after its displacement."""
     world = motion.world[v]
-    if progress.active[world] != 0:
+    if progress.searches[world] != 0:
         x = moved(trial, progress.scale[world], v)
         if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
             x = exact_on_body(bodies.moved, bodies.low_moved, motion, v)
@@ -325,9 +327,9 @@ def take(
     progress: Progress,
     trial: Trial,
 ):
-    """Moves vertices by the shares of their worlds; what a program moves arrives exactly."""
+    """Moves a vertex by the share of its world, if that takes it; what a program moves arrives exactly."""
     world = motion.world[v]
-    if progress.active[world] == 0:
+    if not takes(world, progress):
         return
     scale = progress.scale[world]
     given = not is_solved(unknowns, v)

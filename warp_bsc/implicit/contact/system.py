@@ -1,5 +1,7 @@
 """The unknowns of a step, and what kernels know of them and of their worlds."""
 
+from enum import IntEnum
+
 import warp as wp
 
 from ...response.state.vectors import ZERO, to_single
@@ -35,6 +37,16 @@ class Unknowns:
     arm: wp.array[wp.vec3]
 
 
+class Flag(IntEnum):
+    """What a phase of a Newton step finds in some world, for all threads."""
+
+    MEETS = 0
+    RISES = 1
+    CUTS = 2
+    SEARCHES = 3
+    GOES_ON = 4
+
+
 @wp.struct
 class Progress:
     """How far each world is with its step.
@@ -53,6 +65,7 @@ class Progress:
         change: Largest displacement of an unknown [m].
         remaining: Largest way of what a program moves that is left [m].
         held: 1 if pairs are held in the solve.
+        flags: What has been found in some world, see :class:`Flag`.
         late: Newton steps that began before what a program moves had arrived, but for the first of them.
     """
 
@@ -69,6 +82,7 @@ class Progress:
     change: wp.array[float]
     remaining: wp.array[float]
     held: wp.array[int]
+    flags: wp.array[int]
     late: wp.array[int]
 
 
