@@ -15,7 +15,7 @@ from .system import Contacts, Progress, Unknowns, block_sum_of_parts, contact_bl
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
+@wp.func(inline=False)
 def _inverse(block: wp.mat33, least: float) -> wp.mat33:
     """Returns the inverse of a symmetric block; of its absolute value where that is not positive definite."""
     a, b = block[0, 0], block[0, 1]

@@ -8,7 +8,7 @@ from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
-from .system import Flag, Progress, kind_of_key
+from .system import Flag, Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,12 +63,12 @@ def bound_by_pair(
     share = float(barrier.safe_share(kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
     candidates.share[i] = share
     if share < 1.0:
-        wp.atomic_min(progress.bound, world, share)
+        lower_to(progress.bound, world, share)
         progress.flags[Flag.MEETS] = 1
         for j in range(4):
-            wp.atomic_min(limit, corners[j], share)
+            lower_to(limit, corners[j], share)
             if trial.holder[corners[j]] != corners[j]:
-                wp.atomic_min(limit, trial.holder[corners[j]], share)
+                lower_to(limit, trial.holder[corners[j]], share)
 
 
 @wp.func
@@ -106,6 +106,6 @@ def bound_by_planes(
         square = rate * rate - wp.float64(4.0) * flat * low
         if low - rate + flat < ZERO or (square > ZERO and rate > ZERO and rate < wp.float64(2.0) * flat):
             share = float(wp.float64(2.0) * low / (rate + wp.sqrt(wp.max(square, ZERO))))
-            wp.atomic_min(progress.bound, world, share)
+            lower_to(progress.bound, world, share)
             progress.flags[Flag.MEETS] = 1
-            wp.atomic_min(limit, trial.holder[vertex], share)
+            lower_to(limit, trial.holder[vertex], share)

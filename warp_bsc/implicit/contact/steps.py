@@ -10,7 +10,7 @@ from .conjugate_gradients import Vectors
 from .decisions import may_cut, takes
 from .merit import add_energy
 from .pairs import BarrierSettings, Trial, moved
-from .system import Flag, Progress, Unknowns, displacement, is_solved, unknown_of_corner
+from .system import Flag, Progress, Unknowns, displacement, is_solved, lower_to, raise_to, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
 
@@ -146,7 +146,7 @@ def find_remaining(
         d = motion.x1[v] - trial.x[v]
         trial.displaced[v] = d
         if wp.length_sq(d) > 0.0:
-            wp.atomic_max(progress.remaining, world, wp.length(d))
+            raise_to(progress.remaining, world, wp.length(d))
 
 
 @wp.func
@@ -185,7 +185,7 @@ def displace(
     trial.displaced[v] = d
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
-        wp.atomic_min(progress.bound, world, share)
+        lower_to(progress.bound, world, share)
         progress.flags[Flag.MEETS] = 1
         leaves[world] = 1
         leaves[leaves.shape[0] - 1] = 1
@@ -260,7 +260,7 @@ def begin_truncation(
         return
     limit[v] = 1.0
     if is_solved(unknowns, v):
-        wp.atomic_min(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
+        lower_to(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
 
 
 @wp.func
@@ -346,7 +346,7 @@ def take(
     trial.moved[v] = trial.exact[v]
     trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
     if not given:
-        wp.atomic_max(progress.change, world, wp.length(trial.displaced[v]))
+        raise_to(progress.change, world, wp.length(trial.displaced[v]))
 
 
 @wp.kernel

@@ -183,6 +183,34 @@ def block_sum_of_parts(block: wp.mat33, parts: int) -> wp.mat33:
     )
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    atomicMax((int*)values.data + i, __float_as_int(value));
+#else
+    values.data[i] = wp::max(values.data[i], value);
+#endif
+"""
+)
+def raise_to(values: wp.array[float], i: int, value: float):
+    """Raises a value to another one, both not negative; on GPUs faster than Warp's, by their bits."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    atomicMin((int*)values.data + i, __float_as_int(value));
+#else
+    values.data[i] = wp::min(values.data[i], value);
+#endif
+"""
+)
+def lower_to(values: wp.array[float], i: int, value: float):
+    """Lowers a value to another one, as :func:`raise_to`."""
+    ...
+
+
 @wp.func
 def unknown_of_corner(unknowns: Unknowns, vertex: int) -> int:
     """Returns the unknown of a vertex, the first of its body, or -1."""
