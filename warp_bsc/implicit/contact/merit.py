@@ -101,7 +101,7 @@ def add_friction_energies(
     for i in range(wp.tid(), contact_count(contacts), threads):
         corners, weights = contacts.corners[i], contacts.weights[i]
         world = motion.world[corners[0]]
-        limit = contacts.friction[i] * contacts.load[i]
+        limit = wp.where(weights == wp.vec4(), 0.0, contacts.limit[i])  # 0 of what is merged
         if limit > 0.0 and not (displaced and progress.searches[world] == 0):
             slid, normal = wp.vec3d(), to_double(contacts.normal[i])
             for j in range(4):

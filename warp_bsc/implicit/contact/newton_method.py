@@ -17,7 +17,7 @@ from ...response.state.mesh import host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from . import assembly, bodies, bounds, contact_lists, decisions, held, merit, near, pairs, steps
+from . import assembly, bodies, bounds, contact_lists, decisions, held, merge, merit, near, pairs, steps
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_solve_kernel, make_team
 from .elasticity import differentiate, elements_of_model, make_derivatives
@@ -350,7 +350,12 @@ class NewtonMethod:
             candidates.floor = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
         capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
-        sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
+        sizes: dict = {
+            "count": 1,
+            "listed": 2,
+            "bucket": self._mesh.vertex_count,
+            **dict.fromkeys(("first", "middle", "end"), self._count),
+        }
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = allocate(Contacts, capacity, device, **sizes)
@@ -375,6 +380,7 @@ class NewtonMethod:
         inputs = [self._derivatives, self._rows, unknowns, progress]
         self._launch(assembly.find_loads, self._count, inputs, [self._settings.load])
         self._find_near(progress.active)
+        work.launch_over_entries(merge.merge_contacts, [self._contacts])
         self._assemble(progress.active, True)
         self._solve_linear(progress.active)
         self._hold_ahead(0)
@@ -484,6 +490,7 @@ class NewtonMethod:
         """Finds what is near at the positions."""
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         contacts.count.zero_()
+        contacts.bucket.zero_()
         inputs = [self._settings, self._trial, self._unknowns, active, contacts]
         self._over_candidates(near.find_near, [motion], inputs)
         if work.max_penetrations:
