@@ -1,6 +1,6 @@
-"""Contacts of one vertex pair, or of a vertex and an edge, as one: each face and edge around it has found it.
+"""Contacts of one vertex pair, or of a vertex and an edge, as one in a solve: each face and edge there has found it.
 
-They have the same closest points, so that the energy of one of them is the sum of theirs.
+They have the same closest points, so that gradients, Hessians and friction add up. Impulses are those of each pair.
 """
 
 import warp as wp
@@ -42,9 +42,9 @@ def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4
 
 @wp.func
 def merge_contact(contacts: Contacts, i: int):
-    """Adds to a contact all that have the same closest points, or takes its weights if another one does so.
+    """Adds to a contact all that have its vertices, or takes its weights where another one, of a lower key, does so.
 
-    That is the one of the lowest key. All share the closest points, but the vector between them may be the other way.
+    The vector between the closest points is the other way round where the sides of the pair are.
     """
     feature, key = contacts.feature[i], contacts.key[i]
     if feature[0] < 0:

@@ -79,7 +79,7 @@ class Contacts:
     Attributes:
         count: Number of contacts, shape [1].
         corners: Vertices; of a particle at a plane, four times the particle.
-        weights: Of the vertices in the vector from the second closest point to the first.
+        weights: Of the vertices in the vector from the second closest point to the first; all 0 of what is merged.
         normal: Unit vector from the second closest point to the first.
         load: Force that pushes them apart [N].
         limit: Force of friction at most [N].
