@@ -33,7 +33,7 @@ def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4
             count[side] += 1
     contacts.feature[i] = wp.vec3i(-1)
     if count[0] * count[1] == 1 or count[0] * count[1] == 2:
-        # a vertex, that of the lower number, and the vertex or both of the edge on the other side
+        # a vertex, of two that of the lower number, and the other vertex twice or those of the edge
         one = int(count[0] > count[1] or (count[0] == count[1] and low[0] > low[1]))
         feature = wp.vec3i(low[one], low[1 - one], high[1 - one])
         contacts.feature[i] = feature
