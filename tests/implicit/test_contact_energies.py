@@ -8,7 +8,7 @@ from implicit_scenes import exact_hessians
 from newton_scenes import DT
 
 from warp_bsc.implicit.contact import elasticity
-from warp_bsc.implicit.contact.assembly import add_blocks
+from warp_bsc.implicit.contact.assembly import add_block
 from warp_bsc.implicit.contact.barrier import (
     CURVATURE_AT_HALF,
     barrier_curvature,
@@ -20,13 +20,31 @@ from warp_bsc.implicit.contact.barrier import (
 )
 from warp_bsc.implicit.contact.bodies import SolvedBodies
 from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements, make_derivatives
-from warp_bsc.implicit.contact.matrix import make_matrix
+from warp_bsc.implicit.contact.matrix import Matrix, make_matrix
 from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
-from warp_bsc.implicit.contact.system import Contacts, Unknowns
+from warp_bsc.implicit.contact.system import Contacts, Progress, Unknowns
 from warp_bsc.implicit.elastic import Elastic
 from warp_bsc.implicit.elements import with_gradient
 from warp_bsc.response.state.structs import Motion, allocate
+
+
+@wp.kernel(enable_backward=False)
+def _add_blocks(
+    derivatives: Derivatives,
+    contacts: Contacts,
+    unknowns: Unknowns,
+    row_of_block: wp.array[int],
+    x: wp.array[wp.vec3],
+    progress: Progress,
+    rows: Rows,
+    matrix: Matrix,
+):
+    """Without inertia: no unknown is free."""
+    i, bodies, dt = wp.tid(), SolvedBodies(), wp.float64(DT)
+    add_block(
+        i, derivatives, contacts, unknowns, row_of_block, Trial(), x, Motion(), bodies, dt, progress, rows, 1, matrix
+    )
 
 
 @wp.kernel(enable_backward=False)
@@ -182,10 +200,10 @@ def test_rows_are_the_sums_of_elements(scene):
     first, column = rows.first.numpy(), rows.column.numpy()
     row = np.repeat(np.arange(count), np.diff(first))
     unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
-    without_inertia = [Trial(), scene.array(scene.x), Motion(), SolvedBodies(), wp.float64(DT)]
-    inputs = [derivatives, contacts, unknowns, scene.array(row, int), *without_inertia, scene.array([1], int), rows, 1]
-    blocks_of = make_matrix(rows, np.array([0, count]), parts=2, device=device)
-    wp.launch(add_blocks, len(row), inputs=inputs, outputs=[blocks_of], device=device)
+    blocks_of, progress = make_matrix(rows, np.array([0, count]), parts=2, device=device), allocate(Progress, 1, device)
+    progress.solving.fill_(1)
+    inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array(scene.x), progress, rows]
+    wp.launch(_add_blocks, len(row), inputs=inputs, outputs=[blocks_of], device=device)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)
     matrix, vector = np.zeros((count, 3, count, 3)), np.zeros((count, 3))

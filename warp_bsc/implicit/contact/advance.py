@@ -10,7 +10,7 @@ import warp as wp
 
 from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
-from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merit, near, steps
+from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merge, merit, near, steps
 from .conjugate_gradients import Vectors
 from .matrix import Matrix
 from .pairs import BarrierSettings, Candidates, Trial
@@ -255,6 +255,8 @@ def advance(
         elif phase == Phase.PUBLISH:  # what is near at the end
             for w in range(t, worlds, n):
                 progress.solving[w] = progress.steps[w]
+            for v in range(t, p.contacts.bucket.shape[0], n):
+                p.contacts.bucket[v] = 0
             if t == 0:
                 p.contacts.count[0] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
@@ -262,6 +264,7 @@ def advance(
             solves = int(0)
             for v in range(t, vertices, n):
                 steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
+                p.contacts.bucket[v] = 0
             for i in range(t, p.element_count, n):
                 _differentiate(i, p, motion, settings)
                 _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)
@@ -296,6 +299,8 @@ def advance(
             phase = then
         elif phase == Phase.COUNT:
             for i in range(t, contact_count(p.contacts), n):
+                if solves == 0:
+                    merge.merge_contact(i, p.contacts)
                 contact_lists.count_entries(i, motion, p.contacts, p.unknowns)
                 if solves == 0:
                     merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.energy)

@@ -68,7 +68,7 @@ def _hold(
     contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
     contacts.normal[slot] = n
     contacts.load[slot] = 0.0
-    contacts.friction[slot] = 0.0
+    contacts.limit[slot] = 0.0
     contacts.gradient[slot] = (stiffness * float(given - short)) * n
     contacts.hessian[slot] = stiffness * wp.outer(n, n)
     contacts.key[slot] = key

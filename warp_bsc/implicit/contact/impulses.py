@@ -41,7 +41,7 @@ def publish_contacts(
             slid += weights[j] * (trial.exact[corners[j]] - x0)
             predicted += weights[j] * (to_double(goal[corners[j]]) - x0)
         slid -= wp.dot(slid, normal) * normal
-        limit = wp.float64(contacts.friction[i]) * load
+        limit = wp.float64(contacts.limit[i])
         impulse = load * normal - limit * barrier.friction_slope(wp.length(slid), settings.smoothing) * slid
         impulse *= settings.dt
         plane = int(-1)

@@ -56,7 +56,7 @@ def add_friction_energy(
 ):
     """Adds the work of friction over ``trial.moved``, under the load and along the plane of a contact."""
     corners, weights = contacts.corners[i], contacts.weights[i]
-    limit = contacts.friction[i] * contacts.load[i]
+    limit = wp.where(weights == wp.vec4(), 0.0, contacts.limit[i])  # 0 of what is merged
     if limit > 0.0:
         slid, normal = wp.vec3d(), to_double(contacts.normal[i])
         for j in range(4):

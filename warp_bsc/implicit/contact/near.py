@@ -10,6 +10,7 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
+from .merge import link_contact
 from .merit import MEETS, add_energy
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
 from .system import Contacts, Progress, Unknowns, couples, is_solved, key_of_pair, kind_of_key, to_single_block
@@ -81,11 +82,12 @@ def _add_contact(
     contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
     contacts.normal[slot] = to_single(normal)
     contacts.load[slot] = float(load)
-    contacts.friction[slot] = friction
+    contacts.limit[slot] = friction * float(load)
     contacts.gradient[slot] = to_single(gradient)
     contacts.hessian[slot] = to_single_block(hessian)
     contacts.key[slot] = key
     contacts.couples[slot] = couples(unknowns, corners, weights)
+    link_contact(contacts, slot, corners, weights)
 
 
 @wp.func

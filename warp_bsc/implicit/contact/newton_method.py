@@ -348,6 +348,7 @@ class NewtonMethod:
         problem.candidates = allocate(Candidates, candidates, device, count=1)
         capacity = candidates + self._work.max_penetrations
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
+        sizes["bucket"] = self._mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = problem.contacts = allocate(Contacts, capacity, device, **sizes)

@@ -95,15 +95,17 @@ class Contacts:
     Attributes:
         count: Number of contacts, shape [1].
         corners: Vertices; of a particle at a plane, four times the particle.
-        weights: Of the vertices in the vector from the second closest point to the first.
+        weights: Of the vertices in the vector from the second closest point to the first; all 0 of what is merged.
         normal: Unit vector from the second closest point to the first.
         load: Force that pushes them apart [N].
-        friction: Coefficient.
+        limit: Force of friction at most [N].
         gradient: [N].
         hessian: Positive semidefinite [N/m].
         key: Number of the pair, by which contacts of an unknown are ordered.
         couples: 1 of a contact of two elements that are both solved for, or of a body. The blocks of others, between
             vertices of one element, are parts of the rows of elements.
+        feature: Vertices of a contact of two vertices, or of one and an edge; -1 of others.
+        bucket: 1 more than the first contact of each hash of vertices, 0 for none; ``next`` has those that follow.
         listed: Number of entries, shape [1].
         first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
@@ -120,11 +122,14 @@ class Contacts:
     weights: wp.array[wp.vec4]
     normal: wp.array[wp.vec3]
     load: wp.array[float]
-    friction: wp.array[float]
+    limit: wp.array[float]
     gradient: wp.array[wp.vec3]
     hessian: wp.array[wp.mat33]
     key: wp.array[wp.int64]
     couples: wp.array[int]
+    feature: wp.array[wp.vec3i]
+    bucket: wp.array[int]
+    next: wp.array[int]
     listed: wp.array[int]
     first: wp.array[int]
     middle: wp.array[int]
