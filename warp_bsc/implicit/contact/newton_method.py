@@ -10,6 +10,8 @@ import numpy as np
 import warp as wp
 
 from ...detection.launch import retry_until_fits
+from ...detection.pipeline import MIN_CAPACITY
+from ...detection.settings import capacity_for
 from ...response.contacts.queue import queues_of
 from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
@@ -36,6 +38,8 @@ _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with an element for each corner."""
 _PARTS = 8
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
+_CONTACTS = 64
+"""Contacts that fit at first, for each unknown: many times fewer than candidates in a pile, and of far more bytes."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
 _USUAL_REACH = 1e-3
@@ -178,11 +182,11 @@ class NewtonMethod:
         self._poses = None if self._attachments is None else wp.clone(model.body_q)
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._candidates: list[Candidates] = []
-        self._contacts = Contacts()
+        self._captured, self._contacts = False, Contacts()
+        self._retired: list = []
+        self._allocate_contacts(max(MIN_CAPACITY, _CONTACTS * self._count))
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
-        self._retired: list[tuple] = []
-        self._allocate(queues_of(work.detector, candidates=True))
 
     def _reach(self, mesh) -> np.ndarray:
         """Returns the gap from which each vertex pushes [m], infinite for shapes."""
@@ -228,6 +232,7 @@ class NewtonMethod:
             end: The state at the end, with the poses of bodies as predicted; what is solved for is written.
             dt: Length of the step [s].
         """
+        self._captured |= self._work.device.is_capturing
         self._begin(end, dt)
         self._find_end(end)
 
@@ -338,7 +343,7 @@ class NewtonMethod:
             self._work.launch_over_entries(kernel, [*before, *self._candidates[k : k + 2], *after])
 
     def _allocate(self, queues):
-        self._retired.append((self._candidates, self._contacts))  # a CUDA graph may still write to them
+        self._retire(self._candidates)
         device, self._candidates = self._work.device, []
         for queue in queues:
             candidates = Candidates()
@@ -349,11 +354,18 @@ class NewtonMethod:
             candidates.reach = wp.zeros(len(queue.pairs), dtype=float, device=device)
             candidates.floor = wp.zeros(len(queue.pairs), dtype=float, device=device)
             self._candidates.append(candidates)
-        capacity = sum(len(q.pairs) for q in queues) + self._work.max_penetrations
+
+    def _allocate_contacts(self, capacity):
+        self._retire(self._contacts)
+        device, self._contacts = self._work.device, Contacts()
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = allocate(Contacts, capacity, device, **sizes)
+
+    def _retire(self, buffers):
+        if self._captured:
+            self._retired.append(buffers)  # a CUDA graph may still write to them
 
     def _bound(self, active):
         """Finds the share of the displacements before two elements meet on them, by vertex and by world."""
@@ -482,6 +494,17 @@ class NewtonMethod:
 
     def _find_near(self, active):
         """Finds what is near at the positions."""
+        retry_until_fits(lambda: self._find_contacts(active), self, self._work.device)
+
+    def grow(self) -> bool:
+        """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
+        found = int(self._contacts.count.numpy()[0])
+        if found <= len(self._contacts.corners):
+            return False
+        self._allocate_contacts(capacity_for(found, "contacts"))
+        return True
+
+    def _find_contacts(self, active):
         work, motion, contacts = self._work, self._work.step.motion, self._contacts
         contacts.count.zero_()
         inputs = [self._settings, self._trial, self._unknowns, active, contacts]
