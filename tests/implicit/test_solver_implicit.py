@@ -203,6 +203,17 @@ def test_contacts_that_do_not_fit_are_said_to_lack_where_buffers_cannot_grow(dev
     assert solver.report.converged and len(solver._newton._contacts.corners) > 1
 
 
+def test_energies_of_very_many_fast_particles_do_not_overflow(device):
+    count, velocity = 30_000, (0.0, 0.0, 250.0)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    places = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1).tolist()
+    builder.add_particles(places, [velocity] * count, [1e-3] * count, [1e-3] * count)
+    model = builder.finalize(device=device)
+    solver = bsc.SolverImplicit(model)
+    state = step(solver, model.state(), model.state())
+    assert np.allclose(state.particle_qd.numpy(), velocity) and solver.report.converged
+
+
 def test_states_may_be_one_and_contacts_are_not_used(device):
     ends = []
     for alone in (False, True):

@@ -56,6 +56,8 @@ _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
 _MOST_UNITS, _FAST = 2.0**56, 100.0
 """Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
+_MOST_UNITS_OF_ALL = 2.0**61
+"""The same of all particles together: many and fast ones have coarser units."""
 _TOLERANCE = 1e-2
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
@@ -173,7 +175,8 @@ class NewtonMethod:
         masses = host_array(model.particle_mass)
         moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
-        units = 1.0 / (mass * _UNIT_SPEED**2)
+        total = _of_worlds(np.sum, masses[moves], world[moves], work.worlds, 0.0)
+        units = 1.0 / np.maximum(mass * _UNIT_SPEED**2, total * _FAST**2 / _MOST_UNITS_OF_ALL)
         if len(solved):
             heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * _FAST**2, 1e-9))
