@@ -188,21 +188,30 @@ def test_a_step_in_a_graph_is_the_step_without(device):
         np.testing.assert_array_equal(actual, expected)
 
 
-def test_pairs_that_do_not_fit_are_said_to_lack(device):
-    """In a graph on a GPU, where buffers cannot grow: here by the capacities that the device knows."""
+def test_contacts_that_do_not_fit_are_said_to_lack_where_buffers_cannot_grow(device, monkeypatch):
+    """They cannot in a graph on a GPU."""
     model = ramp(device)
     solver = bsc.SolverImplicit(model, max_iterations=50)
     state = step(solver, model.state(), model.state(), 3)
     assert solver.report.converged
-    problem = solver._newton._problem
-    pairs, few = problem.contacts, copy.copy(problem.contacts)
-    few.corners = wp.zeros(1, dtype=wp.vec4i, device=device)  # all others are dropped
-    problem.contacts = few
-    step(solver, state, model.state())
+    solver._newton._allocate_contacts(1)
+    with monkeypatch.context() as patch:
+        patch.setattr(solver._newton, "_may_grow", False)
+        step(solver, state, model.state())
     assert not solver.report.converged and solver.report.certified
-    problem.contacts = pairs
     step(solver, state, model.state())
-    assert solver.report.converged
+    assert solver.report.converged and len(solver._newton._contacts.corners) > 1
+
+
+def test_energies_of_very_many_fast_particles_do_not_overflow(device):
+    count, velocity = 30_000, (0.0, 0.0, 250.0)
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    places = np.stack([np.arange(count), np.zeros(count), np.zeros(count)], axis=1).tolist()
+    builder.add_particles(places, [velocity] * count, [1e-3] * count, [1e-3] * count)
+    model = builder.finalize(device=device)
+    solver = bsc.SolverImplicit(model)
+    state = step(solver, model.state(), model.state())
+    assert np.allclose(state.particle_qd.numpy(), velocity) and solver.report.converged
 
 
 def test_states_may_be_one_and_contacts_are_not_used(device):

@@ -61,7 +61,8 @@ class Phase(IntEnum):
     PUBLISH = 28
     SOLVE = 29
     SEARCH_CANDIDATES = 30
-    END = 31
+    GROW = 31
+    END = 32
 
 
 class Task(IntEnum):
@@ -121,6 +122,7 @@ class Problem:
     element_count: int
     vertices_at_planes: int
     parts: int
+    grows: int
 
 
 @wp.func_native(
@@ -449,6 +451,9 @@ def advance(
                 decisions.decide(w, least_change, max_steps, max_late_steps, progress, p.plane_share)
             phase = int(Phase.NEXT)
         wait_for_all(p.flow.arrived)
+        if task == Task.FIND_NEAR and phase == then and p.grows != 0:
+            if p.contacts.count[0] > p.contacts.corners.shape[0]:
+                phase = int(Phase.GROW)
         if phase == Phase.BOUNDED:
             meets = progress.flags[Flag.MEETS] != 0
             then, phase = int(Phase.JUDGE), int(Phase.DISPLACED)
@@ -476,3 +481,5 @@ def advance(
         p.flow.goes_on[0] = wp.where(phase == Phase.END, 0, 1)
         p.flow.solves[0] = solves
         p.flow.phase[0] = wp.where(solves_next != 0, int(Phase.DISPLACE), int(Phase.DIFFERENTIATE))
+        if phase == Phase.GROW:
+            p.flow.phase[0] = wp.where(then == Phase.END, int(Phase.PUBLISH), int(Phase.BEGIN))

@@ -12,7 +12,8 @@ _LARGEST_BLOCK = 1024
 _KEPT = {320: 13, 640: 4, _LARGEST_BLOCK: 0}
 """Blocks of the Hessian that a thread keeps in registers, in thread blocks of so many threads at most."""
 _BLOCK, _BLOCKS = 512, 128
-"""Threads of each block of a larger world, and blocks of all worlds at most: a GPU runs them together."""
+"""Threads of each block of a larger world, and blocks of all worlds at most; no more than multiprocessors, as they wait
+for each other and must run together."""
 
 
 @wp.struct
@@ -43,9 +44,10 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]
         while team.parts > 1 and team.parts * unknowns > min(_KEPT):
             team.parts //= 2
         threads = min(_LARGEST_BLOCK, max(64, -(-team.parts * unknowns // 32) * 32))
-        if unknowns > _LARGEST_BLOCK and worlds <= _BLOCKS // 2:
+        most = min(_BLOCKS, device.sm_count)
+        if unknowns > _LARGEST_BLOCK and worlds <= most // 2:
             team.parts, threads = 4, _BLOCK
-            team.blocks = min(_BLOCKS // worlds, -(-team.parts * unknowns // _BLOCK))
+            team.blocks = min(most // worlds, -(-team.parts * unknowns // _BLOCK))
     team.shares = device.is_cuda and unknowns <= _LARGEST_BLOCK
     team.arrived = wp.zeros(worlds, dtype=int, device=device)
     team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=float, device=device)

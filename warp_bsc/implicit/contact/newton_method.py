@@ -10,6 +10,8 @@ import numpy as np
 import warp as wp
 
 from ...detection.launch import retry_until_fits
+from ...detection.pipeline import MIN_CAPACITY
+from ...detection.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
 from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
@@ -33,6 +35,8 @@ _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with an element for each corner."""
 _PARTS = 8
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
+_CONTACTS = 64
+"""Contacts that fit at first, for each unknown: many times fewer than candidates in a pile, and of far more bytes."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
 _USUAL_REACH = 1e-3
@@ -49,6 +53,8 @@ _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
 _MOST_UNITS, _FAST = 2.0**56, 100.0
 """Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
+_MOST_UNITS_OF_ALL = 2.0**61
+"""The same of all particles together: many and fast ones have coarser units."""
 _TOLERANCE = 1e-2
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
@@ -63,6 +69,7 @@ class NewtonMethod:
     """
 
     keeps_contacts = False
+    _may_grow = True
 
     def __init__(self, work: Workspace, *, max_steps: int, results: StepResults, unconverged_steps: wp.array[wp.int64]):
         """Allocates buffers.
@@ -159,7 +166,8 @@ class NewtonMethod:
         masses = host_array(model.particle_mass)
         moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
-        units = 1.0 / (mass * _UNIT_SPEED**2)
+        total = _of_worlds(np.sum, masses[moves], world[moves], work.worlds, 0.0)
+        units = 1.0 / np.maximum(mass * _UNIT_SPEED**2, total * _FAST**2 / _MOST_UNITS_OF_ALL)
         if len(solved):
             heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * _FAST**2, 1e-9))
@@ -183,8 +191,10 @@ class NewtonMethod:
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1
         self._queues: list[PairQueue] = []
-        self._retired: list[tuple] = []
-        self._allocate(queues_of(work.detector, candidates=True))
+        self._captured, self._retired = False, []
+        self._candidates, self._contacts = Candidates(), Contacts()
+        self._allocate_candidates(queues_of(work.detector, candidates=True))
+        self._allocate_contacts(max(MIN_CAPACITY, _CONTACTS * self._count))
 
     def _reach(self, mesh) -> np.ndarray:
         """Returns the gap from which each vertex pushes [m], infinite for shapes."""
@@ -230,6 +240,7 @@ class NewtonMethod:
             end: The state at the end, with the poses of bodies as predicted; what is solved for is written.
             dt: Length of the step [s].
         """
+        self._captured |= self._work.device.is_capturing
         self._begin(end, dt)
         self._find_end(end)
 
@@ -325,15 +336,15 @@ class NewtonMethod:
         self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self._lacks])
         queues = queues_of(detector, candidates=True)
         if [len(q.pairs) for q in self._queues] != [len(q.pairs) for q in queues]:
-            self._allocate(queues)
+            self._allocate_candidates(queues)
         self._prepare_candidates()
 
     def _prepare_candidates(self):
-        self._problem.candidates.count.zero_()
+        self._candidates.count.zero_()
         inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
-            outputs = [self._problem.candidates, self._touching]
+            outputs = [self._candidates, self._touching]
             self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, *outputs])
 
     def _part_touching(self):
@@ -341,17 +352,31 @@ class NewtonMethod:
         self._launch(pairs.part_touching, self._mesh.model.particle_count, inputs, [self._trial, self._origin])
         self._prepare_candidates()
 
-    def _allocate(self, queues):
-        problem, device, self._queues = self._problem, self._work.device, queues
-        self._retired.append((problem.candidates, problem.contacts))  # a CUDA graph may still write to them
-        candidates = sum(len(q.pairs) for q in queues)
-        problem.candidates = allocate(Candidates, candidates, device, count=1)
-        capacity = candidates + self._work.max_penetrations
+    def _allocate_candidates(self, queues):
+        capacity, self._queues = sum(len(q.pairs) for q in queues), queues
+        self._retire(self._candidates)
+        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, count=1)
+
+    def _allocate_contacts(self, capacity):
+        self._retire(self._contacts)
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
         sizes["bucket"] = self._mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
-        self._contacts = problem.contacts = allocate(Contacts, capacity, device, **sizes)
+        self._contacts = self._problem.contacts = allocate(Contacts, capacity, self._work.device, **sizes)
+
+    def _retire(self, buffers):
+        if self._captured:
+            self._retired.append(buffers)  # a CUDA graph may still write to them
+
+    def grow(self) -> bool:
+        """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
+        contacts = self._contacts
+        found = int(contacts.count.numpy()[0])
+        if not self._problem.grows or found <= len(contacts.corners):
+            return False
+        self._allocate_contacts(capacity_for(found, "contacts"))
+        return True
 
     def _take_newton_steps(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
@@ -379,6 +404,10 @@ class NewtonMethod:
         self._advance()
 
     def _advance(self):
+        self._problem.grows = int(self._may_grow and not self._work.device.is_capturing)
+        retry_until_fits(self._launch_advance, self, self._work.device)
+
+    def _launch_advance(self):
         work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
         inputs = [work.step.motion, work.motion.planes, self._settings, float(_LEAST_SPEED * self._dt), *steps_at_most]
         options = {"device": work.device, "block_dim": THREADS}
@@ -386,7 +415,8 @@ class NewtonMethod:
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
-        inputs = [self._contacts, self._settings, self._trial, self._goal, self._work.step, sides, centres, sums, rows]
+        inputs = [self._contacts, self._settings, self._trial, self._goal]
+        inputs += [self._work.step, sides, centres, sums, rows]
         self._work.launch_over_entries(publish_contacts, inputs)
 
     def _launch(self, kernel, size, inputs, outputs):
