@@ -15,7 +15,7 @@ from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impa
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.exact.first_contact import NONE, decide_in
-from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.motion import doubles, edge_edge_motion, vertex_face_motion
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
@@ -255,10 +255,6 @@ def _kernels(kind: PairKind):
 
     decide = decide_in(1)
 
-    @wp.func
-    def double(x: wp.vec3) -> wp.vec3d:
-        return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
-
     @wp.kernel(**_KERNEL)
     def find_exact_status(
         first: int,
@@ -269,19 +265,9 @@ def _kernels(kind: PairKind):
     ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
-        time = decide(
-            number,
-            double(a0),
-            double(b0),
-            double(c0),
-            double(d0),
-            double(a1),
-            double(b1),
-            double(c1),
-            double(d1),
-            False,
-            0,
-        )
+        a0d, b0d, c0d, d0d = doubles(a0, b0, c0, d0)
+        a1d, b1d, c1d, d1d = doubles(a1, b1, c1, d1)
+        time = decide(number, a0d, b0d, c0d, d0d, a1d, b1d, c1d, d1d, False, 0)
         status[i] = wp.int8(wp.where(time < NONE, HIT, FREE))
 
     return find_status, find_impact, cull, classify_survivors, find_exact_status
