@@ -191,14 +191,6 @@ def _axis_of(arcs: Arcs, vertex: int):
 
 
 @wp.func
-def is_on_arc(arcs: Arcs, vertex: int) -> bool:
-    """Returns whether a vertex turns."""
-    if any_turns(arcs):
-        return arcs.deviation[vertex] > _ZERO
-    return False
-
-
-@wp.func
 def on_arc_of(arcs: Arcs, vertex: int, x0: Any, x1: Any, time: wp.float64) -> wp.vec3d:
     """Returns the position of a vertex at a time, see :func:`on_arc`."""
     centre, turn = _axis_of(arcs, vertex)

@@ -166,6 +166,12 @@ def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
 
 
 @wp.func
+def _rescaled_points(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: wp.float64):
+    """Returns four :func:`_rescaled` points."""
+    return _rescaled(a, size), _rescaled(b, size), _rescaled(c, size), _rescaled(d, size)
+
+
+@wp.func
 def _motion_of_kind(
     kind: int,
     # points at the start
@@ -221,18 +227,9 @@ def relative_motion(
     motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)
     size = motion.size
     if _out_of_range(a0, size):
-        motion = _motion_of_kind(
-            kind,
-            _rescaled(from_a, size),
-            _rescaled(from_b, size),
-            _rescaled(from_c, size),
-            _rescaled(from_d, size),
-            _rescaled(to_a, size),
-            _rescaled(to_b, size),
-            _rescaled(to_c, size),
-            _rescaled(to_d, size),
-            roundoff,
-        )
+        a, b, c, d = _rescaled_points(from_a, from_b, from_c, from_d, size)
+        end_a, end_b, end_c, end_d = _rescaled_points(to_a, to_b, to_c, to_d, size)
+        motion = _motion_of_kind(kind, a, b, c, d, end_a, end_b, end_c, end_d, roundoff)
         in_range = size > _SMALLEST_WITH_GRADIENT and size < _ONE
         motion.scale = wp.where(in_range, _LIFT * motion.scale, _ZERO)
     return motion
@@ -267,18 +264,9 @@ def motion_and_distance(
     size = motion.size
     rescaled = distance
     if _out_of_range(a0, size):
-        motion = _motion_of_kind(
-            kind,
-            _rescaled(from_a, size),
-            _rescaled(from_b, size),
-            _rescaled(from_c, size),
-            _rescaled(from_d, size),
-            _rescaled(to_a, size),
-            _rescaled(to_b, size),
-            _rescaled(to_c, size),
-            _rescaled(to_d, size),
-            roundoff,
-        )
+        a, b, c, d = _rescaled_points(from_a, from_b, from_c, from_d, size)
+        end_a, end_b, end_c, end_d = _rescaled_points(to_a, to_b, to_c, to_d, size)
+        motion = _motion_of_kind(kind, a, b, c, d, end_a, end_b, end_c, end_d, roundoff)
         rescaled = _rescaled_coordinate(distance, size)
         if size < _ONE and distance >= _TINY_DISTANCE:
             rescaled = wp.float64(wp.inf)

@@ -32,7 +32,7 @@ from ..detection.launch import launch_over, launch_over_queue, retry_until_fits
 from ..detection.narrow_phase import NarrowPhase
 from ..detection.query_points import query_points
 from ..detection.settings import METHODS as NARROW_PHASE_METHODS
-from ..detection.settings import TOLERANCE, Count, PairCounts, PairKind
+from ..detection.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, PairCounts, PairKind
 from ..detection.stage_timer import StageTimer
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
@@ -59,9 +59,6 @@ _AXIS_BOXES, _BERNSTEIN_SIGNS, _SEPARATING_DIRECTION, _CLASSIFICATION, _SUBDIVIS
 )
 
 _WARP_SIZE = 32
-
-_KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
-"""Without fused operations every device computes the same bits."""
 
 
 @wp.func_native("""
@@ -96,7 +93,7 @@ def _kernels(kind: PairKind, dtype: type):
             return x[first], x[elements[second, 0]], x[elements[second, 1]], x[elements[second, 2]]
         return x[elements[first, 0]], x[elements[first, 1]], x[elements[second, 0]], x[elements[second, 1]]
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def cubic(
         first: int,
         # in
@@ -112,7 +109,7 @@ def _kernels(kind: PairKind, dtype: type):
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
         status[i] = wp.int8(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull(
         first: int,
         # in
@@ -139,7 +136,7 @@ def _kernels(kind: PairKind, dtype: type):
 
     cull_batch = cull_batch_of(dtype, vertex_face)
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull_batches(
         first: int,
         # in
@@ -157,7 +154,7 @@ def _kernels(kind: PairKind, dtype: type):
             survivors[wp.int32(take_slot(survivor_count, 0))] = i + lowest_bit(left)
             left = left & (left - wp.uint64(1))
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def classify_survivors(
         first: int,
         # in
@@ -179,7 +176,7 @@ def _kernels(kind: PairKind, dtype: type):
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         status[i] = wp.int8(classify_reduced(motion, coplanarity(motion)))
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def trace(
         first: int,
         # in

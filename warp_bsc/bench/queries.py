@@ -10,12 +10,12 @@ from .._arguments import checked_integer
 from ..detection.launch import launch_over, launch_over_queue
 from ..detection.query import query_edge_edge, query_vertex_face
 from ..detection.query_arrays import QueryArrays
-from ..detection.settings import TOLERANCE, PairKind
+from ..detection.settings import NO_FUSED_OPERATIONS, TOLERANCE, PairKind
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.exact.first_contact import NONE, decide_in
-from ..kernels.motion import edge_edge_motion, vertex_face_motion
+from ..kernels.motion import doubles, edge_edge_motion, vertex_face_motion
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
@@ -53,9 +53,6 @@ _COPIED_BYTES = 2**28  # more than a cache holds
 _MISSES = {PairKind.VERTEX_FACE: 1.32, PairKind.EDGE_EDGE: 2.33}
 """The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
 culls."""
-
-_KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}
-"""Without fused operations every device computes the same bits."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,7 @@ class QueryBenchmark:
         return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
 
 
-@wp.kernel(**_KERNEL)
+@wp.kernel(**NO_FUSED_OPERATIONS)
 def _generate_queries(
     first: int,
     # in
@@ -136,7 +133,7 @@ def _rounded(x: wp.vec3) -> wp.vec3:
     return wp.vec3(wp.round(256.0 * x[0]), wp.round(256.0 * x[1]), wp.round(256.0 * x[2])) / 256.0
 
 
-@wp.kernel(**_KERNEL)
+@wp.kernel(**NO_FUSED_OPERATIONS)
 def _make_touch(
     first: int,
     # in
@@ -172,7 +169,7 @@ def _kernels(kind: PairKind):
     def read(p: wp.array2d[wp.vec3], i: int):
         return p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7]
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_status(
         first: int,
         # in
@@ -184,7 +181,7 @@ def _kernels(kind: PairKind):
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
         status[i] = wp.int8(ccd(a0, b0, c0, d0, a1, b1, c1, d1))
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_impact(
         first: int,
         # in
@@ -204,7 +201,7 @@ def _kernels(kind: PairKind):
         coordinates[i] = result.coordinates
         normal[i] = result.normal
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull(
         first: int,
         # in
@@ -229,7 +226,7 @@ def _kernels(kind: PairKind):
             return
         survivors[wp.int32(take_slot(counts, 0))] = i
 
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def classify_survivors(
         first: int,
         # in
@@ -255,11 +252,7 @@ def _kernels(kind: PairKind):
 
     decide = decide_in(1)
 
-    @wp.func
-    def double(x: wp.vec3) -> wp.vec3d:
-        return wp.vec3d(wp.float64(x[0]), wp.float64(x[1]), wp.float64(x[2]))
-
-    @wp.kernel(**_KERNEL)
+    @wp.kernel(**NO_FUSED_OPERATIONS)
     def find_exact_status(
         first: int,
         # in
@@ -269,19 +262,9 @@ def _kernels(kind: PairKind):
     ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
-        time = decide(
-            number,
-            double(a0),
-            double(b0),
-            double(c0),
-            double(d0),
-            double(a1),
-            double(b1),
-            double(c1),
-            double(d1),
-            False,
-            0,
-        )
+        a0d, b0d, c0d, d0d = doubles(a0, b0, c0, d0)
+        a1d, b1d, c1d, d1d = doubles(a1, b1, c1, d1)
+        time = decide(number, a0d, b0d, c0d, d0d, a1d, b1d, c1d, d1d, False, 0)
         status[i] = wp.int8(wp.where(time < NONE, HIT, FREE))
 
     return find_status, find_impact, cull, classify_survivors, find_exact_status

@@ -22,7 +22,7 @@ from ..kernels.pipeline.queues import append, is_filled, take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF
 from ..kernels.time_of_impact import Impact
-from .kernels import PairStages
+from .kernels import PairStages, write_impact
 from .launch import launch_over_queue, made_once
 from .mesh import CollisionMesh
 from .narrow_phase import NarrowPhase
@@ -249,15 +249,10 @@ def _kernels(dtype: type, turning: bool) -> tuple[wp.Kernel, wp.Kernel]:
             return
         slot = take_slot(stages.counts, _CONTACTS)
         take_slot(stages.counts, _FOUND)
-        contacts = stages.contacts
-        if slot < wp.int64(contacts.pairs.shape[0]):
+        if slot < wp.int64(stages.contacts.pairs.shape[0]):
             k = wp.int32(slot)
-            contacts.pairs[k] = pair
-            contacts.status[k] = wp.int8(status)
-            contacts.within_tolerance[k] = result.within_tolerance == 1
-            contacts.toi[k] = result.toi
-            contacts.coordinates[k] = result.coordinates
-            contacts.normal[k] = result.normal
+            stages.contacts.pairs[k] = pair
+            write_impact(k, result, stages)
 
     return cull_approaches, decide_approaches
 

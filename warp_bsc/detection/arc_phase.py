@@ -18,7 +18,7 @@ from ..kernels.pipeline.pairs import distance_of_corners, vertices_of_pair
 from ..kernels.pipeline.queues import append, is_filled, take_slot, take_slots
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE
-from .kernels import PairStages
+from .kernels import PairStages, write_impact
 from .launch import launch_over, launch_over_queue, made_once
 from .narrow_phase import NarrowPhase, launch_over_kinds
 from .settings import NO_FUSED_OPERATIONS, Count
@@ -102,12 +102,8 @@ def _decide(
     if slot < wp.int64(contacts.pairs.shape[0]):
         k = wp.int32(slot)
         contacts.pairs[k] = pair
-        contacts.status[k] = wp.int8(result.status)
         contacts.decided[k] = wp.int8(result.status)
-        contacts.within_tolerance[k] = result.within_tolerance == 1
-        contacts.toi[k] = result.toi
-        contacts.coordinates[k] = result.coordinates
-        contacts.normal[k] = result.normal
+        write_impact(k, result, stages)
         stages.order[k] = k
         stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
 

@@ -50,26 +50,15 @@ class BroadPhase(Protocol):
         ...
 
     def pair_elements(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        vertex_face_counts: wp.array,
-        vertex_face: wp.array,
-        edge_edge_counts: wp.array,
-        edge_edge: wp.array,
-        *,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates.
 
         Args:
             x0: Positions at the start, array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            vertex_face_counts: By :class:`Count`, array of int64.
-            vertex_face: Queue for (vertex, face), array of vec2i.
-            edge_edge_counts: By :class:`Count`, array of int64.
-            edge_edge: Queue for (edge, edge), the smaller first, array of vec2i.
+            out: Counts by :class:`Count`, array of int64, and queue for (vertex, face), array of vec2i; then those for
+                (edge, edge), the smaller first.
             changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. Pairs without one of
                 these vertices may be found as well.
             keep_separated: Whether to enqueue the pairs that an axis separates, too.
@@ -77,16 +66,7 @@ class BroadPhase(Protocol):
         ...
 
     def pair_points(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        vertex_edge_counts: wp.array,
-        vertex_edge: wp.array,
-        vertex_vertex_counts: wp.array,
-        vertex_vertex: wp.array,
-        *,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates of points with the edges that no face has, and with points.
 

@@ -109,37 +109,17 @@ class BroadPhaseHierarchy:
         self.hierarchy.filtered_of_worlds = counts
 
     def pair_elements(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        vertex_face_counts: wp.array,
-        vertex_face: wp.array,
-        edge_edge_counts: wp.array,
-        edge_edge: wp.array,
-        *,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates."""
         self._pair_faces(x0, x1, changed, keep_separated)
-        queues = [vertex_face_counts, vertex_face, edge_edge_counts, edge_edge]
-        self._launch_over_pairs(pair_elements_kernel, *queues)
+        self._launch_over_pairs(pair_elements_kernel, *out)
 
     def pair_points(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        vertex_edge_counts: wp.array,
-        vertex_edge: wp.array,
-        vertex_vertex_counts: wp.array,
-        vertex_vertex: wp.array,
-        *,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
-        queues = [vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex]
-        self._launch_over_pairs(pair_points_kernel, *queues)
+        self._launch_over_pairs(pair_points_kernel, *out)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""

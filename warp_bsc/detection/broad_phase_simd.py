@@ -63,16 +63,7 @@ class BroadPhaseSimd:
         self._filtered_of_worlds = counts
 
     def pair_elements(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        vertex_face_counts: wp.array,
-        vertex_face: wp.array,
-        edge_edge_counts: wp.array,
-        edge_edge: wp.array,
-        *,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates."""
         trees = [self._vertices, self._edges, self._faces]
@@ -80,30 +71,21 @@ class BroadPhaseSimd:
             trees.append(self._edges_of_faces)
         self._build(trees, x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
-        self._vertices.pair(self._faces, vertex_face_counts, vertex_face, **options)
-        self._edges.pair(self._edges, edge_edge_counts, edge_edge, ordered=True, **options)
+        self._vertices.pair(self._faces, *out[:2], **options)
+        self._edges.pair(self._edges, *out[2:], ordered=True, **options)
         if self._edges_of_faces:
-            self._edges.pair(self._edges_of_faces, edge_edge_counts, edge_edge, ordered=True, **options)
+            self._edges.pair(self._edges_of_faces, *out[2:], ordered=True, **options)
 
     def pair_points(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        vertex_edge_counts: wp.array,
-        vertex_edge: wp.array,
-        vertex_vertex_counts: wp.array,
-        vertex_vertex: wp.array,
-        *,
-        changed: wp.array | None = None,
-        keep_separated: bool = False,
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates of points with edges that no face has, and with points."""
         if self._points is None or self._free_edges is None:
             return
         self._build([self._points, self._free_edges], x0, x1, changed)
         options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
-        self._points.pair(self._free_edges, vertex_edge_counts, vertex_edge, **options)
-        self._points.pair(self._points, vertex_vertex_counts, vertex_vertex, ordered=True, **options)
+        self._points.pair(self._free_edges, *out[:2], **options)
+        self._points.pair(self._points, *out[2:], ordered=True, **options)
 
     def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:
         """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..kernels.distance_gradients import with_distance_gradients
 from ..kernels.gradients import with_gradients
-from ..kernels.motion import double
+from ..kernels.motion import doubles
 from ..kernels.pipeline.pairs import distance_of_corners, points_of_pair, vertices_of_pair
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..kernels.signs import HIT, UNSURE
@@ -54,19 +54,9 @@ def _kernel(dtype: type) -> wp.Kernel:
         found.toi = contacts.toi[i]
         found.coordinates = contacts.coordinates[i]
         found.normal = contacts.normal[i]
-        contact = with_gradients(
-            kind,
-            double(x0[v[0]]),
-            double(x0[v[1]]),
-            double(x0[v[2]]),
-            double(x0[v[3]]),
-            double(x1[v[0]]),
-            double(x1[v[1]]),
-            double(x1[v[2]]),
-            double(x1[v[3]]),
-            found,
-            tolerance,
-        )
+        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
+        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        contact = with_gradients(kind, a0, b0, c0, d0, a1, b1, c1, d1, found, tolerance)
         toi[i] = contact.toi
         coordinates[i] = contact.coordinates
         normal[i] = contact.normal
@@ -105,20 +95,11 @@ def _distance_kernel(dtype: type) -> wp.Kernel:
         found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
         found.within_tolerance = wp.where(contacts.within_tolerance[i], 1, 0)
         found.toi = contacts.toi[i]
-        contact = with_distance_gradients(
-            wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE),
-            double(x0[v[0]]),
-            double(x0[v[1]]),
-            double(x0[v[2]]),
-            double(x0[v[3]]),
-            double(x1[v[0]]),
-            double(x1[v[1]]),
-            double(x1[v[2]]),
-            double(x1[v[3]]),
-            distance_of_corners(kind, v, radius),
-            found,
-            tolerance,
-        )
+        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
+        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = distance_of_corners(kind, v, radius)
+        contact = with_distance_gradients(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, found, tolerance)
         toi[i] = contact.toi
         grazing[i] = contact.grazing == 1
 

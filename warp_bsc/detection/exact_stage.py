@@ -20,7 +20,7 @@ from ..kernels.exact.distance import BITS as DISTANCE_BITS
 from ..kernels.exact.distance import decide_distance_in
 from ..kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
 from ..kernels.exact.polygon import BITS
-from ..kernels.motion import double, relative_motion
+from ..kernels.motion import doubles, relative_motion
 from ..kernels.pipeline.pairs import distance_of_corners, points_of_pair, vertices_of_pair
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
@@ -74,19 +74,9 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
             return
         i = queue[slot]
         v = vertices_of_pair(kind, elements, contacts.pairs[i])
-        time = decide(
-            kind,
-            double(x0[v[0]]),
-            double(x0[v[1]]),
-            double(x0[v[2]]),
-            double(x0[v[3]]),
-            double(x1[v[0]]),
-            double(x1[v[1]]),
-            double(x1[v[2]]),
-            double(x1[v[3]]),
-            timed,
-            digits,
-        )
+        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
+        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        time = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
         if time == TOO_WIDE:
             left[wp.int32(take_slot(counts, too_wide))] = i
         elif time == NONE:
@@ -98,18 +88,7 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
             if timed:
                 # the time at which floating point has stopped is a lower bound too
                 time = wp.max(time, contacts.toi[i])
-                motion = relative_motion(
-                    kind,
-                    x0[v[0]],
-                    x0[v[1]],
-                    x0[v[2]],
-                    x0[v[3]],
-                    x1[v[0]],
-                    x1[v[1]],
-                    x1[v[2]],
-                    x1[v[3]],
-                    wp.float64(0.0),
-                )
+                motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
                 at, direction = contact_at(motion, time)
                 contacts.within_tolerance[i] = True
                 contacts.toi[i] = time
@@ -146,21 +125,11 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
         if known == FREE or (known == HIT and (contacts.within_tolerance[k] or not timed)):
             return
         v = points_of_pair(kind, stages.elements, contacts.pairs[k])
-        status = decide(
-            wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE),
-            double(x0[v[0]]),
-            double(x0[v[1]]),
-            double(x0[v[2]]),
-            double(x0[v[3]]),
-            double(x1[v[0]]),
-            double(x1[v[1]]),
-            double(x1[v[2]]),
-            double(x1[v[3]]),
-            distance_of_corners(kind, v, radius),
-            contacts.toi[k],
-            digits,
-            timed,
-        )
+        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
+        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = distance_of_corners(kind, v, radius)
+        status = decide(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, contacts.toi[k], digits, timed)
         if status == FREE:
             contacts.decided[k] = wp.int8(status)
             stages.keys[k] = stages.last_key

@@ -10,7 +10,7 @@ from .._arguments import check_finite
 from ..kernels.exact.inversion import tetrahedron_inverts_in
 from ..kernels.exact.polygon import BITS
 from ..kernels.inversion import first_inversion
-from ..kernels.motion import double
+from ..kernels.motion import doubles
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from .launch import launch_over, made_once
 from .mesh import CollisionMesh
@@ -59,22 +59,10 @@ def _classify(dtype: type) -> wp.Kernel:
         within_tolerance: wp.array[bool],
     ):
         i = first + wp.tid()
-        a = tets[i, 0]
-        b = tets[i, 1]
-        c = tets[i, 2]
-        d = tets[i, 3]
-        found = first_inversion(
-            double(x0[a]),
-            double(x0[b]),
-            double(x0[c]),
-            double(x0[d]),
-            double(x1[a]),
-            double(x1[b]),
-            double(x1[c]),
-            double(x1[d]),
-            roundoff,
-            tolerance,
-        )
+        a, b, c, d = tets[i, 0], tets[i, 1], tets[i, 2], tets[i, 3]
+        a0, b0, c0, d0 = doubles(x0[a], x0[b], x0[c], x0[d])
+        a1, b1, c1, d1 = doubles(x1[a], x1[b], x1[c], x1[d])
+        found = first_inversion(a0, b0, c0, d0, a1, b1, c1, d1, roundoff, tolerance)
         status[i] = wp.int8(found.status)
         toi[i] = found.toi
         within_tolerance[i] = found.within_tolerance == 1
@@ -100,21 +88,10 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
         i = first + wp.tid()
         if int(status[i]) != UNSURE:
             return
-        a = tets[i, 0]
-        b = tets[i, 1]
-        c = tets[i, 2]
-        d = tets[i, 3]
-        decided = tetrahedron_inverts(
-            double(x0[a]),
-            double(x0[b]),
-            double(x0[c]),
-            double(x0[d]),
-            double(x1[a]),
-            double(x1[b]),
-            double(x1[c]),
-            double(x1[d]),
-        )
-        status[i] = wp.int8(decided)
+        a, b, c, d = tets[i, 0], tets[i, 1], tets[i, 2], tets[i, 3]
+        a0, b0, c0, d0 = doubles(x0[a], x0[b], x0[c], x0[d])
+        a1, b1, c1, d1 = doubles(x1[a], x1[b], x1[c], x1[d])
+        status[i] = wp.int8(tetrahedron_inverts(a0, b0, c0, d0, a1, b1, c1, d1))
 
     return decide_exactly
 

@@ -49,30 +49,8 @@ NO_FUSED_OPERATIONS = NO_GRADIENTS | {"module_options": {"fuse_fp": False}}
 """The same for a kernel that decides: without fused operations every device computes the same bits."""
 
 
-class PairKind(enum.IntEnum):
-    """The two kinds of pairs, with their numbers in kernels."""
-
-    VERTEX_FACE = int(polynomials.VERTEX_FACE)
-    EDGE_EDGE = int(polynomials.EDGE_EDGE)
-
-    @property
-    def label(self) -> str:
-        """The name in attributes of results: "vertex_face" or "edge_edge"."""
-        return self.name.lower()
-
-    @property
-    def display_name(self) -> str:
-        """The name in tables and messages: "vertex-face" or "edge-edge"."""
-        return self.label.replace("_", "-")
-
-
-class DistanceKind(enum.IntEnum):
-    """The kinds of pairs that may have a minimum distance, with their numbers in kernels."""
-
-    VERTEX_FACE = int(polynomials.VERTEX_FACE)
-    EDGE_EDGE = int(polynomials.EDGE_EDGE)
-    VERTEX_EDGE = int(polynomials.VERTEX_EDGE)
-    VERTEX_VERTEX = int(polynomials.VERTEX_VERTEX)
+class _Kind(enum.IntEnum):
+    """A kind of pairs, with its number in kernels."""
 
     @property
     def label(self) -> str:
@@ -81,8 +59,24 @@ class DistanceKind(enum.IntEnum):
 
     @property
     def display_name(self) -> str:
-        """The name in messages: "vertex-face" and so on."""
+        """The name in tables and messages: "vertex-face" and so on."""
         return self.label.replace("_", "-")
+
+
+class PairKind(_Kind):
+    """The two kinds of pairs, with their numbers in kernels."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+
+
+class DistanceKind(_Kind):
+    """The kinds of pairs that may have a minimum distance, with their numbers in kernels."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+    VERTEX_EDGE = int(polynomials.VERTEX_EDGE)
+    VERTEX_VERTEX = int(polynomials.VERTEX_VERTEX)
 
     @property
     def point_order(self) -> list[int]:
