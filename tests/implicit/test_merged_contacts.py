@@ -62,6 +62,7 @@ def merged(contacts, device, order):
         setattr(struct, name, wp.array(values[order], dtype=Contacts.vars[name].type.dtype, device=device))
     struct.feature = wp.zeros(count, dtype=wp.vec3i, device=device)
     struct.next, struct.bucket = (wp.zeros(n, dtype=int, device=device) for n in (count, 1))
+    struct.most_of_bucket = wp.zeros(3, dtype=float, device=device)
     struct.count = wp.array([count], dtype=int, device=device)
     wp.launch(_link, count, inputs=[struct], device=device)
     wp.launch(_merge, count, inputs=[struct], device=device)

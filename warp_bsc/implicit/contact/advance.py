@@ -258,7 +258,7 @@ def advance(
             for w in range(t, worlds, n):
                 progress.solving[w] = progress.steps[w]
             for v in range(t, p.contacts.bucket.shape[0], n):
-                p.contacts.bucket[v] = 0
+                merge.clear_bucket(p.contacts, v)
             if t == 0:
                 p.contacts.count[0] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
@@ -266,7 +266,7 @@ def advance(
             solves = int(0)
             for v in range(t, vertices, n):
                 steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
-                p.contacts.bucket[v] = 0
+                merge.clear_bucket(p.contacts, v)
             for i in range(t, p.element_count, n):
                 _differentiate(i, p, motion, settings)
                 _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)

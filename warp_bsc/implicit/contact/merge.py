@@ -6,11 +6,11 @@ They have the same closest points, so that gradients, Hessians and friction add 
 import warp as wp
 
 from ...response.state.vectors import ZERO, to_double, to_single
-from .system import Contacts, to_single_block
+from .system import Contacts, raise_to, to_single_block
 
 wp.set_module_options({"enable_backward": False})
 
-_DIGITS = wp.constant(wp.float64(2.0**23))
+_DIGITS = wp.constant(wp.float64(2.0**11))
 """A number, in the largest of some terms, beside which these are rounded so that their sum is exact in any order."""
 
 
@@ -36,8 +36,20 @@ def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4
         # a vertex, of two that of the lower number, and the other vertex twice or those of the edge
         one = int(count[0] > count[1] or (count[0] == count[1] and low[0] > low[1]))
         feature = wp.vec3i(low[one], low[1 - one], high[1 - one])
+        bucket = _bucket_of(contacts, feature)
         contacts.feature[i] = feature
-        contacts.next[i] = wp.atomic_exch(contacts.bucket, _bucket_of(contacts, feature), i + 1)
+        contacts.next[i] = wp.atomic_exch(contacts.bucket, bucket, i + 1)
+        raise_to(contacts.most_of_bucket, 3 * bucket, wp.max(wp.abs(contacts.gradient[i])))
+        raise_to(contacts.most_of_bucket, 3 * bucket + 1, wp.trace(contacts.hessian[i]))
+        raise_to(contacts.most_of_bucket, 3 * bucket + 2, contacts.limit[i])
+
+
+@wp.func
+def clear_bucket(contacts: Contacts, bucket: int):
+    """Takes all contacts out of a bucket."""
+    contacts.bucket[bucket] = 0
+    for k in range(3):
+        contacts.most_of_bucket[3 * bucket + k] = 0.0
 
 
 @wp.func
@@ -49,34 +61,34 @@ def merge_contact(i: int, contacts: Contacts):
     feature, key = contacts.feature[i], contacts.key[i]
     if feature[0] < 0:
         return
-    first = contacts.bucket[_bucket_of(contacts, feature)]
-    count, most = int(0), wp.vec3d()
-    n = first + int(0)
+    bucket = _bucket_of(contacts, feature)
+    by_gradient = wp.vec3d(_DIGITS * wp.float64(contacts.most_of_bucket[3 * bucket]))
+    hessian_digits = _DIGITS * wp.float64(contacts.most_of_bucket[3 * bucket + 1])
+    by_hessian = wp.matrix_from_rows(wp.vec3d(hessian_digits), wp.vec3d(hessian_digits), wp.vec3d(hessian_digits))
+    by_limit = _DIGITS * wp.float64(contacts.most_of_bucket[3 * bucket + 2])
+    gradient, hessian, limit, count = wp.vec3d(), wp.mat33d(), wp.float64(0.0), int(0)
+    normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[bucket] + int(0)
     while n > 0:
         k = n - 1
-        if contacts.feature[k] == feature:
-            if contacts.key[k] < key:
+        # read side by side: most of the time is waiting for memory
+        n, of_feature, of_key = (
+            contacts.next[k] + int(0),
+            contacts.feature[k] + wp.vec3i(),
+            contacts.key[k] + wp.int64(0),
+        )
+        of_gradient, of_hessian = to_double(contacts.gradient[k]), wp.mat33d(contacts.hessian[k])
+        of_limit, same = wp.float64(contacts.limit[k]), wp.float64(wp.sign(wp.dot(contacts.normal[k], normal)))
+        if of_feature == feature:
+            if of_key < key:
                 contacts.weights[i] = wp.vec4()
                 contacts.couples[i] = 0
                 return
             count += 1
-            of_gradient, of_hessian = wp.max(wp.abs(contacts.gradient[k])), wp.trace(contacts.hessian[k])
-            most = wp.max(most, to_double(wp.vec3(of_gradient, of_hessian, contacts.limit[k])))
-        n = contacts.next[k]
+            gradient += (same * of_gradient + by_gradient) - by_gradient
+            hessian += (of_hessian + by_hessian) - by_hessian
+            limit += (of_limit + by_limit) - by_limit
     if count < 2:
         return
-    most *= _DIGITS
-    by_gradient, by_hessian, by_limit = wp.vec3d(most[0]), wp.mat33d(most[1]), most[2]
-    gradient, hessian, limit = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
-    n = first
-    while n > 0:
-        k = n - 1
-        if contacts.feature[k] == feature:
-            same = wp.float64(wp.sign(wp.dot(contacts.normal[k], contacts.normal[i])))
-            gradient += (same * to_double(contacts.gradient[k]) + by_gradient) - by_gradient
-            hessian += (wp.mat33d(contacts.hessian[k]) + by_hessian) - by_hessian
-            limit += (wp.float64(contacts.limit[k]) + by_limit) - by_limit
-        n = contacts.next[k]
     contacts.gradient[i] = to_single(gradient)
     contacts.hessian[i] = to_single_block(hessian)
     contacts.limit[i] = float(limit)

@@ -240,7 +240,7 @@ class NewtonMethod:
             end: The state at the end, with the poses of bodies as predicted; what is solved for is written.
             dt: Length of the step [s].
         """
-        self._captured |= self._work.device.is_capturing
+        self._captured = self._captured or bool(self._work.device.is_capturing)
         self._begin(end, dt)
         self._find_end(end)
 
@@ -360,7 +360,7 @@ class NewtonMethod:
     def _allocate_contacts(self, capacity):
         self._retire(self._contacts)
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
-        sizes["bucket"] = self._mesh.vertex_count
+        sizes |= {"bucket": self._mesh.vertex_count, "most_of_bucket": 3 * self._mesh.vertex_count}
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = self._problem.contacts = allocate(Contacts, capacity, self._work.device, **sizes)
