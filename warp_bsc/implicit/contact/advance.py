@@ -149,7 +149,15 @@ def wait_for_all(arrived: wp.array[int]):
 
 @wp.func
 def _over_pairs(
-    task: int, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings, solves: int, t: int, n: int
+    task: int,
+    is_shorter: bool,
+    p: Problem,
+    motion: Motion,
+    planes: MovingPlanes,
+    settings: BarrierSettings,
+    solves: int,
+    t: int,
+    n: int,
 ):
     group = 1 + solves
     for i in range(t, p.candidates.count[0], n):
@@ -169,7 +177,7 @@ def _over_pairs(
                 p.contacts,
             )
         elif task == Task.BOUND:
-            bounds.bound_by_pair(i, motion, p.candidates, p.trial, p.progress, p.limit)
+            bounds.bound_by_pair(i, motion, p.candidates, p.trial, p.progress, p.limit, is_shorter)
         else:
             merit.add_pair_energy(i, motion, p.candidates, settings, p.trial, p.progress)
     for v in range(t, p.vertices_at_planes, n):
@@ -234,6 +242,7 @@ def advance(
     planes: MovingPlanes,
     settings: BarrierSettings,
     least_change: float,
+    far_change: float,
     max_steps: int,
     max_late_steps: int,
     # in and out
@@ -297,7 +306,7 @@ def advance(
                 for i in range(t, contact_count(p.contacts), n):
                     if progress.searches[motion.world[p.contacts.corners[i][0]]] != 0:
                         merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.trial)
-            _over_pairs(task, p, motion, planes, settings, solves, t, n)
+            _over_pairs(task, passes > 0, p, motion, planes, settings, solves, t, n)
             phase = then
         elif phase == Phase.COUNT:
             for i in range(t, contact_count(p.contacts), n):
@@ -415,12 +424,13 @@ def advance(
             phase = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
         elif phase == Phase.BEGIN_CUTS:  # of single vertices in place of their world, where energies are lower then
             for v in range(t, wp.max(vertices, worlds), n):
-                steps.begin_truncation(v, p.unknowns, p.lower, p.upper, p.trial, progress, p.whole, p.limit)
-            passes, task, then, phase = int(0), int(Task.BOUND), int(Phase.CUT), int(Phase.PAIRS)
+                steps.begin_truncation(v, p.unknowns, p.lower, p.upper, p.trial, progress, p.whole)
+            phase = int(Phase.CUT)  # the first time by the bounds of the displacements, which are known
         elif phase == Phase.CUT:
             for v in range(t, vertices, n):
                 steps.truncate(v, p.unknowns, p.limit, p.trial)
             passes += 1
+            then = int(Phase.CUT)
             if passes == _TRUNCATIONS:
                 for w in range(t, worlds, n):
                     progress.bound[w] = 1.0
@@ -448,7 +458,7 @@ def advance(
             phase = int(Phase.DECIDE)
         elif phase == Phase.DECIDE:
             for w in range(t, worlds, n):
-                decisions.decide(w, least_change, max_steps, max_late_steps, progress, p.plane_share)
+                decisions.decide(w, least_change, far_change, max_steps, max_late_steps, progress, p.plane_share)
             phase = int(Phase.NEXT)
         wait_for_all(p.flow.arrived)
         if task == Task.FIND_NEAR and phase == then and p.grows != 0:

@@ -31,6 +31,8 @@ FLOOR = wp.constant(wp.float64(0.03))
 """Share of the reach of a barrier below which it is too steep to solve for in one step."""
 FORCE_AT_FLOOR = 38.1660556541341
 """Force of the barrier at that gap, in the product of its stiffness and its reach."""
+MOST_LEFT = wp.constant(wp.float64(0.3))
+"""Share of the reach that a pair keeps at most."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
 
@@ -113,6 +115,31 @@ def distance_of_boxes(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.ve
 
 
 @wp.func
+def distance_of_ways(
+    kind: int,
+    # points
+    a: wp.vec3d,
+    b: wp.vec3d,
+    c: wp.vec3d,
+    d: wp.vec3d,
+    # their ways
+    p: wp.vec3d,
+    q: wp.vec3d,
+    r: wp.vec3d,
+    s: wp.vec3d,
+) -> wp.float64:
+    """Returns the distance of the boxes around the ways of two elements, at most that of the elements on them."""
+    lower, upper = wp.min(wp.min(c, c + r), wp.min(d, d + s)), wp.max(wp.max(c, c + r), wp.max(d, d + s))
+    first, last = wp.min(a, a + p), wp.max(a, a + p)
+    low, high = wp.min(b, b + q), wp.max(b, b + q)
+    if kind == EDGE_EDGE:
+        first, last = wp.min(first, low), wp.max(last, high)
+    else:
+        lower, upper = wp.min(lower, low), wp.max(upper, high)
+    return wp.length(wp.max(wp.max(lower - last, first - upper), wp.vec3d()))
+
+
+@wp.func
 def _closing_time(first: wp.float64, second: wp.float64, rate: wp.float64, other: wp.float64, least: wp.float64):
     """Returns when a point at ``first``, along a direction, comes as near as ``least`` to one at ``second``."""
     closing = other - rate
@@ -180,7 +207,7 @@ def floor_gap(gap: wp.float64, reach: wp.float64) -> wp.float64:
 @wp.func
 def least_gap(gap: wp.float64, reach: wp.float64, floor: wp.float64) -> wp.float64:
     """Returns the gap that a pair keeps in a Newton step: half of it, or less where it is large, more where small."""
-    least = wp.min(HALF * gap, wp.float64(0.3) * reach)
+    least = wp.min(HALF * gap, MOST_LEFT * reach)
     return wp.max(least, wp.min(floor, wp.float64(0.9) * gap))
 
 

@@ -7,7 +7,7 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
-from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
+from .pairs import FAR, BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
 from .system import Flag, Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
@@ -31,29 +31,43 @@ def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
 
 @wp.func
 def bound_by_pair(
-    i: int, motion: Motion, candidates: Candidates, trial: Trial, progress: Progress, limit: wp.array[float]
+    i: int,
+    motion: Motion,
+    candidates: Candidates,
+    trial: Trial,
+    progress: Progress,
+    limit: wp.array[float],
+    is_shorter: bool,
 ):
-    """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world."""
-    candidates.share[i] = 1.0
+    """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world.
+
+    Displacements that are parts of those of the last time are shorter: what was far from each other is so still.
+    """
     corners = candidates.corners[i]
     world = motion.world[corners[0]]
-    if progress.solving[world] == 0:
+    if progress.solving[world] == 0 or (is_shorter and candidates.share[i] == FAR):
         return
+    candidates.share[i] = 1.0
     kind = kind_of_key(candidates.key[i])
+    kept = candidates.kept[i]
+    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     a, b, c, d = corners_of(trial.x, corners)
+    p, q, r, s = corners_of(trial.displaced, corners)
+    bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
+    if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= kept + reach + wp.float64(bend):
+        candidates.share[i] = FAR
+        return
     scale = progress.scale[world]
     p = to_double(to_single(moved(trial, scale, corners[0]))) - a
     q = to_double(to_single(moved(trial, scale, corners[1]))) - b
     r = to_double(to_single(moved(trial, scale, corners[2]))) - c
     s = to_double(to_single(moved(trial, scale, corners[3]))) - d
-    # far apart for their ways: no need to find the closest points
-    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
-    kept = candidates.kept[i]
-    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
-    apart = barrier.distance_of_boxes(kind, a, b, c, d) - kept
+    # far apart but for what both do: no need to find the closest points
     bends = _bends(trial, scale, corners)
-    if way + bends[0] <= apart - barrier.least_gap(apart, reach, floor):
+    apart = barrier.distance_of_ways(kind, a, b, c, d, p - r, q - r, wp.vec3d(), s - r)
+    if apart >= kept + bends[0] + barrier.MOST_LEFT * reach:
         return
+    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     least = barrier.least_gap(distance - kept, reach, floor)
     if way + bends[0] <= distance - kept - least:

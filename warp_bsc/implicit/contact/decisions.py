@@ -120,12 +120,18 @@ def takes(w: int, progress: Progress) -> bool:
 
 @wp.func
 def decide(
-    w: int, least_change: float, max_steps: int, max_late_steps: int, progress: Progress, plane_share: wp.array[float]
+    w: int,
+    least_change: float,
+    far_change: float,
+    max_steps: int,
+    max_late_steps: int,
+    progress: Progress,
+    plane_share: wp.array[float],
 ):
     """Halves the share of a world that searches and has not taken it, or ends its Newton step."""
     if takes(w, progress):
         progress.searches[w] = 0
-        _end_step(w, least_change, max_steps, max_late_steps, progress, plane_share)
+        _end_step(w, least_change, far_change, max_steps, max_late_steps, progress, plane_share)
     elif progress.searches[w] != 0:
         progress.scale[w] = 0.5 * progress.scale[w]
         if progress.scale[w] < _LEAST_SCALE:
@@ -138,6 +144,7 @@ def decide(
 def _end_step(
     w: int,
     least_change: float,
+    far_change: float,
     max_steps: int,
     max_late_steps: int,
     progress: Progress,
@@ -145,7 +152,8 @@ def _end_step(
 ):
     """Ends a world whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one.
 
-    They are counted from when what a program moves arrives, if it does.
+    They are twice as many where unknowns change by more than ``far_change``, as in impacts, and are counted from when
+    what a program moves arrives, if it does.
     """
     scale = progress.scale[w]
     plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
@@ -154,7 +162,8 @@ def _end_step(
     steps = progress.steps[w]
     if progress.remaining[w] > 0.0:
         progress.late[w] = steps - 1
-    ends = arrived and (progress.change[w] <= least_change or steps - progress.late[w] >= max_steps)
+    most = wp.where(progress.change[w] > far_change, 2 * max_steps, max_steps)
+    ends = arrived and (progress.change[w] <= least_change or steps - progress.late[w] >= most)
     if scale == 0.0 and arrived:
         ends = True
     if ends or (steps >= max_late_steps and not arrived):

@@ -8,7 +8,16 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double
 from . import barrier
-from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
+from .pairs import (
+    FAR,
+    BarrierSettings,
+    Candidates,
+    Trial,
+    gap_at_plane,
+    plane_at,
+    stiffness_at_plane,
+    stiffness_of_pair,
+)
 from .system import Contacts, Progress, kind_of_key
 
 wp.set_module_options({"enable_backward": False})
@@ -62,7 +71,7 @@ def add_pair_energy(
     """Adds the energy of the barrier of a candidate at the displaced positions, in worlds that search."""
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = motion.world[corners[0]]
-    if progress.searches[world] == 0:
+    if progress.searches[world] == 0 or candidates.share[i] == FAR:
         return
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)

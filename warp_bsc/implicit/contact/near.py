@@ -12,7 +12,16 @@ from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_singl
 from . import barrier
 from .merge import link_contact
 from .merit import MEETS, add_energy
-from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at, stiffness_at_plane, stiffness_of_pair
+from .pairs import (
+    FAR,
+    BarrierSettings,
+    Candidates,
+    Trial,
+    gap_at_plane,
+    plane_at,
+    stiffness_at_plane,
+    stiffness_of_pair,
+)
 from .system import Contacts, Progress, Unknowns, couples, is_solved, key_of_pair, kind_of_key, to_single_block
 
 wp.set_module_options({"enable_backward": False})
@@ -104,7 +113,7 @@ def find_near(
     """Adds a contact if a candidate is near each other, in worlds that solve, and its energy."""
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = motion.world[corners[0]]
-    if progress.solving[world] == 0:
+    if progress.solving[world] == 0 or candidates.share[i] == FAR:
         return
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)

@@ -49,6 +49,8 @@ _SMOOTHING_SPEED = 0.5e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step ends [m/s]."""
+_FAR_SPEED = 0.1
+"""Speed by which one that changes still is far from its end, so that its world takes more Newton steps [m/s]."""
 _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
 _MOST_UNITS, _FAST = 2.0**56, 100.0
@@ -76,7 +78,7 @@ class NewtonMethod:
 
         Args:
             work: The workspace of the steps: motion, mesh and detection.
-            max_steps: Newton steps of a step at most.
+            max_steps: Newton steps of a step at most, but for twice as many where velocities still change much.
             results: Where solves write what they did.
             unconverged_steps: Where they count steps in which a world did not converge.
         """
@@ -409,7 +411,8 @@ class NewtonMethod:
 
     def _launch_advance(self):
         work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
-        inputs = [work.step.motion, work.motion.planes, self._settings, float(_LEAST_SPEED * self._dt), *steps_at_most]
+        changes = float(_LEAST_SPEED * self._dt), float(_FAR_SPEED * self._dt)
+        inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most]
         options = {"device": work.device, "block_dim": THREADS}
         wp.launch(advance, self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
 

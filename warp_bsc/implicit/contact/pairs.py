@@ -22,6 +22,8 @@ _LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
 _PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
+FAR = wp.constant(2.0)
+"""In place of a share of the last displacements: no part of them brings a pair within its reach."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
@@ -40,7 +42,7 @@ class Candidates:
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m].
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
-        share: Share of the last displacements before it would meet.
+        share: Share of the last displacements before it would meet, or :data:`FAR`.
     """
 
     count: wp.array[int]
@@ -216,11 +218,13 @@ def _prepare(
     a, b, c, d = corners_of(origin, corners)
     if not wp.isfinite(a + b + c + d):
         return
-    start, kept = ZERO, ZERO
+    start, kept, whole = ZERO, ZERO, _reach_of(settings, corners)
     if motion.distances.radius:
         start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
-        start = barrier.least_distance(queue.kind, a, b, c, d)
+        start = barrier.distance_of_boxes(queue.kind, a, b, c, d)
+        if not start >= wp.float64(whole):  # farther away, all is the same
+            start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
         if start == ZERO and queue.kind == VERTEX_FACE and settings.reach[corners[1]] == wp.inf:
             if motion.inverse_mass[corners[0]] > 0.0:
@@ -230,11 +234,12 @@ def _prepare(
     if crossings[motion.world[corners[0]]] > 0:
         if crossed_at_start(step, queue.kind, queue.pairs[i]):
             return
-    level, reach = _barrier_of(settings, start, kept, _reach_of(settings, corners))
+    level, reach = _barrier_of(settings, start, kept, whole)
     slot, pair = take_slot_int(candidates.count), queue.pairs[i]
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
     candidates.kept[slot] = kept
+    candidates.share[slot] = 1.0
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))

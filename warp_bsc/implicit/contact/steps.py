@@ -243,7 +243,6 @@ def begin_truncation(
     trial: Trial,
     progress: Progress,
     whole: wp.array[float],
-    limit: wp.array[float],
 ):
     """Lets worlds that take less than all of their displacements try to cut those of single vertices instead."""
     if v < progress.active.shape[0]:
@@ -258,7 +257,6 @@ def begin_truncation(
             progress.bound[v] = 1.0
     if v >= trial.x.shape[0]:
         return
-    limit[v] = 1.0
     if is_solved(unknowns, v):
         lower_to(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
 
