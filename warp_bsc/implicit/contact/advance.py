@@ -250,7 +250,9 @@ def advance(
     n: int,
 ):
     """Goes on with the Newton steps of all worlds until a solve, a search for candidates, or their end comes next."""
+    # things of different kinds in one phase are for different threads, so that they take place at the same time
     t = wp.tid()
+    from_end, from_middle = n - 1 - t, (t + n // 2) % n
     progress = p.progress
     vertices, unknowns, worlds = p.trial.x.shape[0], p.vectors.solution.shape[0], p.progress.active.shape[0]
     body_count = p.bodies.unknown.shape[0]
@@ -273,11 +275,12 @@ def advance(
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
         elif phase == Phase.DIFFERENTIATE:
             solves = int(0)
-            for v in range(t, vertices, n):
+            for v in range(from_end, vertices, n):
                 steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
                 merge.clear_bucket(p.contacts, v)
             for i in range(t, p.element_count, n):
                 _differentiate(i, p, motion, settings)
+            for i in range(from_middle, p.element_count, n):
                 _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)
             phase = int(Phase.LOADS)
         elif phase == Phase.LOADS:
@@ -286,7 +289,7 @@ def advance(
             for u in range(t, unknowns, n):
                 assembly.find_loads(u, p.derivatives, p.rows, p.unknowns, progress, settings.load)
                 _add_inertia(u, p, motion, settings, progress.solving, progress.energy)
-            for u in range(t, wp.max(unknowns, worlds), n):
+            for u in range(from_end, wp.max(unknowns, worlds), n):
                 contact_lists.clear_lists(u, p.contacts)
             task, then, phase = int(Task.FIND_NEAR), int(Phase.COUNT), int(Phase.PAIRS)
         elif phase == Phase.RELEASE_HELD:
@@ -299,11 +302,11 @@ def advance(
             if task == Task.ENERGY:
                 if t == 0:
                     progress.flags[Flag.SEARCHES] = 0
-                for i in range(t, p.element_count, n):
+                for i in range(from_end, p.element_count, n):
                     _add_element_energy(i, p, motion, settings, progress.searches, progress.trial)
-                for u in range(t, unknowns, n):
+                for u in range(from_middle, unknowns, n):
                     _add_inertia(u, p, motion, settings, progress.searches, progress.trial)
-                for i in range(t, contact_count(p.contacts), n):
+                for i in range(from_middle, contact_count(p.contacts), n):
                     if progress.searches[motion.world[p.contacts.corners[i][0]]] != 0:
                         merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.trial)
             _over_pairs(task, passes > 0, p, motion, planes, settings, solves, t, n)

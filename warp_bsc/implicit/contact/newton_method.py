@@ -57,7 +57,7 @@ _MOST_UNITS, _FAST = 2.0**56, 100.0
 """Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
 _MOST_UNITS_OF_ALL = 2.0**61
 """The same of all particles together: many and fast ones have coarser units."""
-_TOLERANCE = 1e-2
+_TOLERANCE = 2e-2
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
 """Newton steps after which a step ends, even if something that a program moves has not arrived."""
