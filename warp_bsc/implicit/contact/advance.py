@@ -19,8 +19,6 @@ from .system import Contacts, Flag, Progress, Unknowns, contact_count
 
 wp.set_module_options({"enable_backward": False})
 
-THREADS = 256
-"""Threads of a block on a GPU."""
 _TRUNCATIONS = wp.constant(4)
 """Passes in which the displacements of single vertices are cut, before those of their world are."""
 _PREDICTIONS = wp.constant(2)
@@ -235,8 +233,7 @@ def _add_inertia(
         steps.add_inertia(u, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, world, energy)
 
 
-@wp.kernel(launch_bounds=THREADS)
-def advance(
+def _advance(
     # in
     motion: Motion,
     planes: MovingPlanes,
@@ -496,3 +493,10 @@ def advance(
         p.flow.phase[0] = wp.where(solves_next != 0, int(Phase.DISPLACE), int(Phase.DIFFERENTIATE))
         if phase == Phase.GROW:
             p.flow.phase[0] = wp.where(then == Phase.END, int(Phase.PUBLISH), int(Phase.BEGIN))
+
+
+ADVANCE = {
+    threads: wp.kernel(_advance, enable_backward=False, module=f"{__name__}.blocks_of_{threads}", launch_bounds=threads)
+    for threads in (256, 512)
+}
+"""The kernel by the threads of its blocks on a GPU, one a multiprocessor: fewer have more registers each."""

@@ -20,7 +20,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import bodies, decisions, pairs, steps
-from .advance import THREADS, Flow, Phase, Problem, advance
+from .advance import ADVANCE, Flow, Phase, Problem
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_solve_kernel, make_team
 from .elasticity import elements_of_model, make_derivatives
@@ -35,6 +35,8 @@ _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with an element for each corner."""
 _PARTS = 8
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
+_MANY_VERTICES = 8192
+"""Vertices from which on threads have several pairs each: blocks have twice as many then."""
 _CONTACTS = 64
 """Contacts that fit at first, for each unknown: many times fewer than candidates in a pile, and of far more bytes."""
 _REACH_OF_EDGE = 0.1
@@ -57,7 +59,7 @@ _MOST_UNITS, _FAST = 2.0**56, 100.0
 """Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
 _MOST_UNITS_OF_ALL = 2.0**61
 """The same of all particles together: many and fast ones have coarser units."""
-_TOLERANCE = 2e-2
+_TOLERANCE = 1e-2
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
 """Newton steps after which a step ends, even if something that a program moves has not arrived."""
@@ -180,7 +182,8 @@ class NewtonMethod:
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
         self._flow = allocate(Flow, 1, device)
-        self._advancing = device.sm_count * THREADS if device.is_cuda else 1
+        self._block = 512 if device.is_cuda and vertices > _MANY_VERTICES else 256
+        self._advancing = device.sm_count * self._block if device.is_cuda else 1
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
@@ -413,8 +416,8 @@ class NewtonMethod:
         work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
         changes = float(_LEAST_SPEED * self._dt), float(_FAR_SPEED * self._dt)
         inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most]
-        options = {"device": work.device, "block_dim": THREADS}
-        wp.launch(advance, self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
+        options = {"device": work.device, "block_dim": self._block}
+        wp.launch(ADVANCE[self._block], self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
