@@ -105,6 +105,8 @@ class SolverImplicit(SolverCCD):
     Limitations:
         Restitution does not exist: contacts are without bounce, and implicit steps damp. A step on a tape raises
         NotImplementedError if the model requires gradients.
+        On a GPU, the blocks of a kernel wait for each other, one on each multiprocessor: do not run steps of two such
+        solvers at the same time on streams of different priorities, as each may hold what the other waits for.
 
     Attributes:
         mesh: The triangles that collide, :class:`.response.state.mesh.ModelMesh`.
