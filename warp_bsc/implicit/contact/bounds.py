@@ -7,7 +7,7 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
-from .pairs import FAR, BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at
+from .pairs import FAR, BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at, stays_far
 from .system import Flag, Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
@@ -47,7 +47,9 @@ def bound_by_pair(
     world = motion.world[corners[0]]
     if progress.solving[world] == 0 or (is_shorter and candidates.share[i] == FAR):
         return
-    candidates.share[i] = 1.0
+    candidates.share[i] = FAR
+    if stays_far(candidates, progress, world, i):
+        return
     kind = kind_of_key(candidates.key[i])
     kept = candidates.kept[i]
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
@@ -55,8 +57,8 @@ def bound_by_pair(
     p, q, r, s = corners_of(trial.displaced, corners)
     bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
     if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= kept + reach + wp.float64(bend):
-        candidates.share[i] = FAR
         return
+    candidates.share[i] = 1.0
     scale = progress.scale[world]
     p = to_double(to_single(moved(trial, scale, corners[0]))) - a
     q = to_double(to_single(moved(trial, scale, corners[1]))) - b

@@ -69,9 +69,11 @@ def add_pair_energy(
     i: int, motion: Motion, candidates: Candidates, settings: BarrierSettings, trial: Trial, progress: Progress
 ):
     """Adds the energy of the barrier of a candidate at the displaced positions, in worlds that search."""
+    if candidates.share[i] == FAR:
+        return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = motion.world[corners[0]]
-    if progress.searches[world] == 0 or candidates.share[i] == FAR:
+    if progress.searches[world] == 0:
         return
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)

@@ -111,9 +111,11 @@ def find_near(
     contacts: Contacts,
 ):
     """Adds a contact if a candidate is near each other, in worlds that solve, and its energy."""
+    if candidates.share[i] == FAR:
+        return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = motion.world[corners[0]]
-    if progress.solving[world] == 0 or candidates.share[i] == FAR:
+    if progress.solving[world] == 0:
         return
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)

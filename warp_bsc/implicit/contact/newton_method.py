@@ -134,7 +134,7 @@ class NewtonMethod:
         row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
         self._vectors = allocate(Vectors, self._count, device)
-        self.progress = allocate(Progress, work.worlds, device, flags=len(Flag))
+        self.progress = allocate(Progress, work.worlds, device, flags=len(Flag), way=work.worlds + 1)
         self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
@@ -346,7 +346,7 @@ class NewtonMethod:
 
     def _prepare_candidates(self):
         self._candidates.count.zero_()
-        inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings]
+        inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings, self.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
             outputs = [self._candidates, self._touching]

@@ -12,7 +12,7 @@ from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_
 from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
 from . import barrier
-from .system import key_of_pair
+from .system import Progress, key_of_pair
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,6 +24,8 @@ _PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
 FAR = wp.constant(2.0)
 """In place of a share of the last displacements: no part of them brings a pair within its reach."""
+_ROUNDED_DOWN = wp.constant(wp.float64(1.0 - 2.0**-20))
+"""What keeps a distance, as it is rounded, from being more than it is."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
@@ -38,6 +40,7 @@ class Candidates:
         count: Number of pairs, shape [1].
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
+        start: Distance at the start of the step, or less [m].
         kept: Distance that each pair keeps in any case [m].
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m].
@@ -48,6 +51,7 @@ class Candidates:
     count: wp.array[int]
     corners: wp.array[wp.vec4i]
     key: wp.array[wp.int64]
+    start: wp.array[float]
     kept: wp.array[wp.float64]
     level: wp.array[wp.float64]
     reach: wp.array[float]
@@ -201,12 +205,21 @@ NO_FACE = wp.constant(2**31 - 1)
 
 
 @wp.func
+def stays_far(candidates: Candidates, progress: Progress, world: int, i: int) -> bool:
+    """Returns whether a pair is beyond its reach, whichever of the vertices of its world go the longest ways."""
+    way = wp.float64(progress.way[world])
+    apart = wp.float64(candidates.start[i]) - way - wp.max(way, wp.float64(progress.way[progress.way.shape[0] - 1]))
+    return apart >= candidates.kept[i] + wp.float64(candidates.reach[i])
+
+
+@wp.func
 def _prepare(
     step: Step,
     queue: PairQueue,
     settings: BarrierSettings,
     origin: wp.array[wp.vec3],
     crossings: wp.array[int],
+    progress: Progress,
     candidates: Candidates,
     touching: Touching,
     i: int,
@@ -238,11 +251,12 @@ def _prepare(
     slot, pair = take_slot_int(candidates.count), queue.pairs[i]
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
+    candidates.start[slot] = float(start * _ROUNDED_DOWN)
     candidates.kept[slot] = kept
-    candidates.share[slot] = 1.0
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
+    candidates.share[slot] = wp.where(stays_far(candidates, progress, motion.world[corners[0]], slot), FAR, 1.0)
 
 
 @wp.kernel
@@ -252,6 +266,7 @@ def prepare_candidates(
     settings: BarrierSettings,
     origin: wp.array[wp.vec3],
     crossings: wp.array[int],
+    progress: Progress,
     first: PairQueue,
     second: PairQueue,
     # in and out
@@ -268,7 +283,7 @@ def prepare_candidates(
             if number == 1:
                 of = second
             if has_pair(of, i):
-                _prepare(step, of, settings, origin, crossings, candidates, touching, i)
+                _prepare(step, of, settings, origin, crossings, progress, candidates, touching, i)
             number += 1
 
 

@@ -14,6 +14,9 @@ from .system import Flag, Progress, Unknowns, displacement, is_solved, lower_to,
 
 wp.set_module_options({"enable_backward": False})
 
+_ROUNDED = wp.constant(2.0**-20)
+"""More than what rounding changes, as a share of a length."""
+
 
 @wp.kernel
 def predict_positions(
@@ -88,6 +91,8 @@ def begin_step(
         progress.scale[v] = 1.0
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
+        progress.way[v] = 0.0
+        progress.way[progress.way.shape[0] - 1] = 0.0
         progress.remaining[v] = 0.0
         progress.late[v] = 0
         plane_share[v] = 0.0
@@ -132,6 +137,14 @@ def truncate(
 
 
 @wp.func
+def _way(motion: Motion, trial: Trial, v: int) -> float:
+    """Returns how far a vertex is from where it was at the start of the step, here or on its displacement [m]."""
+    off = trial.x[v] - motion.x0[v]
+    farthest = wp.max(wp.length(off), wp.length(off + trial.displaced[v])) + trial.bend[v]
+    return farthest * (1.0 + _ROUNDED) + _ROUNDED * wp.max(wp.abs(trial.x[v]))
+
+
+@wp.func
 def find_remaining(
     v: int,
     motion: Motion,
@@ -147,6 +160,7 @@ def find_remaining(
         trial.displaced[v] = d
         if wp.length_sq(d) > 0.0:
             raise_to(progress.remaining, world, wp.length(d))
+            raise_to(progress.way, progress.way.shape[0] - 1, _way(motion, trial, v))
 
 
 @wp.func
@@ -183,6 +197,7 @@ def displace(
         progress.change[world] = wp.inf
         return
     trial.displaced[v] = d
+    raise_to(progress.way, world, _way(motion, trial, v))
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
         lower_to(progress.bound, world, share)

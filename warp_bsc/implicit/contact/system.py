@@ -63,6 +63,8 @@ class Progress:
         uncut: The same, before displacements of single vertices are cut.
         cuts: 1 if those are cut.
         change: Largest displacement of an unknown [m].
+        way: How far a vertex has been, or is led by the displacements, from where it was at the start of the
+            step [m]; the last is that of what a program moves, of all worlds.
         remaining: Largest way of what a program moves that is left [m].
         held: 1 if pairs are held in the solve.
         flags: What has been found in some world, see :class:`Flag`.
@@ -80,6 +82,7 @@ class Progress:
     uncut: wp.array[wp.int64]
     cuts: wp.array[int]
     change: wp.array[float]
+    way: wp.array[float]
     remaining: wp.array[float]
     held: wp.array[int]
     flags: wp.array[int]
