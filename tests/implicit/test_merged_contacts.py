@@ -23,11 +23,10 @@ def _merge(contacts: Contacts):
     merge_contact(wp.tid(), contacts)
 
 
-@pytest.fixture(scope="module")
-def contacts(device):
-    """Those at the end of a step of a fan that slides over the middle of another, and of one over the edge of a roof.
+def contacts_of_step(device, **options):
+    """Contacts after a step of a fan that slides over the middle of another, and of one over the edge of a roof.
 
-    They are not merged. By name, in the order of their keys.
+    By name, in the order of their keys.
     """
     angle = np.pi / 3.0 * np.arange(6)
     ring = 0.05 * np.stack([np.cos(angle), np.sin(angle), np.full(6, 0.4)], axis=1)
@@ -46,13 +45,19 @@ def contacts(device):
             vertices=[wp.vec3(*v) for v in x], indices=faces.ravel().tolist(), tri_ke=1e3, tri_ka=1e3,
         )  # fmt: skip
     model = builder.finalize(device=device)
-    solver, state = bsc.SolverImplicit(model, friction=0.3, report_contacts=True), model.state()
+    solver, state = bsc.SolverImplicit(model, friction=0.3, **options), model.state()
     solver.step(state, state, None, None, 1.0 / 240.0)
     found = solver._newton._contacts
     count = found.count.numpy()[0]
     order = np.argsort(found.key.numpy()[:count])
     names = "corners", "weights", "normal", "gradient", "hessian", "limit", "key", "couples"
     return {name: getattr(found, name).numpy()[:count][order] for name in names}
+
+
+@pytest.fixture(scope="module")
+def contacts(device):
+    """Those at the end of the step, which are reported: each pair's own."""
+    return contacts_of_step(device, report_contacts=True)
 
 
 def merged(contacts, device, order):
@@ -95,6 +100,12 @@ def test_contacts_of_a_feature_are_their_sum(contacts, device):
         np.testing.assert_allclose(actual, expected, atol=2e-6 * np.abs(expected).max())
     gradient = np.abs(sums(contacts)[0])
     assert gradient[:, :2].max() > 0.05 * gradient.max()  # friction
+
+
+def test_a_solve_takes_one_contact_of_a_feature(device):
+    in_solve = contacts_of_step(device)
+    assert len(in_solve["key"]) == 48 + 8
+    assert (in_solve["weights"].any(axis=1).sum(), in_solve["couples"].sum()) == (2, 2)
 
 
 def test_sums_do_not_depend_on_the_order_of_contacts(contacts, device):

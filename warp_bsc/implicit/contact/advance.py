@@ -80,7 +80,7 @@ class Flow:
         phase: The phase that comes next, shape [1].
         solves: Solves of the Newton step so far, shape [1].
         solves_next: 1 if a solve comes next, shape [1].
-        goes_on: 1 if a solve or a search for candidates comes next, shape [1].
+        goes_on: 1 if a solve, a search for candidates or larger buffers come next, shape [1].
         arrived: How often blocks of threads have waited, shape [1].
     """
 
@@ -93,7 +93,22 @@ class Flow:
 
 @wp.struct
 class Problem:
-    """What Newton steps read and write, see :class:`.newton_method.NewtonMethod`."""
+    """What Newton steps read and write.
+
+    Attributes:
+        row_of_block: Row of each block of ``rows``.
+        goal: Where inertia leads each vertex [m].
+        lower, upper: Boxes of vertices within which the candidates are all that may come near each other [m].
+        limit: Share of its displacement before each vertex meets something.
+        plane_share: Share of their ways that infinite planes have gone, by world.
+        whole: Share that each world takes without cuts of single vertices.
+        first: Solution of the Newton step before pairs are held.
+        leaves: 1 for each world of which a vertex leaves its box, and for any, last.
+        lacks: See :func:`.step_report.write_results`.
+        vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
+        parts: Threads that share a row or a block.
+        grows: 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs.
+    """
 
     elements: elasticity.Elements
     derivatives: elasticity.Derivatives

@@ -1,7 +1,7 @@
 """Newton's method on the energy of a step: inertia, elasticity, barriers and friction. Read :meth:`NewtonMethod.solve`.
 
 Each Newton step solves for displacements by conjugate gradients, takes the share of them that brings no two elements
-together, and less of it where the energy does not fall. Conditions are on the device, as in :mod:`...response.step`.
+together, and less of it where the energy does not fall. What lies between two solves is :mod:`.advance`, on the device.
 """
 
 from collections.abc import Callable

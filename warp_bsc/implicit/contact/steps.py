@@ -1,4 +1,4 @@
-"""Kernels over the vertices of a Newton step: prediction, displacements, energies, and where it ends."""
+"""Vertices in a Newton step: prediction, displacements, inertia, and where they end."""
 
 import warp as wp
 
