@@ -14,6 +14,7 @@ from newton_scenes import SOFT, add_patch, bullet
 import warp_bsc as bsc
 from warp_bsc.bench.response_scenes import build_scene
 from warp_bsc.bench.response_simulation import Simulation, energy_gained
+from warp_bsc.implicit.contact import newton_method
 from warp_bsc.response.state.motion import arrays_of
 
 DT, GRAVITY = 1.0 / 60.0, 9.81
@@ -109,11 +110,27 @@ def test_a_budget_of_newton_steps_is_kept_and_said_to_have_run_out(device):
         report = solver.report
         suffices = most == 50
         assert report.newton_steps == most or (suffices and 2 < report.newton_steps < 50)
-        assert report.converged == suffices and (report.last_change <= 1e-3) == suffices
+        assert report.converged == suffices and (report.last_change <= 5e-3) == suffices
         assert report.unconverged_steps == int(not suffices)
         assert f"{report.unconverged_steps} whose Newton steps did not converge" in str(report)
         changes.append(report.last_change)
     assert changes[0] > changes[1] > changes[2]
+
+
+def test_a_step_ends_where_what_is_left_of_changes_is_small(device, monkeypatch):
+    """Velocities are within 1 mm/s of those of many more Newton steps, after fewer than their changes alone ask for."""
+    taken, velocities = [], []
+    for least in (None, 1e-6):
+        if least:
+            monkeypatch.setattr(newton_method, "_LEAST_SPEED", least)
+        model = ramp(device)
+        solver = bsc.SolverImplicit(model, max_iterations=50)
+        end = model.state()
+        step(solver, model.state(), end)
+        taken.append((solver.report.newton_steps, solver.report.last_change))
+        velocities.append(end.particle_qd.numpy())
+    assert np.abs(velocities[0] - velocities[1]).max() < 1e-3 < taken[0][1]
+    assert taken[0][0] < taken[1][0] and solver.report.converged
 
 
 def test_what_changes_velocities_much_takes_up_to_twice_as_many_newton_steps(device):

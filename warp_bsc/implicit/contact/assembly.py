@@ -118,7 +118,6 @@ def assemble(
             if unknowns.particle[u] >= 0:
                 vectors.solution[u] = trial.displaced[unknowns.particle[u]]
             vectors.inverse[u] = wp.mat33()
-            vectors.direction[u] = wp.vec3()
         return
     gradient, block = contact_gradient(contacts, unknowns, u, part, parts)
     gradient, block = sum_of_parts(gradient, parts), block_sum_of_parts(block, parts)

@@ -11,6 +11,8 @@ _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
 _KEPT = {320: 13, 640: 4, _LARGEST_BLOCK: 0}
 """Blocks of the Hessian that a thread keeps in registers, in thread blocks of so many threads at most."""
+_COUPLED = 256
+"""Contacts that couple which fit into shared memory: those of larger numbers are read from global memory."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most; no more than multiprocessors, as they wait
 for each other and must run together."""
@@ -23,35 +25,35 @@ class Team:
     Attributes:
         blocks: Number of blocks.
         parts: Threads that share a row, a power of 2.
-        shares: Whether the direction of a solve is in shared memory, where the threads of a block read it.
         arrived: How often blocks have waited for the others, shape [worlds].
-        sums: Of the blocks of each world, of two sums in turn, shape [worlds, 2 blocks].
+        sums: Two of each block of each world, shape [worlds, 2 blocks].
     """
 
     blocks: int
     parts: int
-    shares: bool
     arrived: wp.array[int]
     sums: wp.array2d[float]
 
 
-def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int]:
-    """Returns the team for worlds of so many unknowns at most, and the number of threads in its blocks."""
+def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int, wp.Kernel]:
+    """Returns the team for worlds of so many unknowns at most, threads of a block, and the kernel that solves."""
     team, threads = Team(), 1
     team.blocks = team.parts = 1
+    shared = device.is_cuda and unknowns <= _LARGEST_BLOCK
     if device.is_cuda:
         team.parts = 4
         while team.parts > 1 and team.parts * unknowns > min(_KEPT):
             team.parts //= 2
         threads = min(_LARGEST_BLOCK, max(64, -(-team.parts * unknowns // 32) * 32))
         most = min(_BLOCKS, device.sm_count)
-        if unknowns > _LARGEST_BLOCK and worlds <= most // 2:
+        if not shared and worlds <= most // 2:
             team.parts, threads = 4, _BLOCK
             team.blocks = min(most // worlds, -(-team.parts * unknowns // _BLOCK))
-    team.shares = device.is_cuda and unknowns <= _LARGEST_BLOCK
     team.arrived = wp.zeros(worlds, dtype=int, device=device)
     team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=float, device=device)
-    return team, threads
+    bounds = min(size for size in _KEPT if threads <= size)
+    kept = -(-_KEPT[bounds] // team.parts) if device.is_cuda else 0
+    return team, threads, _make_solve_kernel(bounds, kept, shared)
 
 
 @wp.struct
@@ -62,158 +64,237 @@ class Vectors:
         gradient: Of the energy [N].
         inverse: Inverted blocks of the diagonal, which precondition, shape [unknown_count].
         solution: The displacements [m]; those that are given, before.
-        residual, direction, along: Of the iteration; the last is the product with the direction, and then the residual
-            as it is preconditioned.
+        residual, preconditioned: Of the iteration; the second is the first by ``inverse``.
+        product: Of the Hessian and ``preconditioned``.
+        direction, along: In which the solution changes, and the product with it.
     """
 
     gradient: wp.array[wp.vec3]
     inverse: wp.array[wp.mat33]
     solution: wp.array[wp.vec3]
     residual: wp.array[wp.vec3]
+    preconditioned: wp.array[wp.vec3]
+    product: wp.array[wp.vec3]
     direction: wp.array[wp.vec3]
     along: wp.array[wp.vec3]
 
 
 _SOLVE = """
 #define INLINE __attribute__((always_inline))
-    const int parts = matrix.parts, width = matrix.width, blocks = team.blocks;
+    const int parts = matrix.parts, width = matrix.width, blocks = SHARED ? 1 : team.blocks;
     const int first = unknowns.of_worlds.data[world], rows = unknowns.of_worlds.data[world + 1] - first;
     const int* is_free = unknowns.is_free.data + first;
     const int first_coupled = contacts.coupled_first.data[world];
     const int coupled = contacts.coupled_end.data[world] - first_coupled;
     float* pulls = (float*)(contacts.pull.data + first_coupled);
-    float* direction = (float*)(vectors.direction.data + first);
     float* solution = (float*)(vectors.solution.data + first);
     float* residual = (float*)(vectors.residual.data + first);
+    float* product = (float*)(vectors.product.data + first);
+    float* direction = (float*)(vectors.direction.data + first);
     float* along = (float*)(vectors.along.data + first);
 #if defined(__CUDA_ARCH__)
-    __shared__ float shared_direction[3 * 1024], shared_pulls[3 * 512];
-    __shared__ float sums_of_warps[2][32];
+#if SHARED
+    __shared__ float preconditioned[3 * THREADS];
+#else
+    float* preconditioned = (float*)(vectors.preconditioned.data + first);
+#endif
+    __shared__ float shared_inverses[9 * (KEPT ? THREADS : 1)], sums_of_warps[2][32];
+    __shared__ float shared_pulls[3 * COUPLED], coupled_weights[4 * COUPLED], coupled_blocks[9 * COUPLED];
+    __shared__ int coupled_corners[4 * COUPLED], entry_pulled[ENTRIES], entries;
+    __shared__ float entry_weight[ENTRIES];
     typedef float real;
     const int lane = threadIdx.x, threads = blockDim.x;
-    if (team.shares) direction = shared_direction;
-    if (blocks == 1 && coupled <= 512) pulls = shared_pulls;
+    const bool shares_contacts = SHARED && coupled <= COUPLED;
+    if (shares_contacts) pulls = shared_pulls;
     int turn = 0;
     auto wait = [&]() {
-        ++turn;
         __syncthreads();
         if (blocks > 1) {
             if (lane == 0) {
                 __threadfence();
                 atomicAdd(&team.arrived.data[world], 1);
-                while (*(volatile int*)&team.arrived.data[world] < turn * blocks) {}
+                while (*(volatile int*)&team.arrived.data[world] < (turn + 1) * blocks) {}
                 __threadfence();
             }
+            ++turn;
             __syncthreads();
         }
     };
-    // in single precision: a sum of a tree of warps is as good as its terms
-    auto sum = [&](float value) INLINE {
-        float* sums = sums_of_warps[turn & 1];
-        for (int offset = 16; offset; offset >>= 1) value += __shfl_xor_sync(~0u, value, offset);
-        if ((lane & 31) == 0) sums[lane >> 5] = value;
-        __syncthreads();
-        value = 0.0f;
-        for (int warp = 0; warp < threads >> 5; ++warp) value += sums[warp];
-        if (blocks == 1) {
-            ++turn;
-            return value;
+    // in single precision: a sum of a tree of warps is as good as its terms; threads wait between two sums
+    auto sum = [&](float& a, float& b) INLINE {
+        for (int offset = 16; offset; offset >>= 1) {
+            a += __shfl_xor_sync(~0u, a, offset);
+            b += __shfl_xor_sync(~0u, b, offset);
         }
-        float* of_blocks = team.sums.data + (2 * world + (turn & 1)) * blocks;
-        if (lane == 0) of_blocks[block] = value;
+        if ((lane & 31) == 0) {
+            sums_of_warps[0][lane >> 5] = a;
+            sums_of_warps[1][lane >> 5] = b;
+        }
+        __syncthreads();
+        a = b = 0.0f;
+        for (int warp = 0; warp < threads >> 5; ++warp) {
+            a += sums_of_warps[0][warp];
+            b += sums_of_warps[1][warp];
+        }
+        if (blocks == 1) return;
+        volatile float* of_blocks = team.sums.data + 2 * world * blocks;
+        if (lane == 0) {
+            of_blocks[2 * block] = a;
+            of_blocks[2 * block + 1] = b;
+        }
         wait();
-        value = 0.0f;
-        for (int other = 0; other < blocks; ++other) value += ((volatile float*)of_blocks)[other];
-        return value;
+        a = b = 0.0f;
+        for (int other = 0; other < blocks; ++other) {
+            a += of_blocks[2 * other];
+            b += of_blocks[2 * other + 1];
+        }
     };
     const unsigned sharers = (parts == 32 ? ~0u : (1u << parts) - 1u) << (lane & 31 & ~(parts - 1));
     auto sum_of_parts = [&](float value) INLINE {
         for (int offset = parts / 2; offset; offset >>= 1) value += __shfl_xor_sync(sharers, value, offset);
         return value;
     };
+    if (shares_contacts) {
+        for (int n = lane; n < coupled; n += threads) {
+            const int i = contacts.coupled.data[first_coupled + n];
+            for (int j = 0; j < 4; ++j) {
+                coupled_corners[4 * n + j] = contacts.coupled_unknowns.data[first_coupled + n][j];
+                coupled_weights[4 * n + j] = contacts.weights.data[i][j];
+            }
+            for (int c = 0; c < 9; ++c) coupled_blocks[9 * n + c] = ((float*)&contacts.hessian.data[i])[c];
+        }
+        if (lane == 0) entries = 0;
+        __syncthreads();
+    }
 #else
     const int lane = 0, threads = 1;
+    float* preconditioned = (float*)(vectors.preconditioned.data + first);
+    const bool shares_contacts = false;
+    const int* coupled_corners = nullptr;
+    const float *coupled_weights = nullptr, *coupled_blocks = nullptr;
     auto wait = []() {};
-    auto sum = [](double value) { return value; };
+    auto sum = [](double, double) {};
     typedef double real;
     auto sum_of_parts = [](float value) { return value; };
 #endif
     const int part = lane % parts, stride = blocks * threads / parts, begin = (block * threads + lane) / parts;
     // a thread with one row has what it needs of it in registers: also some blocks
     const bool keeps = KEPT > 0 && rows <= stride;
-    wp::vec3 own_x, own_r, own_z;
-    auto get = [&](const wp::vec3& own, const float* all, int row) {
-        return keeps ? own : wp::vec3(all[3 * row], all[3 * row + 1], all[3 * row + 2]);
+    wp::vec3 own_x, own_r, own_w, own_p, own_s;
+    auto vector_of = [](const float* all, int row) {
+        return wp::vec3(all[3 * row], all[3 * row + 1], all[3 * row + 2]);
     };
+    auto get = [&](const wp::vec3& own, const float* all, int row) { return keeps ? own : vector_of(all, row); };
     auto put = [&](wp::vec3& own, float* all, int row, const wp::vec3& value) {
         if (keeps) own = value;
         else for (int c = 0; c < 3; ++c) all[3 * row + c] = value[c];
+    };
+    auto precondition = [&](int row, const wp::vec3& r) {
+#if defined(__CUDA_ARCH__)
+        if (keeps) {
+            wp::vec3 z;
+            for (int k = 0; k < 9; ++k) z[k / 3] += shared_inverses[k * THREADS + lane] * r[k % 3];
+            return z;
+        }
+#endif
+        return wp::mul(vectors.inverse.data[first + row], r);
     };
     const int* first_entries = matrix.first.data + matrix.group.data[world];
     auto first_entry = [&](int row) { return first_entries + (row * parts + part) / width; };
     const int of_group = (begin * parts + part) % width;  // so it is for all rows of the thread
     float kept[KEPT + 1][9];
-    int kept_column[KEPT + 1];
-    wp::mat33 own_inverse;
+    int kept_column[KEPT + 1], own_entry = 0, own_end = 0;
+    bool own_free = false;
+    int own_first = 0, own_count = -1;  // of its contacts that couple, in shared memory
     if (keeps && begin < rows) {
-        own_inverse = vectors.inverse.data[first + begin];
-        const int entry = first_entry(begin)[0], end = first_entry(begin)[1];
+        own_free = is_free[begin];
+#if defined(__CUDA_ARCH__)
+        for (int c = 0; c < 9; ++c)
+            shared_inverses[c * THREADS + lane] = ((float*)&vectors.inverse.data[first + begin])[c];
+#endif
+        own_entry = first_entry(begin)[0], own_end = first_entry(begin)[1];
 #pragma unroll
         for (int k = 0; k < KEPT; ++k) {
-            const int at = (entry + k) * width + of_group;
-            const int column = entry + k < end ? matrix.column.data[at] : -1;
+            const int at = (own_entry + k) * width + of_group;
+            const int column = own_entry + k < own_end ? matrix.column.data[at] : -1;
             kept_column[k] = column < 0 ? 0 : 3 * (column - first);
             for (int c = 0; c < 9; ++c)
                 kept[k][c] = column < 0 ? 0.0f : matrix.value.data[9 * (at - of_group) + c * width + of_group];
         }
+        own_entry += KEPT;
+#if defined(__CUDA_ARCH__)
+        if (shares_contacts && coupled && unknowns.particle.data[first + begin] >= 0) {
+            const int middle = contacts.middle.data[first + begin] + part, end = contacts.end.data[first + begin];
+            const int count = end > middle ? (end - middle + parts - 1) / parts : 0;
+            const int at = count ? atomicAdd(&entries, count) : 0;
+            if (at + count <= ENTRIES) {
+                own_first = at, own_count = count;
+                for (int n = 0; n < count; ++n) {
+                    entry_pulled[at + n] = 3 * contacts.pulled.data[middle + n * parts];
+                    entry_weight[at + n] = contacts.entry_weight.data[middle + n * parts];
+                }
+            }
+        }
+#endif
     }
-    auto pull = [&](const float* p) INLINE {  // products of contacts that couple with a vector
+    auto pull = [&]() INLINE {  // products of contacts that couple with what is multiplied
         if (coupled == 0) return;
         for (int n = block * threads + lane; n < coupled; n += blocks * threads) {
-            const int i = contacts.coupled.data[first_coupled + n];
-            const wp::vec4i corners = contacts.coupled_unknowns.data[first_coupled + n];
-            const wp::vec4 weights = contacts.weights.data[i];
+            const int i = shares_contacts ? 0 : contacts.coupled.data[first_coupled + n];
+            const int* corners = shares_contacts
+                ? coupled_corners + 4 * n : (const int*)(contacts.coupled_unknowns.data + first_coupled + n);
+            const float* weights = shares_contacts
+                ? coupled_weights + 4 * n : (const float*)(contacts.weights.data + i);
+            const float* h = shares_contacts ? coupled_blocks + 9 * n : (const float*)(contacts.hessian.data + i);
             wp::vec3 apart;
             for (int j = 0; j < 4; ++j) {
                 const int u = corners[j];
-                const float* d = p + 3 * (u >= 0 ? u - first : u < -1 ? -2 - u - first : 0);
+                const float* d = preconditioned + 3 * (u >= 0 ? u - first : u < -1 ? -2 - u - first : 0);
                 const float weight = u == -1 ? 0.0f : weights[j];
                 apart += weight * wp::vec3(d[0], d[1], d[2]);
-                if (u < -1)  // of a body: its turn follows its shift
-                    apart += weight * wp::cross(
-                        wp::vec3(d[3], d[4], d[5]), unknowns.arm.data[contacts.corners.data[i][j]]
-                    );
+                if (u < -1) {  // of a body: its turn follows its shift
+                    const int vertex = contacts.corners.data[contacts.coupled.data[first_coupled + n]][j];
+                    apart += weight * wp::cross(wp::vec3(d[3], d[4], d[5]), unknowns.arm.data[vertex]);
+                }
             }
-            apart = wp::mul(contacts.hessian.data[i], apart);
-            for (int c = 0; c < 3; ++c) pulls[3 * n + c] = apart[c];
+            for (int c = 0; c < 3; ++c)
+                pulls[3 * n + c] = h[3 * c] * apart[0] + h[3 * c + 1] * apart[1] + h[3 * c + 2] * apart[2];
         }
         wait();
     };
-    auto multiply = [&](int row, const float* p) INLINE {
+    auto multiply = [&](int row) INLINE {
         const int u = first + row;
         wp::vec3 total;
-        int entry = first_entry(row)[0];
-        const int end = first_entry(row)[1];
+        int entry = own_entry, end = own_end;
         if (keeps) {
 #pragma unroll
             for (int k = 0; k < KEPT; ++k) {
-                const float* d = p + kept_column[k];
+                const float* d = preconditioned + kept_column[k];
                 for (int c = 0; c < 3; ++c)
                     total[c] += kept[k][3 * c] * d[0] + kept[k][3 * c + 1] * d[1] + kept[k][3 * c + 2] * d[2];
             }
-            entry += KEPT;
+        } else {
+            entry = first_entry(row)[0];
+            end = first_entry(row)[1];
         }
         const float* v = matrix.value.data + 9 * entry * width + of_group;
         for (; entry < end; ++entry, v += 9 * width) {
             const int column = matrix.column.data[entry * width + of_group];
             if (column < 0) break;
-            const float* d = p + 3 * (column - first);
+            const float* d = preconditioned + 3 * (column - first);
             for (int c = 0; c < 3; ++c)
                 total[c] += v[3 * c * width] * d[0] + v[(3 * c + 1) * width] * d[1] + v[(3 * c + 2) * width] * d[2];
         }
-        if (coupled) {
+#if defined(__CUDA_ARCH__)
+#pragma unroll 1
+        for (int n = own_first; n < own_first + own_count; ++n) {
+            const float weight = entry_weight[n];
+            for (int c = 0; c < 3; ++c) total[c] += weight * shared_pulls[entry_pulled[n] + c];
+        }
+#endif
+        if (coupled && own_count < 0) {
             const bool of_body = unknowns.particle.data[u] < 0;
-#pragma unroll 4
+#pragma unroll 1
             for (int n = contacts.middle.data[u] + part; n < contacts.end.data[u]; n += parts) {
                 const float* by = pulls + 3 * contacts.pulled.data[n];
                 const float weight = contacts.entry_weight.data[n];
@@ -230,78 +311,84 @@ _SOLVE = """
         for (int c = 0; c < 3; ++c) total[c] = sum_of_parts(total[c]);
         return total;
     };
-    pull(solution);
-    real own = 0.0f;
     for (int row = begin; row < rows; row += stride) {
-        wp::vec3 r;
-        if (is_free[row]) r = -vectors.gradient.data[first + row] - multiply(row, solution);
         if (part) continue;
-        const wp::vec3 z = wp::mul(vectors.inverse.data[first + row], r);
-        if (keeps) own_x = vectors.solution.data[first + row];
-        put(own_r, residual, row, r);
-        for (int c = 0; c < 3; ++c) direction[3 * row + c] = z[c];
-        own += wp::dot(r, z);
+        const wp::vec3 x = vectors.solution.data[first + row];
+        if (keeps) own_x = x;
+        put(own_p, direction, row, wp::vec3());
+        put(own_s, along, row, wp::vec3());
+        for (int c = 0; c < 3; ++c) preconditioned[3 * row + c] = x[c];
     }
-    real squared = sum(own);
-    const real limit = tolerance * tolerance * squared;
-    int count = 0;
-    bool goes_on = squared > 0.0f;
-    while (goes_on) {
-        pull(direction);
-        own = 0.0f;
-        for (int row = begin; row < rows; row += stride) {
-            if (!is_free[row]) continue;
-            const wp::vec3 p = multiply(row, direction);
-            if (part) continue;
-            put(own_z, along, row, p);
-            own += direction[3 * row] * p[0] + direction[3 * row + 1] * p[1] + direction[3 * row + 2] * p[2];
-        }
-        const real curvature = sum(own);
-        const bool is_convex = curvature > 0.0f;
-        float step = 0.0f;
-        if (is_convex) step = (float)(squared / curvature);
-        else if (count == 0) step = (float)(squared / wp::max(-curvature, (real)1e-30f + (real)0.01f * squared));
-        ++count;
-        own = 0.0f;
-        for (int row = begin; row < rows; row += stride) {
-            if (!is_free[row] || part) continue;
-            const wp::vec3 d(direction[3 * row], direction[3 * row + 1], direction[3 * row + 2]);
-            const wp::vec3 x = get(own_x, solution, row) + step * d;
-            const wp::vec3 r = get(own_r, residual, row) - step * get(own_z, along, row);
-            const wp::vec3 z = wp::mul(keeps ? own_inverse : vectors.inverse.data[first + row], r);
-            put(own_x, solution, row, x);
-            put(own_r, residual, row, r);
-            put(own_z, along, row, z);
-            own += wp::dot(r, z);
-        }
-        const real after = sum(own);
-        goes_on = is_convex && after > limit && count < max_iterations;
-        const float momentum = (float)(after / squared);
-        squared = after;
-        if (!goes_on) break;
-        for (int row = begin; row < rows; row += stride) {
-            if (!is_free[row] || part) continue;
-            const wp::vec3 z = get(own_z, along, row);
-            for (int c = 0; c < 3; ++c) direction[3 * row + c] = z[c] + momentum * direction[3 * row + c];
-        }
+    real before = 0.0f, limit = 0.0f, curvature = 0.0f;
+    int count = -1;
+    while (true) {
         wait();
+        pull();
+        real squared = 0.0f, of_product = 0.0f;
+        for (int row = begin; row < rows; row += stride) {
+            if (!(keeps ? own_free : is_free[row])) continue;
+            const wp::vec3 w = multiply(row);
+            if (part) continue;
+            put(own_w, product, row, w);
+            if (count < 0) continue;
+            const wp::vec3 r = get(own_r, residual, row), z = vector_of(preconditioned, row);
+            squared += wp::dot(r, z);
+            of_product += wp::dot(w, z);
+        }
+        if (count < 0) {  // the first product is that of the solution so far, for the residual
+            count = 0;
+            wait();
+            for (int row = begin; row < rows; row += stride) {
+                if (part) continue;
+                wp::vec3 r;
+                if (is_free[row]) r = -vectors.gradient.data[first + row] - get(own_w, product, row);
+                const wp::vec3 z = precondition(row, r);
+                put(own_r, residual, row, r);
+                for (int c = 0; c < 3; ++c) preconditioned[3 * row + c] = z[c];
+            }
+            continue;
+        }
+        sum(squared, of_product);
+        if (count == 0) limit = tolerance * tolerance * squared;
+        if (!(squared > limit)) break;
+        const real momentum = count == 0 ? (real)0.0f : squared / before;
+        curvature = of_product - momentum * momentum * curvature;
+        const bool is_convex = curvature > 0.0f;
+        if (!is_convex && count > 0) break;
+        const real bend = is_convex ? curvature : wp::max(-curvature, (real)1e-30f + (real)0.01f * squared);
+        const float step = (float)(squared / bend), again = (float)momentum;
+        before = squared;
+        ++count;
+        for (int row = begin; row < rows; row += stride) {
+            if (!(keeps ? own_free : is_free[row]) || part) continue;
+            const wp::vec3 p = vector_of(preconditioned, row) + again * get(own_p, direction, row);
+            const wp::vec3 s = get(own_w, product, row) + again * get(own_s, along, row);
+            const wp::vec3 r = get(own_r, residual, row) - step * s;
+            const wp::vec3 z = precondition(row, r);
+            put(own_x, solution, row, get(own_x, solution, row) + step * p);
+            put(own_r, residual, row, r);
+            put(own_p, direction, row, p);
+            put(own_s, along, row, s);
+            for (int c = 0; c < 3; ++c) preconditioned[3 * row + c] = z[c];
+        }
+        if (!is_convex || count == max_iterations) break;
     }
-    if (keeps && part == 0 && begin < rows && is_free[begin]) vectors.solution.data[first + begin] = own_x;
+    if (keeps && part == 0 && begin < rows && own_free) vectors.solution.data[first + begin] = own_x;
     return count;
 """
 
 
 @functools.cache
-def make_solve_kernel(threads: int):
-    """Returns the kernel that solves for worlds, by blocks of so many threads.
+def _make_solve_kernel(bounds: int, kept: int, shared: bool):
+    """Returns the kernel that solves for worlds, by blocks of so many threads at most, each of which keeps some blocks.
 
-    By hand, with plain pointers and registers: most of an iteration would otherwise be arithmetic of addresses, and
-    waiting for memory.
+    What is multiplied is in ``shared`` memory, if it fits there. By hand, with plain pointers and registers: most of an
+    iteration would otherwise be arithmetic of addresses, and waiting for memory.
     """
-    bounds = min(size for size in _KEPT if threads <= size)
-    kept = 0 if threads == 1 else _KEPT[bounds]
+    sizes = {"SHARED": int(shared), "THREADS": bounds, "KEPT": kept, "COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED}
+    snippet = functools.reduce(lambda text, name: text.replace(name, str(sizes[name])), sizes, _SOLVE)
 
-    @wp.func_native(snippet=_SOLVE.replace("KEPT", str(kept)))
+    @wp.func_native(snippet=snippet)
     def solve(
         matrix: Matrix,
         contacts: Contacts,

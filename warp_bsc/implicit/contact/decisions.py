@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .system import Flag, Progress, Unknowns
+from .system import Flag, Progress, Unknowns, change_left
 
 wp.set_module_options({"enable_backward": False})
 
@@ -102,6 +102,7 @@ def begin_newton_step(w: int, progress: Progress):
     progress.solving[w] = progress.active[w]
     if progress.active[w] == 0:
         return
+    progress.before[w] = progress.change[w]
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
     progress.cuts[w] = 0
@@ -163,7 +164,7 @@ def _end_step(
     if progress.remaining[w] > 0.0:
         progress.late[w] = steps - 1
     most = wp.where(progress.change[w] > far_change, 2 * max_steps, max_steps)
-    ends = arrived and (progress.change[w] <= least_change or steps - progress.late[w] >= most)
+    ends = arrived and (change_left(progress, w) <= least_change or steps - progress.late[w] >= most)
     if scale == 0.0 and arrived:
         ends = True
     if ends or (steps >= max_late_steps and not arrived):

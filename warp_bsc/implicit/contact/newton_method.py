@@ -22,7 +22,7 @@ from ...response.state.workspace import Workspace
 from . import bodies, decisions, pairs, steps
 from .advance import ADVANCE, Flow, Phase, Problem
 from .attachments import attach, attachments_of_model
-from .conjugate_gradients import Vectors, make_solve_kernel, make_team
+from .conjugate_gradients import Vectors, make_team
 from .elasticity import elements_of_model, make_derivatives
 from .impulses import publish_contacts
 from .matrix import make_matrix
@@ -119,8 +119,7 @@ class NewtonMethod:
         unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
         largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
-        self._team, self._threads = make_team(largest, work.worlds, device)
-        self._solve_worlds = make_solve_kernel(self._threads)
+        self._team, self._threads, self._solve_worlds = make_team(largest, work.worlds, device)
         self._bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
         holder = np.arange(vertices)
         if len(solved):

@@ -7,7 +7,7 @@ from ...response.report import SolverReport
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from ...response.tuning import MAX_STRAIN
-from .system import Progress
+from .system import Progress, change_left
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,11 +46,10 @@ def write_results(
     The first of ``lacks`` is 1 if candidates or contacts did not fit; the second becomes 1 once the step is counted.
     """
     w = wp.tid()
-    speed = progress.change[w] / dt
     arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
-    converged = progress.steps[w] == 0 or (arrived and lacks[0] == 0 and speed <= least_speed)
+    converged = progress.steps[w] == 0 or (arrived and lacks[0] == 0 and change_left(progress, w) <= least_speed * dt)
     results.newton_steps[w] = progress.steps[w]
-    results.last_change[w] = speed
+    results.last_change[w] = progress.change[w] / dt
     results.arrived[w] = arrived
     results.converged[w] = converged
     if not converged and wp.atomic_max(lacks, 1, 1) == 0:
@@ -86,9 +85,9 @@ class ImplicitStepReport(SolverReport):
     def converged(self) -> bool:
         """Whether the Newton steps of all worlds sufficed for the last step.
 
-        It is false if :attr:`last_change` is more than 1 mm/s, if :attr:`arrived` is false, and if pairs that are near
-        each other did not fit into the buffers of a CUDA graph. Such a step is free of collisions all the same, if it
-        is certified; it lags behind its forces.
+        It is false if velocities are farther than 1 mm/s from where the changes of the last two Newton steps lead, if
+        :attr:`arrived` is false, and if pairs that are near each other did not fit into the buffers of a CUDA graph.
+        Such a step is free of collisions all the same, if it is certified; it lags behind its forces.
         """
         return bool(self.results.converged.numpy().all())
 

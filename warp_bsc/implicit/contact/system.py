@@ -62,7 +62,7 @@ class Progress:
         trial: Energy at the displaced positions, in units.
         uncut: The same, before displacements of single vertices are cut.
         cuts: 1 if those are cut.
-        change: Largest displacement of an unknown [m].
+        change, before: Largest displacement of an unknown in the Newton step, and in the one before it [m].
         way: How far a vertex has been, or is led by the displacements, from where it was at the start of the
             step [m]; the last is that of what a program moves, of all worlds.
         remaining: Largest way of what a program moves that is left [m].
@@ -82,11 +82,24 @@ class Progress:
     uncut: wp.array[wp.int64]
     cuts: wp.array[int]
     change: wp.array[float]
+    before: wp.array[float]
     way: wp.array[float]
     remaining: wp.array[float]
     held: wp.array[int]
     flags: wp.array[int]
     late: wp.array[int]
+
+
+@wp.func
+def change_left(progress: Progress, w: int) -> float:
+    """Returns how far unknowns of a world are from their end [m]: at most as far as they have come last.
+
+    The sum of the changes to come, if each is less than the one before it by the same factor as the last one was.
+    """
+    change, before = progress.change[w], progress.before[w]
+    if progress.scale[w] < 1.0 or progress.cuts[w] != 0 or change >= 0.5 * before:
+        return change
+    return change * change / (before - change)
 
 
 @wp.struct
