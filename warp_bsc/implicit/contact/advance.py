@@ -161,6 +161,15 @@ def wait_for_all(arrived: wp.array[int]):
 
 
 @wp.func
+def _spread(thread: int, n: int) -> int:
+    """Returns a number of a thread by which blocks take turns, warp by warp: each has its share of what is little."""
+    if n == 1:
+        return thread
+    block, warp = thread // wp.block_dim(), thread % wp.block_dim() // 32
+    return (warp * (n // wp.block_dim()) + block) * 32 + thread % 32
+
+
+@wp.func
 def _over_pairs(
     task: int,
     is_shorter: bool,
@@ -219,12 +228,15 @@ def _over_pairs(
 
 
 @wp.func
-def _differentiate(i: int, p: Problem, motion: Motion, settings: BarrierSettings):
+def _differentiate(i: int, order: int, p: Problem, motion: Motion, settings: BarrierSettings):
     kind = elasticity.kind_of(p.elements, i)
     world = motion.world[elasticity.first_vertex(p.elements, kind, i - p.elements.first[kind])]
     if p.progress.solving[world] == 0:
         return
-    elasticity.differentiate_element(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, True, p.derivatives)
+    if order == 1:
+        elasticity.find_gradient(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, p.derivatives)
+    else:
+        elasticity.find_hessian(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, True, p.derivatives)
 
 
 @wp.func
@@ -265,6 +277,7 @@ def _advance(
     # things of different kinds in one phase are for different threads, so that they take place at the same time
     t = wp.tid()
     from_end, from_middle = n - 1 - t, (t + n // 2) % n
+    spread = _spread(t, n)
     progress = p.progress
     vertices, unknowns, worlds = p.trial.x.shape[0], p.vectors.solution.shape[0], p.progress.active.shape[0]
     body_count = p.bodies.unknown.shape[0]
@@ -281,7 +294,7 @@ def _advance(
             for w in range(t, worlds, n):
                 progress.solving[w] = progress.steps[w]
             for v in range(t, p.contacts.bucket.shape[0], n):
-                merge.clear_bucket(p.contacts, v)
+                p.contacts.bucket[v] = 0
             if t == 0:
                 p.contacts.count[0] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
@@ -289,10 +302,12 @@ def _advance(
             solves = int(0)
             for v in range(from_end, vertices, n):
                 steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
-                merge.clear_bucket(p.contacts, v)
-            for i in range(t, p.element_count, n):
-                _differentiate(i, p, motion, settings)
-            for i in range(from_middle, p.element_count, n):
+                p.contacts.bucket[v] = 0
+            for i in range(spread, p.element_count, n):
+                _differentiate(i, 1, p, motion, settings)
+            for i in range((spread + n // 4) % n, p.element_count, n):
+                _differentiate(i, 2, p, motion, settings)
+            for i in range((spread + n // 2) % n, p.element_count, n):
                 _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)
             phase = int(Phase.LOADS)
         elif phase == Phase.LOADS:

@@ -53,7 +53,7 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int,
     team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=float, device=device)
     bounds = min(size for size in _KEPT if threads <= size)
     kept = -(-_KEPT[bounds] // team.parts) if device.is_cuda else 0
-    return team, threads, _make_solve_kernel(bounds, kept, shared)
+    return team, threads, _make_solve_kernel(bounds, team.parts, kept, shared)
 
 
 @wp.struct
@@ -81,7 +81,7 @@ class Vectors:
 
 _SOLVE = """
 #define INLINE __attribute__((always_inline))
-    const int parts = matrix.parts, width = matrix.width, blocks = SHARED ? 1 : team.blocks;
+    const int parts = PARTS, width = matrix.width, blocks = SHARED ? 1 : team.blocks;
     const int first = unknowns.of_worlds.data[world], rows = unknowns.of_worlds.data[world + 1] - first;
     const int* is_free = unknowns.is_free.data + first;
     const int first_coupled = contacts.coupled_first.data[world];
@@ -94,7 +94,7 @@ _SOLVE = """
     float* along = (float*)(vectors.along.data + first);
 #if defined(__CUDA_ARCH__)
 #if SHARED
-    __shared__ float preconditioned[3 * THREADS];
+    __shared__ __align__(16) float preconditioned[WIDE * THREADS];
 #else
     float* preconditioned = (float*)(vectors.preconditioned.data + first);
 #endif
@@ -105,6 +105,10 @@ _SOLVE = """
     typedef float real;
     const int lane = threadIdx.x, threads = blockDim.x;
     const bool shares_contacts = SHARED && coupled <= COUPLED;
+    auto multiplied = [&](int at) INLINE {  // read at once
+        const float4 all = *(const float4*)(preconditioned + at);
+        return wp::vec3(all.x, all.y, all.z);
+    };
     if (shares_contacts) pulls = shared_pulls;
     int turn = 0;
     auto wait = [&]() {
@@ -132,7 +136,8 @@ _SOLVE = """
         }
         __syncthreads();
         a = b = 0.0f;
-        for (int warp = 0; warp < threads >> 5; ++warp) {
+#pragma unroll
+        for (int warp = 0; warp < THREADS / 32; ++warp) {  // 0 of those that do not run
             a += sums_of_warps[0][warp];
             b += sums_of_warps[1][warp];
         }
@@ -154,6 +159,7 @@ _SOLVE = """
         for (int offset = parts / 2; offset; offset >>= 1) value += __shfl_xor_sync(sharers, value, offset);
         return value;
     };
+    if (lane < 64) sums_of_warps[lane / 32][lane % 32] = 0.0f;
     if (shares_contacts) {
         for (int n = lane; n < coupled; n += threads) {
             const int i = contacts.coupled.data[first_coupled + n];
@@ -173,18 +179,17 @@ _SOLVE = """
     const int* coupled_corners = nullptr;
     const float *coupled_weights = nullptr, *coupled_blocks = nullptr;
     auto wait = []() {};
+    auto multiplied = [&](int at) { return wp::vec3(); };
     auto sum = [](double, double) {};
     typedef double real;
     auto sum_of_parts = [](float value) { return value; };
 #endif
     const int part = lane % parts, stride = blocks * threads / parts, begin = (block * threads + lane) / parts;
     // a thread with one row has what it needs of it in registers: also some blocks
-    const bool keeps = KEPT > 0 && rows <= stride;
+    const bool keeps = KEPT > 0 && (SHARED || rows <= stride);
     wp::vec3 own_x, own_r, own_w, own_p, own_s;
-    auto vector_of = [](const float* all, int row) {
-        return wp::vec3(all[3 * row], all[3 * row + 1], all[3 * row + 2]);
-    };
-    auto get = [&](const wp::vec3& own, const float* all, int row) { return keeps ? own : vector_of(all, row); };
+    auto vector_of = [](const float* all, int at) { return wp::vec3(all[at], all[at + 1], all[at + 2]); };
+    auto get = [&](const wp::vec3& own, const float* all, int row) { return keeps ? own : vector_of(all, 3 * row); };
     auto put = [&](wp::vec3& own, float* all, int row, const wp::vec3& value) {
         if (keeps) own = value;
         else for (int c = 0; c < 3; ++c) all[3 * row + c] = value[c];
@@ -217,7 +222,7 @@ _SOLVE = """
         for (int k = 0; k < KEPT; ++k) {
             const int at = (own_entry + k) * width + of_group;
             const int column = own_entry + k < own_end ? matrix.column.data[at] : -1;
-            kept_column[k] = column < 0 ? 0 : 3 * (column - first);
+            kept_column[k] = column < 0 ? 0 : WIDE * (column - first);
             for (int c = 0; c < 9; ++c)
                 kept[k][c] = column < 0 ? 0.0f : matrix.value.data[9 * (at - of_group) + c * width + of_group];
         }
@@ -249,12 +254,12 @@ _SOLVE = """
             wp::vec3 apart;
             for (int j = 0; j < 4; ++j) {
                 const int u = corners[j];
-                const float* d = preconditioned + 3 * (u >= 0 ? u - first : u < -1 ? -2 - u - first : 0);
+                const float* d = preconditioned + WIDE * (u >= 0 ? u - first : u < -1 ? -2 - u - first : 0);
                 const float weight = u == -1 ? 0.0f : weights[j];
                 apart += weight * wp::vec3(d[0], d[1], d[2]);
                 if (u < -1) {  // of a body: its turn follows its shift
                     const int vertex = contacts.corners.data[contacts.coupled.data[first_coupled + n]][j];
-                    apart += weight * wp::cross(wp::vec3(d[3], d[4], d[5]), unknowns.arm.data[vertex]);
+                    apart += weight * wp::cross(wp::vec3(d[WIDE], d[WIDE + 1], d[WIDE + 2]), unknowns.arm.data[vertex]);
                 }
             }
             for (int c = 0; c < 3; ++c)
@@ -269,9 +274,8 @@ _SOLVE = """
         if (keeps) {
 #pragma unroll
             for (int k = 0; k < KEPT; ++k) {
-                const float* d = preconditioned + kept_column[k];
-                for (int c = 0; c < 3; ++c)
-                    total[c] += kept[k][3 * c] * d[0] + kept[k][3 * c + 1] * d[1] + kept[k][3 * c + 2] * d[2];
+                const wp::vec3 d = multiplied(kept_column[k]);
+                for (int c = 0; c < 9; ++c) total[c % 3] = fmaf(kept[k][3 * (c % 3) + c / 3], d[c / 3], total[c % 3]);
             }
         } else {
             entry = first_entry(row)[0];
@@ -281,7 +285,7 @@ _SOLVE = """
         for (; entry < end; ++entry, v += 9 * width) {
             const int column = matrix.column.data[entry * width + of_group];
             if (column < 0) break;
-            const float* d = preconditioned + 3 * (column - first);
+            const float* d = preconditioned + WIDE * (column - first);
             for (int c = 0; c < 3; ++c)
                 total[c] += v[3 * c * width] * d[0] + v[(3 * c + 1) * width] * d[1] + v[(3 * c + 2) * width] * d[2];
         }
@@ -317,7 +321,7 @@ _SOLVE = """
         if (keeps) own_x = x;
         put(own_p, direction, row, wp::vec3());
         put(own_s, along, row, wp::vec3());
-        for (int c = 0; c < 3; ++c) preconditioned[3 * row + c] = x[c];
+        for (int c = 0; c < 3; ++c) preconditioned[WIDE * row + c] = x[c];
     }
     real before = 0.0f, limit = 0.0f, curvature = 0.0f;
     int count = -1;
@@ -331,7 +335,7 @@ _SOLVE = """
             if (part) continue;
             put(own_w, product, row, w);
             if (count < 0) continue;
-            const wp::vec3 r = get(own_r, residual, row), z = vector_of(preconditioned, row);
+            const wp::vec3 r = get(own_r, residual, row), z = vector_of(preconditioned, WIDE * row);
             squared += wp::dot(r, z);
             of_product += wp::dot(w, z);
         }
@@ -344,7 +348,7 @@ _SOLVE = """
                 if (is_free[row]) r = -vectors.gradient.data[first + row] - get(own_w, product, row);
                 const wp::vec3 z = precondition(row, r);
                 put(own_r, residual, row, r);
-                for (int c = 0; c < 3; ++c) preconditioned[3 * row + c] = z[c];
+                for (int c = 0; c < 3; ++c) preconditioned[WIDE * row + c] = z[c];
             }
             continue;
         }
@@ -361,7 +365,7 @@ _SOLVE = """
         ++count;
         for (int row = begin; row < rows; row += stride) {
             if (!(keeps ? own_free : is_free[row]) || part) continue;
-            const wp::vec3 p = vector_of(preconditioned, row) + again * get(own_p, direction, row);
+            const wp::vec3 p = vector_of(preconditioned, WIDE * row) + again * get(own_p, direction, row);
             const wp::vec3 s = get(own_w, product, row) + again * get(own_s, along, row);
             const wp::vec3 r = get(own_r, residual, row) - step * s;
             const wp::vec3 z = precondition(row, r);
@@ -369,7 +373,7 @@ _SOLVE = """
             put(own_r, residual, row, r);
             put(own_p, direction, row, p);
             put(own_s, along, row, s);
-            for (int c = 0; c < 3; ++c) preconditioned[3 * row + c] = z[c];
+            for (int c = 0; c < 3; ++c) preconditioned[WIDE * row + c] = z[c];
         }
         if (!is_convex || count == max_iterations) break;
     }
@@ -379,13 +383,14 @@ _SOLVE = """
 
 
 @functools.cache
-def _make_solve_kernel(bounds: int, kept: int, shared: bool):
+def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
     """Returns the kernel that solves for worlds, by blocks of so many threads at most, each of which keeps some blocks.
 
     What is multiplied is in ``shared`` memory, if it fits there. By hand, with plain pointers and registers: most of an
     iteration would otherwise be arithmetic of addresses, and waiting for memory.
     """
-    sizes = {"SHARED": int(shared), "THREADS": bounds, "KEPT": kept, "COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED}
+    sizes = {"SHARED": int(shared), "WIDE": 4 if shared else 3, "THREADS": bounds, "PARTS": parts, "KEPT": kept}
+    sizes |= {"COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED}
     snippet = functools.reduce(lambda text, name: text.replace(name, str(sizes[name])), sizes, _SOLVE)
 
     @wp.func_native(snippet=snippet)

@@ -709,11 +709,39 @@ def differentiate(
     kind = kind_of(elements, i)
     in_world = world[first_vertex(elements, kind, i - elements.first[kind])]
     if active[in_world] != 0:
-        differentiate_element(i, kind, elements, x, x0, dt, convex[in_world] != 0, out)
+        find_gradient(i, kind, elements, x, x0, dt, out)
+        find_hessian(i, kind, elements, x, x0, dt, convex[in_world] != 0, out)
 
 
 @wp.func
-def differentiate_element(
+def find_gradient(
+    i: int,
+    kind: int,
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    x0: wp.array[wp.vec3],
+    dt: wp.float64,
+    out: Derivatives,
+):
+    """Computes the gradient of an element, and all that the Hessian of bending is made of."""
+    e = i - elements.first[kind]
+    gradient, turn, curvature = mat43d(), mat43d(), ZERO
+    if kind != ElementKind.BENDING:
+        gradient = element_gradient(elements, kind, e, x, x0, dt)
+    else:
+        if has_energy(elements, kind, e, x):
+            turn, moment, curvature = bend(elements, e, x, x0, dt)
+            gradient = moment * turn
+        out.curvature[e] = float(curvature)
+        for j in range(4):
+            out.turn[4 * e + j] = to_single(turn[j])
+    corner = first_corner(elements, kind, e)
+    for j in range(element_size(kind)):
+        out.gradient[corner + j] = to_single(gradient[j])
+
+
+@wp.func
+def find_hessian(
     i: int,
     kind: int,
     elements: Elements,
@@ -723,18 +751,6 @@ def differentiate_element(
     is_convex: bool,
     out: Derivatives,
 ):
-    """Computes the gradient and the Hessian of an element, as :func:`differentiate` does."""
-    e = i - elements.first[kind]
-    gradient = element_gradient(elements, kind, e, x, x0, dt)
-    corner = first_corner(elements, kind, e)
-    for j in range(element_size(kind)):
-        out.gradient[corner + j] = to_single(gradient[j])
+    """Computes the Hessian of an element, for bending as :func:`find_gradient` does."""
     if kind != ElementKind.BENDING:
-        store_hessian(elements, kind, e, x, x0, dt, is_convex, out.block)
-        return
-    turn, curvature = mat43d(), ZERO
-    if has_energy(elements, kind, e, x):
-        turn, _moment, curvature = bend(elements, e, x, x0, dt)
-    out.curvature[e] = float(curvature)
-    for j in range(4):
-        out.turn[4 * e + j] = to_single(turn[j])
+        store_hessian(elements, kind, i - elements.first[kind], x, x0, dt, is_convex, out.block)

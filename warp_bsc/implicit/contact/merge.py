@@ -3,15 +3,24 @@
 They have the same closest points, so that gradients, Hessians and friction add up. Impulses are those of each pair.
 """
 
+from typing import Any
+
 import warp as wp
 
 from ...response.state.vectors import ZERO, to_double, to_single
-from .system import Contacts, raise_to, to_single_block
+from .system import Contacts, to_single_block
 
 wp.set_module_options({"enable_backward": False})
 
-_DIGITS = wp.constant(wp.float64(2.0**11))
-"""A number, in the largest of some terms, beside which these are rounded so that their sum is exact in any order."""
+
+@wp.func
+def _lost(a: Any, b: Any, total: Any):
+    """Returns what rounding takes from a sum of two: with it, sums do not depend on the order of their terms.
+
+    Knuth, The Art of Computer Programming, volume 2, section 4.2.2, theorem B.
+    """
+    rounded = total - a
+    return (a - (total - rounded)) + (b - rounded)
 
 
 @wp.func
@@ -39,17 +48,6 @@ def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4
         bucket = _bucket_of(contacts, feature)
         contacts.feature[i] = feature
         contacts.next[i] = wp.atomic_exch(contacts.bucket, bucket, i + 1)
-        raise_to(contacts.most_of_bucket, 3 * bucket, wp.max(wp.abs(contacts.gradient[i])))
-        raise_to(contacts.most_of_bucket, 3 * bucket + 1, wp.trace(contacts.hessian[i]))
-        raise_to(contacts.most_of_bucket, 3 * bucket + 2, contacts.limit[i])
-
-
-@wp.func
-def clear_bucket(contacts: Contacts, bucket: int):
-    """Takes all contacts out of a bucket."""
-    contacts.bucket[bucket] = 0
-    for k in range(3):
-        contacts.most_of_bucket[3 * bucket + k] = 0.0
 
 
 @wp.func
@@ -62,11 +60,8 @@ def merge_contact(i: int, contacts: Contacts):
     if feature[0] < 0:
         return
     bucket = _bucket_of(contacts, feature)
-    by_gradient = wp.vec3d(_DIGITS * wp.float64(contacts.most_of_bucket[3 * bucket]))
-    hessian_digits = _DIGITS * wp.float64(contacts.most_of_bucket[3 * bucket + 1])
-    by_hessian = wp.matrix_from_rows(wp.vec3d(hessian_digits), wp.vec3d(hessian_digits), wp.vec3d(hessian_digits))
-    by_limit = _DIGITS * wp.float64(contacts.most_of_bucket[3 * bucket + 2])
     gradient, hessian, limit, count = wp.vec3d(), wp.mat33d(), wp.float64(0.0), int(0)
+    gradient_lost, hessian_lost, limit_lost = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
     normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[bucket] + int(0)
     while n > 0:
         k = n - 1
@@ -84,11 +79,13 @@ def merge_contact(i: int, contacts: Contacts):
                 contacts.couples[i] = 0
                 return
             count += 1
-            gradient += (same * of_gradient + by_gradient) - by_gradient
-            hessian += (of_hessian + by_hessian) - by_hessian
-            limit += (of_limit + by_limit) - by_limit
+            of_gradient = same * of_gradient
+            gradient_lost += _lost(gradient, of_gradient, gradient + of_gradient)
+            hessian_lost += _lost(hessian, of_hessian, hessian + of_hessian)
+            limit_lost += _lost(limit, of_limit, limit + of_limit)
+            gradient, hessian, limit = gradient + of_gradient, hessian + of_hessian, limit + of_limit
     if count < 2:
         return
-    contacts.gradient[i] = to_single(gradient)
-    contacts.hessian[i] = to_single_block(hessian)
-    contacts.limit[i] = float(limit)
+    contacts.gradient[i] = to_single(gradient + gradient_lost)
+    contacts.hessian[i] = to_single_block(hessian + hessian_lost)
+    contacts.limit[i] = float(limit + limit_lost)

@@ -122,7 +122,6 @@ class Contacts:
             vertices of one element, are parts of the rows of elements.
         feature: Vertices of a contact of two vertices, or of one and an edge; -1 of others.
         bucket: 1 more than the first contact of each hash of vertices, 0 for none; ``next`` has those that follow.
-        most_of_bucket: Largest gradient, Hessian and limit there, one behind the other.
         listed: Number of entries, shape [1].
         first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
@@ -147,7 +146,6 @@ class Contacts:
     feature: wp.array[wp.vec3i]
     bucket: wp.array[int]
     next: wp.array[int]
-    most_of_bucket: wp.array[float]
     listed: wp.array[int]
     first: wp.array[int]
     middle: wp.array[int]
