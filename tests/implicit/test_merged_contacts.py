@@ -20,7 +20,8 @@ def _link(contacts: Contacts):
 
 @wp.kernel(enable_backward=False)
 def _merge(contacts: Contacts):
-    merge_contact(wp.tid(), contacts)
+    k = wp.tid()
+    merge_contact(k // contacts.parts, k % contacts.parts, contacts)
 
 
 def contacts_of_step(device, **options):
@@ -66,10 +67,11 @@ def merged(contacts, device, order):
     for name, values in contacts.items():
         setattr(struct, name, wp.array(values[order], dtype=Contacts.vars[name].type.dtype, device=device))
     struct.feature = wp.zeros(count, dtype=wp.vec3i, device=device)
-    struct.next, struct.bucket = (wp.zeros(n, dtype=int, device=device) for n in (count, 1))
+    struct.parts = 8 if device.is_cuda else 1
+    struct.next, struct.bucket = (wp.zeros(n, dtype=int, device=device) for n in (count, struct.parts))
     struct.count = wp.array([count], dtype=int, device=device)
     wp.launch(_link, count, inputs=[struct], device=device)
-    wp.launch(_merge, count, inputs=[struct], device=device)
+    wp.launch(_merge, count * struct.parts, inputs=[struct], device=device)
     left = np.flatnonzero(struct.weights.numpy().any(axis=1))
     left = left[np.argsort(struct.key.numpy()[left])]
     assert struct.couples.numpy().sum() == len(left)

@@ -133,6 +133,26 @@ def test_a_step_ends_where_what_is_left_of_changes_is_small(device, monkeypatch)
     assert taken[0][0] < taken[1][0] and solver.report.converged
 
 
+@pytest.mark.parametrize("cells", [9, 21, 29, 37])
+def test_cloth_of_any_size_hangs_in_its_weight(device, cells):
+    """Each size is solved by threads that share the work in another way on a GPU: the held row carries the weight."""
+    builder = newton.ModelBuilder()
+    builder.add_cloth_grid(
+        pos=wp.vec3(), rot=wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.5 * np.pi), vel=wp.vec3(),
+        dim_x=cells, dim_y=cells, cell_x=0.3 / cells, cell_y=0.3 / cells, mass=0.1 / (cells + 1) ** 2, fix_top=True,
+        tri_ke=100.0, tri_ka=100.0, tri_kd=0.0,
+    )  # fmt: skip
+    model = builder.finalize(device=device)
+    solver, state = bsc.SolverImplicit(model, max_iterations=50), model.state()
+    for _ in range(3):
+        step(solver, state, state)
+    assert solver.report.converged and solver.report.certified
+    z, free = state.particle_q.numpy()[:, 2], model.particle_inv_mass.numpy() > 0
+    below = z[~free].min() - 0.3 - z[free].min()  # than where it began
+    assert 0.001 < below < 9.81 * (1 + 2 + 3) / 60.0**2  # that of a fall
+    assert (np.diff(z.reshape(cells + 1, cells + 1), axis=0) > 0.0).all()
+
+
 def test_what_changes_velocities_much_takes_up_to_twice_as_many_newton_steps(device):
     """A first Newton step along a flight changes velocities by more than 0.1 m/s, one to where cloth lies does not."""
     model = ramp(device)

@@ -302,7 +302,8 @@ def _advance(
             solves = int(0)
             for v in range(from_end, vertices, n):
                 steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
-                p.contacts.bucket[v] = 0
+            for k in range(from_end, p.contacts.bucket.shape[0], n):
+                p.contacts.bucket[k] = 0
             for i in range(spread, p.element_count, n):
                 _differentiate(i, 1, p, motion, settings)
             for i in range((spread + n // 4) % n, p.element_count, n):
@@ -339,12 +340,14 @@ def _advance(
             _over_pairs(task, passes > 0, p, motion, planes, settings, solves, t, n)
             phase = then
         elif phase == Phase.COUNT:
-            for i in range(t, contact_count(p.contacts), n):
+            for k in range(t, p.parts * contact_count(p.contacts), n):
+                i, part = k // p.parts, k % p.parts
                 if solves == 0:
-                    merge.merge_contact(i, p.contacts)
-                contact_lists.count_entries(i, motion, p.contacts, p.unknowns)
-                if solves == 0:
-                    merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.energy)
+                    merge.merge_contact(i, part, p.contacts)
+                if part == 0:
+                    contact_lists.count_entries(i, motion, p.contacts, p.unknowns)
+                    if solves == 0:
+                        merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.energy)
             phase = int(Phase.PLACE)
         elif phase == Phase.PLACE:
             for u in range(t, wp.max(unknowns, worlds), n):

@@ -98,16 +98,22 @@ _SOLVE = """
 #else
     float* preconditioned = (float*)(vectors.preconditioned.data + first);
 #endif
-    __shared__ float shared_inverses[9 * (KEPT ? THREADS : 1)], sums_of_warps[2][32];
-    __shared__ float shared_pulls[3 * COUPLED], coupled_weights[4 * COUPLED], coupled_blocks[9 * COUPLED];
-    __shared__ int coupled_corners[4 * COUPLED], entry_pulled[ENTRIES], entries;
-    __shared__ float entry_weight[ENTRIES];
+    __shared__ float shared_inverses[INVERSES + 1], sums_of_warps[2][32];
+    __shared__ float shared_pulls[3 * COUPLED], coupled_blocks[9 * COUPLED], entry_weight[ENTRIES];
+    __shared__ float4 coupled_weights[COUPLED];
+    __shared__ int4 coupled_columns[COUPLED];
+    __shared__ int entry_pulled[ENTRIES], entries;
     typedef float real;
     const int lane = threadIdx.x, threads = blockDim.x;
-    const bool shares_contacts = SHARED && coupled <= COUPLED;
+    const bool shares_contacts = SHARED && coupled <= COUPLED && unknowns.particle.data[first + rows - 1] >= 0;
+    auto quotient = [](float a, float b) { return __fdividef(a, b); };
     auto multiplied = [&](int at) INLINE {  // read at once
+#if SHARED
         const float4 all = *(const float4*)(preconditioned + at);
         return wp::vec3(all.x, all.y, all.z);
+#else
+        return wp::vec3(preconditioned[at], preconditioned[at + 1], preconditioned[at + 2]);
+#endif
     };
     if (shares_contacts) pulls = shared_pulls;
     int turn = 0;
@@ -163,10 +169,15 @@ _SOLVE = """
     if (shares_contacts) {
         for (int n = lane; n < coupled; n += threads) {
             const int i = contacts.coupled.data[first_coupled + n];
+            int columns[4];
+            float weights[4];
             for (int j = 0; j < 4; ++j) {
-                coupled_corners[4 * n + j] = contacts.coupled_unknowns.data[first_coupled + n][j];
-                coupled_weights[4 * n + j] = contacts.weights.data[i][j];
+                const int u = contacts.coupled_unknowns.data[first_coupled + n][j];
+                columns[j] = u < 0 ? 0 : WIDE * (u - first);
+                weights[j] = u < 0 ? 0.0f : contacts.weights.data[i][j];
             }
+            coupled_columns[n] = make_int4(columns[0], columns[1], columns[2], columns[3]);
+            coupled_weights[n] = make_float4(weights[0], weights[1], weights[2], weights[3]);
             for (int c = 0; c < 9; ++c) coupled_blocks[9 * n + c] = ((float*)&contacts.hessian.data[i])[c];
         }
         if (lane == 0) entries = 0;
@@ -176,9 +187,8 @@ _SOLVE = """
     const int lane = 0, threads = 1;
     float* preconditioned = (float*)(vectors.preconditioned.data + first);
     const bool shares_contacts = false;
-    const int* coupled_corners = nullptr;
-    const float *coupled_weights = nullptr, *coupled_blocks = nullptr;
     auto wait = []() {};
+    auto quotient = [](double a, double b) { return a / b; };
     auto multiplied = [&](int at) { return wp::vec3(); };
     auto sum = [](double, double) {};
     typedef double real;
@@ -196,7 +206,7 @@ _SOLVE = """
     };
     auto precondition = [&](int row, const wp::vec3& r) {
 #if defined(__CUDA_ARCH__)
-        if (keeps) {
+        if (INVERSES) {
             wp::vec3 z;
             for (int k = 0; k < 9; ++k) z[k / 3] += shared_inverses[k * THREADS + lane] * r[k % 3];
             return z;
@@ -214,7 +224,7 @@ _SOLVE = """
     if (keeps && begin < rows) {
         own_free = is_free[begin];
 #if defined(__CUDA_ARCH__)
-        for (int c = 0; c < 9; ++c)
+        for (int c = 0; c < INVERSES / THREADS; ++c)
             shared_inverses[c * THREADS + lane] = ((float*)&vectors.inverse.data[first + begin])[c];
 #endif
         own_entry = first_entry(begin)[0], own_end = first_entry(begin)[1];
@@ -228,7 +238,7 @@ _SOLVE = """
         }
         own_entry += KEPT;
 #if defined(__CUDA_ARCH__)
-        if (shares_contacts && coupled && unknowns.particle.data[first + begin] >= 0) {
+        if (shares_contacts && coupled) {
             const int middle = contacts.middle.data[first + begin] + part, end = contacts.end.data[first + begin];
             const int count = end > middle ? (end - middle + parts - 1) / parts : 0;
             const int at = count ? atomicAdd(&entries, count) : 0;
@@ -244,26 +254,32 @@ _SOLVE = """
     }
     auto pull = [&]() INLINE {  // products of contacts that couple with what is multiplied
         if (coupled == 0) return;
-        for (int n = block * threads + lane; n < coupled; n += blocks * threads) {
-            const int i = shares_contacts ? 0 : contacts.coupled.data[first_coupled + n];
-            const int* corners = shares_contacts
-                ? coupled_corners + 4 * n : (const int*)(contacts.coupled_unknowns.data + first_coupled + n);
-            const float* weights = shares_contacts
-                ? coupled_weights + 4 * n : (const float*)(contacts.weights.data + i);
-            const float* h = shares_contacts ? coupled_blocks + 9 * n : (const float*)(contacts.hessian.data + i);
+#if defined(__CUDA_ARCH__)
+        for (int n = lane; shares_contacts && n < coupled; n += threads) {
+            const int4 at = coupled_columns[n];
+            const float4 by = coupled_weights[n];
+            const float* h = coupled_blocks + 9 * n;
+            const wp::vec3 apart = by.x * multiplied(at.x) + by.y * multiplied(at.y)
+                + by.z * multiplied(at.z) + by.w * multiplied(at.w);
+            for (int c = 0; c < 3; ++c)
+                shared_pulls[3 * n + c] = h[3 * c] * apart[0] + h[3 * c + 1] * apart[1] + h[3 * c + 2] * apart[2];
+        }
+#endif
+        for (int n = block * threads + lane; !shares_contacts && n < coupled; n += blocks * threads) {
+            const int i = contacts.coupled.data[first_coupled + n];
+            const wp::vec4i corners = contacts.coupled_unknowns.data[first_coupled + n];
+            const wp::vec4 weights = contacts.weights.data[i];
             wp::vec3 apart;
             for (int j = 0; j < 4; ++j) {
                 const int u = corners[j];
                 const float* d = preconditioned + WIDE * (u >= 0 ? u - first : u < -1 ? -2 - u - first : 0);
                 const float weight = u == -1 ? 0.0f : weights[j];
-                apart += weight * wp::vec3(d[0], d[1], d[2]);
-                if (u < -1) {  // of a body: its turn follows its shift
-                    const int vertex = contacts.corners.data[contacts.coupled.data[first_coupled + n]][j];
-                    apart += weight * wp::cross(wp::vec3(d[WIDE], d[WIDE + 1], d[WIDE + 2]), unknowns.arm.data[vertex]);
-                }
+                apart += weight * vector_of(d, 0);
+                if (u < -1)  // of a body: its turn follows its shift
+                    apart += weight * wp::cross(vector_of(d, WIDE), unknowns.arm.data[contacts.corners.data[i][j]]);
             }
-            for (int c = 0; c < 3; ++c)
-                pulls[3 * n + c] = h[3 * c] * apart[0] + h[3 * c + 1] * apart[1] + h[3 * c + 2] * apart[2];
+            apart = wp::mul(contacts.hessian.data[i], apart);
+            for (int c = 0; c < 3; ++c) pulls[3 * n + c] = apart[c];
         }
         wait();
     };
@@ -355,12 +371,12 @@ _SOLVE = """
         sum(squared, of_product);
         if (count == 0) limit = tolerance * tolerance * squared;
         if (!(squared > limit)) break;
-        const real momentum = count == 0 ? (real)0.0f : squared / before;
+        const real momentum = count == 0 ? (real)0.0f : quotient(squared, before);
         curvature = of_product - momentum * momentum * curvature;
         const bool is_convex = curvature > 0.0f;
         if (!is_convex && count > 0) break;
         const real bend = is_convex ? curvature : wp::max(-curvature, (real)1e-30f + (real)0.01f * squared);
-        const float step = (float)(squared / bend), again = (float)momentum;
+        const float step = (float)quotient(squared, bend), again = (float)momentum;
         before = squared;
         ++count;
         for (int row = begin; row < rows; row += stride) {
@@ -390,6 +406,8 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
     iteration would otherwise be arithmetic of addresses, and waiting for memory.
     """
     sizes = {"SHARED": int(shared), "WIDE": 4 if shared else 3, "THREADS": bounds, "PARTS": parts, "KEPT": kept}
+    # in shared memory, of which a block has 48 KiB
+    sizes["INVERSES"] = 9 * bounds if kept and shared and bounds == min(_KEPT) else 0
     sizes |= {"COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED}
     snippet = functools.reduce(lambda text, name: text.replace(name, str(sizes[name])), sizes, _SOLVE)
 

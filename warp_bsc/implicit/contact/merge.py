@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from ...response.state.vectors import ZERO, to_double, to_single
-from .system import Contacts, to_single_block
+from ...response.state.vectors import ZERO, to_double
+from .system import Contacts, sum_of_parts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,11 +23,33 @@ def _lost(a: Any, b: Any, total: Any):
     return (a - (total - rounded)) + (b - rounded)
 
 
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const unsigned mask = ((1u << parts) - 1u) << (threadIdx.x & 31u & ~(unsigned)(parts - 1));
+    for (int offset = parts / 2; offset > 0; offset /= 2) {
+        const double other = __shfl_xor_sync(mask, value, offset), more = __shfl_xor_sync(mask, lost, offset);
+        const double total = value + other, rounded = total - value;
+        lost += more + ((value - (total - rounded)) + (other - rounded));
+        value = total;
+    }
+#endif
+    return (float)(value + lost);
+"""
+)
+def _sum_of_parts(value: wp.float64, lost: wp.float64, parts: int) -> float:
+    """Returns the sum of the values of ``parts`` threads, and of what they lost; 1 on a CPU."""
+    ...
+
+
 @wp.func
-def _bucket_of(contacts: Contacts, feature: wp.vec3i) -> int:
+def _first_bucket(contacts: Contacts, feature: wp.vec3i) -> int:
     number = wp.uint32(feature[0]) * wp.uint32(73856093) + wp.uint32(feature[1]) * wp.uint32(19349663)
     number += wp.uint32(feature[2]) * wp.uint32(83492791)
-    return int((number ^ (number >> wp.uint32(15))) % wp.uint32(contacts.bucket.shape[0]))
+    return (
+        int((number ^ (number >> wp.uint32(15))) % wp.uint32(contacts.bucket.shape[0] // contacts.parts))
+        * contacts.parts
+    )
 
 
 @wp.func
@@ -45,24 +67,25 @@ def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4
         # a vertex, of two that of the lower number, and the other vertex twice or those of the edge
         one = int(count[0] > count[1] or (count[0] == count[1] and low[0] > low[1]))
         feature = wp.vec3i(low[one], low[1 - one], high[1 - one])
-        bucket = _bucket_of(contacts, feature)
+        bucket = _first_bucket(contacts, feature) + i % contacts.parts
         contacts.feature[i] = feature
         contacts.next[i] = wp.atomic_exch(contacts.bucket, bucket, i + 1)
 
 
 @wp.func
-def merge_contact(i: int, contacts: Contacts):
+def merge_contact(i: int, part: int, contacts: Contacts):
     """Adds to a contact all that have its vertices, or takes its weights where another one, of a lower key, does so.
 
-    The vector between the closest points is the other way round where the sides of the pair are.
+    The vector between the closest points is the other way round where the sides of the pair are. So many threads share
+    a contact, each with a bucket.
     """
     feature, key = contacts.feature[i], contacts.key[i]
     if feature[0] < 0:
         return
-    bucket = _bucket_of(contacts, feature)
-    gradient, hessian, limit, count = wp.vec3d(), wp.mat33d(), wp.float64(0.0), int(0)
+    gradient, hessian, limit, count = wp.vec3d(), wp.mat33d(), wp.float64(0.0), float(0.0)
     gradient_lost, hessian_lost, limit_lost = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
-    normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[bucket] + int(0)
+    normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[_first_bucket(contacts, feature) + part] + int(0)
+    lower, parts = float(0.0), contacts.parts
     while n > 0:
         k = n - 1
         # read side by side: most of the time is waiting for memory
@@ -75,17 +98,23 @@ def merge_contact(i: int, contacts: Contacts):
         of_limit, same = wp.float64(contacts.limit[k]), wp.float64(wp.sign(wp.dot(contacts.normal[k], normal)))
         if of_feature == feature:
             if of_key < key:
-                contacts.weights[i] = wp.vec4()
-                contacts.couples[i] = 0
-                return
-            count += 1
+                lower, n = 1.0, 0
+            count += 1.0
             of_gradient = same * of_gradient
             gradient_lost += _lost(gradient, of_gradient, gradient + of_gradient)
             hessian_lost += _lost(hessian, of_hessian, hessian + of_hessian)
             limit_lost += _lost(limit, of_limit, limit + of_limit)
             gradient, hessian, limit = gradient + of_gradient, hessian + of_hessian, limit + of_limit
-    if count < 2:
-        return
-    contacts.gradient[i] = to_single(gradient + gradient_lost)
-    contacts.hessian[i] = to_single_block(hessian + hessian_lost)
-    contacts.limit[i] = float(limit + limit_lost)
+    found = sum_of_parts(wp.vec3(lower, count, 0.0), parts)
+    if found[0] > 0.0:
+        contacts.weights[i] = wp.vec4()
+        contacts.couples[i] = 0
+    elif found[1] > 1.0:
+        total, block = wp.vec3(), wp.mat33()
+        for a in range(3):
+            total[a] = _sum_of_parts(gradient[a], gradient_lost[a], parts)
+            for b in range(3):
+                block[a, b] = _sum_of_parts(hessian[a, b], hessian_lost[a, b], parts)
+        contacts.gradient[i] = total
+        contacts.hessian[i] = block
+        contacts.limit[i] = _sum_of_parts(limit, limit_lost, parts)

@@ -364,10 +364,12 @@ class NewtonMethod:
     def _allocate_contacts(self, capacity):
         self._retire(self._contacts)
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
-        sizes["bucket"] = self._mesh.vertex_count
+        sizes["bucket"] = self._problem.parts * self._mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
-        self._contacts = self._problem.contacts = allocate(Contacts, capacity, self._work.device, **sizes)
+        self._contacts = allocate(Contacts, capacity, self._work.device, **sizes)
+        self._contacts.parts = self._problem.parts
+        self._problem.contacts = self._contacts
 
     def _retire(self, buffers):
         if self._captured:

@@ -121,7 +121,8 @@ class Contacts:
         couples: 1 of a contact of two elements that are both solved for, or of a body. The blocks of others, between
             vertices of one element, are parts of the rows of elements.
         feature: Vertices of a contact of two vertices, or of one and an edge; -1 of others.
-        bucket: 1 more than the first contact of each hash of vertices, 0 for none; ``next`` has those that follow.
+        parts: Threads that share a contact, and buckets of each hash of vertices.
+        bucket: 1 more than the first contact there, 0 for none; ``next`` has those that follow.
         listed: Number of entries, shape [1].
         first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
@@ -144,6 +145,7 @@ class Contacts:
     key: wp.array[wp.int64]
     couples: wp.array[int]
     feature: wp.array[wp.vec3i]
+    parts: int
     bucket: wp.array[int]
     next: wp.array[int]
     listed: wp.array[int]
