@@ -358,8 +358,12 @@ def _advance(
                 contact_lists.list_entries(i, motion, p.contacts, p.unknowns)
             phase = int(Phase.SORT)
         elif phase == Phase.SORT:
-            for i in range(t, p.contacts.listed[0], n):
-                contact_lists.sort_entries(i, p.contacts)
+            if n == 1:  # long lists in less than a thread for each entry takes
+                for u in range(unknowns):
+                    contact_lists.sort_list(u, p.contacts)
+            else:
+                for i in range(t, p.contacts.listed[0], n):
+                    contact_lists.sort_entries(i, p.contacts)
             phase = int(Phase.BLOCKS)
         elif phase == Phase.BLOCKS:
             for i in range(t, p.parts * p.row_of_block.shape[0], n):

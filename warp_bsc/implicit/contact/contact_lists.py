@@ -97,6 +97,14 @@ def list_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns)
 
 
 @wp.func
+def _put_entry(contacts: Contacts, at: int, order: wp.int64, entry: int):
+    contacts.entries[at] = entry
+    if order >= _COUPLES:
+        contacts.pulled[at] = contacts.place_in_coupled[entry >> 2]
+        contacts.entry_weight[at] = contacts.weights[entry >> 2][entry & 3]
+
+
+@wp.func
 def sort_entries(n: int, contacts: Contacts):
     """Puts an entry of an unknown to its place by its pair, so that sums do not depend on the order of threads.
 
@@ -110,9 +118,36 @@ def sort_entries(n: int, contacts: Contacts):
         single += wp.where(other < _COUPLES, 1, 0)
         if other < own or (other == own and contacts.unsorted[m] < entry):
             rank += 1
-    contacts.entries[first + rank] = entry
-    if own >= _COUPLES:
-        contacts.pulled[first + rank] = contacts.place_in_coupled[entry >> 2]
-        contacts.entry_weight[first + rank] = contacts.weights[entry >> 2][entry & 3]
+    _put_entry(contacts, first + rank, own, entry)
     if rank == 0:
+        contacts.middle[u] = first + single
+
+
+@wp.func
+def sort_list(u: int, contacts: Contacts):
+    """Puts all entries of an unknown to their places, as :func:`sort_entries`, by one thread: by shell sort."""
+    first, end = contacts.first[u], contacts.end[u]
+    step = end - first
+    while step > 1:
+        step = step * 5 // 11 + int(step == 2)
+        for i in range(first + step, end):
+            own, entry = contacts.order[i] + wp.int64(0), contacts.unsorted[i] + int(0)
+            at, moves = int(i), bool(True)
+            while moves:
+                moves = False
+                if at - step >= first:
+                    other, of_other = contacts.order[at - step] + wp.int64(0), contacts.unsorted[at - step] + int(0)
+                    moves = own < other or (own == other and entry < of_other)
+                    if moves:
+                        contacts.order[at] = other
+                        contacts.unsorted[at] = of_other
+                        at -= step
+            contacts.order[at] = own
+            contacts.unsorted[at] = entry
+    single = int(0)
+    for n in range(first, end):
+        order = contacts.order[n] + wp.int64(0)
+        single += wp.where(order < _COUPLES, 1, 0)
+        _put_entry(contacts, n, order, contacts.unsorted[n])
+    if end > first:
         contacts.middle[u] = first + single
