@@ -465,7 +465,7 @@ def _advance(
             phase = int(Phase.CUT)  # the first time by the bounds of the displacements, which are known
         elif phase == Phase.CUT:
             for v in range(t, vertices, n):
-                steps.truncate(v, p.unknowns, p.limit, p.trial)
+                steps.truncate(v, p.unknowns, p.limit, passes == 0, p.trial)
             passes += 1
             then = int(Phase.CUT)
             if passes == _TRUNCATIONS:

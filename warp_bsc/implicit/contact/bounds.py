@@ -41,12 +41,19 @@ def bound_by_pair(
 ):
     """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world.
 
-    Displacements that are parts of those of the last time are shorter: what was far from each other is so still.
+    Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
+    what did not meet does not where none of its vertices is cut since.
     """
     corners = candidates.corners[i]
     world = motion.world[corners[0]]
     if progress.solving[world] == 0 or (is_shorter and candidates.share[i] == FAR):
         return
+    if is_shorter and candidates.share[i] == 1.0:
+        cuts = int(0)
+        for j in range(4):
+            cuts += trial.cut[trial.holder[corners[j]]]
+        if cuts == 0:
+            return
     candidates.share[i] = FAR
     if stays_far(candidates, progress, world, i):
         return

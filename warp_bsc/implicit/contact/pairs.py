@@ -94,6 +94,7 @@ class Trial:
         x: Positions of vertices [m].
         displaced: Displacements [m].
         share: Share of its displacement that a vertex takes of what its world takes.
+        cut: 1 of each holder whose share the last truncation made smaller.
         holder: Vertex whose share each vertex takes: itself, or the first of its body.
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
         exact: Positions without rounding, which for friction is a large part of the way [m].
@@ -105,6 +106,7 @@ class Trial:
     x: wp.array[wp.vec3]
     displaced: wp.array[wp.vec3]
     share: wp.array[float]
+    cut: wp.array[int]
     holder: wp.array[int]
     bend: wp.array[float]
     exact: wp.array[wp.vec3d]

@@ -128,10 +128,16 @@ def truncate(
     v: int,
     unknowns: Unknowns,
     limit: wp.array[float],
+    begins: bool,
     trial: Trial,
 ):
-    """Takes the shares of vertices that are solved for down to their bounds, and clears these."""
+    """Takes the shares of vertices that are solved for down to their bounds, clears these, and notes what it cuts.
+
+    When it ``begins``, vertices that were to stay in their boxes are cut already.
+    """
+    trial.cut[v] = 0
     if trial.holder[v] == v and is_solved(unknowns, v):
+        trial.cut[v] = int(limit[v] < 1.0 or (begins and trial.share[v] < 1.0))
         trial.share[v] = trial.share[v] * limit[v]
     limit[v] = 1.0
 
