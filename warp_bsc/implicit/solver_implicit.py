@@ -180,8 +180,8 @@ class SolverImplicit(SolverCCD):
         if jointed is not None:
             raise ValueError(
                 f"a joint holds body {jointed} ({model.body_label[jointed]!r}), and SolverImplicit solves for free "
-                "bodies only: in a coupled solver (newton.solvers.experimental.coupled), give the body and the joint to "
-                "another entry, and this one a proxy of the body; or pass bodies='left' if something else writes poses"
+                "bodies only: in a coupled solver (newton.solvers.experimental.coupled), give the body and the joint "
+                "to another entry, and this one a proxy of it; or pass bodies='left' if something else writes poses"
             )
         if moves and model.attachment_particle_body_count:
             if _dynamic_bodies(model)[host_array(model.attachment_particle_body_body)].any():
