@@ -103,7 +103,9 @@ class SolverImplicit(SolverCCD):
     one.
 
     Stiffness and reach of barriers follow from masses, edges, radii and elasticity; no option needs tuning. Contacts
-    that are passed to :meth:`step` are not needed, and not used.
+    that are passed to :meth:`step` are not needed, and not used. Where gravity of more than 98.1, or edges of more than
+    0.5 without gravity, tell at construction that lengths are not in metres, speeds that are given in m/s here are
+    scaled, so that a model in centimetres moves as it does in metres.
 
     Each world is stepped as if it were alone, bit for bit as measured on CPUs, but for the distance by which contacts
     that the solve leaves are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
