@@ -270,6 +270,23 @@ def test_a_particle_that_is_not_finite_harms_no_other(name, value, device):
     assert solver.report.certified == (name == "particle_qd")  # which is 0 after the first step
 
 
+@pytest.mark.parametrize("name", ["particle_q", "particle_qd", "particle_f"])
+@pytest.mark.parametrize("mass", [0.001, 0.0])
+@pytest.mark.filterwarnings("ignore:.*not finite", "ignore:.*not certified")
+def test_a_world_with_input_that_is_not_finite_is_not_converged(name, mass, device):
+    """Also of a particle that is solved for alone in its world, or is not; the other world is converged."""
+    builder = newton.ModelBuilder()
+    for world, of_particle in enumerate((0.001, mass)):
+        builder.begin_world()
+        builder.add_particle(wp.vec3(float(world), 0.0, 0.0), wp.vec3(), of_particle)
+        builder.end_world()
+    model = builder.finalize(device=device)
+    solver, _ = run(model, 1, before=lambda state: change(getattr(state, name), 1, np.nan), report_worlds=True)
+    is_used = mass > 0.0 or name != "particle_f"
+    assert solver.report.worlds.converged.numpy().tolist() == [True, not is_used]
+    assert solver.report.converged != is_used and solver.report.unconverged_steps == is_used
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.filterwarnings("ignore:.*not finite", "ignore:.*strained")
 def test_a_force_that_is_not_finite_harms_no_other_particle(value, device):

@@ -320,7 +320,7 @@ class NewtonMethod:
             self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
         inputs = [self._trial, self._unknowns, self._dt]
-        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end])
+        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end, self.progress])
         inputs = [self.progress, self._dt, self._metre * _LEAST_SPEED, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 

@@ -47,7 +47,8 @@ def write_results(
     """
     w = wp.tid()
     arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
-    converged = progress.steps[w] == 0 or (arrived and lacks[0] == 0 and change_left(progress, w) <= least_speed * dt)
+    converged = arrived and lacks[0] == 0 and change_left(progress, w) <= least_speed * dt
+    converged = wp.isfinite(progress.change[w]) and (progress.steps[w] == 0 or converged)
     results.newton_steps[w] = progress.steps[w]
     results.last_change[w] = progress.change[w] / dt
     results.arrived[w] = arrived
@@ -78,7 +79,10 @@ class ImplicitStepReport(SolverReport):
 
     @property
     def last_change(self) -> float:
-        """Largest change of the velocity of a particle by the last Newton step of a world in the last step [m/s]."""
+        """Largest change of the velocity of a particle by the last Newton step of a world in the last step [m/s].
+
+        It is infinite where a position, a velocity or a force was not finite.
+        """
         return self._read(self.results.last_change)
 
     @property
