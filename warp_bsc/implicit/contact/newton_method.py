@@ -62,6 +62,9 @@ _MOST_UNITS_OF_ALL = 2.0**61
 _GRAVITY, _EDGE, _OTHER_UNIT = 9.81, 0.05, 10.0
 """Usual gravity [m/s^2] and edges [m]; what is that many times as much in a model tells that its unit is no metre."""
 _TOLERANCE = 1e-2
+"""Residual at which a solve ends, as a share of the first: by energies, most of which are of what is heavy."""
+_LIGHT = 0.01, 1e-4
+"""Median of masses as a share of the mean, below which what is light asks for a smaller residual, and down to which."""
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
 """Newton steps after which a step ends, even if something that a program moves has not arrived."""
@@ -174,6 +177,9 @@ class NewtonMethod:
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
         total = _of_worlds(np.sum, masses[moves], world[moves], work.worlds, 0.0)
         units = 1.0 / np.maximum(mass * _UNIT_SPEED**2, total * _FAST**2 / _MOST_UNITS_OF_ALL) / self._metre**2
+        light = _of_worlds(np.median, masses[moves], world[moves], work.worlds, 1.0) / mass
+        tolerance = _TOLERANCE * np.where(light < _LIGHT[0], np.sqrt(np.maximum(light, _LIGHT[1])), 1.0)
+        self._tolerance = wp.array(tolerance, dtype=float, device=device)
         if len(solved):
             heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * (_FAST * self._metre) ** 2, 1e-9))
@@ -398,7 +404,7 @@ class NewtonMethod:
             self._contacts,
             self._unknowns,
             self.progress.solving,
-            _TOLERANCE,
+            self._tolerance,
             _MAX_ITERATIONS,
             team,
         ]
