@@ -60,8 +60,9 @@ class _Inertia(SolverBase):
             self._bodies.inertia, self._bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
             self._bodies.inverse_mass = model.body_inv_mass
 
-    def step(self, state_in, state_out, control, contacts, dt):
+    def step(self, state_in, state_out, control, contacts, dt, *, observables=None):
         """Writes the positions and velocities that inertia leads to."""
+        self.validate_observables(observables, contacts)
         model = self.model
         if self._bodies is not None:
             inputs = [state_in.body_q, state_in.body_qd, state_in.body_f, model.body_flags, model.gravity]
@@ -247,6 +248,13 @@ class SolverImplicit(SolverCCD):
 
     def _measure_strain(self):
         self._meter.measure_step(self._motion.vertices, self.report.last_strain)
+
+    def update_contacts(self, contacts, state=None):
+        """Raises NotImplementedError: the contacts of the solve are no contacts of Newton's pipeline."""
+        raise NotImplementedError(
+            "SolverImplicit does not use Newton's contacts, and has no forces of them: pass report_contacts=True, and "
+            "read report.contacts and the impulses beside it"
+        )
 
     def notify_model_changed(self, flags: int) -> None:
         """Reads masses, materials, gravity and shapes again, see :class:`warp_bsc.SolverCCD`."""
