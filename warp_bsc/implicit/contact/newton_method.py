@@ -50,7 +50,7 @@ _RECOVERY_SPEED = 0.3
 _SMOOTHING_SPEED = 0.5e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
-"""Speed by which no unknown changes any more where a step ends [m/s]."""
+"""Speed by which no unknown changes any more where a step of 1/60 s ends [m/s], proportionally less in shorter ones."""
 _FAR_SPEED = 0.1
 """Speed by which one that changes still is far from its end, so that its world takes more Newton steps [m/s]."""
 _UNIT_SPEED = 1e-5
@@ -287,6 +287,10 @@ class NewtonMethod:
         if self._mesh.model.tet_count and not self._work.device.is_capturing:
             self._settings.elasticity.assign(self._elasticity(self._mesh))
 
+    @property
+    def _least_speed(self):
+        return self._metre * _LEAST_SPEED * min(1.0, 60.0 * self._dt)
+
     def _begin(self, end, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
@@ -327,7 +331,7 @@ class NewtonMethod:
             work.launch_over_bodies(begin_response_to_bodies)
         inputs = [self._trial, self._unknowns, self._dt]
         self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end, self.progress])
-        inputs = [self.progress, self._dt, self._metre * _LEAST_SPEED, self._lacks]
+        inputs = [self.progress, self._dt, self._least_speed, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
     def _renew_candidates(self):
@@ -421,7 +425,7 @@ class NewtonMethod:
 
     def _launch_advance(self):
         work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
-        changes = float(self._metre * _LEAST_SPEED * self._dt), float(self._metre * _FAR_SPEED * self._dt)
+        changes = float(self._least_speed * self._dt), float(self._metre * _FAR_SPEED * self._dt)
         inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most]
         options = {"device": work.device, "block_dim": self._block}
         wp.launch(ADVANCE[self._block], self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
