@@ -199,12 +199,58 @@ def hinged_box(device):
 
 def test_bodies_behind_joints_are_for_another_solver(device):
     model = hinged_box(device)
-    with pytest.raises(ValueError, match=r"a joint holds body 0 \('door'\).* coupled solver .* bodies='left'"):
+    with pytest.raises(ValueError, match=r"a joint holds body 0 \('door'\).* to another entry, .* bodies='left'"):
         SolverImplicit(model)
     solver, states = SolverImplicit(model, bodies="left"), [model.state(), model.state()]
     solver.step(*states, None, None, DT)
     np.testing.assert_array_equal(states[1].body_q.numpy(), model.body_q.numpy())
     assert (states[1].particle_q.numpy()[:, 2] < -0.5).all()
+
+
+def coupled_press(device, mode, iterations):
+    """A plate on a vertical slide of another solver, over a soft block on a static box, and the entry of the block."""
+    builder = newton.ModelBuilder()
+    soft = {"density": 200.0, "k_mu": 2e4, "k_lambda": 2e4, "k_damp": 1e-3}
+    cells = {"dim_x": 2, "dim_y": 2, "dim_z": 1, "cell_x": 0.05, "cell_y": 0.05, "cell_z": 0.05}
+    at = {"pos": wp.vec3(-0.05, -0.05, 0.003), "rot": wp.quat_identity(), "vel": wp.vec3()}
+    builder.add_soft_grid(**at, **cells, **soft)
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.05), wp.quat_identity()), **BOX)
+    cfg = newton.ModelBuilder.ShapeConfig(density=0.0)
+    plate = builder.add_link(mass=0.4, inertia=wp.mat33(4e-3 * np.eye(3)), lock_inertia=True, label="plate")
+    builder.add_shape_box(plate, cfg=cfg, hx=0.1, hy=0.1, hz=0.02)
+    slide = wp.transform(wp.vec3(0.0, 0.0, 0.076), wp.quat_identity())
+    builder.add_articulation([builder.add_joint_prismatic(-1, plate, axis=(0.0, 0.0, 1.0), parent_xform=slide)])
+    builder.color()
+    model, stages = builder.finalize(device=device), []
+
+    def make(view):
+        stages.append(SolverImplicit(view, report_contacts=True))
+        return stages[-1]
+
+    entries = [
+        SolverCoupled.Entry(name="slide", solver=newton.solvers.SolverFeatherstone, bodies=[0], joints=[0]),
+        SolverCoupled.Entry(name="soft", solver=make, particles=list(range(model.particle_count))),
+    ]
+    kind = {"bodies": [0], "joints": [0], "mode": mode}
+    proxies = [SolverCoupledProxy.Proxy(source="slide", destination="soft", **kind)]
+    config = SolverCoupledProxy.Config(proxies=proxies, iterations=iterations)
+    return model, SolverCoupledProxy(model, entries, config), stages[0]
+
+
+@pytest.mark.parametrize("mode, iterations", [("staggered", 1), ("lagged", 2)])
+def test_a_proxy_whose_joint_the_entry_sees_is_carried_by_what_it_rests_on(mode, iterations, device):
+    """The joint is the other solver's: the force that comes back is the weight of the plate, and the plate rests."""
+    model, coupled, stage = coupled_press(device, mode, iterations)
+    states, forces = [model.state(), model.state()], []
+    newton.eval_fk(model, model.joint_q, model.joint_qd, states[0])
+    for _ in range(60):
+        states[0].clear_forces()
+        coupled.step(*states, model.control(), None, DT)
+        states.reverse()
+        forces.append(stage.report.body_impulse.numpy()[0, :3] / DT)
+    np.testing.assert_allclose(np.mean(forces[-10:], axis=0), (0.0, 0.0, 0.4 * 9.81), atol=4e-3)
+    assert np.abs(states[0].joint_qd.numpy()).max() < 1e-3 and abs(states[0].joint_q.numpy()[0]) < 1e-3
+    assert stage.report.totals.revoked_steps == stage.report.totals.uncertified_steps == 0
 
 
 def test_a_proxy_of_a_coupled_solver_flies_as_a_body_of_the_solve(device):

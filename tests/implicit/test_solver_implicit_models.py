@@ -10,6 +10,7 @@ import warp_bsc as bsc
 from warp_bsc.implicit.solver_implicit import SolverImplicit
 
 DT, GRAVITY = 1.0 / 60.0, 9.81
+TILTED = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.5)
 
 
 def add_table(builder, *, half=0.5, **options):
@@ -228,6 +229,23 @@ def test_barriers_do_not_throw_what_starts_near(rate, on_plane, device):
     assert state.particle_q.numpy()[:, 2].min() > 0.0
 
 
+def test_short_steps_fall_as_fast_as_long_ones(device):
+    """What a step leaves unsolved adds up over many of them: the sheet is curved, stiff and damped, and falls fast."""
+    builder = newton.ModelBuilder()
+    x, y = (k.ravel() for k in np.meshgrid(np.arange(4.0), np.arange(4.0)))
+    corner = np.arange(16).reshape(4, 4)[:-1, :-1].ravel()
+    faces = np.concatenate([[corner, corner + 1, corner + 5], [corner, corner + 5, corner + 4]], axis=1).T
+    curved = {"vertices": np.stack([x, y, 0.3 * x**2], axis=1), "indices": faces.ravel(), "scale": 1.0}
+    at = {"pos": wp.vec3(0.0, 0.0, 10.0), "rot": TILTED, "vel": wp.vec3(0.0, 0.0, -10.0)}
+    material = {"tri_ke": 50.0, "tri_ka": 50.0, "tri_kd": 5.0, "edge_ke": 10.0, "edge_kd": 10.0}
+    builder.add_cloth_mesh(**at, **curved, density=0.02, **material)
+    model = builder.finalize(device=device)
+    _, state = run(model, 60, dt=1.0 / 600.0)
+    mass = model.particle_mass.numpy()
+    velocity = mass @ state.particle_qd.numpy() / mass.sum()
+    assert velocity[2] + 10.0 == pytest.approx(-0.1 * GRAVITY, rel=2e-3)
+
+
 @pytest.mark.parametrize("on_plane", [False, True])
 def test_what_touches_at_the_start_rests(on_plane, device):
     solver, state = run(sheet(device, 0.0, on_plane=on_plane), 20)
@@ -245,6 +263,19 @@ def test_what_crosses_at_the_start_is_named(device):
     assert np.isfinite(state.particle_q.numpy()).all()
     solver, _ = run(sheet(device, -0.02, on_plane=True), 1)
     assert solver.report.excluded == 25
+
+
+def test_forces_of_contacts_of_newton_are_refused(device):
+    """They are in the report; observables that a program does not ask for are none, as of any solver."""
+    model = sheet(device, 0.002)
+    solver, states = SolverImplicit(model), [model.state(), model.state()]
+    contacts = newton.CollisionPipeline(model).contacts()
+    solver.step(*states, None, contacts, DT, observables=None)
+    assert states[1].particle_q.numpy()[:, 2].mean() < 0.002
+    with pytest.raises(NotImplementedError, match="report_contacts=True"):
+        solver.update_contacts(contacts, states[1])
+    with pytest.raises(ValueError, match="contact_f"):
+        solver.observables({"contact_f"})
 
 
 # Abuse
@@ -268,6 +299,37 @@ def test_a_particle_that_is_not_finite_harms_no_other(name, value, device):
     _check_others(state, [12])
     assert solver.report.totals.not_finite_steps > 0
     assert solver.report.certified == (name == "particle_qd")  # which is 0 after the first step
+
+
+@pytest.mark.parametrize("name", ["particle_q", "particle_qd", "particle_f"])
+@pytest.mark.parametrize("mass", [0.001, 0.0])
+@pytest.mark.filterwarnings("ignore:.*not finite", "ignore:.*not certified")
+def test_a_world_with_input_that_is_not_finite_is_not_converged(name, mass, device):
+    """Also of a particle that is solved for alone in its world, or is not; the other world is converged."""
+    builder = newton.ModelBuilder()
+    for world, of_particle in enumerate((0.001, mass)):
+        builder.begin_world()
+        builder.add_particle(wp.vec3(float(world), 0.0, 0.0), wp.vec3(), of_particle)
+        builder.end_world()
+    model = builder.finalize(device=device)
+    solver, _ = run(model, 1, before=lambda state: change(getattr(state, name), 1, np.nan), report_worlds=True)
+    is_used = mass > 0.0 or name != "particle_f"
+    assert solver.report.worlds.converged.numpy().tolist() == [True, not is_used]
+    assert solver.report.converged != is_used and solver.report.unconverged_steps == is_used
+
+
+def test_a_light_cloth_is_solved_for_beside_something_heavy(device):
+    """A linear solve ends by energies, most of which are of what is heavy: one Newton step is as of the cloth alone."""
+    ends = []
+    for others in (0, 1):
+        builder = newton.ModelBuilder()
+        add_patch(builder, 4, 0.04, (0.0, 0.0, 0.0))
+        builder.particle_mass[0] = builder.particle_mass[4] = 0.0
+        for _ in range(others):
+            builder.add_particle(wp.vec3(9.0, 0.0, 0.0), wp.vec3(), 1e3, radius=0.01)
+        _, state = run(builder.finalize(device=device), 1, max_iterations=1)
+        ends.append(state.particle_q.numpy()[:25])
+    np.testing.assert_allclose(ends[1], ends[0], atol=2e-5)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -38,12 +38,14 @@ def _dynamic_bodies(model: newton.Model) -> np.ndarray:
 
 
 def _find_jointed_body(model: newton.Model) -> int | None:
-    """Returns a dynamic body that a joint holds, None if there is none."""
+    """Returns a dynamic body that a joint holds, None if there is none. Joints of proxies are of another solver."""
     if not model.joint_count:
         return None
     holds = host_array(model.joint_enabled) & (host_array(model.joint_type) != newton.JointType.FREE)
     ends = np.concatenate([host_array(model.joint_child)[holds], host_array(model.joint_parent)[holds]])
-    jointed = ends[ends >= 0][_dynamic_bodies(model)[ends[ends >= 0]]]
+    ends = ends[ends >= 0]
+    is_proxy = (host_array(model.body_flags) & BodyFlags.PROXY) != 0
+    jointed = ends[(_dynamic_bodies(model) & ~is_proxy)[ends]]
     return int(jointed[0]) if len(jointed) else None
 
 
@@ -58,8 +60,9 @@ class _Inertia(SolverBase):
             self._bodies.inertia, self._bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
             self._bodies.inverse_mass = model.body_inv_mass
 
-    def step(self, state_in, state_out, control, contacts, dt):
+    def step(self, state_in, state_out, control, contacts, dt, *, observables=None):
         """Writes the positions and velocities that inertia leads to."""
+        self.validate_observables(observables, contacts)
         model = self.model
         if self._bodies is not None:
             inputs = [state_in.body_q, state_in.body_qd, state_in.body_f, model.body_flags, model.gravity]
@@ -95,9 +98,15 @@ class SolverImplicit(SolverCCD):
 
     Free bodies are solved for: they rest on each other, on cloth, on static shapes and on infinite planes, as their
     flags, groups and filters of collision say. Kinematic bodies and those without mass are where the program puts them.
+    In an entry of a coupled solver, proxies are free bodies of their mass, whatever joints hold their sources: what the
+    solve changes of their momentum is fed back. With ``mode="lagged"`` give the coupler two passes or more: with one,
+    proxies that rest on something hard bounce ever higher, by a factor of 1.5 a step in theory; ``"staggered"`` needs
+    one.
 
     Stiffness and reach of barriers follow from masses, edges, radii and elasticity; no option needs tuning. Contacts
-    that are passed to :meth:`step` are not needed, and not used.
+    that are passed to :meth:`step` are not needed, and not used. Where gravity of more than 98.1, or edges of more than
+    0.5 without gravity, tell at construction that lengths are not in metres, speeds that are given in m/s here are
+    scaled, so that a model in centimetres moves as it does in metres.
 
     Each world is stepped as if it were alone, bit for bit as measured on CPUs, but for the distance by which contacts
     that the solve leaves are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
@@ -174,8 +183,8 @@ class SolverImplicit(SolverCCD):
         if jointed is not None:
             raise ValueError(
                 f"a joint holds body {jointed} ({model.body_label[jointed]!r}), and SolverImplicit solves for free "
-                "bodies only: put it into a coupled solver (newton.solvers.experimental.coupled), in which another "
-                "solver moves the bodies, or pass bodies='left' if something else writes their poses"
+                "bodies only: in a coupled solver (newton.solvers.experimental.coupled), give the body and the joint "
+                "to another entry, and this one a proxy of it; or pass bodies='left' if something else writes poses"
             )
         if moves and model.attachment_particle_body_count:
             if _dynamic_bodies(model)[host_array(model.attachment_particle_body_body)].any():
@@ -239,6 +248,13 @@ class SolverImplicit(SolverCCD):
 
     def _measure_strain(self):
         self._meter.measure_step(self._motion.vertices, self.report.last_strain)
+
+    def update_contacts(self, contacts, state=None):
+        """Raises NotImplementedError: the contacts of the solve are no contacts of Newton's pipeline."""
+        raise NotImplementedError(
+            "SolverImplicit does not use Newton's contacts, and has no forces of them: pass report_contacts=True, and "
+            "read report.contacts and the impulses beside it"
+        )
 
     def notify_model_changed(self, flags: int) -> None:
         """Reads masses, materials, gravity and shapes again, see :class:`warp_bsc.SolverCCD`."""

@@ -431,7 +431,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         contacts: Contacts,
         unknowns: Unknowns,
         active: wp.array[int],
-        tolerance: float,
+        tolerance: wp.array[float],
         max_iterations: int,
         team: Team,
         # in and out
@@ -449,7 +449,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         world, block = number // team.blocks, number % team.blocks
         if active[world] == 0:
             return
-        count = solve(matrix, contacts, unknowns, tolerance, max_iterations, team, vectors, world, block)
+        count = solve(matrix, contacts, unknowns, tolerance[world], max_iterations, team, vectors, world, block)
         if block == 0 and lane == 0:
             iterations[world] = iterations[world] + count
 

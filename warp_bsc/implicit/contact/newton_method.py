@@ -15,7 +15,7 @@ from ...detection.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
 from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
-from ...response.state.mesh import host_array
+from ...response.state.mesh import ModelMesh, host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
@@ -50,7 +50,7 @@ _RECOVERY_SPEED = 0.3
 _SMOOTHING_SPEED = 0.5e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
-"""Speed by which no unknown changes any more where a step ends [m/s]."""
+"""Speed by which no unknown changes any more where a step of 1/60 s ends [m/s], proportionally less in shorter ones."""
 _FAR_SPEED = 0.1
 """Speed by which one that changes still is far from its end, so that its world takes more Newton steps [m/s]."""
 _UNIT_SPEED = 1e-5
@@ -59,7 +59,12 @@ _MOST_UNITS, _FAST = 2.0**56, 100.0
 """Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
 _MOST_UNITS_OF_ALL = 2.0**61
 """The same of all particles together: many and fast ones have coarser units."""
+_GRAVITY, _EDGE, _OTHER_UNIT = 9.81, 0.05, 10.0
+"""Usual gravity [m/s^2] and edges [m]; what is that many times as much in a model tells that its unit is no metre."""
 _TOLERANCE = 1e-2
+"""Residual at which a solve ends, as a share of the first: by energies, most of which are of what is heavy."""
+_LIGHT = 0.01, 1e-4
+"""Median of masses as a share of the mean, below which what is light asks for a smaller residual, and down to which."""
 _MAX_ITERATIONS = 200
 LATE_STEPS = 16
 """Newton steps after which a step ends, even if something that a program moves has not arrived."""
@@ -148,6 +153,7 @@ class NewtonMethod:
         self._place = wp.zeros(work.worlds, dtype=int, device=device)
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
         self._settings = BarrierSettings()
+        self._metre = _metre_of(mesh)
         reach = self._reach(mesh)
         self._settings.reach = wp.array(reach, dtype=float, device=device)
         self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
@@ -170,10 +176,13 @@ class NewtonMethod:
         moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
         mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
         total = _of_worlds(np.sum, masses[moves], world[moves], work.worlds, 0.0)
-        units = 1.0 / np.maximum(mass * _UNIT_SPEED**2, total * _FAST**2 / _MOST_UNITS_OF_ALL)
+        units = 1.0 / np.maximum(mass * _UNIT_SPEED**2, total * _FAST**2 / _MOST_UNITS_OF_ALL) / self._metre**2
+        light = _of_worlds(np.median, masses[moves], world[moves], work.worlds, 1.0) / mass
+        tolerance = _TOLERANCE * np.where(light < _LIGHT[0], np.sqrt(np.maximum(light, _LIGHT[1])), 1.0)
+        self._tolerance = wp.array(tolerance, dtype=float, device=device)
         if len(solved):
             heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
-            units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * _FAST**2, 1e-9))
+            units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * (_FAST * self._metre) ** 2, 1e-9))
         self._settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._attachments = attachments_of_model(model)
         self._poses = None if self._attachments is None else wp.clone(model.body_q)
@@ -204,12 +213,9 @@ class NewtonMethod:
         """Returns the gap from which each vertex pushes [m], infinite for shapes."""
         model, particles = mesh.model, mesh.model.particle_count
         reach = np.full(mesh.vertex_count, np.inf)
-        x = np.zeros((mesh.vertex_count, 3))
-        x[:particles] = model.particle_q.numpy() if particles else 0.0
-        edges = mesh.edges[(mesh.edges < particles).all(axis=1)]
-        lengths = np.linalg.norm(x[edges[:, 1]] - x[edges[:, 0]], axis=1)
-        world = mesh.device_world.numpy()
-        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, _USUAL_REACH / _REACH_OF_EDGE)
+        edges, lengths = _edges_of_particles(mesh)
+        world, least = mesh.device_world.numpy(), self._metre * _USUAL_REACH
+        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, least / _REACH_OF_EDGE)
         reach[:particles] = _REACH_OF_EDGE * usual[world[:particles]]
         for k in range(2):
             np.minimum.at(reach, edges[:, k], _SHORT_EDGE * lengths)
@@ -281,12 +287,16 @@ class NewtonMethod:
         if self._mesh.model.tet_count and not self._work.device.is_capturing:
             self._settings.elasticity.assign(self._elasticity(self._mesh))
 
+    @property
+    def _least_speed(self):
+        return self._metre * _LEAST_SPEED * min(1.0, 60.0 * self._dt)
+
     def _begin(self, end, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
         self._settings.dt = dt
-        self._settings.recovery = _RECOVERY_SPEED * dt
-        self._settings.smoothing = _SMOOTHING_SPEED * dt
+        self._settings.recovery = self._metre * _RECOVERY_SPEED * dt
+        self._settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
         self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
         if self._attachments is not None:
             inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
@@ -320,8 +330,8 @@ class NewtonMethod:
             self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
         inputs = [self._trial, self._unknowns, self._dt]
-        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end])
-        inputs = [self.progress, self._dt, _LEAST_SPEED, self._lacks]
+        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end, self.progress])
+        inputs = [self.progress, self._dt, self._least_speed, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
     def _renew_candidates(self):
@@ -398,7 +408,7 @@ class NewtonMethod:
             self._contacts,
             self._unknowns,
             self.progress.solving,
-            _TOLERANCE,
+            self._tolerance,
             _MAX_ITERATIONS,
             team,
         ]
@@ -415,7 +425,7 @@ class NewtonMethod:
 
     def _launch_advance(self):
         work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
-        changes = float(_LEAST_SPEED * self._dt), float(_FAR_SPEED * self._dt)
+        changes = float(self._least_speed * self._dt), float(self._metre * _FAR_SPEED * self._dt)
         inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most]
         options = {"device": work.device, "block_dim": self._block}
         wp.launch(ADVANCE[self._block], self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
@@ -432,6 +442,21 @@ class NewtonMethod:
     def _launch_over_bodies(self, kernel, inputs):
         """Launches a kernel over the bodies, with those of the solve as its last argument, if there are any."""
         self._launch(kernel, len(self._bodies.unknown), inputs, [self._bodies])
+
+
+def _edges_of_particles(mesh: ModelMesh) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the edges between particles, shape [n, 2], and their lengths in the model, shape [n]."""
+    edges = mesh.edges[(mesh.edges < mesh.model.particle_count).all(axis=1)]
+    ends = host_array(mesh.model.particle_q)[edges] if len(edges) else np.zeros((0, 2, 3))
+    return edges, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+
+
+def _metre_of(mesh: ModelMesh) -> float:
+    """Returns how many units of length of a model are a metre: as its gravity tells, or its edges if it has none."""
+    gravity = np.linalg.norm(host_array(mesh.model.gravity), axis=1).max()
+    lengths = _edges_of_particles(mesh)[1]
+    metre = gravity / _GRAVITY if gravity > 0.0 or not len(lengths) else np.median(lengths) / _EDGE
+    return float(metre) if metre > _OTHER_UNIT else 1.0
 
 
 def _of_worlds(function, values: np.ndarray, world: np.ndarray, worlds: int, default: float) -> np.ndarray:

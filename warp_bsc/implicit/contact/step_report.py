@@ -47,7 +47,8 @@ def write_results(
     """
     w = wp.tid()
     arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
-    converged = progress.steps[w] == 0 or (arrived and lacks[0] == 0 and change_left(progress, w) <= least_speed * dt)
+    converged = arrived and lacks[0] == 0 and change_left(progress, w) <= least_speed * dt
+    converged = wp.isfinite(progress.change[w]) and (progress.steps[w] == 0 or converged)
     results.newton_steps[w] = progress.steps[w]
     results.last_change[w] = progress.change[w] / dt
     results.arrived[w] = arrived
@@ -78,16 +79,20 @@ class ImplicitStepReport(SolverReport):
 
     @property
     def last_change(self) -> float:
-        """Largest change of the velocity of a particle by the last Newton step of a world in the last step [m/s]."""
+        """Largest change of the velocity of a particle by the last Newton step of a world in the last step [m/s].
+
+        It is infinite where a position, a velocity or a force was not finite.
+        """
         return self._read(self.results.last_change)
 
     @property
     def converged(self) -> bool:
         """Whether the Newton steps of all worlds sufficed for the last step.
 
-        It is false if velocities are farther than 1 mm/s from where the changes of the last two Newton steps lead, if
-        :attr:`arrived` is false, and if pairs that are near each other did not fit into the buffers of a CUDA graph.
-        Such a step is free of collisions all the same, if it is certified; it lags behind its forces.
+        It is false if velocities are farther than 1 mm/s, in steps of less than 1/60 s proportionally less, from where
+        the changes of the last two Newton steps lead, if a position, a velocity or a force was not finite, if
+        :attr:`arrived` is false, and if pairs that are near each other did not fit into the buffers of a CUDA graph. A
+        step that is not converged is free of collisions all the same, if it is certified; it lags behind its forces.
         """
         return bool(self.results.converged.numpy().all())
 

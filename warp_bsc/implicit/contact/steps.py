@@ -378,10 +378,16 @@ def finish(
     motion: Motion,
     vertices: Vertices,
     end: StateArrays,
+    progress: Progress,
 ):
-    """Writes where the step ends, and the predicted velocity with what the step has added to it."""
+    """Writes where the step ends, and the predicted velocity with what the step has added to it.
+
+    The change is infinite in worlds with a vertex whose prediction is not finite.
+    """
     v = wp.tid()
     x = trial.x[v]
+    if motion.is_not_finite[v] != 0:
+        progress.change[motion.world[v]] = wp.inf
     if not is_solved(unknowns, v):
         return
     # not by the way from the start, which in short steps is rounding
