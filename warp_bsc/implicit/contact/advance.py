@@ -228,7 +228,7 @@ def _over_pairs(
 
 
 @wp.func
-def _differentiate(i: int, order: int, p: Problem, motion: Motion, settings: BarrierSettings):
+def _differentiate(i: int, order: int, p: Problem, motion: Motion, settings: BarrierSettings, far_change: float):
     kind = elasticity.kind_of(p.elements, i)
     world = motion.world[elasticity.first_vertex(p.elements, kind, i - p.elements.first[kind])]
     if p.progress.solving[world] == 0:
@@ -236,7 +236,8 @@ def _differentiate(i: int, order: int, p: Problem, motion: Motion, settings: Bar
     if order == 1:
         elasticity.find_gradient(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, p.derivatives)
     else:
-        elasticity.find_hessian(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, True, p.derivatives)
+        is_far = decisions.is_far(world, far_change, p.progress)
+        elasticity.find_hessian(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, is_far, p.derivatives)
 
 
 @wp.func
@@ -305,9 +306,9 @@ def _advance(
             for k in range(from_end, p.contacts.bucket.shape[0], n):
                 p.contacts.bucket[k] = 0
             for i in range(spread, p.element_count, n):
-                _differentiate(i, 1, p, motion, settings)
+                _differentiate(i, 1, p, motion, settings, far_change)
             for i in range((spread + n // 4) % n, p.element_count, n):
-                _differentiate(i, 2, p, motion, settings)
+                _differentiate(i, 2, p, motion, settings, far_change)
             for i in range((spread + n // 2) % n, p.element_count, n):
                 _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)
             phase = int(Phase.LOADS)

@@ -97,12 +97,23 @@ def choose_truncation(w: int, whole: wp.array[float], progress: Progress):
 
 
 @wp.func
+def is_far(w: int, far_change: float, progress: Progress) -> bool:
+    """Returns whether a world may be far from its end: in its first Newton step, or after a large change or none.
+
+    Hessians of elements are then without what curves downwards, so that the energy falls. Near the end they are exact:
+    compressed cloth is softer than without, and changes would become less by a half or less in each Newton step.
+    """
+    before = progress.before[w]
+    return progress.steps[w] == 0 or before > far_change or before < 0.0
+
+
+@wp.func
 def begin_newton_step(w: int, progress: Progress):
     """Clears what a Newton step measures of a world."""
     progress.solving[w] = progress.active[w]
     if progress.active[w] == 0:
         return
-    progress.before[w] = progress.change[w]
+    progress.before[w] = wp.where(progress.scale[w] > 0.0, progress.scale[w] * progress.change[w], -1.0)
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
     progress.cuts[w] = 0
@@ -156,7 +167,7 @@ def _end_step(
     They are twice as many where unknowns change by more than ``far_change``, as in impacts, and are counted from when
     what a program moves arrives, if it does.
     """
-    scale = progress.scale[w]
+    scale, was_far = progress.scale[w], is_far(w, far_change, progress)
     plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
     progress.steps[w] = progress.steps[w] + 1
     arrived = scale == 1.0 or progress.remaining[w] == 0.0
@@ -166,7 +177,7 @@ def _end_step(
     most = wp.where(progress.change[w] > far_change, 2 * max_steps, max_steps)
     ends = arrived and (change_left(progress, w) <= least_change or steps - progress.late[w] >= most)
     if scale == 0.0 and arrived:
-        ends = True
+        ends = ends or was_far
     if ends or (steps >= max_late_steps and not arrived):
         progress.active[w] = 0
         progress.solving[w] = 0

@@ -52,7 +52,7 @@ _SMOOTHING_SPEED = 0.5e-3
 _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step of 1/60 s ends [m/s], proportionally less in shorter ones."""
 _FAR_SPEED = 0.1
-"""Speed by which one that changes still is far from its end, so that its world takes more Newton steps [m/s]."""
+"""Speed by which one that changes still is far from its end [m/s]: see ``is_far``, and more Newton steps follow."""
 _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
 _MOST_UNITS, _FAST = 2.0**56, 100.0

@@ -62,7 +62,8 @@ class Progress:
         trial: Energy at the displaced positions, in units.
         uncut: The same, before displacements of single vertices are cut.
         cuts: 1 if those are cut.
-        change, before: Largest displacement of an unknown in the Newton step, and in the one before it [m].
+        change: Largest displacement of an unknown in the Newton step [m].
+        before: The same in the one before it, as far as it was taken, -1 if it was not [m].
         way: How far a vertex has been, or is led by the displacements, from where it was at the start of the
             step [m]; the last is that of what a program moves, of all worlds.
         remaining: Largest way of what a program moves that is left [m].
