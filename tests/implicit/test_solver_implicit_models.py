@@ -329,7 +329,7 @@ def test_a_light_cloth_is_solved_for_beside_something_heavy(device):
             builder.add_particle(wp.vec3(9.0, 0.0, 0.0), wp.vec3(), 1e3, radius=0.01)
         _, state = run(builder.finalize(device=device), 1, max_iterations=1)
         ends.append(state.particle_q.numpy()[:25])
-    np.testing.assert_allclose(ends[1], ends[0], atol=2e-5)
+    np.testing.assert_allclose(ends[1], ends[0], atol=2e-4)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

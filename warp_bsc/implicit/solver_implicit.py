@@ -25,7 +25,7 @@ from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.step_report import ImplicitStepReport, StepResults
 
-MAX_STEPS = 4
+MAX_STEPS = 10
 """Newton steps of a step: after 48 steps, cloth across the edge of a box is 1.2 mm from where more would have it."""
 
 
@@ -121,7 +121,7 @@ class SolverImplicit(SolverCCD):
         mesh: The triangles that collide, :class:`.response.state.mesh.ModelMesh`.
         report: What a step found and did, :class:`.contact.step_report.ImplicitStepReport`.
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
-        max_iterations: Newton steps of a step, twice as many at most.
+        max_iterations: Newton steps of a step at most.
     """
 
     _near = 0.0  # barriers do that
@@ -159,10 +159,9 @@ class SolverImplicit(SolverCCD):
             particle_radius: Radius of each particle [m], or one for all.
             collision_filter: Groups and masks of particles and shapes.
             inversions: What happens to tetrahedra that invert: ``"left"``, ``"reported"`` or ``"prevented"``.
-            max_iterations: Newton steps of a step at most, twice as many while velocities change by more than 0.1 m/s,
-                as in impacts. Fewer bound the time of a step, and let cloth lag behind its forces;
-                ``report.converged`` says whether they sufficed. While something that a program moves is on its way, a
-                step takes up to 16.
+            max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
+                hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
+                whether they sufficed. While something that a program moves is on its way, a step takes up to 16.
             report_contacts: Whether ``report`` has the contacts of each step, with the impulses of barriers and
                 friction at its end; a number is that of the contacts that are listed at most.
             report_worlds: Whether ``report.worlds`` has results by world.

@@ -164,8 +164,7 @@ def _end_step(
 ):
     """Ends a world whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one.
 
-    They are twice as many where unknowns change by more than ``far_change``, as in impacts, and are counted from when
-    what a program moves arrives, if it does.
+    They are counted from when what a program moves arrives, if it does.
     """
     scale, was_far = progress.scale[w], is_far(w, far_change, progress)
     plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
@@ -174,8 +173,7 @@ def _end_step(
     steps = progress.steps[w]
     if progress.remaining[w] > 0.0:
         progress.late[w] = steps - 1
-    most = wp.where(progress.change[w] > far_change, 2 * max_steps, max_steps)
-    ends = arrived and (change_left(progress, w) <= least_change or steps - progress.late[w] >= most)
+    ends = arrived and (change_left(progress, w) <= least_change or steps - progress.late[w] >= max_steps)
     if scale == 0.0 and arrived:
         ends = ends or was_far
     if ends or (steps >= max_late_steps and not arrived):

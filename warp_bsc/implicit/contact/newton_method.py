@@ -52,7 +52,7 @@ _SMOOTHING_SPEED = 0.5e-3
 _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step of 1/60 s ends [m/s], proportionally less in shorter ones."""
 _FAR_SPEED = 0.1
-"""Speed by which one that changes still is far from its end [m/s]: see ``is_far``, and more Newton steps follow."""
+"""Speed by which one that changes still is far from its end [m/s], see ``is_far``."""
 _UNIT_SPEED = 1e-5
 """Speed of a particle whose kinetic energy is about a unit of energy [m/s]."""
 _MOST_UNITS, _FAST = 2.0**56, 100.0
@@ -85,7 +85,7 @@ class NewtonMethod:
 
         Args:
             work: The workspace of the steps: motion, mesh and detection.
-            max_steps: Newton steps of a step at most, but for twice as many where velocities still change much.
+            max_steps: Newton steps of a step at most.
             results: Where solves write what they did.
             unconverged_steps: Where they count steps in which a world did not converge.
         """
