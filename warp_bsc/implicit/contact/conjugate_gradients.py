@@ -1,4 +1,11 @@
-"""Conjugate gradients that stop at negative curvature, each world by one block of threads."""
+"""Conjugate gradients that stop at negative curvature, each world by one block of threads.
+
+Both sums of an iteration are of one product, so that threads wait for each other once for them.
+
+References:
+    A. T. Chronopoulos and C. W. Gear, s-step iterative methods for symmetric linear systems, Journal of Computational
+    and Applied Mathematics 25(2), 1989, doi:10.1016/0377-0427(89)90045-9.
+"""
 
 import functools
 
