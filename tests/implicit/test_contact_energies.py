@@ -30,6 +30,21 @@ from warp_bsc.response.state.structs import Motion, allocate
 
 
 @wp.kernel(enable_backward=False)
+def _differentiate(
+    elements: Elements,
+    x: wp.array[wp.vec3d],
+    x0: wp.array[wp.vec3],
+    dt: wp.float64,
+    is_convex: bool,
+    out: Derivatives,
+):
+    i = wp.tid()
+    kind = elasticity.kind_of(elements, i)
+    elasticity.find_gradient(i, kind, elements, x, x0, dt, out)
+    elasticity.find_hessian(i, kind, elements, x, x0, dt, is_convex, out)
+
+
+@wp.kernel(enable_backward=False)
 def _add_blocks(
     derivatives: Derivatives,
     contacts: Contacts,
@@ -102,10 +117,8 @@ class Scene:
         """Returns the derivatives of all elements, on the device."""
         device = self.model.device
         out = make_derivatives(self.vertices, device)
-        world = wp.zeros(self.model.particle_count, dtype=int, device=device)
-        flags = [self.array([1], int), self.array([int(convex)], int)]
-        inputs = [self.elements, self.array(self.x, wp.vec3d), self.array(self.x0), wp.float64(DT), world, *flags]
-        wp.launch(elasticity.differentiate, self.count, inputs=inputs, outputs=[out], device=device)
+        inputs = [self.elements, self.array(self.x, wp.vec3d), self.array(self.x0), wp.float64(DT), convex]
+        wp.launch(_differentiate, self.count, inputs=inputs, outputs=[out], device=device)
         return out
 
     def differentiated(self):

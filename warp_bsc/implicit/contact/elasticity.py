@@ -77,7 +77,7 @@ class Elements:
 
 @wp.struct
 class Derivatives:
-    """What :func:`differentiate` computes.
+    """What :func:`find_gradient` and :func:`find_hessian` compute.
 
     Attributes:
         gradient: Of each corner of each element [N], shape [corners].
@@ -687,32 +687,6 @@ def store_hessian(
         _store_spring_hessian(elements, e, x, x0, dt, is_convex, blocks)
 
 
-@wp.kernel
-def differentiate(
-    # in
-    elements: Elements,
-    x: wp.array[wp.vec3d],
-    x0: wp.array[wp.vec3],
-    dt: wp.float64,
-    world: wp.array[int],
-    active: wp.array[int],
-    convex: wp.array[int],
-    # out
-    out: Derivatives,
-):
-    """Computes the gradient and the Hessian of each element, in active worlds.
-
-    The Hessian of bending is that of Gauss and Newton: without the curvature of the angle. In ``convex`` worlds, those
-    of others are without their negative curvature too, or more.
-    """
-    i = wp.tid()
-    kind = kind_of(elements, i)
-    in_world = world[first_vertex(elements, kind, i - elements.first[kind])]
-    if active[in_world] != 0:
-        find_gradient(i, kind, elements, x, x0, dt, out)
-        find_hessian(i, kind, elements, x, x0, dt, convex[in_world] != 0, out)
-
-
 @wp.func
 def find_gradient(
     i: int,
@@ -751,6 +725,9 @@ def find_hessian(
     is_convex: bool,
     out: Derivatives,
 ):
-    """Computes the Hessian of an element, for bending as :func:`find_gradient` does."""
+    """Computes the Hessian of an element, convex or exact; that of bending is made of what :func:`find_gradient` finds.
+
+    The latter is that of Gauss and Newton: without the curvature of the angle.
+    """
     if kind != ElementKind.BENDING:
         store_hessian(elements, kind, i - elements.first[kind], x, x0, dt, is_convex, out.block)
