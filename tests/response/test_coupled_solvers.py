@@ -101,7 +101,10 @@ def test_a_proxy_flies_as_a_body_of_the_inner_solver_does(inner, mass, mode, ite
     assert (state.particle_q.numpy()[:, 2] < -0.01).any()
 
 
-@pytest.mark.parametrize("mode, iterations, mass", [("lagged", 1, 0.02), ("staggered", 1, 0.2), ("staggered", 2, 0.2)])
+@pytest.mark.parametrize(
+    "mode, iterations, mass",
+    [("lagged", 1, 0.02), ("staggered", 1, 0.2), pytest.param("staggered", 2, 0.2, marks=pytest.mark.slow)],
+)
 def test_a_step_is_certified_in_the_state_of_the_program(mode, iterations, mass, device):
     """If, and only if, exact detection finds that state free; until it is seen, the step is not certified."""
     model = ball_over_sheet(device, mass)
