@@ -305,6 +305,7 @@ def stop(monkeypatch, scene, folder, at, *options):
     assert len(json.loads((folder / "hits.json").read_bytes())["intervals"]) == at
 
 
+@pytest.mark.slow
 def test_resumed(troubled, alone, tmp_path, monkeypatch, capsys):
     at, in_workers = 18, ("--workers", "2")
     folder = tmp_path / "stopped"

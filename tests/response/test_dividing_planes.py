@@ -445,7 +445,7 @@ def test_what_is_pressed_onto_the_ground_does_not_come_ever_nearer(device):
 
     solver = bsc.SolverCCD(Changed(model, press))
     state, end = model.state(), model.state()
-    for _ in range(150):
+    for _ in range(90):
         height = max(0.8 * height, 5e-6)
         solver.step(state, end, None, None, DT)
         state, end = end, state
