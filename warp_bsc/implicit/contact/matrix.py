@@ -19,7 +19,6 @@ class Matrix:
 
     Attributes:
         width: Threads of a group.
-        parts: Threads that share a row.
         group: First group of each world.
         first: First entry of each group, and the end of the last: as many as its threads have blocks at most.
         column: Unknown of each entry of each thread, -1 where a thread has fewer.
@@ -28,7 +27,6 @@ class Matrix:
     """
 
     width: int
-    parts: int
     group: wp.array[int]
     first: wp.array[int]
     column: wp.array[int]
@@ -46,7 +44,7 @@ def make_matrix(rows: Rows, of_worlds: np.ndarray, parts: int, device: wp.Device
         device: Where to put it.
     """
     matrix = Matrix()
-    matrix.width, matrix.parts = 32 if device.is_cuda else 1, parts
+    matrix.width = 32 if device.is_cuda else 1
     first_block, column = rows.first.numpy().astype(np.int64), rows.column.numpy()
     sizes = np.diff(of_worlds)
     group = np.append(0, np.cumsum(-(-sizes * parts // matrix.width)))
