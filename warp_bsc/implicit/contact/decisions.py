@@ -140,32 +140,22 @@ def decide(
     progress: Progress,
     plane_share: wp.array[float],
 ):
-    """Halves the share of a world that searches and has not taken it, or ends its Newton step."""
-    if takes(w, progress):
-        progress.searches[w] = 0
-        _end_step(w, least_change, far_change, max_steps, max_late_steps, progress, plane_share)
-    elif progress.searches[w] != 0:
+    """Halves the share of a world that searches and has not taken it, or ends its Newton step.
+
+    A world ends whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one. They
+    are counted from when what a program moves arrives, if it does.
+    """
+    takes_share = takes(w, progress)
+    progress.trial[w] = wp.int64(0)
+    if progress.searches[w] == 0:
+        return
+    if not takes_share:
         progress.scale[w] = 0.5 * progress.scale[w]
         if progress.scale[w] < _LEAST_SCALE:
             progress.scale[w] = 0.0
         progress.flags[Flag.SEARCHES] = 1
-    progress.trial[w] = wp.int64(0)
-
-
-@wp.func
-def _end_step(
-    w: int,
-    least_change: float,
-    far_change: float,
-    max_steps: int,
-    max_late_steps: int,
-    progress: Progress,
-    plane_share: wp.array[float],
-):
-    """Ends a world whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one.
-
-    They are counted from when what a program moves arrives, if it does.
-    """
+        return
+    progress.searches[w] = 0
     scale, was_far = progress.scale[w], is_far(w, far_change, progress)
     plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
     progress.steps[w] = progress.steps[w] + 1
