@@ -106,7 +106,8 @@ class Problem:
         leaves: 1 for each world of which a vertex leaves its box, and for any, last.
         lacks: See :func:`.step_report.write_results`.
         vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
-        parts: Threads that share a row or a block.
+        parts: Threads that share rows and blocks.
+        turns: Rows or blocks that they share, one after the other, no more than they are.
         grows: 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs.
     """
 
@@ -135,6 +136,7 @@ class Problem:
     element_count: int
     vertices_at_planes: int
     parts: int
+    turns: int
     grows: int
 
 
@@ -182,7 +184,9 @@ def _over_pairs(
     n: int,
 ):
     group = 1 + solves
-    for i in range(t, p.candidates.count[0], n):
+    near_count = p.candidates.near[0]
+    for k in range(t, near_count + p.candidates.far[0], n):
+        i = wp.where(k < near_count, k, p.candidates.corners.shape[0] - 1 - (k - near_count))
         if task == Task.FIND_NEAR:
             near.find_near(i, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
         elif task == Task.HOLD:
@@ -341,8 +345,8 @@ def _advance(
             _over_pairs(task, passes > 0, p, motion, planes, settings, solves, t, n)
             phase = then
         elif phase == Phase.COUNT:
-            for k in range(t, p.parts * contact_count(p.contacts), n):
-                i, part = k // p.parts, k % p.parts
+            for k in range(t, p.contacts.parts * contact_count(p.contacts), n):
+                i, part = k // p.contacts.parts, k % p.contacts.parts
                 if solves == 0:
                     merge.merge_contact(i, part, p.contacts)
                 if part == 0:
@@ -367,8 +371,8 @@ def _advance(
                     contact_lists.sort_entries(i, p.contacts)
             phase = int(Phase.BLOCKS)
         elif phase == Phase.BLOCKS:
-            for i in range(t, p.parts * p.row_of_block.shape[0], n):
-                assembly.add_block(
+            for i in range(t, p.parts * ((p.row_of_block.shape[0] + p.turns - 1) // p.turns), n):
+                assembly.add_blocks(
                     i,
                     p.derivatives,
                     p.contacts,
@@ -382,11 +386,12 @@ def _advance(
                     progress,
                     p.rows,
                     p.parts,
+                    p.turns,
                     p.matrix,
                 )
             phase = int(Phase.ASSEMBLE)
         elif phase == Phase.ASSEMBLE:
-            for i in range(t, p.parts * unknowns, n):
+            for i in range(t, p.parts * ((unknowns + p.turns - 1) // p.turns), n):
                 assembly.assemble(
                     i,
                     p.derivatives,
@@ -402,6 +407,7 @@ def _advance(
                     p.rows,
                     p.matrix,
                     p.parts,
+                    p.turns,
                     p.vectors,
                 )
             for w in range(t, worlds + 1, n):

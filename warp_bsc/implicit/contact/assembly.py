@@ -51,7 +51,7 @@ def _inertia(
 
 
 @wp.func
-def add_block(
+def add_blocks(
     i: int,
     derivatives: Derivatives,
     contacts: Contacts,
@@ -65,24 +65,34 @@ def add_block(
     progress: Progress,
     rows: Rows,
     parts: int,
+    turns: int,
     matrix: Matrix,
 ):
-    """Adds up a block of elements, of contacts that do not couple, and of inertia, in worlds that solve.
+    """Adds up blocks of elements, of contacts that do not couple, and of inertia, in worlds that solve.
 
-    So many threads share a block, as here and there an unknown has very many contacts.
+    So many threads share as many blocks as they take ``turns``: they add up the contacts of one after the other
+    together, as here and there an unknown has very many, and the rest each for one.
     """
-    k, part = i // parts, i % parts
-    u, v = row_of_block[k], rows.column[k]
-    if progress.solving[unknowns.world[u]] == 0:
-        return
-    total = block_sum_of_parts(contact_block(contacts, unknowns, u, v, part, parts), parts)
-    if part != 0:
-        return
-    total += sum_of_blocks(rows, derivatives, k)
-    if u == v and unknowns.is_free[u] != 0:
-        _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
-        total += inertia
-    set_block(matrix, k, total)
+    first, part = i // parts * turns, i % parts
+    own, total = first + part, wp.mat33()
+    is_own = part < turns and own < row_of_block.shape[0]
+    if is_own:
+        is_own = progress.solving[unknowns.world[row_of_block[own]]] != 0
+    if is_own:
+        u = row_of_block[own]
+        total = sum_of_blocks(rows, derivatives, own)
+        if u == rows.column[own] and unknowns.is_free[u] != 0:
+            _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
+            total += inertia
+    for k in range(first, wp.min(first + turns, row_of_block.shape[0])):
+        u = row_of_block[k]
+        if contacts.first[u] < contacts.middle[u] and progress.solving[unknowns.world[u]] != 0:
+            of_contacts = contact_block(contacts, unknowns, u, rows.column[k], part, parts)
+            of_contacts = block_sum_of_parts(of_contacts, parts)
+            if k == own:
+                total += of_contacts
+    if is_own:
+        set_block(matrix, own, total)
 
 
 @wp.func
@@ -101,33 +111,40 @@ def assemble(
     rows: Rows,
     matrix: Matrix,
     parts: int,
+    turns: int,
     vectors: Vectors,
 ):
-    """Computes the gradient of the energy by an unknown, and what preconditions, in worlds that solve.
+    """Computes the gradient of the energy by unknowns, and what preconditions, in worlds that solve.
 
     The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
-    ways. Later ones go on from where they are. So many threads share an unknown.
+    ways. Later ones go on from where they are. Threads share unknowns as blocks in :func:`add_blocks`.
     """
-    u, part = i // parts, i % parts
-    if progress.solving[unknowns.world[u]] == 0:
+    first, part = i // parts * turns, i % parts
+    own, count = first + part, unknowns.world.shape[0]
+    gradient, block = wp.vec3(), wp.mat33()
+    for u in range(first, wp.min(first + turns, count)):
+        if contacts.first[u] < contacts.end[u] and progress.solving[unknowns.world[u]] != 0:
+            of_contacts, of_coupled = contact_gradient(contacts, unknowns, u, part, parts)
+            of_contacts, of_coupled = sum_of_parts(of_contacts, parts), block_sum_of_parts(of_coupled, parts)
+            if u == own:
+                gradient, block = of_contacts, of_coupled
+    if part >= turns or own >= count:
         return
-    if unknowns.is_free[u] == 0:
+    if progress.solving[unknowns.world[own]] == 0:
+        return
+    if unknowns.is_free[own] == 0:
         if begins:
-            vectors.gradient[u] = wp.vec3()
-            vectors.solution[u] = wp.vec3()
-            if unknowns.particle[u] >= 0:
-                vectors.solution[u] = trial.displaced[unknowns.particle[u]]
-            vectors.inverse[u] = wp.mat33()
+            vectors.gradient[own] = wp.vec3()
+            vectors.solution[own] = wp.vec3()
+            if unknowns.particle[own] >= 0:
+                vectors.solution[own] = trial.displaced[unknowns.particle[own]]
+            vectors.inverse[own] = wp.mat33()
         return
-    gradient, block = contact_gradient(contacts, unknowns, u, part, parts)
-    gradient, block = sum_of_parts(gradient, parts), block_sum_of_parts(block, parts)
-    if part != 0:
-        return
-    pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
-    vectors.gradient[u] = gradient + sum_of_corners(rows, derivatives, u) + pull
-    vectors.inverse[u] = _inverse(block_of(matrix, rows.first[u]) + block, wp.min(wp.get_diag(inertia)))
+    pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, own)
+    vectors.gradient[own] = gradient + sum_of_corners(rows, derivatives, own) + pull
+    vectors.inverse[own] = _inverse(block_of(matrix, rows.first[own]) + block, wp.min(wp.get_diag(inertia)))
     if begins:
-        vectors.solution[u] = wp.vec3()
+        vectors.solution[own] = wp.vec3()
 
 
 @wp.func

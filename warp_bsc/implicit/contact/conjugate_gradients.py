@@ -54,8 +54,10 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int,
         threads = min(_LARGEST_BLOCK, max(64, -(-team.parts * unknowns // 32) * 32))
         most = min(_BLOCKS, device.sm_count)
         if not shared and worlds <= most // 2:
-            team.parts, threads = 4, _BLOCK
-            team.blocks = min(most // worlds, -(-team.parts * unknowns // _BLOCK))
+            team.parts, threads, most = 4, _BLOCK, most // worlds
+            while team.parts < 32 and 2 * team.parts * unknowns <= most * _BLOCK:
+                team.parts *= 2
+            team.blocks = min(most, -(-team.parts * unknowns // _BLOCK))
     team.arrived = wp.zeros(worlds, dtype=int, device=device)
     team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=float, device=device)
     bounds = min(size for size in _KEPT if threads <= size)
@@ -105,7 +107,7 @@ _SOLVE = """
 #else
     float* preconditioned = (float*)(vectors.preconditioned.data + first);
 #endif
-    __shared__ float shared_inverses[INVERSES + 1], sums_of_warps[2][32];
+    __shared__ float shared_inverses[INVERSES + 1], sums_of_warps[2][32], sums_of_blocks[2];
     __shared__ float shared_pulls[3 * COUPLED], coupled_blocks[9 * COUPLED], entry_weight[ENTRIES];
     __shared__ float4 coupled_weights[COUPLED];
     __shared__ int4 coupled_columns[COUPLED];
@@ -161,11 +163,20 @@ _SOLVE = """
             of_blocks[2 * block + 1] = b;
         }
         wait();
-        a = b = 0.0f;
-        for (int other = 0; other < blocks; ++other) {
-            a += of_blocks[2 * other];
-            b += of_blocks[2 * other + 1];
+        if (lane < 32) {
+            a = b = 0.0f;
+            for (int other = lane; other < blocks; other += 32) {
+                a += of_blocks[2 * other];
+                b += of_blocks[2 * other + 1];
+            }
+            for (int offset = 16; offset; offset >>= 1) {
+                a += __shfl_xor_sync(~0u, a, offset);
+                b += __shfl_xor_sync(~0u, b, offset);
+            }
+            if (lane == 0) sums_of_blocks[0] = a, sums_of_blocks[1] = b;
         }
+        __syncthreads();
+        a = sums_of_blocks[0], b = sums_of_blocks[1];
     };
     const unsigned sharers = (parts == 32 ? ~0u : (1u << parts) - 1u) << (lane & 31 & ~(parts - 1));
     auto sum_of_parts = [&](float value) INLINE {
@@ -313,7 +324,7 @@ _SOLVE = """
                 total[c] += v[3 * c * width] * d[0] + v[(3 * c + 1) * width] * d[1] + v[(3 * c + 2) * width] * d[2];
         }
 #if defined(__CUDA_ARCH__)
-        // loops that are not unrolled: with more code here, the blocks above are in local memory instead of registers
+        // loops that are not unrolled where blocks above would be in local memory instead of registers by more code here
 #pragma unroll 1
         for (int n = own_first; n < own_first + own_count; ++n) {
             const float weight = entry_weight[n];
@@ -322,8 +333,9 @@ _SOLVE = """
 #endif
         if (coupled && own_count < 0) {
             const bool of_body = unknowns.particle.data[u] < 0;
-#pragma unroll 1
-            for (int n = contacts.middle.data[u] + part; n < contacts.end.data[u]; n += parts) {
+            const int end = contacts.end.data[u];
+#pragma unroll UNROLLED
+            for (int n = contacts.middle.data[u] + part; n < end; n += parts) {
                 const float* by = pulls + 3 * contacts.pulled.data[n];
                 const float weight = contacts.entry_weight.data[n];
                 wp::vec3 force(weight * by[0], weight * by[1], weight * by[2]);
@@ -416,7 +428,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
     sizes = {"SHARED": int(shared), "WIDE": 4 if shared else 3, "THREADS": bounds, "PARTS": parts, "KEPT": kept}
     # in shared memory, of which a block has 48 KiB
     sizes["INVERSES"] = 9 * bounds if kept and shared and bounds == min(_KEPT) else 0
-    sizes |= {"COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED}
+    sizes |= {"COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED, "UNROLLED": 1 if shared else 4}
     snippet = functools.reduce(lambda text, name: text.replace(name, str(sizes[name])), sizes, _SOLVE)
 
     @wp.func_native(snippet=snippet)

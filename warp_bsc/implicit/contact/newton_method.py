@@ -36,7 +36,7 @@ _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 _PARTS = 8
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
 _MANY_VERTICES = 8192
-"""Vertices from which on threads have several pairs each: blocks have twice as many then."""
+"""Vertices from which on threads have several pairs each: blocks have twice as many then, and threads share less."""
 _CONTACTS = 64
 """Contacts that fit at first, for each unknown: many times fewer than candidates in a pile, and of far more bytes."""
 _REACH_OF_EDGE = 0.1
@@ -190,7 +190,8 @@ class NewtonMethod:
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
         self._flow = allocate(Flow, 1, device)
-        self._block = 512 if device.is_cuda and vertices > _MANY_VERTICES else 256
+        self._is_many = device.is_cuda and vertices > _MANY_VERTICES
+        self._block = 512 if self._is_many else 256
         self._advancing = device.sm_count * self._block if device.is_cuda else 1
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
@@ -203,6 +204,7 @@ class NewtonMethod:
         p.element_count = sum(map(len, of_elements))
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1
+        p.turns = _PARTS if self._is_many else 1
         self._queues: list[PairQueue] = []
         self._captured, self._retired = False, []
         self._candidates, self._contacts = Candidates(), Contacts()
@@ -354,7 +356,8 @@ class NewtonMethod:
         self._prepare_candidates()
 
     def _prepare_candidates(self):
-        self._candidates.count.zero_()
+        self._candidates.near.zero_()
+        self._candidates.far.zero_()
         inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings, self.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
@@ -369,16 +372,19 @@ class NewtonMethod:
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self._candidates)
-        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, count=1)
+        self._candidates = self._problem.candidates = allocate(
+            Candidates, capacity, self._work.device, near=1, far=1
+        )
 
     def _allocate_contacts(self, capacity):
         self._retire(self._contacts)
         sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
-        sizes["bucket"] = self._problem.parts * self._mesh.vertex_count
+        parts = 1 if self._is_many else self._problem.parts
+        sizes["bucket"] = parts * self._mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
         sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
         self._contacts = allocate(Contacts, capacity, self._work.device, **sizes)
-        self._contacts.parts = self._problem.parts
+        self._contacts.parts = parts
         self._problem.contacts = self._contacts
 
     def _retire(self, buffers):

@@ -34,10 +34,14 @@ _PARTED_ROUNDED = wp.constant(2.0**-20)
 
 @wp.struct
 class Candidates:
-    """Pairs of elements that may come near each other in the step, but for those that are excluded, in any order.
+    """Pairs of elements that may come near each other in the step, but for those that are excluded.
+
+    What is within its reach at the start comes first, the others from the end backwards, each in any order: threads that
+    run together then mostly do the same.
 
     Attributes:
-        count: Number of pairs, shape [1].
+        near: Number of pairs within their reach at the start, shape [1].
+        far: Number of the others, shape [1].
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
         start: Distance at the start of the step, or less [m].
@@ -48,7 +52,8 @@ class Candidates:
         share: Share of the last displacements before it would meet, or :data:`FAR`.
     """
 
-    count: wp.array[int]
+    near: wp.array[int]
+    far: wp.array[int]
     corners: wp.array[wp.vec4i]
     key: wp.array[wp.int64]
     start: wp.array[float]
@@ -250,7 +255,12 @@ def _prepare(
         if crossed_at_start(step, queue.kind, queue.pairs[i]):
             return
     level, reach = _barrier_of(settings, start, kept, whole)
-    slot, pair = take_slot_int(candidates.count), queue.pairs[i]
+    pair = queue.pairs[i]
+    slot = int(0)
+    if start < level + reach:
+        slot = take_slot_int(candidates.near)
+    else:
+        slot = candidates.corners.shape[0] - 1 - take_slot_int(candidates.far)
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
     candidates.start[slot] = float(start * _ROUNDED_DOWN)
