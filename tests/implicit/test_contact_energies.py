@@ -83,7 +83,7 @@ def _evaluate_barrier(gap: wp.array[wp.float64], reach: wp.float64, values: wp.a
 
 @wp.kernel(enable_backward=False)
 def _sum_corners(rows: Rows, derivatives: Derivatives, gradient: wp.array[wp.vec3]):
-    gradient[wp.tid()] = sum_of_corners(rows, derivatives, wp.tid())
+    gradient[wp.tid()] = sum_of_corners(rows, derivatives, wp.tid(), 0, 1)
 
 
 class Scene:

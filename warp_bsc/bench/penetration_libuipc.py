@@ -30,7 +30,7 @@ _THICKNESS = 1e-3
 _CONTACT_DISTANCE = 1e-3
 """Distance at which contact begins to push [m]; by default 0.01 m."""
 _STRENGTH = 1e6
-"""Strength of the constraints that move held particles, relative to masses; by default 100. Held ones of ``twist`` lag by
+"""Strength of the constraints that move held particles, relative to masses; by default 100. Those of ``twist`` lag by
 0.03 mm at most; at 1e4 by 2.3 mm, and the cloth stretches by 2.7 percentage points less."""
 _RIGID = 1e8
 """Stiffness of fixed shapes [Pa], which do not move anyway."""

@@ -70,29 +70,26 @@ def add_blocks(
 ):
     """Adds up blocks of elements, of contacts that do not couple, and of inertia, in worlds that solve.
 
-    So many threads share as many blocks as they take ``turns``: they add up the contacts of one after the other
-    together, as here and there an unknown has very many, and the rest each for one.
+    So many threads add up one block together, as here and there an unknown has very many contacts: as many blocks as
+    they take ``turns``, of which each ends one.
     """
     first, part = i // parts * turns, i % parts
-    own, total = first + part, wp.mat33()
-    is_own = part < turns and own < row_of_block.shape[0]
-    if is_own:
-        is_own = progress.solving[unknowns.world[row_of_block[own]]] != 0
-    if is_own:
-        u = row_of_block[own]
-        total = sum_of_blocks(rows, derivatives, own)
-        if u == rows.column[own] and unknowns.is_free[u] != 0:
-            _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, u)
-            total += inertia
+    own, block = int(-1), wp.mat33()
     for k in range(first, wp.min(first + turns, row_of_block.shape[0])):
-        u = row_of_block[k]
-        if contacts.first[u] < contacts.middle[u] and progress.solving[unknowns.world[u]] != 0:
-            of_contacts = contact_block(contacts, unknowns, u, rows.column[k], part, parts)
-            of_contacts = block_sum_of_parts(of_contacts, parts)
-            if k == own:
-                total += of_contacts
-    if is_own:
-        set_block(matrix, own, total)
+        u, v = row_of_block[k], rows.column[k]
+        if progress.solving[unknowns.world[u]] != 0:
+            total = contact_block(contacts, unknowns, u, v, part, parts) + sum_of_blocks(
+                rows, derivatives, k, part, parts
+            )
+            total = block_sum_of_parts(total, parts)
+            if k - first == part:
+                own, block = k, total
+    if own >= 0:
+        row = row_of_block[own]
+        if row == rows.column[own] and unknowns.is_free[row] != 0:
+            _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, row)
+            block += inertia
+        set_block(matrix, own, block)
 
 
 @wp.func
@@ -120,17 +117,15 @@ def assemble(
     ways. Later ones go on from where they are. Threads share unknowns as blocks in :func:`add_blocks`.
     """
     first, part = i // parts * turns, i % parts
-    own, count = first + part, unknowns.world.shape[0]
-    gradient, block = wp.vec3(), wp.mat33()
-    for u in range(first, wp.min(first + turns, count)):
-        if contacts.first[u] < contacts.end[u] and progress.solving[unknowns.world[u]] != 0:
+    own, gradient, block = int(-1), wp.vec3(), wp.mat33()
+    for u in range(first, wp.min(first + turns, unknowns.world.shape[0])):
+        if progress.solving[unknowns.world[u]] != 0:
             of_contacts, of_coupled = contact_gradient(contacts, unknowns, u, part, parts)
-            of_contacts, of_coupled = sum_of_parts(of_contacts, parts), block_sum_of_parts(of_coupled, parts)
-            if u == own:
-                gradient, block = of_contacts, of_coupled
-    if part >= turns or own >= count:
-        return
-    if progress.solving[unknowns.world[own]] == 0:
+            force = sum_of_parts(of_contacts + sum_of_corners(rows, derivatives, u, part, parts), parts)
+            of_coupled = block_sum_of_parts(of_coupled, parts)
+            if u - first == part:
+                own, gradient, block = u, force, of_coupled
+    if own < 0:
         return
     if unknowns.is_free[own] == 0:
         if begins:
@@ -141,7 +136,7 @@ def assemble(
             vectors.inverse[own] = wp.mat33()
         return
     pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, own)
-    vectors.gradient[own] = gradient + sum_of_corners(rows, derivatives, own) + pull
+    vectors.gradient[own] = gradient + pull
     vectors.inverse[own] = _inverse(block_of(matrix, rows.first[own]) + block, wp.min(wp.get_diag(inertia)))
     if begins:
         vectors.solution[own] = wp.vec3()
@@ -166,6 +161,6 @@ def find_loads(
     if unknowns.is_free[u] == 0:
         load[p] = 0.0
         return
-    force = wp.length(sum_of_corners(rows, derivatives, u))
+    force = wp.length(sum_of_corners(rows, derivatives, u, 0, 1))
     if progress.steps[world] == 0 or force > 2.0 * load[p] or force < 0.25 * load[p]:
         load[p] = force

@@ -7,7 +7,7 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
-from .pairs import FAR, BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at, stays_far
+from .pairs import FAR, ROUNDED_DOWN, BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at, stays_far
 from .system import Flag, Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
@@ -27,6 +27,12 @@ def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
     other = scale * trial.share[trial.holder[corners[3]]]
     first, second = share * first, other * second
     return wp.vec2d(wp.float64(first + second), wp.float64(share * first + other * second))
+
+
+@wp.func
+def _relative_way(p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.float64:
+    """Returns how much nearer displacements of corners bring two elements at most: what all do does not count."""
+    return wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
 
 
 @wp.func
@@ -54,6 +60,7 @@ def bound_by_pair(
             cuts += trial.cut[trial.holder[corners[j]]]
         if cuts == 0:
             return
+    was_far = candidates.share[i] == FAR
     candidates.share[i] = FAR
     if stays_far(candidates, progress, world, i):
         return
@@ -62,24 +69,34 @@ def bound_by_pair(
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
+    if was_far:
+        candidates.now[i] = float(barrier.distance_of_boxes(kind, a, b, c, d) * ROUNDED_DOWN)
+    now = wp.float64(candidates.now[i])
     bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
-    if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= kept + reach + wp.float64(bend):
-        return
+    within = kept + reach + wp.float64(bend)
+    if now >= within:
+        if (
+            now >= within + _relative_way(p, q, r, s)
+            or barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within
+        ):
+            return
     candidates.share[i] = 1.0
     scale = progress.scale[world]
     p = to_double(to_single(moved(trial, scale, corners[0]))) - a
     q = to_double(to_single(moved(trial, scale, corners[1]))) - b
     r = to_double(to_single(moved(trial, scale, corners[2]))) - c
     s = to_double(to_single(moved(trial, scale, corners[3]))) - d
-    # far apart but for what both do: no need to find the closest points
     bends = _bends(trial, scale, corners)
+    way = _relative_way(p, q, r, s) + bends[0]
+    # the closest points are found for what comes near
+    if way <= now - kept - barrier.least_gap(now - kept, reach, floor):
+        return
     apart = barrier.distance_of_ways(kind, a, b, c, d, p - r, q - r, wp.vec3d(), s - r)
     if apart >= kept + bends[0] + barrier.MOST_LEFT * reach:
         return
-    way = wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
     _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     least = barrier.least_gap(distance - kept, reach, floor)
-    if way + bends[0] <= distance - kept - least:
+    if way <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))

@@ -324,7 +324,7 @@ _SOLVE = """
                 total[c] += v[3 * c * width] * d[0] + v[(3 * c + 1) * width] * d[1] + v[(3 * c + 2) * width] * d[2];
         }
 #if defined(__CUDA_ARCH__)
-        // loops that are not unrolled where blocks above would be in local memory instead of registers by more code here
+        // not unrolled where blocks are kept: with more code here, they are in local memory instead of registers
 #pragma unroll 1
         for (int n = own_first; n < own_first + own_count; ++n) {
             const float weight = entry_weight[n];

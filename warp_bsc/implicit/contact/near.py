@@ -14,6 +14,7 @@ from .merge import link_contact
 from .merit import MEETS, add_energy
 from .pairs import (
     FAR,
+    ROUNDED_DOWN,
     BarrierSettings,
     Candidates,
     Trial,
@@ -120,9 +121,12 @@ def find_near(
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)
     a, b, c, d = corners_of(trial.exact, corners)
-    if barrier.distance_of_boxes(kind, a, b, c, d) >= candidates.level[i] + reach:
+    apart = barrier.distance_of_boxes(kind, a, b, c, d)
+    candidates.now[i] = float(apart * ROUNDED_DOWN)
+    if apart >= candidates.level[i] + reach:
         return
     weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
+    candidates.now[i] = float(distance * ROUNDED_DOWN)
     gap = distance - candidates.level[i]
     if gap >= reach:
         return

@@ -372,9 +372,7 @@ class NewtonMethod:
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self._candidates)
-        self._candidates = self._problem.candidates = allocate(
-            Candidates, capacity, self._work.device, near=1, far=1
-        )
+        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, near=1, far=1)
 
     def _allocate_contacts(self, capacity):
         self._retire(self._contacts)

@@ -24,7 +24,7 @@ _PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
 FAR = wp.constant(2.0)
 """In place of a share of the last displacements: no part of them brings a pair within its reach."""
-_ROUNDED_DOWN = wp.constant(wp.float64(1.0 - 2.0**-20))
+ROUNDED_DOWN = wp.constant(wp.float64(1.0 - 2.0**-20))
 """What keeps a distance, as it is rounded, from being more than it is."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
@@ -36,8 +36,8 @@ _PARTED_ROUNDED = wp.constant(2.0**-20)
 class Candidates:
     """Pairs of elements that may come near each other in the step, but for those that are excluded.
 
-    What is within its reach at the start comes first, the others from the end backwards, each in any order: threads that
-    run together then mostly do the same.
+    What is within its reach at the start comes first, the others from the end backwards, each in any order: threads
+    that run together then mostly do the same.
 
     Attributes:
         near: Number of pairs within their reach at the start, shape [1].
@@ -50,6 +50,7 @@ class Candidates:
         reach: Gap beyond the level from which its barrier pushes [m].
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet, or :data:`FAR`.
+        now: Distance where the Newton step begins, or less, of what was not far in the one before [m].
     """
 
     near: wp.array[int]
@@ -62,6 +63,7 @@ class Candidates:
     reach: wp.array[float]
     floor: wp.array[float]
     share: wp.array[float]
+    now: wp.array[float]
 
 
 @wp.struct
@@ -263,7 +265,7 @@ def _prepare(
         slot = candidates.corners.shape[0] - 1 - take_slot_int(candidates.far)
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
-    candidates.start[slot] = float(start * _ROUNDED_DOWN)
+    candidates.start[slot] = float(start * ROUNDED_DOWN)
     candidates.kept[slot] = kept
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)

@@ -86,10 +86,10 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
 
 
 @wp.func
-def sum_of_blocks(rows: Rows, derivatives: Derivatives, k: int) -> wp.mat33:
-    """Returns a block of the Hessian of all elements [N/m]."""
+def sum_of_blocks(rows: Rows, derivatives: Derivatives, k: int, part: int, parts: int) -> wp.mat33:
+    """Returns a block of the Hessian of all elements, or one of some parts of it [N/m]."""
     total = wp.mat33()
-    for n in range(rows.first_source[k], rows.first_source[k + 1]):
+    for n in range(rows.first_source[k] + part, rows.first_source[k + 1], parts):
         source = rows.source[n] + int(0)
         if source >= 0:
             total += derivatives.block[source]
@@ -101,9 +101,9 @@ def sum_of_blocks(rows: Rows, derivatives: Derivatives, k: int) -> wp.mat33:
 
 
 @wp.func
-def sum_of_corners(rows: Rows, derivatives: Derivatives, u: int) -> wp.vec3:
-    """Returns the gradient of the energy of all elements by an unknown [N]."""
+def sum_of_corners(rows: Rows, derivatives: Derivatives, u: int, part: int, parts: int) -> wp.vec3:
+    """Returns the gradient of the energy of all elements by an unknown, or one of some parts of it [N]."""
     total = wp.vec3()
-    for n in range(rows.first_corner[u], rows.first_corner[u + 1]):
+    for n in range(rows.first_corner[u] + part, rows.first_corner[u + 1], parts):
         total += derivatives.gradient[rows.corner[n]]
     return total
