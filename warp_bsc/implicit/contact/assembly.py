@@ -78,9 +78,7 @@ def add_blocks(
     for k in range(first, wp.min(first + turns, row_of_block.shape[0])):
         u, v = row_of_block[k], rows.column[k]
         if progress.solving[unknowns.world[u]] != 0:
-            total = contact_block(contacts, unknowns, u, v, part, parts) + sum_of_blocks(
-                rows, derivatives, k, part, parts
-            )
+            total = contact_block(contacts, u, v, part, parts) + sum_of_blocks(rows, derivatives, k, part, parts)
             total = block_sum_of_parts(total, parts)
             if k - first == part:
                 own, block = k, total

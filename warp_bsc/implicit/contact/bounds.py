@@ -50,26 +50,27 @@ def bound_by_pair(
     Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
     what did not meet does not where none of its vertices is cut since.
     """
-    corners = candidates.corners[i]
-    world = motion.world[corners[0]]
-    if progress.solving[world] == 0 or (is_shorter and candidates.share[i] == FAR):
+    # read side by side: most of the time is waiting for memory
+    world, before = candidates.world[i] + int(0), candidates.share[i] + float(0.0)
+    stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
+    if progress.solving[world] == 0 or (before == FAR and (is_shorter or stays)):
         return
-    if is_shorter and candidates.share[i] == 1.0:
+    corners = candidates.corners[i]
+    if is_shorter and before == 1.0:
         cuts = int(0)
         for j in range(4):
             cuts += trial.cut[trial.holder[corners[j]]]
         if cuts == 0:
             return
-    was_far = candidates.share[i] == FAR
     candidates.share[i] = FAR
-    if stays_far(candidates, progress, world, i):
+    if stays:
         return
     kind = kind_of_key(candidates.key[i])
     kept = candidates.kept[i]
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
-    if was_far:
+    if before == FAR:
         candidates.now[i] = float(barrier.distance_of_boxes(kind, a, b, c, d) * ROUNDED_DOWN)
     now = wp.float64(candidates.now[i])
     bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]

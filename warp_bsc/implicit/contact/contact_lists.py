@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...response.state.structs import Motion
-from .system import Contacts, Unknowns, unknown_of_corner
+from .system import Contacts, Unknowns, first_unknown
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,12 +16,11 @@ def count_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns
     """Counts a contact in ``end`` of the unknowns that are solved for, and of its world if it couples."""
     for j in range(4):
         if contacts.weights[i][j] != 0.0:
-            vertex = contacts.corners[i][j]
-            u = unknown_of_corner(unknowns, vertex)
+            u = first_unknown(contacts.unknowns[i][j])
             if u >= 0:
                 if unknowns.is_free[u] != 0:
                     wp.atomic_add(contacts.end, u, 1)
-                    if unknowns.of_vertex[vertex] < 0:
+                    if contacts.unknowns[i][j] < 0:
                         wp.atomic_add(contacts.end, u + 1, 1)
     if contacts.couples[i] != 0:
         wp.atomic_add(contacts.coupled_end, motion.world[contacts.corners[i][0]], 1)
@@ -69,14 +68,14 @@ def _list_entry(contacts: Contacts, u: int, entry: int):
 
 
 @wp.func
-def _list_coupled(contacts: Contacts, unknowns: Unknowns, world: int, i: int):
+def _list_coupled(contacts: Contacts, world: int, i: int):
     n = wp.atomic_add(contacts.coupled_end, world, 1)
     contacts.coupled[n] = i
     contacts.place_in_coupled[i] = n - contacts.coupled_first[world]
-    corners, of_corners = contacts.corners[i], wp.vec4i(-1)
+    of_corners = contacts.unknowns[i] + wp.vec4i()
     for j in range(4):
-        if contacts.weights[i][j] != 0.0:
-            of_corners[j] = unknowns.of_vertex[corners[j]]
+        if contacts.weights[i][j] == 0.0:
+            of_corners[j] = -1
     contacts.coupled_unknowns[n] = of_corners
 
 
@@ -84,15 +83,14 @@ def _list_coupled(contacts: Contacts, unknowns: Unknowns, world: int, i: int):
 def list_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns):
     """Lists a contact for its unknowns, behind their ``end``, which moves on, and for its world if it couples."""
     if contacts.couples[i] != 0:
-        _list_coupled(contacts, unknowns, motion.world[contacts.corners[i][0]], i)
+        _list_coupled(contacts, motion.world[contacts.corners[i][0]], i)
     for j in range(4):
         if contacts.weights[i][j] != 0.0:
-            vertex = contacts.corners[i][j]
-            u = unknown_of_corner(unknowns, vertex)
+            u = first_unknown(contacts.unknowns[i][j])
             if u >= 0:
                 if unknowns.is_free[u] != 0:
                     _list_entry(contacts, u, 4 * i + j)
-                    if unknowns.of_vertex[vertex] < 0:
+                    if contacts.unknowns[i][j] < 0:
                         _list_entry(contacts, u + 1, 4 * i + j)
 
 

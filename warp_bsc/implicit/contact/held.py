@@ -19,6 +19,7 @@ from .system import (
     key_in_group,
     key_of_pair,
     kind_of_key,
+    unknowns_of,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -64,7 +65,9 @@ def _hold(
     if slot >= contacts.corners.shape[0]:
         return
     stiffness = _STIFFER / compliance
+    of_corners = unknowns_of(unknowns, corners)
     contacts.corners[slot] = corners
+    contacts.unknowns[slot] = of_corners
     contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
     contacts.normal[slot] = n
     contacts.load[slot] = 0.0
@@ -72,7 +75,7 @@ def _hold(
     contacts.gradient[slot] = (stiffness * float(given - short)) * n
     contacts.hessian[slot] = stiffness * wp.outer(n, n)
     contacts.key[slot] = key
-    contacts.couples[slot] = couples(unknowns, corners, weights)
+    contacts.couples[slot] = couples(of_corners, weights)
 
 
 @wp.func

@@ -72,7 +72,7 @@ def add_pair_energy(
     if candidates.share[i] == FAR:
         return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
-    world = motion.world[corners[0]]
+    world = candidates.world[i]
     if progress.searches[world] == 0:
         return
     kind = kind_of_key(candidates.key[i])

@@ -23,7 +23,17 @@ from .pairs import (
     stiffness_at_plane,
     stiffness_of_pair,
 )
-from .system import Contacts, Progress, Unknowns, couples, is_solved, key_of_pair, kind_of_key, to_single_block
+from .system import (
+    Contacts,
+    Progress,
+    Unknowns,
+    couples,
+    is_solved,
+    key_of_pair,
+    kind_of_key,
+    to_single_block,
+    unknowns_of,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -88,7 +98,9 @@ def _add_contact(
         else:
             across = slope * across
         hessian += across
+    of_corners = unknowns_of(unknowns, corners)
     contacts.corners[slot] = corners
+    contacts.unknowns[slot] = of_corners
     contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
     contacts.normal[slot] = to_single(normal)
     contacts.load[slot] = float(load)
@@ -96,7 +108,7 @@ def _add_contact(
     contacts.gradient[slot] = to_single(gradient)
     contacts.hessian[slot] = to_single_block(hessian)
     contacts.key[slot] = key
-    contacts.couples[slot] = couples(unknowns, corners, weights)
+    contacts.couples[slot] = couples(of_corners, weights)
     link_contact(contacts, slot, corners, weights)
 
 
@@ -115,7 +127,7 @@ def find_near(
     if candidates.share[i] == FAR:
         return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
-    world = motion.world[corners[0]]
+    world = candidates.world[i]
     if progress.solving[world] == 0:
         return
     key = candidates.key[i] + wp.int64(0)

@@ -36,15 +36,16 @@ _PARTED_ROUNDED = wp.constant(2.0**-20)
 class Candidates:
     """Pairs of elements that may come near each other in the step, but for those that are excluded.
 
-    What is within its reach at the start comes first, the others from the end backwards, each in any order: threads
-    that run together then mostly do the same.
+    What would come within its reach if vertices went as far as in the step before comes first, the others from the end
+    backwards, each in any order: threads that run together then mostly do the same.
 
     Attributes:
-        near: Number of pairs within their reach at the start, shape [1].
+        near: Number of the first ones, shape [1].
         far: Number of the others, shape [1].
+        world: World of each pair.
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
-        start: Distance at the start of the step, or less [m].
+        apart: How far the vertices of a pair can go together before it is within its reach, negative if it is [m].
         kept: Distance that each pair keeps in any case [m].
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m].
@@ -55,9 +56,10 @@ class Candidates:
 
     near: wp.array[int]
     far: wp.array[int]
+    world: wp.array[int]
     corners: wp.array[wp.vec4i]
     key: wp.array[wp.int64]
-    start: wp.array[float]
+    apart: wp.array[float]
     kept: wp.array[wp.float64]
     level: wp.array[wp.float64]
     reach: wp.array[float]
@@ -214,11 +216,10 @@ NO_FACE = wp.constant(2**31 - 1)
 
 
 @wp.func
-def stays_far(candidates: Candidates, progress: Progress, world: int, i: int) -> bool:
+def stays_far(apart: float, progress: Progress, world: int) -> bool:
     """Returns whether a pair is beyond its reach, whichever of the vertices of its world go the longest ways."""
-    way = wp.float64(progress.way[world])
-    apart = wp.float64(candidates.start[i]) - way - wp.max(way, wp.float64(progress.way[progress.way.shape[0] - 1]))
-    return apart >= candidates.kept[i] + wp.float64(candidates.reach[i])
+    way = progress.way[world]
+    return apart >= way + wp.max(way, progress.way[progress.way.shape[0] - 1])
 
 
 @wp.func
@@ -259,18 +260,20 @@ def _prepare(
     level, reach = _barrier_of(settings, start, kept, whole)
     pair = queue.pairs[i]
     slot = int(0)
-    if start < level + reach:
+    world, apart = motion.world[corners[0]], float((start - kept - reach) * ROUNDED_DOWN)
+    if apart < 2.0 * progress.way_before[world]:
         slot = take_slot_int(candidates.near)
     else:
         slot = candidates.corners.shape[0] - 1 - take_slot_int(candidates.far)
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
-    candidates.start[slot] = float(start * ROUNDED_DOWN)
+    candidates.world[slot] = world
+    candidates.apart[slot] = apart
     candidates.kept[slot] = kept
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
-    candidates.share[slot] = wp.where(stays_far(candidates, progress, motion.world[corners[0]], slot), FAR, 1.0)
+    candidates.share[slot] = wp.where(stays_far(apart, progress, world), FAR, 1.0)
 
 
 @wp.kernel

@@ -91,6 +91,7 @@ def begin_step(
         progress.scale[v] = 1.0
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
+        progress.way_before[v] = progress.way[v]
         progress.way[v] = 0.0
         progress.way[progress.way.shape[0] - 1] = 0.0
         progress.remaining[v] = 0.0

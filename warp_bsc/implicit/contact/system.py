@@ -66,6 +66,7 @@ class Progress:
         before: The same in the one before it, as far as it was taken, -1 if it was not [m].
         way: How far a vertex has been, or is led by the displacements, from where it was at the start of the
             step [m]; the last is that of what a program moves, of all worlds.
+        way_before: The same in the step before, shape [worlds].
         remaining: Largest way of what a program moves that is left [m].
         held: 1 if pairs are held in the solve.
         flags: What has been found in some world, see :class:`Flag`.
@@ -85,6 +86,7 @@ class Progress:
     change: wp.array[float]
     before: wp.array[float]
     way: wp.array[float]
+    way_before: wp.array[float]
     remaining: wp.array[float]
     held: wp.array[int]
     flags: wp.array[int]
@@ -112,6 +114,7 @@ class Contacts:
     Attributes:
         count: Number of contacts, shape [1].
         corners: Vertices; of a particle at a plane, four times the particle.
+        unknowns: The ``of_vertex`` of the corners.
         weights: Of the vertices in the vector from the second closest point to the first; all 0 of what is merged.
         normal: Unit vector from the second closest point to the first.
         load: Force that pushes them apart [N].
@@ -137,6 +140,7 @@ class Contacts:
 
     count: wp.array[int]
     corners: wp.array[wp.vec4i]
+    unknowns: wp.array[wp.vec4i]
     weights: wp.array[wp.vec4]
     normal: wp.array[wp.vec3]
     load: wp.array[float]
@@ -236,10 +240,15 @@ def lower_to(values: wp.array[float], i: int, value: float):
 
 
 @wp.func
+def first_unknown(of_vertex: int) -> int:
+    """Returns the unknown of a vertex, given its ``of_vertex``: the first of its body, or -1."""
+    return wp.where(of_vertex < -1, -2 - of_vertex, of_vertex)
+
+
+@wp.func
 def unknown_of_corner(unknowns: Unknowns, vertex: int) -> int:
     """Returns the unknown of a vertex, the first of its body, or -1."""
-    u = unknowns.of_vertex[vertex]
-    return wp.where(u < -1, -2 - u, u)
+    return first_unknown(unknowns.of_vertex[vertex])
 
 
 @wp.func
@@ -269,28 +278,20 @@ def contact_count(contacts: Contacts) -> int:
 
 
 @wp.func
-def contact_block(contacts: Contacts, unknowns: Unknowns, u: int, v: int, part: int, parts: int) -> wp.mat33:
+def contact_block(contacts: Contacts, u: int, v: int, part: int, parts: int) -> wp.mat33:
     """Returns the block of two unknowns of the Hessian of contacts that do not couple, or one of some parts of it."""
     block = wp.mat33()
     for n in range(contacts.first[u] + part, contacts.middle[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
-        corners, weights = contacts.corners[i], contacts.weights[i]
+        of_corners, weights = contacts.unknowns[i], contacts.weights[i]
         weight = float(0.0)
         for j in range(4):
-            if unknowns.of_vertex[corners[j]] == v:
+            if of_corners[j] == v:
                 weight += weights[j]
         if weight != 0.0:
             block += weights[entry & 3] * weight * contacts.hessian[i]
     return block
-
-
-@wp.func
-def _by_corner(unknowns: Unknowns, vertex: int, u: int, force: wp.vec3) -> wp.vec3:
-    """Returns what a force on a vertex is to an unknown: itself, or its torque if that is the turn of a body."""
-    if unknowns.of_vertex[vertex] == -1 - u:  # the unknown behind the first of the body
-        return wp.cross(unknowns.arm[vertex], force)
-    return force
 
 
 @wp.func
@@ -300,16 +301,14 @@ def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int, part: int, 
     for n in range(contacts.first[u] + part, contacts.end[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
-        weight, vertex = contacts.weights[i][entry & 3], contacts.corners[i][entry & 3]
-        gradient += _by_corner(unknowns, vertex, u, weight * contacts.gradient[i])
-        if n < contacts.middle[u]:
-            continue
-        if unknowns.of_vertex[vertex] == -1 - u:
-            r = unknowns.arm[vertex]
-            turn = wp.skew(r)
-            block += weight * weight * (turn * contacts.hessian[i] * wp.transpose(turn))
-        else:
-            block += weight * weight * contacts.hessian[i]
+        weight = contacts.weights[i][entry & 3]
+        force, hessian = weight * contacts.gradient[i], weight * weight * contacts.hessian[i]
+        if contacts.unknowns[i][entry & 3] == -1 - u:  # the turn of a body, which is behind its shift
+            turn = wp.skew(unknowns.arm[contacts.corners[i][entry & 3]])
+            force, hessian = turn * force, turn * hessian * wp.transpose(turn)
+        gradient += force
+        if n >= contacts.middle[u]:
+            block += hessian
     return gradient, block
 
 
@@ -326,11 +325,18 @@ def key_in_group(group: int, key: wp.int64) -> wp.int64:
 
 
 @wp.func
-def couples(unknowns: Unknowns, corners: wp.vec4i, weights: wp.vec4d) -> int:
+def unknowns_of(unknowns: Unknowns, corners: wp.vec4i) -> wp.vec4i:
+    """Returns the ``of_vertex`` of corners."""
+    of_vertex = unknowns.of_vertex
+    return wp.vec4i(of_vertex[corners[0]], of_vertex[corners[1]], of_vertex[corners[2]], of_vertex[corners[3]])
+
+
+@wp.func
+def couples(of_corners: wp.vec4i, weights: wp.vec4d) -> int:
     """Returns whether both elements of a contact are solved for, or one is of a body."""
     first, second = int(0), int(0)
     for j in range(4):
-        u = unknowns.of_vertex[corners[j]]
+        u = of_corners[j]
         if u < -1:
             return 1
         if u >= 0 and weights[j] > ZERO:
