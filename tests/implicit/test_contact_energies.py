@@ -8,7 +8,7 @@ from implicit_scenes import exact_hessians
 from newton_scenes import DT
 
 from warp_bsc.implicit.contact import elasticity
-from warp_bsc.implicit.contact.assembly import add_block
+from warp_bsc.implicit.contact.assembly import add_blocks
 from warp_bsc.implicit.contact.barrier import (
     CURVATURE_AT_HALF,
     barrier_curvature,
@@ -53,12 +53,28 @@ def _add_blocks(
     x: wp.array[wp.vec3],
     progress: Progress,
     rows: Rows,
+    parts: int,
+    turns: int,
     matrix: Matrix,
 ):
     """Without inertia: no unknown is free."""
-    i, bodies, dt = wp.tid(), SolvedBodies(), wp.float64(DT)
-    add_block(
-        i, derivatives, contacts, unknowns, row_of_block, Trial(), x, Motion(), bodies, dt, progress, rows, 1, matrix
+    i, trial, motion, bodies, dt = wp.tid(), Trial(), Motion(), SolvedBodies(), wp.float64(DT)
+    add_blocks(
+        i,
+        derivatives,
+        contacts,
+        unknowns,
+        row_of_block,
+        trial,
+        x,
+        motion,
+        bodies,
+        dt,
+        progress,
+        rows,
+        parts,
+        turns,
+        matrix,
     )
 
 
@@ -216,7 +232,9 @@ def test_rows_are_the_sums_of_elements(scene):
     blocks_of, progress = make_matrix(rows, np.array([0, count]), parts=2, device=device), allocate(Progress, 1, device)
     progress.solving.fill_(1)
     inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array(scene.x), progress, rows]
-    wp.launch(_add_blocks, len(row), inputs=inputs, outputs=[blocks_of], device=device)
+    parts, turns = (8, 3) if wp.get_device(device).is_cuda else (1, 1)  # threads that share a block, and blocks they do
+    threads = parts * -(-len(row) // turns)
+    wp.launch(_add_blocks, threads, inputs=[*inputs, parts, turns], outputs=[blocks_of], device=device)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)
     matrix, vector = np.zeros((count, 3, count, 3)), np.zeros((count, 3))
