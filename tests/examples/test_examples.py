@@ -360,11 +360,13 @@ def test_funnel_is_passed(capsys):
     assert "0 not certified" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_funnel_without_stage():
     with pytest.raises(AssertionError, match="of the particles are in the funnel"):
         run(path_of("funnel"), 46, "--triangles", "1000", "--no-ccd").test_final()
 
 
+@pytest.mark.slow
 def test_dancer_without_stage():
     with pytest.raises(AssertionError, match="edges of deforming meshes cross their faces"):
         run(path_of("dancer"), 40, "--triangles", "1000", "--no-ccd").test_final()
