@@ -246,7 +246,7 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
     judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE, lambda done: progress(steps + done, 2 * steps))
     return PenetrationMeasurement(
         device=device,
-        version=importlib.metadata.version(simulator.package),
+        version=_version_of(simulator.package),
         particles=model.particle_count,
         triangles=model.tri_count,
         frames=len(judgement.crossings),
@@ -261,6 +261,14 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
         uncertified_steps=trajectory.uncertified_steps,
         milliseconds=(float(np.median(timed)), float(np.mean(timed))),
     )
+
+
+def _version_of(package: str) -> str:
+    """Returns the version of a distribution; one that was built from source may have no metadata."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "of unknown version"
 
 
 def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], None]):
