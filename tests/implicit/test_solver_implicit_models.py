@@ -440,9 +440,10 @@ def test_a_kinematic_body_at_200_metres_a_second(device):
         assert all(named.intersection(corners) for corners in judge.find_collisions(before, after))
         before = after
     assert np.isfinite(state.particle_q.numpy()).all()
-    middle = state.particle_q.numpy()[4, 2]
-    report = solver.report  # the body takes the cloth along, or the report says that it does not
-    assert middle > height + 0.05 or report.totals.uncertified_steps > 0 or not report.converged
+    middle, report = state.particle_q.numpy()[4], solver.report
+    # the body takes the cloth along, or the cloth slides off to a side, or the report says that it is not taken along
+    is_beside = (np.abs(middle[:2]) > (0.03, 0.04)).any()
+    assert middle[2] > height + 0.05 or is_beside or report.totals.uncertified_steps > 0 or not report.converged
 
 
 @pytest.mark.filterwarnings("ignore:.*not certified", "ignore:edges pass", "ignore:.*strained")
