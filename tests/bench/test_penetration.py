@@ -117,6 +117,11 @@ def test_self_contact_limits_the_speed_of_what_flies_freely():
     assert found.speed_kept < 0.4
 
 
+def test_what_was_built_without_metadata_is_measured(monkeypatch):
+    monkeypatch.setitem(SIMULATORS, "xpbd", dataclasses.replace(SIMULATORS["xpbd"], package="no-such-distribution"))
+    assert measure_penetration("bullet", "xpbd", frames=1).measured.version == "of unknown version"
+
+
 def test_a_step_that_meets_something_says_nothing_of_free_flight():
     """The block meets the sheet 10 ms after the start."""
     built = build_penetration_scene("soft", "vbd", 60)

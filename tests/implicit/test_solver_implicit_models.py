@@ -319,7 +319,7 @@ def test_a_world_with_input_that_is_not_finite_is_not_converged(name, mass, devi
 
 
 def test_a_light_cloth_is_solved_for_beside_something_heavy(device):
-    """A linear solve ends by energies, most of which are of what is heavy: one Newton step is as of the cloth alone."""
+    """A linear solve ends by energies, most of which are of what is heavy: two Newton steps are as of cloth alone."""
     ends = []
     for others in (0, 1):
         builder = newton.ModelBuilder()
@@ -327,9 +327,9 @@ def test_a_light_cloth_is_solved_for_beside_something_heavy(device):
         builder.particle_mass[0] = builder.particle_mass[4] = 0.0
         for _ in range(others):
             builder.add_particle(wp.vec3(9.0, 0.0, 0.0), wp.vec3(), 1e3, radius=0.01)
-        _, state = run(builder.finalize(device=device), 1, max_iterations=1)
+        _, state = run(builder.finalize(device=device), 1, max_iterations=2)
         ends.append(state.particle_q.numpy()[:25])
-    np.testing.assert_allclose(ends[1], ends[0], atol=2e-4)
+    np.testing.assert_allclose(ends[1], ends[0], atol=2e-5)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -4,7 +4,6 @@ The scenes are in :mod:`.penetration_scenes`, which is imported with Newton when
 """
 
 import contextlib
-import importlib.metadata
 import io
 import math
 import warnings
@@ -13,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+
+from .provenance import version_of
 
 __all__ = [
     "FRAME_RATE",
@@ -246,7 +247,7 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
     judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE, lambda done: progress(steps + done, 2 * steps))
     return PenetrationMeasurement(
         device=device,
-        version=_version_of(simulator.package),
+        version=version_of(simulator.package) or "of unknown version",  # built from source
         particles=model.particle_count,
         triangles=model.tri_count,
         frames=len(judgement.crossings),
@@ -261,14 +262,6 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
         uncertified_steps=trajectory.uncertified_steps,
         milliseconds=(float(np.median(timed)), float(np.mean(timed))),
     )
-
-
-def _version_of(package: str) -> str:
-    """Returns the version of a distribution; one that was built from source may have no metadata."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "of unknown version"
 
 
 def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], None]):

@@ -18,7 +18,7 @@ from .._atomic_file import OutputFile
 from .._version import __version__
 from .timing import count_threads
 
-__all__ = ["COMMIT", "LIBRARIES", "describe_run", "shorten_path", "with_record", "write_measurement"]
+__all__ = ["COMMIT", "LIBRARIES", "describe_run", "shorten_path", "version_of", "with_record", "write_measurement"]
 
 COMMIT = "WARP_BSC_COMMIT"
 """Environment variable that names the commit of a copy of the project without git, as on another machine."""
@@ -61,7 +61,7 @@ def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> d
         "load": _LOAD,
         "gpus": [device.name for device in devices if device.is_cuda],
         "python": platform.python_version(),
-        "versions": {"warp-bsc": __version__} | _find_versions(),
+        "versions": {"warp-bsc": __version__} | {name: found for name in LIBRARIES if (found := version_of(name))},
     }
 
 
@@ -90,6 +90,14 @@ def write_measurement(
         file.commit()
     finally:
         file.discard()
+
+
+def version_of(name: str) -> str | None:
+    """Returns the version of a distribution; None if it is not installed, or was built without metadata."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def shorten_path(path: str) -> str:
@@ -127,16 +135,6 @@ def _find_commit() -> tuple[str | None, bool | None]:
             )
     named = os.environ.get(COMMIT)
     return (named, False) if named else (None, None)
-
-
-def _find_versions() -> dict[str, str]:
-    versions = {}
-    for name in LIBRARIES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return versions
 
 
 def _name_cpu() -> str:

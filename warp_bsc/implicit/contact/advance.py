@@ -192,7 +192,6 @@ def _over_pairs(
         elif task == Task.HOLD:
             held.hold_pair(
                 i,
-                motion,
                 p.candidates,
                 p.trial,
                 p.unknowns,
@@ -203,7 +202,7 @@ def _over_pairs(
                 p.contacts,
             )
         elif task == Task.BOUND:
-            bounds.bound_by_pair(i, motion, p.candidates, p.trial, p.progress, p.limit, is_shorter)
+            bounds.bound_by_pair(i, p.candidates, p.trial, p.progress, p.limit, is_shorter)
         else:
             merit.add_pair_energy(i, motion, p.candidates, settings, p.trial, p.progress)
     for v in range(t, p.vertices_at_planes, n):

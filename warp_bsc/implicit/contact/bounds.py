@@ -38,7 +38,6 @@ def _relative_way(p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.floa
 @wp.func
 def bound_by_pair(
     i: int,
-    motion: Motion,
     candidates: Candidates,
     trial: Trial,
     progress: Progress,

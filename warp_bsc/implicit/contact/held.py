@@ -96,7 +96,6 @@ def release_held(
 @wp.func
 def hold_pair(
     i: int,
-    motion: Motion,
     candidates: Candidates,
     trial: Trial,
     unknowns: Unknowns,
@@ -111,7 +110,7 @@ def hold_pair(
     Only one that is the first, by ``limit``, for one of its vertices: what would come later may not come at all.
     """
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
-    if progress.solving[motion.world[corners[0]]] == 0:
+    if progress.solving[candidates.world[i]] == 0:
         return
     share = candidates.share[i] + float(0.0)
     if share >= 1.0:
