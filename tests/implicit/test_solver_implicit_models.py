@@ -267,11 +267,11 @@ def test_what_crosses_at_the_start_is_named(device):
 
 def test_forces_of_contacts_of_newton_are_refused(device):
     """They are in the report; observables that a program does not ask for are none, as of any solver."""
-    model = sheet(device, 0.002)
+    model = sheet(device, 0.02)
     solver, states = SolverImplicit(model), [model.state(), model.state()]
     contacts = newton.CollisionPipeline(model).contacts()
     solver.step(*states, None, contacts, DT, observables=None)
-    assert states[1].particle_q.numpy()[:, 2].mean() < 0.002
+    assert states[1].particle_q.numpy()[:, 2].mean() < 0.02
     with pytest.raises(NotImplementedError, match="report_contacts=True"):
         solver.update_contacts(contacts, states[1])
     with pytest.raises(ValueError, match="contact_f"):

@@ -84,7 +84,7 @@ def add_pair_energy(
     if gap < reach:
         value = MEETS
         if gap > ZERO:
-            stiffness = stiffness_of_pair(motion, settings, trial, corners, kind == EDGE_EDGE, reach)
+            stiffness = stiffness_of_pair(motion, settings, trial, progress, world, corners, kind == EDGE_EDGE, reach)
             value = stiffness * barrier.barrier_energy(gap, reach)
         add_energy(progress.trial, world, value, settings.units)
 
@@ -132,5 +132,6 @@ def add_plane_energies(
         if gap < reach:
             value = MEETS
             if gap > ZERO:
-                value = stiffness_at_plane(motion, settings, vertex, reach) * barrier.barrier_energy(gap, reach)
+                value = stiffness_at_plane(motion, settings, progress, world, vertex, reach)
+                value *= barrier.barrier_energy(gap, reach)
             add_energy(progress.trial, world, value, settings.units)

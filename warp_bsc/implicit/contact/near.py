@@ -146,7 +146,7 @@ def find_near(
         add_energy(progress.energy, world, MEETS, settings.units)
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    stiffness = stiffness_of_pair(motion, settings, trial, corners, kind == EDGE_EDGE, reach)
+    stiffness = stiffness_of_pair(motion, settings, trial, progress, world, corners, kind == EDGE_EDGE, reach)
     add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
     friction = pair_friction(motion, corners)
     _add_contact(
@@ -198,7 +198,7 @@ def find_near_planes(
             add_energy(progress.energy, world, MEETS, settings.units)
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
-        stiffness = stiffness_at_plane(motion, settings, vertex, reach)
+        stiffness = stiffness_at_plane(motion, settings, progress, world, vertex, reach)
         add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
         key = key_of_pair(1, 0, vertex, i)
         there, _error_there = signed_distance(planes.end[i], trial.exact[vertex])

@@ -308,7 +308,7 @@ class NewtonMethod:
         self.progress.active.zero_()
         self._flow.arrived.zero_()
         self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
-        inputs = [motion, self._margin, self._unknowns, self._bodies]
+        inputs = [motion, self._margin, self._mesh.model.gravity, self._dt, self._unknowns, self._bodies]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self._lacks.zero_()
         self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)

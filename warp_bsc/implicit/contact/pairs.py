@@ -20,6 +20,8 @@ _WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
 """Share of its distance at the start that only pairs keep which start within their minimum distance."""
 _LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
+_LAYERS = wp.constant(wp.float64(64.0 * barrier.CURVATURE_AT_HALF / barrier.FORCE_AT_FLOOR))
+"""How many layers a barrier carries at the gap below which it hardly comes nearer, as a factor of their stiffness."""
 _PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
 FAR = wp.constant(2.0)
@@ -140,29 +142,47 @@ def _reach_of(settings: BarrierSettings, corners: wp.vec4i) -> float:
 
 
 @wp.func
-def _compliance(motion: Motion, settings: BarrierSettings, vertex: int) -> wp.float64:
-    """Returns how far a force of 1 N moves a vertex in the step [m/N], by its mass and the solid around it."""
+def _compliance(motion: Motion, settings: BarrierSettings, layers: wp.float64, vertex: int) -> wp.float64:
+    """Returns how far a force of 1 N moves a vertex in the step [m/N], by its mass and the solid around it.
+
+    Its mass is that of so many layers.
+    """
     inverse = wp.float64(inverse_mass_of(motion, vertex))
-    return inverse / (ONE / (settings.dt * settings.dt) + inverse * wp.float64(settings.elasticity[vertex]))
+    return inverse / (layers / (settings.dt * settings.dt) + inverse * wp.float64(settings.elasticity[vertex]))
+
+
+@wp.func
+def _layers(progress: Progress, world: int, reach: wp.float64) -> wp.float64:
+    """Returns how many layers a barrier is made for: more than 1 where gravity alone would press one far into it."""
+    return wp.max(ONE, _LAYERS * wp.float64(progress.fall[world]) / reach)
 
 
 @wp.func
 def stiffness_of_pair(
-    motion: Motion, settings: BarrierSettings, trial: Trial, corners: wp.vec4i, is_edges: bool, reach: wp.float64
+    motion: Motion,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
+    world: int,
+    corners: wp.vec4i,
+    is_edges: bool,
+    reach: wp.float64,
 ) -> wp.float64:
     """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
 
-    It is more where elements push harder than that carries at the gap below which a pair hardly comes nearer: what is
-    taut would otherwise be stuck there. It is less of edges of faces that are nearly parallel where the Newton step
-    begins, whose closest points jump from end to end: their ends are near these faces, which push as well.
+    It is more where elements, or many layers, push harder than that carries at the gap below which a pair hardly comes
+    nearer: what is taut, or under a pile, would otherwise be stuck there. It is less of edges of faces that are nearly
+    parallel where the Newton step begins, whose closest points jump from end to end: their ends are near these faces,
+    which push as well.
     """
-    first = _compliance(motion, settings, corners[0])
-    second = _compliance(motion, settings, corners[2]) + _compliance(motion, settings, corners[3])
+    layers = _layers(progress, world, reach)
+    first = _compliance(motion, settings, layers, corners[0])
+    second = _compliance(motion, settings, layers, corners[2]) + _compliance(motion, settings, layers, corners[3])
     if is_edges:
-        first = HALF * (first + _compliance(motion, settings, corners[1]))
+        first = HALF * (first + _compliance(motion, settings, layers, corners[1]))
         second = HALF * second
     else:
-        second = (second + _compliance(motion, settings, corners[1])) / wp.float64(3.0)
+        second = (second + _compliance(motion, settings, layers, corners[1])) / wp.float64(3.0)
     load, of_faces = float(0.0), int(1)
     for j in range(4):
         load = wp.max(load, settings.load[corners[j]])
@@ -179,10 +199,13 @@ def stiffness_of_pair(
 
 
 @wp.func
-def stiffness_at_plane(motion: Motion, settings: BarrierSettings, vertex: int, reach: wp.float64) -> wp.float64:
+def stiffness_at_plane(
+    motion: Motion, settings: BarrierSettings, progress: Progress, world: int, vertex: int, reach: wp.float64
+) -> wp.float64:
     """Returns the stiffness of a barrier between a vertex and a plane [N/m], as :func:`stiffness_of_pair`."""
     needed = wp.float64(settings.load[vertex]) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
-    return wp.max(ONE / (_compliance(motion, settings, vertex) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
+    compliance = _compliance(motion, settings, _layers(progress, world, reach), vertex)
+    return wp.max(ONE / (compliance * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
 
 
 @wp.func

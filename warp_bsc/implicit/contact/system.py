@@ -71,6 +71,7 @@ class Progress:
         held: 1 if pairs are held in the solve.
         flags: What has been found in some world, see :class:`Flag`.
         late: Newton steps that began before what a program moves had arrived, but for the first of them.
+        fall: How far gravity moves what is at rest in the step [m].
     """
 
     active: wp.array[int]
@@ -91,6 +92,7 @@ class Progress:
     held: wp.array[int]
     flags: wp.array[int]
     late: wp.array[int]
+    fall: wp.array[float]
 
 
 @wp.func
