@@ -168,6 +168,44 @@ def test_compressed_cloth_takes_few_newton_steps(device):
     assert solver.report.converged and solver.report.newton_steps <= 5
 
 
+def sheets(device, cell, gap, speed):
+    """Twelve sheets of cloth above each other and the ground, falling."""
+    builder = newton.ModelBuilder()
+    builder.add_ground_plane()
+    membrane = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 0.0, "edge_ke": 1e-3, "edge_kd": 1e-4}
+    cells = {"dim_x": 4, "dim_y": 4, "cell_x": cell, "cell_y": cell, "mass": 0.3 * cell**2, "particle_radius": 0.0}
+    for k in range(1, 13):
+        at = wp.vec3(0.0, 0.0, gap * k)
+        builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(0.0, 0.0, -speed), **cells, **membrane)
+    return builder.finalize(device=device)
+
+
+def test_sheets_that_hit_each_other_where_single_vertices_are_cut_have_their_barriers(device):
+    """What falls side by side is not far from each other any more once one of its vertices is cut."""
+    solver = bsc.SolverImplicit(sheets(device, 0.04, 0.006, 1.0))
+    states, hits = [solver.model.state(), solver.model.state()], 0
+    for k in range(20):
+        solver.step(states[k % 2], states[1 - k % 2], None, None, DT)
+        hits += solver.report.hits
+    assert hits == 0
+    assert solver.report.converged
+    assert solver.report.unconverged_steps <= 4
+    assert np.abs(states[0].particle_qd.numpy()).max() < 0.05
+
+
+def test_layers_of_small_cells_rest_on_each_other(device):
+    """Their barriers reach less far than gravity moves them in a step, and carry all that are above."""
+    solver = bsc.SolverImplicit(sheets(device, 0.01, 0.0015, 0.0))
+    state = step(solver, solver.model.state(), solver.model.state(), 20)
+    assert solver.report.converged
+    assert solver.report.newton_steps <= 2
+    assert solver.report.unconverged_steps <= 4
+    heights = state.particle_q.numpy()[:, 2].reshape(12, -1).mean(axis=1)
+    assert (np.diff(heights) > 3e-4).all()  # with a reach of 1e-3
+    assert heights[0] > 1e-4
+    assert np.abs(state.particle_qd.numpy()).max() < 5e-3
+
+
 def test_what_a_program_presses_into_a_wedge_has_not_arrived(device):
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, hx=0.2, hy=0.2, hz=0.1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()))

@@ -7,7 +7,18 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from . import barrier
-from .pairs import FAR, ROUNDED_DOWN, BarrierSettings, Candidates, Trial, gap_at_plane, moved, plane_at, stays_far
+from .pairs import (
+    FAR,
+    FAR_TOGETHER,
+    ROUNDED_DOWN,
+    BarrierSettings,
+    Candidates,
+    Trial,
+    gap_at_plane,
+    moved,
+    plane_at,
+    stays_far,
+)
 from .system import Flag, Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
@@ -47,7 +58,7 @@ def bound_by_pair(
     """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world.
 
     Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
-    what did not meet does not where none of its vertices is cut since.
+    what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
     """
     # read side by side: most of the time is waiting for memory
     world, before = candidates.world[i] + int(0), candidates.share[i] + float(0.0)
@@ -55,7 +66,7 @@ def bound_by_pair(
     if progress.solving[world] == 0 or (before == FAR and (is_shorter or stays)):
         return
     corners = candidates.corners[i]
-    if is_shorter and before == 1.0:
+    if is_shorter and (before == 1.0 or before == FAR_TOGETHER):
         cuts = int(0)
         for j in range(4):
             cuts += trial.cut[trial.holder[corners[j]]]
@@ -69,16 +80,16 @@ def bound_by_pair(
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
-    if before == FAR:
+    if before >= FAR:
         candidates.now[i] = float(barrier.distance_of_boxes(kind, a, b, c, d) * ROUNDED_DOWN)
     now = wp.float64(candidates.now[i])
     bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
     within = kept + reach + wp.float64(bend)
     if now >= within:
-        if (
-            now >= within + _relative_way(p, q, r, s)
-            or barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within
-        ):
+        if not is_shorter and now >= within + _relative_way(p, q, r, s):
+            candidates.share[i] = FAR_TOGETHER
+            return
+        if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within:
             return
     candidates.share[i] = 1.0
     scale = progress.scale[world]

@@ -126,8 +126,9 @@ def begin_newton_step(w: int, progress: Progress):
 
 @wp.func
 def takes(w: int, progress: Progress) -> bool:
-    """Returns whether a world that searches takes its share: its energy falls, or what a program moves comes."""
-    return progress.searches[w] != 0 and (progress.remaining[w] > 0.0 or _falls(progress, w))
+    """Returns whether a world that searches takes its share: its energy falls, what a program moves comes, or none."""
+    may_rise = progress.remaining[w] > 0.0 or progress.scale[w] == 0.0
+    return progress.searches[w] != 0 and (may_rise or _falls(progress, w))
 
 
 @wp.func

@@ -69,7 +69,7 @@ def add_pair_energy(
     i: int, motion: Motion, candidates: Candidates, settings: BarrierSettings, trial: Trial, progress: Progress
 ):
     """Adds the energy of the barrier of a candidate at the displaced positions, in worlds that search."""
-    if candidates.share[i] == FAR:
+    if candidates.share[i] >= FAR:
         return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = candidates.world[i]

@@ -124,7 +124,7 @@ def find_near(
     contacts: Contacts,
 ):
     """Adds a contact if a candidate is near each other, in worlds that solve, and its energy."""
-    if candidates.share[i] == FAR:
+    if candidates.share[i] >= FAR:
         return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     world = candidates.world[i]

@@ -26,6 +26,8 @@ _PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
 FAR = wp.constant(2.0)
 """In place of a share of the last displacements: no part of them brings a pair within its reach."""
+FAR_TOGETHER = wp.constant(3.0)
+"""The same, as long as its vertices take the same part: displacements that hardly differ do not bring it nearer."""
 ROUNDED_DOWN = wp.constant(wp.float64(1.0 - 2.0**-20))
 """What keeps a distance, as it is rounded, from being more than it is."""
 _PARTED = wp.constant(1e-3)
@@ -52,7 +54,7 @@ class Candidates:
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m].
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
-        share: Share of the last displacements before it would meet, or :data:`FAR`.
+        share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
         now: Distance where the Newton step begins, or less, of what was not far in the one before [m].
     """
 
