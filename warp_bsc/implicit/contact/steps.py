@@ -230,7 +230,8 @@ def renew_boxes(
 ):
     """Makes the boxes of vertices those around their last displacement, from where they are now.
 
-    Only in worlds in which one left its box, so that each is as if it were alone.
+    Only in worlds in which one left its box, so that each is as if it were alone. A displacement that is far longer
+    than what the step would take without forces counts in part: all may be near each other on ways of metres.
     """
     v = wp.tid()
     if leaves[motion.world[v]] == 0:
@@ -240,6 +241,8 @@ def renew_boxes(
         return
     pad = margin[v] + float(0.0)
     if unknowns.of_vertex[v] != -1:
+        longest = 4.0 * pad + wp.length(motion.x1[v] - motion.x0[v])
+        d *= wp.min(longest / wp.max(wp.length(d), 1.0e-30), 1.0)
         pad += 0.5 * wp.length(d)
     else:
         d = motion.x1[v] - x
