@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .system import Flag, Progress, Unknowns, change_left
+from .system import Flag, Progress, Unknowns, is_near_end
 
 wp.set_module_options({"enable_backward": False})
 
@@ -164,7 +164,8 @@ def decide(
     steps = progress.steps[w]
     if progress.remaining[w] > 0.0:
         progress.late[w] = steps - 1
-    ends = arrived and (change_left(progress, w) <= least_change or steps - progress.late[w] >= max_steps)
+    progress.driven[w] = wp.max(progress.driven[w], progress.remaining[w])
+    ends = arrived and (is_near_end(progress, w, least_change) or steps - progress.late[w] >= max_steps)
     if scale == 0.0 and arrived:
         ends = ends or was_far
     if ends or (steps >= max_late_steps and not arrived):

@@ -7,7 +7,7 @@ from ...response.report import SolverReport
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from ...response.tuning import MAX_STRAIN
-from .system import Progress, change_left
+from .system import Progress, is_near_end
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +47,7 @@ def write_results(
     """
     w = wp.tid()
     arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
-    converged = arrived and lacks[0] == 0 and change_left(progress, w) <= least_speed * dt
+    converged = arrived and lacks[0] == 0 and is_near_end(progress, w, least_speed * dt)
     converged = wp.isfinite(progress.change[w]) and (progress.steps[w] == 0 or converged)
     results.newton_steps[w] = progress.steps[w]
     results.last_change[w] = progress.change[w] / dt

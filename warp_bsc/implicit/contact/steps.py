@@ -98,6 +98,7 @@ def begin_step(
         progress.way[progress.way.shape[0] - 1] = 0.0
         progress.remaining[v] = 0.0
         progress.late[v] = 0
+        progress.driven[v] = 0.0
         progress.fall[v] = dt * dt * wp.length(gravity[v % gravity.shape[0]])
         plane_share[v] = 0.0
     if v >= trial.x.shape[0]:

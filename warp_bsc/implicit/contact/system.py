@@ -72,6 +72,7 @@ class Progress:
         flags: What has been found in some world, see :class:`Flag`.
         late: Newton steps that began before what a program moves had arrived, but for the first of them.
         fall: How far gravity moves what is at rest in the step [m].
+        driven: Largest way of what a program moves in the step [m].
     """
 
     active: wp.array[int]
@@ -93,6 +94,16 @@ class Progress:
     flags: wp.array[int]
     late: wp.array[int]
     fall: wp.array[float]
+    driven: wp.array[float]
+
+
+@wp.func
+def is_near_end(progress: Progress, w: int, least_change: float) -> bool:
+    """Returns whether unknowns of a world are so near their end that it takes no other Newton step.
+
+    They may be farther by up to ten times where a program moves something fast: by a hundredth of its way.
+    """
+    return change_left(progress, w) <= wp.clamp(0.01 * progress.driven[w], least_change, 10.0 * least_change)
 
 
 @wp.func
