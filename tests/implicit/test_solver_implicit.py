@@ -14,8 +14,9 @@ from newton_scenes import SOFT, add_patch, bullet
 import warp_bsc as bsc
 from warp_bsc.bench.response_scenes import build_scene
 from warp_bsc.bench.response_simulation import Simulation, energy_gained
-from warp_bsc.implicit.contact import newton_method
+from warp_bsc.implicit.contact import newton_method, system
 from warp_bsc.response.state.motion import arrays_of
+from warp_bsc.response.state.structs import allocate
 
 DT, GRAVITY = 1.0 / 60.0, 9.81
 
@@ -131,6 +132,24 @@ def test_a_step_ends_where_what_is_left_of_changes_is_small(device, monkeypatch)
         velocities.append(end.particle_qd.numpy())
     assert np.abs(velocities[0] - velocities[1]).max() < 1e-3 < taken[0][1]
     assert taken[0][0] < taken[1][0] and solver.report.converged
+
+
+@wp.kernel
+def find_near_end(progress: system.Progress, is_near: wp.array[wp.bool]):
+    w = wp.tid()
+    is_near[w] = system.is_near_end(progress, w, 1.0)
+
+
+def test_a_step_ends_within_a_hundredth_of_the_way_of_what_a_program_moves(device):
+    """But ten times as far from its end as without, at most; each world by what moves in it."""
+    progress = allocate(system.Progress, 6, device)
+    progress.scale.fill_(1.0)
+    progress.before.fill_(1.0)
+    progress.driven.assign([0.0, 0.0, 300.0, 300.0, 1e6, 1e6])
+    progress.change.assign([0.9, 1.1, 2.9, 3.1, 9.9, 10.1])
+    is_near = wp.zeros(6, dtype=wp.bool, device=device)
+    wp.launch(find_near_end, 6, inputs=[progress, is_near], device=device)
+    np.testing.assert_array_equal(is_near.numpy(), [True, False] * 3)
 
 
 @pytest.mark.parametrize("cells", [9, 21, 29, 37])
