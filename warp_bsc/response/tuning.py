@@ -122,7 +122,7 @@ SEGMENTS = 32
 # capacities
 PAIRS_PER_FACE = 96
 """Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow. Four layers of cloth
-that land on each other have up to 160 in a Newton step."""
+that lie on each other have some 50, and up to 160 in a Newton step in which they land."""
 DIVIDING_PLANES = 32
 """Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
 ITERATIONS_RESERVED = 3

@@ -21,7 +21,7 @@ _WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
 _LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
 _LAYERS = wp.constant(wp.float64(64.0 * barrier.CURVATURE_AT_HALF / barrier.FORCE_AT_FLOOR))
-"""How many layers a barrier carries at the gap below which it hardly comes nearer, as a factor of their stiffness."""
+"""For so many layers, 64, that it carries at :data:`.barrier.FLOOR`, the stiffness of a barrier by that for one."""
 _PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
 FAR = wp.constant(2.0)

@@ -89,11 +89,11 @@ class ImplicitStepReport(SolverReport):
     def converged(self) -> bool:
         """Whether the Newton steps of all worlds sufficed for the last step.
 
-        It is false if velocities are farther than 1 mm/s, in steps of less than 1/60 s proportionally less, from where
-        the changes of the last two Newton steps lead, or than 1% of the speed of what a program moves, up to ten times
-        as far; if a position, a velocity or a force was not finite, if
-        :attr:`arrived` is false, and if pairs that are near each other did not fit into the buffers of a CUDA graph. A
-        step that is not converged is free of collisions all the same, if it is certified; it lags behind its forces.
+        It is false if velocities are farther from where the changes of the last two Newton steps lead than 1 mm/s, or
+        1% of the speed of what a program moves up to 10 mm/s, in steps of less than 1/60 s proportionally less; if a
+        position, a velocity or a force was not finite, if :attr:`arrived` is false, and if pairs that are near each
+        other did not fit into the buffers of a CUDA graph. A step that is not converged is free of collisions all the
+        same, if it is certified; it lags behind its forces.
         """
         return bool(self.results.converged.numpy().all())
 
