@@ -212,6 +212,21 @@ def test_sheets_that_hit_each_other_where_single_vertices_are_cut_have_their_bar
     assert np.abs(states[0].particle_qd.numpy()).max() < 0.05
 
 
+def test_boxes_of_candidates_take_a_part_of_a_displacement_of_metres(device):
+    """Else all pairs are candidates, which do not fit into the buffers of a graph; the others take all of theirs."""
+    solver = bsc.SolverImplicit(sheets(device, 0.04, 0.006, 1.0))
+    newton_steps = solver._newton
+    step(solver, solver.model.state(), solver.model.state())
+    displaced = np.full((len(newton_steps._lower), 3), [0.005, 0.0, 0.0])
+    displaced[7] = 0.0, 20.0, 0.0
+    newton_steps._trial.displaced.assign(displaced)
+    newton_steps._leaves.fill_(1)
+    newton_steps._renew_candidates()
+    size = newton_steps._upper.numpy() - newton_steps._lower.numpy()
+    assert 0.02 < size[7, 1] < 0.15
+    assert (np.delete(size[:, 0], 7) > 0.005).all()
+
+
 def test_layers_of_small_cells_rest_on_each_other(device):
     """Their barriers reach less far than gravity moves them in a step, and carry all that are above."""
     solver = bsc.SolverImplicit(sheets(device, 0.01, 0.0015, 0.0))
