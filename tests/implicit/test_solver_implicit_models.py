@@ -247,6 +247,17 @@ def test_short_steps_fall_as_fast_as_long_ones(device):
 
 
 @pytest.mark.parametrize("on_plane", [False, True])
+def test_what_is_pressed_in_short_steps_keeps_its_gap(on_plane, device):
+    """Barriers carry a load of 500 times gravity. If they do not, gaps become half in each step, down to rounding."""
+    model = sheet(device, 0.001, on_plane=on_plane)
+    press = np.zeros((model.particle_count, 3), dtype=np.float32)
+    press[:, 2] = -500.0 * GRAVITY * model.particle_mass.numpy()
+    solver, state = run(model, 60, dt=1.0 / 600.0, each=lambda state, step: state.particle_f.assign(press))
+    assert solver.report.certified and solver.report.converged
+    assert state.particle_q.numpy()[:, 2].min() > 1e-6
+
+
+@pytest.mark.parametrize("on_plane", [False, True])
 def test_what_touches_at_the_start_rests(on_plane, device):
     solver, state = run(sheet(device, 0.0, on_plane=on_plane), 20)
     assert solver.report.certified

@@ -20,6 +20,8 @@ _WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
 """Share of its distance at the start that only pairs keep which start within their minimum distance."""
 _LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
+_LEAST_REACH = wp.constant(wp.float64(0.1))
+"""Share of the reach that this is of at least, however short a step cuts it: positions are rounded."""
 _LAYERS = wp.constant(wp.float64(64.0 * barrier.CURVATURE_AT_HALF / barrier.FORCE_AT_FLOOR))
 """For so many layers, 64, that it carries at :data:`.barrier.FLOOR`, the stiffness of a barrier by that for one."""
 _PARALLEL = wp.constant(wp.float64(1e-3))
@@ -217,10 +219,15 @@ def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, 
     The reach of what starts within it ends a little above its gap: a barrier otherwise throws apart, at up to its reach
     a step, what a program puts there or what fell there in the step before. That of a pair within its minimum distance
     is as steep as in a press, so that the force on what is gripped there is one that floats can balance.
+
+    The level is below that to keep where the gap is tiny, so that the force is finite. It is so much less as the reach
+    is shorter: the barrier would else carry little, and what is pressed together in short steps come ever nearer.
     """
     whole = wp.float64(reach)
-    least = wp.where(kept > ZERO and kept >= _WITHIN * start, barrier.FLOOR, _LEAST_GAP)
-    level = wp.min(kept, start - least * whole)
+    least = _LEAST_GAP * wp.clamp(settings.recovery, _LEAST_REACH * whole, whole)
+    if kept > ZERO and kept >= _WITHIN * start:
+        least = barrier.FLOOR * whole
+    level = wp.min(kept, start - least)
     return level, wp.min(whole, start - level + settings.recovery)
 
 
