@@ -18,8 +18,10 @@ _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
 _KEPT = {320: 13, 640: 4, _LARGEST_BLOCK: 0}
 """Blocks of the Hessian that a thread keeps in registers, in thread blocks of so many threads at most."""
-_COUPLED = 256
-"""Contacts that couple which fit into shared memory: those of larger numbers are read from global memory."""
+_SHARED_MEMORY, _OF_CONTACT = 46 * 1024, 68
+"""Bytes of shared memory that a block takes at most, with some to spare, and those of a contact there."""
+_AGAIN = 0.1
+"""Share of the square of its first residual at which a solve ends at most that goes on from the one before."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most; no more than multiprocessors, as they wait
 for each other and must run together."""
@@ -34,12 +36,14 @@ class Team:
         parts: Threads that share a row, a power of 2.
         arrived: How often blocks have waited for the others, shape [worlds].
         sums: Two of each block of each world, shape [worlds, 2 blocks].
+        limit: Square of the residual at which the first solve of a Newton step ends, shape [worlds].
     """
 
     blocks: int
     parts: int
     arrived: wp.array[int]
     sums: wp.array2d[float]
+    limit: wp.array[float]
 
 
 def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int, wp.Kernel]:
@@ -60,6 +64,7 @@ def make_team(unknowns: int, worlds: int, device: wp.Device) -> tuple[Team, int,
             team.blocks = min(most, -(-team.parts * unknowns // _BLOCK))
     team.arrived = wp.zeros(worlds, dtype=int, device=device)
     team.sums = wp.zeros((worlds, 2 * team.blocks), dtype=float, device=device)
+    team.limit = wp.zeros(worlds, dtype=float, device=device)
     bounds = min(size for size in _KEPT if threads <= size)
     kept = -(-_KEPT[bounds] // team.parts) if device.is_cuda else 0
     return team, threads, _make_solve_kernel(bounds, team.parts, kept, shared)
@@ -108,13 +113,16 @@ _SOLVE = """
     float* preconditioned = (float*)(vectors.preconditioned.data + first);
 #endif
     __shared__ float shared_inverses[INVERSES + 1], sums_of_warps[2][32], sums_of_blocks[2];
-    __shared__ float shared_pulls[3 * COUPLED], coupled_blocks[9 * COUPLED], entry_weight[ENTRIES];
+    // of the first contacts that couple; blocks are symmetric, entries those of rows, as four times the contact plus
+    // the place
+    __shared__ float shared_pulls[3 * COUPLED], coupled_blocks[6 * COUPLED];
     __shared__ float4 coupled_weights[COUPLED];
-    __shared__ int4 coupled_columns[COUPLED];
-    __shared__ int entry_pulled[ENTRIES], entries;
+    __shared__ ushort4 coupled_columns[COUPLED];
+    __shared__ unsigned short coupled_entries[4 * COUPLED];
+    __shared__ int entries;
     typedef float real;
     const int lane = threadIdx.x, threads = blockDim.x;
-    const bool shares_contacts = SHARED && coupled <= COUPLED && unknowns.particle.data[first + rows - 1] >= 0;
+    const int shared = SHARED && unknowns.particle.data[first + rows - 1] >= 0 ? wp::min(coupled, COUPLED) : 0;
     auto quotient = [](float a, float b) { return __fdividef(a, b); };
     auto multiplied = [&](int at) INLINE {  // read at once
 #if SHARED
@@ -124,7 +132,6 @@ _SOLVE = """
         return wp::vec3(preconditioned[at], preconditioned[at + 1], preconditioned[at + 2]);
 #endif
     };
-    if (shares_contacts) pulls = shared_pulls;
     int turn = 0;
     auto wait = [&]() {
         __syncthreads();
@@ -184,19 +191,21 @@ _SOLVE = """
         return value;
     };
     if (lane < 64) sums_of_warps[lane / 32][lane % 32] = 0.0f;
-    if (shares_contacts) {
-        for (int n = lane; n < coupled; n += threads) {
+    if (shared) {
+        for (int n = lane; n < shared; n += threads) {
             const int i = contacts.coupled.data[first_coupled + n];
-            int columns[4];
+            unsigned short columns[4];
             float weights[4];
             for (int j = 0; j < 4; ++j) {
                 const int u = contacts.coupled_unknowns.data[first_coupled + n][j];
                 columns[j] = u < 0 ? 0 : WIDE * (u - first);
                 weights[j] = u < 0 ? 0.0f : contacts.weights.data[i][j];
             }
-            coupled_columns[n] = make_int4(columns[0], columns[1], columns[2], columns[3]);
+            coupled_columns[n] = make_ushort4(columns[0], columns[1], columns[2], columns[3]);
             coupled_weights[n] = make_float4(weights[0], weights[1], weights[2], weights[3]);
-            for (int c = 0; c < 9; ++c) coupled_blocks[9 * n + c] = ((float*)&contacts.hessian.data[i])[c];
+            const float* h = (float*)&contacts.hessian.data[i];
+            const int places[6] = {0, 4, 8, 1, 2, 5};  // of the diagonal, and above it
+            for (int c = 0; c < 6; ++c) coupled_blocks[c * COUPLED + n] = h[places[c]];
         }
         if (lane == 0) entries = 0;
         __syncthreads();
@@ -204,7 +213,7 @@ _SOLVE = """
 #else
     const int lane = 0, threads = 1;
     float* preconditioned = (float*)(vectors.preconditioned.data + first);
-    const bool shares_contacts = false;
+    const int shared = 0;
     auto wait = []() {};
     auto quotient = [](double a, double b) { return a / b; };
     auto multiplied = [&](int at) { return wp::vec3(); };
@@ -238,7 +247,7 @@ _SOLVE = """
     float kept[KEPT + 1][9];
     int kept_column[KEPT + 1], own_entry = 0, own_end = 0;
     bool own_free = false;
-    int own_first = 0, own_count = -1;  // of its contacts that couple, in shared memory
+    int own_first = 0, own_count = 0;  // of its contacts in shared memory
     if (keeps && begin < rows) {
         own_free = is_free[begin];
 #if defined(__CUDA_ARCH__)
@@ -255,35 +264,33 @@ _SOLVE = """
                 kept[k][c] = column < 0 ? 0.0f : matrix.value.data[9 * (at - of_group) + c * width + of_group];
         }
         own_entry += KEPT;
-#if defined(__CUDA_ARCH__)
-        if (shares_contacts && coupled) {
-            const int middle = contacts.middle.data[first + begin] + part, end = contacts.end.data[first + begin];
-            const int count = end > middle ? (end - middle + parts - 1) / parts : 0;
-            const int at = count ? atomicAdd(&entries, count) : 0;
-            if (at + count <= ENTRIES) {
-                own_first = at, own_count = count;
-                for (int n = 0; n < count; ++n) {
-                    entry_pulled[at + n] = 3 * contacts.pulled.data[middle + n * parts];
-                    entry_weight[at + n] = contacts.entry_weight.data[middle + n * parts];
-                }
-            }
-        }
-#endif
     }
+#if defined(__CUDA_ARCH__)
+    if (shared && begin < rows) {
+        const int middle = contacts.middle.data[first + begin] + part, end = contacts.end.data[first + begin];
+        for (int n = middle; n < end; n += parts) own_count += contacts.pulled.data[n] < shared;
+        own_first = own_count ? atomicAdd(&entries, own_count) : 0;
+        for (int n = middle, at = own_first; n < end; n += parts)
+            if (contacts.pulled.data[n] < shared)
+                coupled_entries[at++] = 4 * contacts.pulled.data[n] + (contacts.entries.data[n] & 3);
+    }
+#endif
     auto pull = [&]() INLINE {  // products of contacts that couple with what is multiplied
         if (coupled == 0) return;
 #if defined(__CUDA_ARCH__)
-        for (int n = lane; shares_contacts && n < coupled; n += threads) {
-            const int4 at = coupled_columns[n];
+        for (int n = lane; n < shared; n += threads) {
+            const ushort4 at = coupled_columns[n];
             const float4 by = coupled_weights[n];
-            const float* h = coupled_blocks + 9 * n;
+            const float* h = coupled_blocks + n;
             const wp::vec3 apart = by.x * multiplied(at.x) + by.y * multiplied(at.y)
                 + by.z * multiplied(at.z) + by.w * multiplied(at.w);
-            for (int c = 0; c < 3; ++c)
-                shared_pulls[3 * n + c] = h[3 * c] * apart[0] + h[3 * c + 1] * apart[1] + h[3 * c + 2] * apart[2];
+            const float xy = h[3 * COUPLED], xz = h[4 * COUPLED], yz = h[5 * COUPLED];
+            shared_pulls[3 * n] = h[0] * apart[0] + xy * apart[1] + xz * apart[2];
+            shared_pulls[3 * n + 1] = xy * apart[0] + h[COUPLED] * apart[1] + yz * apart[2];
+            shared_pulls[3 * n + 2] = xz * apart[0] + yz * apart[1] + h[2 * COUPLED] * apart[2];
         }
 #endif
-        for (int n = block * threads + lane; !shares_contacts && n < coupled; n += blocks * threads) {
+        for (int n = shared + block * threads + lane; n < coupled; n += blocks * threads) {
             const int i = contacts.coupled.data[first_coupled + n];
             const wp::vec4i corners = contacts.coupled_unknowns.data[first_coupled + n];
             const wp::vec4 weights = contacts.weights.data[i];
@@ -327,16 +334,19 @@ _SOLVE = """
         // not unrolled where blocks are kept: with more code here, they are in local memory instead of registers
 #pragma unroll 1
         for (int n = own_first; n < own_first + own_count; ++n) {
-            const float weight = entry_weight[n];
-            for (int c = 0; c < 3; ++c) total[c] += weight * shared_pulls[entry_pulled[n] + c];
+            const int at = coupled_entries[n];
+            const float weight = ((float*)coupled_weights)[at];
+            for (int c = 0; c < 3; ++c) total[c] += weight * shared_pulls[3 * (at >> 2) + c];
         }
 #endif
-        if (coupled && own_count < 0) {
+        if (coupled > shared) {
             const bool of_body = unknowns.particle.data[u] < 0;
             const int end = contacts.end.data[u];
 #pragma unroll UNROLLED
             for (int n = contacts.middle.data[u] + part; n < end; n += parts) {
-                const float* by = pulls + 3 * contacts.pulled.data[n];
+                const int at = contacts.pulled.data[n];
+                if (at < shared) continue;
+                const float* by = pulls + 3 * at;
                 const float weight = contacts.entry_weight.data[n];
                 wp::vec3 force(weight * by[0], weight * by[1], weight * by[2]);
                 if (of_body) {
@@ -389,7 +399,11 @@ _SOLVE = """
             continue;
         }
         sum(squared, of_product);
-        if (count == 0) limit = tolerance * tolerance * squared;
+        if (count == 0) {
+            limit = tolerance * tolerance * squared;
+            if (solves.data[0] == 0) team.limit.data[world] = (float)limit;
+            else limit = wp::min(wp::max(limit, (real)team.limit.data[world]), (real)AGAIN * squared);
+        }
         if (!(squared > limit)) break;
         const real momentum = count == 0 ? (real)0.0f : quotient(squared, before);
         curvature = of_product - momentum * momentum * curvature;
@@ -426,9 +440,14 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
     iteration would otherwise be arithmetic of addresses, and waiting for memory.
     """
     sizes = {"SHARED": int(shared), "WIDE": 4 if shared else 3, "THREADS": bounds, "PARTS": parts, "KEPT": kept}
-    # in shared memory, of which a block has 48 KiB
-    sizes["INVERSES"] = 9 * bounds if kept and shared and bounds == min(_KEPT) else 0
-    sizes |= {"COUPLED": _COUPLED, "ENTRIES": 4 * _COUPLED, "UNROLLED": 1 if shared else 4}
+    inverses = 9 * bounds if kept and shared and bounds == min(_KEPT) else 0
+    left = _SHARED_MEMORY - 4 * (inverses + 4 * bounds) if shared else 0
+    sizes |= {
+        "INVERSES": inverses,
+        "COUPLED": max(left // _OF_CONTACT, 1),
+        "UNROLLED": 1 if shared else 4,
+        "AGAIN": _AGAIN,
+    }
     snippet = functools.reduce(lambda text, name: text.replace(name, str(sizes[name])), sizes, _SOLVE)
 
     @wp.func_native(snippet=snippet)
@@ -438,6 +457,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         unknowns: Unknowns,
         tolerance: float,
         max_iterations: int,
+        solves: wp.array[int],
         team: Team,
         vectors: Vectors,
         world: int,
@@ -453,6 +473,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         active: wp.array[int],
         tolerance: wp.array[float],
         max_iterations: int,
+        solves: wp.array[int],
         team: Team,
         # in and out
         vectors: Vectors,
@@ -461,6 +482,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
     ):
         """Solves H d = -g in active worlds, until the norm of the residual, preconditioned, is a share of its first.
 
+        The first of ``solves`` of a Newton step counts; those that follow it go on from there, with what is held since.
         Where the matrix is found not to be positive definite, the solution so far ends the solve, or the preconditioned
         negative gradient if there is none: both are directions in which the energy falls. What is given stays given.
         """
@@ -469,7 +491,7 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         world, block = number // team.blocks, number % team.blocks
         if active[world] == 0:
             return
-        count = solve(matrix, contacts, unknowns, tolerance[world], max_iterations, team, vectors, world, block)
+        count = solve(matrix, contacts, unknowns, tolerance[world], max_iterations, solves, team, vectors, world, block)
         if block == 0 and lane == 0:
             iterations[world] = iterations[world] + count
 

@@ -414,6 +414,7 @@ class NewtonMethod:
             self.progress.solving,
             self._tolerance,
             _MAX_ITERATIONS,
+            self._flow.solves,
             team,
         ]
         outputs = [self._vectors, self.iterations]
