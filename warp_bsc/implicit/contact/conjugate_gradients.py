@@ -18,7 +18,7 @@ _LARGEST_BLOCK = 1024
 """Threads of the only block of a world, at most."""
 _KEPT = {320: 13, 640: 4, _LARGEST_BLOCK: 0}
 """Blocks of the Hessian that a thread keeps in registers, in thread blocks of so many threads at most."""
-_SHARED_MEMORY, _OF_CONTACT = 46 * 1024, 68
+_SHARED_MEMORY, _OF_CONTACT = 44 * 1024, 68
 """Bytes of shared memory that a block takes at most, with some to spare, and those of a contact there."""
 _AGAIN = 0.1
 """Share of the square of its first residual at which a solve ends at most that goes on from the one before."""
