@@ -474,6 +474,19 @@ def test_what_is_crushed_is_named(device):
     assert np.abs(state.particle_qd.numpy()).max() < 100.0
 
 
+def test_no_candidates_are_sought_between_shapes_alone(device):
+    builder = newton.ModelBuilder()
+    add_patch(builder, 4, 0.04, (0.0, 0.0, 0.3))
+    builder.add_shape_sphere(body=-1, radius=0.1)
+    solver, _ = run(builder.finalize(device=device), 1)
+    newton_method, detector = solver._newton, solver._work.detector
+    newton_method._find_candidates()
+    found = newton_method._candidates
+    counts = detector.counters.read()
+    queued = counts.vertex_face.queued + counts.edge_edge.queued
+    assert 0 < queued == found.near.numpy()[0] + found.far.numpy()[0]
+
+
 # Models with little
 
 

@@ -114,7 +114,8 @@ class NewtonMethod:
         of_bodies[solved] = number[particles::2]
         self._count = len(order)
         first = of_bodies[body_of_vertex]  # that of -1 is the last
-        unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
+        of_vertex = np.append(unknown, np.where(first < 0, -1, -2 - first))
+        unknowns.of_vertex, self._is_sought = array(of_vertex), array(of_vertex != -1)
         unknowns.particle = array(np.where(order < particles, order, -1))
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
         unknowns.world = array(owner_world[order])
@@ -346,7 +347,8 @@ class NewtonMethod:
         work, detector = self._work, self._work.detector
 
         def find():
-            detector.find_candidates(self._lower, self._upper, keep_separated=True)
+            options = {"changed": self._is_sought, "keep_separated": True}  # no pairs of shapes alone
+            detector.find_candidates(self._lower, self._upper, **options)
 
         retry_until_fits(find, detector, work.device)
         self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self._lacks])
