@@ -5,8 +5,8 @@ one of the next level, up to one root: a tree whose links are arithmetic. The sa
 side, so that one box is compared with eight at once.
 
 - ``boxes``, float32, 96 a packet: for each axis the lowest and the highest coordinate at the start, then at the end.
-- ``elements``, int32, 41 a packet: the numbers of the elements, three corners each, their worlds, and which of them
-  have changed, as bits.
+- ``elements``, int32, 48 a packet: the numbers of the elements, three corners each, their worlds, and their marks: 0
+  of what has not changed, more than 1 of what is of a rigid body, by body.
 - ``nodes``, float32, 48 a node: for each axis the lowest and the highest coordinate of the children, at any time.
 - ``node_marks``, int32, 24 a node: the first and the last world of the children, and whether elements below them have
   changed.
@@ -34,7 +34,7 @@ import warp as wp
     auto highest = [](float a, float b) { return a > b ? a : b; };
 
     const float* box = boxes.data + 96 * (size_t)packet;
-    const int* element = elements.data + 41 * (size_t)packet;
+    const int* element = elements.data + 48 * (size_t)packet;
 
     // the packet's own box, over all of the time, and its worlds, sorted as they are
     Floats lows[3], highs[3];
@@ -83,11 +83,11 @@ import warp as wp
         return true;
     };
 
-    const unsigned changed = element[40];
+    const unsigned changed = bits(ints(element + 40) != 0);
     auto compare = [&](int other, unsigned lanes) {
         const float* other_box = other_boxes.data + 96 * (size_t)other;
-        const int* other_element = other_elements.data + 41 * (size_t)other;
-        const unsigned other_changed = other_element[40];
+        const int* other_element = other_elements.data + 48 * (size_t)other;
+        const unsigned other_changed = bits(ints(other_element + 40) != 0);
         if (!other_changed)
             lanes &= changed;
         if (!lanes)
@@ -107,10 +107,13 @@ import warp as wp
         for (; lanes; lanes &= lanes - 1) {
             const int lane = __builtin_ctz(lanes);
             Ints overlap = ints(other_element + 32) == element[32 + lane];
+            const int mark = element[40 + lane];
+            if (mark > 1)
+                overlap &= ints(other_element + 40) != mark;
             for (int axis = 0; axis < 3; ++axis)
                 overlap &= (other_low[axis] <= lane_highs[axis][lane]) & (other_high[axis] >= lane_lows[axis][lane]);
             unsigned mask = bits(overlap);
-            if (!(changed >> lane & 1))
+            if (!mark)
                 mask &= other_changed;
             if (symmetric && other == packet)
                 mask &= ~((2u << lane) - 1u);
@@ -228,9 +231,10 @@ def pair_packet(
 
     Those are the swept boxes, unless an axis separates the two at the start and at the end, on the same side; with
     ``keep_separated`` such pairs are enqueued as well. With ``at_end`` they are the boxes at the end. Pairs without a
-    changed element are excluded. With ``symmetric`` both are of one tree, and each pair is found once. With ``ordered``
-    the smaller number comes first, else that of the packet. With groups, the pairs that a :class:`.pairs.PairFilter`
-    leaves out are counted, by world as well if there is an array for that, and are not enqueued.
+    changed element are excluded, and those within a rigid body, by marks. With ``symmetric`` both are of one tree, and
+    each pair is found once. With ``ordered`` the smaller number comes first, else that of the packet. With groups, the
+    pairs that a :class:`.pairs.PairFilter` leaves out are counted, by world as well if there is an array for that, and
+    are not enqueued.
     """
     ...
 
@@ -241,7 +245,7 @@ _FIT_SNIPPET = """
     typedef double Doubles __attribute__((ext_vector_type(4)));
 
     const {scalar} infinity = __builtin_inf();
-    const int* element = elements.data + 41 * (size_t)packet;
+    const int* element = elements.data + 48 * (size_t)packet;
     float* box = boxes.data + 96 * (size_t)packet;
     float* node = nodes.data + 48 * (size_t)(packet / 8) + packet % 8;
     int* marks = node_marks.data + 24 * (size_t)(packet / 8) + packet % 8;
@@ -265,12 +269,12 @@ _FIT_SNIPPET = """
     for (int row = 0; row < 12; ++row)
         for (int lane = 0; lane < 8; ++lane)
             rows[row][lane] = row % 2 ? -__builtin_inff() : __builtin_inff();
-    unsigned changed_lanes = 0;
+    int lane_marks[8] = {{}}, any_changed = 0;
     for (int lane = 0; lane < count; ++lane) {{
         Four low0 = infinity, high0 = -infinity, low1 = infinity, high1 = -infinity;
         auto finite = low0 == low0;
         double pad = 0.0;
-        bool is_changed = !changed.data;
+        int mark = !changed.data;
         for (int i = 0; i < corners; ++i) {{
             const int corner = element[8 + 8 * i + lane];
             const Four start = load(x0, corner), end = load(x1, corner);
@@ -282,9 +286,10 @@ _FIT_SNIPPET = """
             if (padding.data)
                 pad = padding.data[corner] > pad ? padding.data[corner] : pad;
             if (changed.data)
-                is_changed |= changed.data[corner] != 0;
+                mark = changed.data[corner] > mark ? changed.data[corner] : mark;
         }}
-        changed_lanes |= (unsigned)is_changed << lane;
+        lane_marks[lane] = mark;
+        any_changed |= mark != 0;
         if (!(finite[0] && finite[1] && finite[2]))
             continue;  // an empty box overlaps none
         const auto a = rounded(low0, -pad), b = rounded(high0, pad), c = rounded(low1, -pad), d = rounded(high1, pad);
@@ -306,8 +311,8 @@ _FIT_SNIPPET = """
         node[16 * axis + 8] = high;
     }}
     __builtin_memcpy(box, rows, sizeof(rows));
-    elements.data[41 * (size_t)packet + 40] = changed_lanes;
-    marks[16] = changed_lanes != 0;
+    __builtin_memcpy(elements.data + 48 * (size_t)packet + 40, lane_marks, sizeof(lane_marks));
+    marks[16] = any_changed;
 """
 
 
@@ -320,7 +325,7 @@ def fit_packet_of(dtype: type) -> wp.Function:
 
     Returns:
         Device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
-        ends, the number of corners of an element, nonzero for each changed vertex or None for all, how far boxes reach
+        ends, the number of corners of an element, the mark of each vertex or None for 1, how far boxes reach
         beyond each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and which
         elements have changed. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an
         element with a position that is not finite is empty. Indices are not checked.

@@ -16,7 +16,7 @@ from warp_bsc.detection.wide_tree import hilbert_transpose
 from warp_bsc.kernels.pipeline.hierarchy import count_set_bits
 
 
-def find_pairs(broad_phase, mesh, x0, x1):
+def find_pairs(broad_phase, mesh, x0, x1, changed=None):
     """Counts and pairs of each kind, and the (edge, face) pairs at the start."""
     device = mesh.device
     if broad_phase is BroadPhaseSimd and device.is_cuda:
@@ -29,7 +29,8 @@ def find_pairs(broad_phase, mesh, x0, x1):
     queues = [wp.full(400_000, wp.vec2i(-1, -1), dtype=wp.vec2i, device=device) for _ in range(3)]
     finder = broad_phase(mesh, own_count)
     finder.grow(1_000_000)
-    finder.pair_elements(x0, x1, counts[0], queues[0], counts[1], queues[1])
+    changed = None if changed is None else wp.array(changed, dtype=int, device=device)
+    finder.pair_elements(x0, x1, counts[0], queues[0], counts[1], queues[1], changed=changed)
     own_count.zero_()
     finder.pair_edges_with_faces(x0, counts[2], queues[2])
     counts = counts.numpy()
@@ -194,6 +195,23 @@ def test_pairs_of_faces_of_which_one_has_changed():
         changes = (changed[mesh.faces] != 0).any(axis=1)
         expected = everything[changes[everything].any(axis=1)]
         np.testing.assert_array_equal(face_pairs(mesh, x0, x1, changed), expected)
+
+
+def test_simd_packets_leave_out_pairs_within_a_rigid_body():
+    """And those of what has not changed: 1 marks cloth, 0 shapes that stand, more are bodies."""
+    random = np.random.default_rng(0)
+    faces = np.arange(180).reshape(60, 3)
+    mark = np.repeat(random.integers(0, 4, 60), 3)
+    x0, x1 = random.uniform(0.0, 1.0, (2, 180, 3)).astype(np.float32)
+    mesh = bsc.CollisionMesh(faces, len(x0))
+    found = find_pairs(BroadPhaseSimd, mesh, x0, x1, mark)
+    everything = all_pairs(mesh, x0, x1)
+    for k, (first, second) in enumerate([(np.arange(180), faces[:, 0]), (mesh.edges[:, 0], mesh.edges[:, 0])]):
+        i, j = np.divmod(everything[k], 2**32)
+        marks, others = mark[first[i]], mark[second[j]]
+        sought = (marks != others) | (marks == 1)
+        assert 0 < sought.sum() < len(sought)
+        assert found[k] == np.array(everything[k])[sought].tolist()
 
 
 @wp.struct

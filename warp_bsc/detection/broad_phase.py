@@ -59,8 +59,8 @@ class BroadPhase(Protocol):
             x1: Positions at the end, of the same type.
             out: Counts by :class:`Count`, array of int64, and queue for (vertex, face), array of vec2i; then those for
                 (edge, edge), the smaller first.
-            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. Pairs without one of
-                these vertices may be found as well.
+            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. More than 1, by body,
+                for those of rigid bodies, within which none are. What is not sought may be found as well.
             keep_separated: Whether to enqueue the pairs that an axis separates, too.
         """
         ...

@@ -265,7 +265,7 @@ class WideTree:
         # lanes without an element keep an empty box, which overlaps no other, and the world -1
         empty = np.array([np.inf, -np.inf], dtype=np.float32).reshape(1, 2, 1)
         self._boxes = wp.array(np.tile(empty, (packets, 6, 8)), dtype=wp.float32, device=device)
-        self._elements = wp.full((packets, 41), -1, dtype=int, device=device)
+        self._elements = wp.full((packets, 48), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
         self._size = self._sorted_size = 0.0  # of all packets, when fitted and when sorted
@@ -303,7 +303,7 @@ class WideTree:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            changed: Nonzero for each changed vertex, array of int; None for all.
+            changed: As of :meth:`.BroadPhase.pair_elements`.
         """
         _, fit_packets = _kernels(x0.dtype)
         inputs = [x0, x1, self._corners.shape[1], len(self._corners), changed, self._padding]

@@ -115,7 +115,8 @@ class NewtonMethod:
         self._count = len(order)
         first = of_bodies[body_of_vertex]  # that of -1 is the last
         of_vertex = np.append(unknown, np.where(first < 0, -1, -2 - first))
-        unknowns.of_vertex, self._is_sought = array(of_vertex), array(of_vertex != -1)
+        unknowns.of_vertex = array(of_vertex)
+        self._sought = array(np.append(np.ones(particles), np.where(first < 0, 0, 2 + body_of_vertex)))
         unknowns.particle = array(np.where(order < particles, order, -1))
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
         unknowns.world = array(owner_world[order])
@@ -347,7 +348,8 @@ class NewtonMethod:
         work, detector = self._work, self._work.detector
 
         def find():
-            options = {"changed": self._is_sought, "keep_separated": True}  # no pairs of shapes alone
+            # no pairs of shapes alone, or within a body
+            options = {"changed": self._sought, "keep_separated": True}
             detector.find_candidates(self._lower, self._upper, **options)
 
         retry_until_fits(find, detector, work.device)
