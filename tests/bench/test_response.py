@@ -235,11 +235,11 @@ def test_a_program_moves_bodies_and_particles(device):
 
 def test_newton_steps_are_limited_unless_the_run_is_the_converged_one(device, monkeypatch):
     """After as many steps as are compared, here fewer, while cubes meet."""
-    monkeypatch.setattr("warp_bsc.bench.response.EARLY_STEPS", 4)
-    limited, converged = (measure("pile", name, device=device, seconds=4 / 60) for name in ("implicit", CONVERGED))
-    assert limited.steps == converged.steps == 4
+    monkeypatch.setattr("warp_bsc.bench.response.EARLY_STEPS", 14)
+    limited, converged = (measure("pile", name, device=device, seconds=14 / 60) for name in ("implicit", CONVERGED))
+    assert limited.steps == converged.steps == 14
     assert limited.crossings == limited.collisions == limited.uncertified_steps == 0
-    assert 1e-3 < limited.distance_from(converged) < 100.0
+    assert 1e-2 < limited.distance_from(converged) < 100.0
     assert converged.distance_from(converged) == 0.0
 
 

@@ -339,8 +339,8 @@ class DetectionPipeline:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
-            changed: As of :meth:`find_contacts`.
-            keep_separated: As of :meth:`.BroadPhase.pair_elements`.
+            changed: As of :meth:`.BroadPhase.pair_elements`.
+            keep_separated: The same.
         """
         self._pad_arcs()
         self.counters.array.zero_()

@@ -21,7 +21,7 @@ _KEPT = {320: 13, 640: 4, _LARGEST_BLOCK: 0}
 _SHARED_MEMORY, _OF_CONTACT = 44 * 1024, 68
 """Bytes of shared memory that a block takes at most, with some to spare, and those of a contact there."""
 _AGAIN = 0.1
-"""Share of the square of its first residual at which a solve ends at most that goes on from the one before."""
+"""A solve that goes on from the one before ends at this share of the square of its first residual, or below."""
 _BLOCK, _BLOCKS = 512, 128
 """Threads of each block of a larger world, and blocks of all worlds at most; no more than multiprocessors, as they wait
 for each other and must run together."""

@@ -114,8 +114,7 @@ class NewtonMethod:
         of_bodies[solved] = number[particles::2]
         self._count = len(order)
         first = of_bodies[body_of_vertex]  # that of -1 is the last
-        of_vertex = np.append(unknown, np.where(first < 0, -1, -2 - first))
-        unknowns.of_vertex = array(of_vertex)
+        unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
         self._sought = array(np.append(np.ones(particles), np.where(first < 0, 0, 2 + body_of_vertex)))
         unknowns.particle = array(np.where(order < particles, order, -1))
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
@@ -349,8 +348,7 @@ class NewtonMethod:
 
         def find():
             # no pairs of shapes alone, or within a body
-            options = {"changed": self._sought, "keep_separated": True}
-            detector.find_candidates(self._lower, self._upper, **options)
+            detector.find_candidates(self._lower, self._upper, changed=self._sought, keep_separated=True)
 
         retry_until_fits(find, detector, work.device)
         self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self._lacks])

@@ -21,7 +21,7 @@ _WITHIN = wp.constant(wp.float64(1.0 - 2.0**-19))
 _LEAST_GAP = wp.constant(wp.float64(1e-3))
 """Least gap at the start for a barrier, as a share of its reach: forces stay finite where elements nearly touch."""
 _LEAST_REACH = wp.constant(wp.float64(0.1))
-"""Share of the reach that this is of at least, however short a step cuts it: positions are rounded."""
+"""It is that share of a tenth of the reach at least, however short a step cuts that: positions are rounded."""
 _LAYERS = wp.constant(wp.float64(64.0 * barrier.CURVATURE_AT_HALF / barrier.FORCE_AT_FLOOR))
 """For so many layers, 64, that it carries at :data:`.barrier.FLOOR`, the stiffness of a barrier by that for one."""
 _PARALLEL = wp.constant(wp.float64(1e-3))
