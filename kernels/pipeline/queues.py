@@ -53,6 +53,28 @@ def take_slot_int(count: wp.array[int]) -> int:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
+    // one atomic for all threads of a warp that are here and raise the same count
+    const unsigned mask = __match_any_sync(__activemask(), queue);
+    const int lane = threadIdx.x & 31;
+    const int leader = __ffs(mask) - 1;
+    int base = 0;
+    if (lane == leader)
+        base = atomicAdd(&counts.data[queue], __popc(mask));
+    base = __shfl_sync(mask, base, leader);
+    return base + __popc(mask & ((1u << lane) - 1u));
+#else
+    return __atomic_fetch_add(&counts.data[queue], 1, __ATOMIC_RELAXED);
+#endif
+"""
+)
+def take_slot_of(counts: wp.array[int], queue: int) -> int:
+    """Raises one of several counts of 32 bits by one, and returns its old value."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
     // one atomic for all threads of a warp that are here; the sum over lower lanes, bit by bit
     const unsigned mask = __activemask();
     const int lane = threadIdx.x & 31;

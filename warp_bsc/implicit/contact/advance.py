@@ -1,7 +1,8 @@
 """Newton steps as one kernel: all that lies between two solves, phase after phase, read from top to bottom.
 
-All threads of the device take a share of each phase, and wait for each other behind it. What a phase finds in some
-world decides which comes next: without a launch, a host, or a condition of a CUDA graph in between.
+Each world has a team of threads, which take a share of each phase, and wait for each other behind it. What a phase
+finds decides which comes next: without a launch, a host, or a condition of a CUDA graph in between. A world waits for
+others only where it needs a search for candidates, until they end or need one as well.
 """
 
 from enum import IntEnum
@@ -15,7 +16,7 @@ from .conjugate_gradients import Vectors
 from .matrix import Matrix
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import Rows
-from .system import Contacts, Flag, Progress, Unknowns, contact_count
+from .system import Contacts, Progress, Unknowns, Worlds, end_of_contacts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,22 +46,21 @@ class Phase(IntEnum):
     TAKE_BOUND = 14
     DISPLACED = 15
     JUDGE = 16
-    JUDGED = 17
-    BEGIN_RELEASE = 18
-    END_RELEASE = 19
-    BEGIN_CUTS = 20
-    CUT = 21
-    TAKE_CUT = 22
-    CHOOSE_CUTS = 23
-    UNDO_CUTS = 24
-    TAKE = 25
-    DECIDE = 26
-    NEXT = 27
-    PUBLISH = 28
-    SOLVE = 29
-    SEARCH_CANDIDATES = 30
-    GROW = 31
-    END = 32
+    BEGIN_RELEASE = 17
+    END_RELEASE = 18
+    BEGIN_CUTS = 19
+    CUT = 20
+    TAKE_CUT = 21
+    CHOOSE_CUTS = 22
+    UNDO_CUTS = 23
+    TAKE = 24
+    DECIDE = 25
+    NEXT = 26
+    PUBLISH = 27
+    SOLVE = 28
+    SEARCH_CANDIDATES = 29
+    GROW = 30
+    END = 31
 
 
 class Task(IntEnum):
@@ -74,14 +74,14 @@ class Task(IntEnum):
 
 @wp.struct
 class Flow:
-    """Where the Newton steps of all worlds are.
+    """Where the Newton steps are.
 
     Attributes:
-        phase: The phase that comes next, shape [1].
-        solves: Solves of the Newton step so far, shape [1].
-        solves_next: 1 if a solve comes next, shape [1].
-        goes_on: 1 if a solve, a search for candidates or larger buffers come next, shape [1].
-        arrived: How often blocks of threads have waited, shape [1].
+        phase: The phase of each world that comes next.
+        solves: Solves of each world in its Newton step so far.
+        solves_next: 1 if a solve comes next for one, shape [1].
+        goes_on: 1 if a search for candidates or larger buffers come next for one, shape [1].
+        arrived: How often blocks of threads of each world have waited.
     """
 
     phase: wp.array[int]
@@ -103,7 +103,8 @@ class Problem:
         plane_share: Share of their ways that infinite planes have gone, by world.
         whole: Share that each world takes without cuts of single vertices.
         first: Solution of the Newton step before pairs are held.
-        leaves: 1 for each world of which a vertex leaves its box, and for any, last.
+        leaves: 1 for each world of which a vertex leaves its box.
+        any_leaves: 1 if there is one, shape [1].
         lacks: See :func:`.step_report.write_results`.
         vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
         parts: Threads that share rows and blocks.
@@ -132,8 +133,9 @@ class Problem:
     whole: wp.array[float]
     first: wp.array[wp.vec3]
     leaves: wp.array[int]
+    any_leaves: wp.array[int]
     lacks: wp.array[int]
-    element_count: int
+    worlds: Worlds
     vertices_at_planes: int
     parts: int
     turns: int
@@ -144,12 +146,13 @@ class Problem:
     snippet="""
 #if defined(__CUDA_ARCH__)
     __syncthreads();
-    if (gridDim.x > 1) {
+    if (blocks > 1) {
         if (threadIdx.x == 0) {
             __threadfence();
-            const unsigned before = atomicAdd((unsigned*)arrived.data, 1u);
-            const unsigned all = (before / gridDim.x + 1u) * gridDim.x;
-            while ((int)(*(volatile unsigned*)arrived.data - all) < 0) {}
+            unsigned* count = (unsigned*)arrived.data + world;
+            const unsigned before = atomicAdd(count, 1u);
+            const unsigned all = (before / blocks + 1u) * blocks;
+            while ((int)(*(volatile unsigned*)count - all) < 0) {}
             __threadfence();
         }
         __syncthreads();
@@ -157,8 +160,8 @@ class Problem:
 #endif
 """
 )
-def wait_for_all(arrived: wp.array[int]):
-    """Waits until all threads of the launch are here, and sees what they have written; they must all be running."""
+def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
+    """Waits until all threads of a world are here, and sees what they have written; its blocks must all be running."""
     ...
 
 
@@ -180,39 +183,37 @@ def _over_pairs(
     planes: MovingPlanes,
     settings: BarrierSettings,
     solves: int,
+    w: int,
     t: int,
     n: int,
 ):
     group = 1 + solves
-    near_count = p.candidates.near[0]
-    for k in range(t, near_count + p.candidates.far[0], n):
-        i = wp.where(k < near_count, k, p.candidates.corners.shape[0] - 1 - (k - near_count))
+    start, near_count = p.candidates.start[w], p.candidates.near[w]
+    last = start + p.candidates.room[w] - 1
+    for k in range(t, near_count + p.candidates.far[w], n):
+        i = wp.where(k < near_count, start + k, last - (k - near_count))
         if task == Task.FIND_NEAR:
-            near.find_near(i, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
+            near.find_near(i, w, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
         elif task == Task.HOLD:
-            held.hold_pair(
-                i,
-                p.candidates,
-                p.trial,
-                p.unknowns,
-                p.vectors.inverse,
-                p.progress,
-                p.limit,
-                group,
-                p.contacts,
-            )
+            held.hold_pair(i, w, p.candidates, p.trial, p.unknowns, p.vectors.inverse, p.limit, group, p.contacts)
         elif task == Task.BOUND:
-            bounds.bound_by_pair(i, p.candidates, p.trial, p.progress, p.limit, is_shorter)
+            bounds.bound_by_pair(i, w, p.candidates, p.trial, p.progress, p.limit, is_shorter)
         else:
-            merit.add_pair_energy(i, motion, p.candidates, settings, p.trial, p.progress)
-    for v in range(t, p.vertices_at_planes, n):
+            merit.add_pair_energy(i, w, motion, p.candidates, settings, p.trial, p.progress)
+    if p.vertices_at_planes == 0:
+        return
+    for k in range(p.worlds.first_vertex[w] + t, p.worlds.first_given[w], n):
+        v = p.worlds.vertices[k] + int(0)
+        if v >= p.vertices_at_planes:
+            continue
         if task == Task.FIND_NEAR:
             near.find_near_planes(
-                v, motion, planes, p.plane_share, settings, p.trial, p.unknowns, p.progress, p.contacts
+                v, w, motion, planes, p.plane_share, settings, p.trial, p.unknowns, p.progress, p.contacts
             )
         elif task == Task.HOLD:
             held.hold_at_planes(
                 v,
+                w,
                 motion,
                 planes,
                 p.plane_share,
@@ -220,48 +221,38 @@ def _over_pairs(
                 p.trial,
                 p.unknowns,
                 p.vectors.inverse,
-                p.progress,
                 group,
                 p.contacts,
             )
         elif task == Task.BOUND:
-            bounds.bound_by_planes(v, motion, planes, p.plane_share, settings, p.trial, p.progress, p.limit)
+            bounds.bound_by_planes(v, w, motion, planes, p.plane_share, settings, p.trial, p.progress, p.limit)
         else:
-            merit.add_plane_energies(v, motion, planes, p.plane_share, settings, p.trial, p.progress)
+            merit.add_plane_energies(v, w, motion, planes, p.plane_share, settings, p.trial, p.progress)
 
 
 @wp.func
-def _differentiate(i: int, order: int, p: Problem, motion: Motion, settings: BarrierSettings, far_change: float):
+def _differentiate(k: int, order: int, p: Problem, motion: Motion, settings: BarrierSettings, is_far: bool):
+    i = p.worlds.elements[k] + int(0)
     kind = elasticity.kind_of(p.elements, i)
-    world = motion.world[elasticity.first_vertex(p.elements, kind, i - p.elements.first[kind])]
-    if p.progress.solving[world] == 0:
-        return
     if order == 1:
         elasticity.find_gradient(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, p.derivatives)
     else:
-        is_far = decisions.is_far(world, far_change, p.progress)
         elasticity.find_hessian(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, is_far, p.derivatives)
 
 
 @wp.func
 def _add_element_energy(
-    i: int, p: Problem, motion: Motion, settings: BarrierSettings, mask: wp.array[int], energy: wp.array[wp.int64]
+    k: int, w: int, p: Problem, motion: Motion, settings: BarrierSettings, energy: wp.array[wp.int64]
 ):
+    i = p.worlds.elements[k] + int(0)
     kind = elasticity.kind_of(p.elements, i)
-    world = motion.world[elasticity.first_vertex(p.elements, kind, i - p.elements.first[kind])]
-    if mask[world] == 0:
-        return
     value = elasticity.element_energy(p.elements, i, kind, p.trial.moved, motion.x0, settings.dt)
-    merit.add_energy(energy, world, value, settings.units)
+    merit.add_energy(energy, w, value, settings.units)
 
 
 @wp.func
-def _add_inertia(
-    u: int, p: Problem, motion: Motion, settings: BarrierSettings, mask: wp.array[int], energy: wp.array[wp.int64]
-):
-    world = p.unknowns.world[u]
-    if mask[world] != 0:
-        steps.add_inertia(u, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, world, energy)
+def _add_inertia(u: int, w: int, p: Problem, motion: Motion, settings: BarrierSettings, energy: wp.array[wp.int64]):
+    steps.add_inertia(u, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, w, energy)
 
 
 def _advance(
@@ -273,106 +264,137 @@ def _advance(
     far_change: float,
     max_steps: int,
     max_late_steps: int,
+    resumes: int,
     # in and out
     p: Problem,
     n: int,
+    blocks: int,
 ):
-    """Goes on with the Newton steps of all worlds until a solve, a search for candidates, or their end comes next."""
+    """Goes on with the Newton steps of worlds until a solve, a search for candidates, or their end comes next.
+
+    ``n`` threads, in so many blocks, are the team of a world. Those that waited for candidates or buffers go on where
+    it ``resumes``. What decides about the next phase is not written in that, as some threads may still be reading it.
+    """
+    w, t = wp.tid() // n, wp.tid() % n
+    phase, solves = p.flow.phase[w] + int(0), p.flow.solves[w] + int(0)
+    progress, arrived = p.progress, p.flow.arrived
+    if resumes != 0 and phase > Phase.SOLVE and phase < Phase.END:
+        phase = wp.where(phase == Phase.GROW, int(Phase.BEGIN), int(Phase.DIFFERENTIATE))
+    if phase >= Phase.SOLVE or (progress.active[w] == 0 and phase != Phase.PUBLISH):
+        return
     # things of different kinds in one phase are for different threads, so that they take place at the same time
-    t = wp.tid()
     from_end, from_middle = n - 1 - t, (t + n // 2) % n
     spread = _spread(t, n)
-    progress = p.progress
-    vertices, unknowns, worlds = p.trial.x.shape[0], p.vectors.solution.shape[0], p.progress.active.shape[0]
-    body_count = p.bodies.unknown.shape[0]
-    phase, solves = p.flow.phase[0] + int(0), p.flow.solves[0] + int(0)
+    first_vertex, end_of_vertices = p.worlds.first_vertex[w] + int(0), p.worlds.first_given[w] + int(0)
+    if progress.given_moves[w] != 0:
+        end_of_vertices = p.worlds.first_vertex[w + 1] + int(0)
+    first_unknown, end_of_unknowns = p.unknowns.of_worlds[w] + int(0), p.unknowns.of_worlds[w + 1] + int(0)
+    first_body = p.unknowns.first_of_bodies[w] + int(0)
+    first_element, end_of_elements = p.worlds.first_element[w] + int(0), p.worlds.first_element[w + 1] + int(0)
+    first_contact = p.contacts.start[w] + int(0)
     # of the phase over pairs: what it does, and which phase follows
     task, then = int(Task.BOUND), int(Phase.BOUNDED)
     passes, releases = int(0), bool(False)
     while phase < Phase.SOLVE:
         if phase == Phase.BEGIN:
-            for w in range(t, worlds, n):
+            if t == 0:
                 decisions.begin_newton_step(w, progress)
             phase = int(Phase.DIFFERENTIATE)
         elif phase == Phase.PUBLISH:  # what is near at the end
-            for w in range(t, worlds, n):
-                progress.solving[w] = progress.steps[w]
-            for v in range(t, p.contacts.bucket.shape[0], n):
-                p.contacts.bucket[v] = 0
+            for k in range(
+                p.contacts.parts * p.contacts.first_bucket[w] + t,
+                p.contacts.parts * p.contacts.first_bucket[w + 1],
+                n,
+            ):
+                p.contacts.bucket[k] = 0
             if t == 0:
-                p.contacts.count[0] = 0
+                p.contacts.count[w] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
+            if progress.steps[w] == 0:
+                phase = int(Phase.END)
         elif phase == Phase.DIFFERENTIATE:
             solves = int(0)
-            for v in range(from_end, vertices, n):
-                steps.find_remaining(v, motion, p.unknowns, p.trial, progress)
-            for k in range(from_end, p.contacts.bucket.shape[0], n):
+            for k in range(first_vertex + from_end, end_of_vertices, n):
+                steps.find_remaining(p.worlds.vertices[k], w, motion, p.unknowns, p.trial, progress)
+            for k in range(
+                p.contacts.parts * p.contacts.first_bucket[w] + from_end,
+                p.contacts.parts * p.contacts.first_bucket[w + 1],
+                n,
+            ):
                 p.contacts.bucket[k] = 0
-            for i in range(spread, p.element_count, n):
-                _differentiate(i, 1, p, motion, settings, far_change)
-            for i in range((spread + n // 4) % n, p.element_count, n):
-                _differentiate(i, 2, p, motion, settings, far_change)
-            for i in range((spread + n // 2) % n, p.element_count, n):
-                _add_element_energy(i, p, motion, settings, progress.solving, progress.energy)
+            is_far = decisions.is_far(w, far_change, progress)
+            for k in range(first_element + spread, end_of_elements, n):
+                _differentiate(k, 1, p, motion, settings, is_far)
+            for k in range(first_element + (spread + n // 4) % n, end_of_elements, n):
+                _differentiate(k, 2, p, motion, settings, is_far)
+            for k in range(first_element + (spread + n // 2) % n, end_of_elements, n):
+                _add_element_energy(k, w, p, motion, settings, progress.energy)
             phase = int(Phase.LOADS)
         elif phase == Phase.LOADS:
             if t == 0:
-                p.contacts.count[0] = 0
-            for u in range(t, unknowns, n):
-                assembly.find_loads(u, p.derivatives, p.rows, p.unknowns, progress, settings.load)
-                _add_inertia(u, p, motion, settings, progress.solving, progress.energy)
-            for u in range(from_end, wp.max(unknowns, worlds), n):
-                contact_lists.clear_lists(u, p.contacts)
+                p.contacts.count[w] = 0
+                contact_lists.clear_lists(w, p.contacts)
+            for u in range(first_unknown + t, end_of_unknowns, n):
+                assembly.find_loads(u, w, p.derivatives, p.rows, p.unknowns, progress, settings.load)
+                _add_inertia(u, w, p, motion, settings, progress.energy)
+            for u in range(first_unknown + from_end, end_of_unknowns, n):
+                p.contacts.end[u] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.COUNT), int(Phase.PAIRS)
         elif phase == Phase.RELEASE_HELD:
-            for i in range(t, contact_count(p.contacts), n):
-                held.release_held(i, motion, p.unknowns, p.vectors.solution, progress, p.contacts)
-            for u in range(t, wp.max(unknowns, worlds), n):
-                contact_lists.clear_lists(u, p.contacts)
+            if t == 0:
+                decisions.begin_hold(w, progress)
+            for i in range(first_contact + t, end_of_contacts(p.contacts, w), n):
+                held.release_held(i, p.unknowns, p.vectors.solution, p.contacts)
+            for u in range(first_unknown + t, end_of_unknowns, n):
+                p.contacts.end[u] = 0
+            if t == 0:
+                contact_lists.clear_lists(w, p.contacts)
             task, then, phase = int(Task.HOLD), int(Phase.COUNT), int(Phase.PAIRS)
         elif phase == Phase.PAIRS:
             if task == Task.ENERGY:
-                if t == 0:
-                    progress.flags[Flag.SEARCHES] = 0
-                for i in range(from_end, p.element_count, n):
-                    _add_element_energy(i, p, motion, settings, progress.searches, progress.trial)
-                for u in range(from_middle, unknowns, n):
-                    _add_inertia(u, p, motion, settings, progress.searches, progress.trial)
-                for i in range(from_middle, contact_count(p.contacts), n):
-                    if progress.searches[motion.world[p.contacts.corners[i][0]]] != 0:
-                        merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.trial)
-            _over_pairs(task, passes > 0, p, motion, planes, settings, solves, t, n)
+                for k in range(first_element + from_end, end_of_elements, n):
+                    _add_element_energy(k, w, p, motion, settings, progress.trial)
+                for u in range(first_unknown + from_middle, end_of_unknowns, n):
+                    _add_inertia(u, w, p, motion, settings, progress.trial)
+                for i in range(first_contact + from_middle, end_of_contacts(p.contacts, w), n):
+                    merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, progress.trial)
+            _over_pairs(task, passes > 0, p, motion, planes, settings, solves, w, t, n)
             phase = then
         elif phase == Phase.COUNT:
-            for k in range(t, p.contacts.parts * contact_count(p.contacts), n):
-                i, part = k // p.contacts.parts, k % p.contacts.parts
+            for k in range(t, p.contacts.parts * (end_of_contacts(p.contacts, w) - first_contact), n):
+                i, part = first_contact + k // p.contacts.parts, k % p.contacts.parts
                 if solves == 0:
-                    merge.merge_contact(i, part, p.contacts)
+                    merge.merge_contact(i, part, w, p.contacts)
                 if part == 0:
-                    contact_lists.count_entries(i, motion, p.contacts, p.unknowns)
+                    contact_lists.count_entries(i, w, p.contacts, p.unknowns)
                     if solves == 0:
-                        merit.add_friction_energy(i, motion, p.contacts, settings, p.trial, progress.energy)
+                        merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, progress.energy)
             phase = int(Phase.PLACE)
         elif phase == Phase.PLACE:
-            for u in range(t, wp.max(unknowns, worlds), n):
-                contact_lists.place_entries(u, p.contacts, p.lacks)
-            phase = int(Phase.LIST)
+            if t == 0:
+                contact_lists.place_coupled(w, p.contacts, p.lacks)
+            for u in range(first_unknown + t, end_of_unknowns, n):
+                contact_lists.place_entries(u, w, p.contacts)
+            phase = wp.where(p.contacts.count[w] > 0, int(Phase.LIST), int(Phase.BLOCKS))
         elif phase == Phase.LIST:
-            for i in range(t, contact_count(p.contacts), n):
-                contact_lists.list_entries(i, motion, p.contacts, p.unknowns)
+            for i in range(first_contact + t, end_of_contacts(p.contacts, w), n):
+                contact_lists.list_entries(i, w, p.contacts, p.unknowns)
             phase = int(Phase.SORT)
         elif phase == Phase.SORT:
             if n == 1:  # long lists in less than a thread for each entry takes
-                for u in range(unknowns):
+                for u in range(first_unknown, end_of_unknowns):
                     contact_lists.sort_list(u, p.contacts)
             else:
-                for i in range(t, p.contacts.listed[0], n):
+                first_entry = p.contacts.entries_of_each * first_contact
+                for i in range(first_entry + t, first_entry + p.contacts.listed[w], n):
                     contact_lists.sort_entries(i, p.contacts)
             phase = int(Phase.BLOCKS)
         elif phase == Phase.BLOCKS:
-            for i in range(t, p.parts * ((p.row_of_block.shape[0] + p.turns - 1) // p.turns), n):
+            count = p.rows.first[end_of_unknowns] - p.rows.first[first_unknown]
+            for i in range(t, p.parts * ((count + p.turns - 1) // p.turns), n):
                 assembly.add_blocks(
                     i,
+                    w,
                     p.derivatives,
                     p.contacts,
                     p.unknowns,
@@ -382,7 +404,6 @@ def _advance(
                     motion,
                     p.bodies,
                     settings.dt,
-                    progress,
                     p.rows,
                     p.parts,
                     p.turns,
@@ -390,9 +411,10 @@ def _advance(
                 )
             phase = int(Phase.ASSEMBLE)
         elif phase == Phase.ASSEMBLE:
-            for i in range(t, p.parts * ((unknowns + p.turns - 1) // p.turns), n):
+            for i in range(t, p.parts * ((end_of_unknowns - first_unknown + p.turns - 1) // p.turns), n):
                 assembly.assemble(
                     i,
+                    w,
                     p.derivatives,
                     p.contacts,
                     p.unknowns,
@@ -401,7 +423,6 @@ def _advance(
                     motion,
                     p.bodies,
                     settings.dt,
-                    progress,
                     solves == 0,
                     p.rows,
                     p.matrix,
@@ -409,106 +430,105 @@ def _advance(
                     p.turns,
                     p.vectors,
                 )
-            for w in range(t, worlds + 1, n):
-                if solves == 0:
-                    p.leaves[w] = 0
-                    if w < worlds:
-                        progress.searches[w] = progress.active[w]
-            if t == 0:
-                for k in range(progress.flags.shape[0]):
-                    progress.flags[k] = 0
+            if t == 0 and solves == 0:
+                p.leaves[w] = 0
             phase = int(Phase.SOLVE)
         elif phase == Phase.DISPLACE:  # after a solve
-            for b in range(t, body_count, n):
-                bodies.displace_bodies(b, motion, p.unknowns, progress, p.vectors.solution, p.bodies)
-            if body_count > 0:
-                wait_for_all(p.flow.arrived)
-            for v in range(t, vertices, n):
+            if t == 0 and releases:
+                decisions.begin_release(w, progress)
+            for u in range(first_body + 2 * t, end_of_unknowns, 2 * n):
+                bodies.displace_body(u, motion, p.unknowns, p.vectors.solution, p.bodies)
+            if first_body < end_of_unknowns:
+                wait_for_team(arrived, w, blocks)
+            for k in range(first_vertex + t, end_of_vertices, n):
                 steps.displace(
-                    v, motion, p.unknowns, p.vectors, p.lower, p.upper, p.bodies, p.trial, progress, p.limit, p.leaves
+                    p.worlds.vertices[k],
+                    w,
+                    motion,
+                    p.unknowns,
+                    p.vectors,
+                    p.lower,
+                    p.upper,
+                    p.bodies,
+                    p.trial,
+                    progress,
+                    p.limit,
+                    p.leaves,
                 )
             task, then, phase = int(Task.BOUND), int(Phase.BOUNDED), int(Phase.PAIRS)
         elif phase == Phase.HOLD:  # what would meet on the displacements, and solve again
-            for w in range(t, worlds, n):
-                decisions.begin_hold(w, progress)
-            for u in range(t, unknowns, n):
+            for u in range(first_unknown + t, end_of_unknowns, n):
                 if solves == 0:
                     p.first[u] = p.vectors.solution[u]
             solves += 1
             phase = int(Phase.RELEASE_HELD)
         elif phase == Phase.TAKE_BOUND:
-            for w in range(t, worlds, n):
+            if t == 0:
                 decisions.take_bound(w, progress)
             phase = int(Phase.DISPLACED)
         elif phase == Phase.DISPLACED:
-            for b in range(t, body_count, n):
-                bodies.move_bodies(b, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, False, p.bodies)
-            if body_count > 0:
-                wait_for_all(p.flow.arrived)
-            for v in range(t, vertices, n):
-                steps.write_moved(v, motion, p.unknowns, p.bodies, progress, p.trial)
+            if t == 0:
+                progress.bound[w] = 1.0
             if then == Phase.JUDGE and solves == 0:  # no pairs are held
-                then = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
+                then = wp.where(decisions.may_cut(progress, w), int(Phase.BEGIN_CUTS), int(Phase.TAKE))
+            for u in range(first_body + 2 * t, end_of_unknowns, 2 * n):
+                bodies.move_body(u, w, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, False, p.bodies)
+            if first_body < end_of_unknowns:
+                wait_for_team(arrived, w, blocks)
+            for k in range(first_vertex + t, end_of_vertices, n):
+                steps.write_moved(p.worlds.vertices[k], progress.scale[w], motion, p.unknowns, p.bodies, p.trial)
             task, phase = int(Task.ENERGY), int(Phase.PAIRS)
-        elif phase == Phase.JUDGE:
-            for w in range(t, worlds, n):
-                decisions.find_rises(w, progress)
-            phase = int(Phase.JUDGED)
         elif phase == Phase.BEGIN_RELEASE:
-            for w in range(t, worlds, n):
-                decisions.begin_release(w, progress)
-            for u in range(t, unknowns, n):
-                if progress.solving[p.unknowns.world[u]] != 0:
-                    p.vectors.solution[u] = p.first[u]
+            for u in range(first_unknown + t, end_of_unknowns, n):
+                p.vectors.solution[u] = p.first[u]
             releases, phase = True, int(Phase.DISPLACE)
-        elif phase == Phase.END_RELEASE:
-            for w in range(t, worlds, n):
-                decisions.end_release(w, progress)
-            phase = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
         elif phase == Phase.BEGIN_CUTS:  # of single vertices in place of their world, where energies are lower then
-            for v in range(t, wp.max(vertices, worlds), n):
-                steps.begin_truncation(v, p.unknowns, p.lower, p.upper, p.trial, progress, p.whole)
+            for k in range(first_vertex + t, end_of_vertices, n):
+                steps.begin_truncation(p.worlds.vertices[k], p.unknowns, p.lower, p.upper, p.trial)
             phase = int(Phase.CUT)  # the first time by the bounds of the displacements, which are known
         elif phase == Phase.CUT:
-            for v in range(t, vertices, n):
-                steps.truncate(v, p.unknowns, p.limit, passes == 0, p.trial)
+            if t == 0 and passes == 0:
+                decisions.begin_cuts(w, p.whole, progress)
+            for k in range(first_vertex + t, end_of_vertices, n):
+                steps.truncate(p.worlds.vertices[k], p.unknowns, p.limit, passes == 0, p.trial)
             passes += 1
             then = int(Phase.CUT)
             if passes == _TRUNCATIONS:
-                for w in range(t, worlds, n):
+                if t == 0:
                     progress.bound[w] = 1.0
                 then = int(Phase.TAKE_CUT)
             task, phase = int(Task.BOUND), int(Phase.PAIRS)
         elif phase == Phase.TAKE_CUT:
-            for w in range(t, worlds, n):
+            if t == 0:
                 decisions.take_cut(w, progress)
             then, phase = int(Phase.CHOOSE_CUTS), int(Phase.DISPLACED)
         elif phase == Phase.CHOOSE_CUTS:
-            for w in range(t, worlds, n):
+            if t == 0:
                 decisions.choose_truncation(w, p.whole, progress)
             phase = int(Phase.UNDO_CUTS)
         elif phase == Phase.UNDO_CUTS:
-            for v in range(t, vertices, n):
-                steps.undo_truncation(v, motion, progress, p.trial)
+            for k in range(first_vertex + t, end_of_vertices, n):
+                if progress.cuts[w] == 0:
+                    p.trial.share[p.worlds.vertices[k]] = 1.0
             phase = int(Phase.TAKE)
         elif phase == Phase.TAKE:
-            for b in range(t, body_count, n):
-                bodies.move_bodies(b, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, True, p.bodies)
-            if body_count > 0:
-                wait_for_all(p.flow.arrived)
-            for v in range(t, vertices, n):
-                steps.take(v, motion, p.unknowns, p.bodies, progress, p.trial)
+            for u in range(first_body + 2 * t, end_of_unknowns, 2 * n):
+                bodies.move_body(u, w, motion, p.unknowns, progress, p.trial.share, p.vectors.solution, True, p.bodies)
+            if first_body < end_of_unknowns:
+                wait_for_team(arrived, w, blocks)
+            for k in range(first_vertex + t, end_of_vertices, n):
+                steps.take(p.worlds.vertices[k], w, motion, p.unknowns, p.bodies, progress, p.trial)
             phase = int(Phase.DECIDE)
         elif phase == Phase.DECIDE:
-            for w in range(t, worlds, n):
+            if t == 0:
                 decisions.decide(w, least_change, far_change, max_steps, max_late_steps, progress, p.plane_share)
             phase = int(Phase.NEXT)
-        wait_for_all(p.flow.arrived)
+        wait_for_team(arrived, w, blocks)
         if task == Task.FIND_NEAR and phase == then and p.grows != 0:
-            if p.contacts.count[0] > p.contacts.corners.shape[0]:
+            if end_of_contacts(p.contacts, w) - first_contact < p.contacts.count[w]:
                 phase = int(Phase.GROW)
         if phase == Phase.BOUNDED:
-            meets = progress.flags[Flag.MEETS] != 0
+            meets = progress.bound[w] < 1.0
             then, phase = int(Phase.JUDGE), int(Phase.DISPLACED)
             if releases:
                 then, phase = int(Phase.END_RELEASE), int(Phase.TAKE_BOUND)
@@ -516,26 +536,31 @@ def _advance(
                 phase = int(Phase.HOLD)
             elif meets:
                 phase = int(Phase.TAKE_BOUND)
-        elif phase == Phase.JUDGED:
-            phase = wp.where(progress.flags[Flag.CUTS] != 0, int(Phase.BEGIN_CUTS), int(Phase.TAKE))
-            if progress.flags[Flag.RISES] != 0:
-                phase = int(Phase.BEGIN_RELEASE)
+        elif phase == Phase.JUDGE and decisions.rises(w, progress):
+            phase = int(Phase.BEGIN_RELEASE)
+        elif phase == Phase.JUDGE or phase == Phase.END_RELEASE:
+            phase = wp.where(decisions.may_cut(progress, w), int(Phase.BEGIN_CUTS), int(Phase.TAKE))
         elif phase == Phase.NEXT:
             phase = int(Phase.DIFFERENTIATE)
-            if progress.flags[Flag.SEARCHES] != 0:
+            if progress.searches[w] != 0:
                 then, phase = int(Phase.TAKE), int(Phase.DISPLACED)
-            elif progress.flags[Flag.GOES_ON] == 0:
+            elif progress.active[w] == 0:
                 phase = int(Phase.END)
-            elif p.leaves[worlds] != 0:
+            elif p.leaves[w] != 0:
                 phase = int(Phase.SEARCH_CANDIDATES)
     if t == 0:
-        solves_next = int(phase == Phase.SOLVE)
-        p.flow.solves_next[0] = solves_next
-        p.flow.goes_on[0] = wp.where(phase == Phase.END, 0, 1)
-        p.flow.solves[0] = solves
-        p.flow.phase[0] = wp.where(solves_next != 0, int(Phase.DISPLACE), int(Phase.DIFFERENTIATE))
-        if phase == Phase.GROW:
-            p.flow.phase[0] = wp.where(then == Phase.END, int(Phase.PUBLISH), int(Phase.BEGIN))
+        p.flow.solves[w] = solves
+        progress.solving[w] = int(phase == Phase.SOLVE)
+        if phase == Phase.SOLVE:
+            p.flow.solves_next[0] = 1
+            phase = int(Phase.DISPLACE)
+        elif phase == Phase.END:
+            p.leaves[w] = 0
+        else:
+            p.flow.goes_on[0] = 1
+            if phase == Phase.SEARCH_CANDIDATES:
+                p.any_leaves[0] = 1
+        p.flow.phase[w] = phase
 
 
 ADVANCE = {

@@ -53,6 +53,7 @@ def _inertia(
 @wp.func
 def add_blocks(
     i: int,
+    world: int,
     derivatives: Derivatives,
     contacts: Contacts,
     unknowns: Unknowns,
@@ -62,26 +63,24 @@ def add_blocks(
     motion: Motion,
     bodies: SolvedBodies,
     dt: wp.float64,
-    progress: Progress,
     rows: Rows,
     parts: int,
     turns: int,
     matrix: Matrix,
 ):
-    """Adds up blocks of elements, of contacts that do not couple, and of inertia, in worlds that solve.
+    """Adds up blocks of elements, of contacts that do not couple, and of inertia, of a world.
 
     So many threads add up one block together, as here and there an unknown has very many contacts: as many blocks as
     they take ``turns``, of which each ends one.
     """
-    first, part = i // parts * turns, i % parts
+    first, part = rows.first[unknowns.of_worlds[world]] + i // parts * turns, i % parts
     own, block = int(-1), wp.mat33()
-    for k in range(first, wp.min(first + turns, row_of_block.shape[0])):
+    for k in range(first, wp.min(first + turns, rows.first[unknowns.of_worlds[world + 1]])):
         u, v = row_of_block[k], rows.column[k]
-        if progress.solving[unknowns.world[u]] != 0:
-            total = contact_block(contacts, u, v, part, parts) + sum_of_blocks(rows, derivatives, k, part, parts)
-            total = block_sum_of_parts(total, parts)
-            if k - first == part:
-                own, block = k, total
+        total = contact_block(contacts, u, v, part, parts) + sum_of_blocks(rows, derivatives, k, part, parts)
+        total = block_sum_of_parts(total, parts)
+        if k - first == part:
+            own, block = k, total
     if own >= 0:
         row = row_of_block[own]
         if row == rows.column[own] and unknowns.is_free[row] != 0:
@@ -93,6 +92,7 @@ def add_blocks(
 @wp.func
 def assemble(
     i: int,
+    world: int,
     derivatives: Derivatives,
     contacts: Contacts,
     unknowns: Unknowns,
@@ -101,7 +101,6 @@ def assemble(
     motion: Motion,
     bodies: SolvedBodies,
     dt: wp.float64,
-    progress: Progress,
     begins: bool,
     rows: Rows,
     matrix: Matrix,
@@ -109,20 +108,19 @@ def assemble(
     turns: int,
     vectors: Vectors,
 ):
-    """Computes the gradient of the energy by unknowns, and what preconditions, in worlds that solve.
+    """Computes the gradient of the energy by unknowns of a world, and what preconditions.
 
     The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
     ways. Later ones go on from where they are. Threads share unknowns as blocks in :func:`add_blocks`.
     """
-    first, part = i // parts * turns, i % parts
+    first, part = unknowns.of_worlds[world] + i // parts * turns, i % parts
     own, gradient, block = int(-1), wp.vec3(), wp.mat33()
-    for u in range(first, wp.min(first + turns, unknowns.world.shape[0])):
-        if progress.solving[unknowns.world[u]] != 0:
-            of_contacts, of_coupled = contact_gradient(contacts, unknowns, u, part, parts)
-            force = sum_of_parts(of_contacts + sum_of_corners(rows, derivatives, u, part, parts), parts)
-            of_coupled = block_sum_of_parts(of_coupled, parts)
-            if u - first == part:
-                own, gradient, block = u, force, of_coupled
+    for u in range(first, wp.min(first + turns, unknowns.of_worlds[world + 1])):
+        of_contacts, of_coupled = contact_gradient(contacts, unknowns, u, part, parts)
+        force = sum_of_parts(of_contacts + sum_of_corners(rows, derivatives, u, part, parts), parts)
+        of_coupled = block_sum_of_parts(of_coupled, parts)
+        if u - first == part:
+            own, gradient, block = u, force, of_coupled
     if own < 0:
         return
     if unknowns.is_free[own] == 0:
@@ -143,18 +141,19 @@ def assemble(
 @wp.func
 def find_loads(
     u: int,
+    world: int,
     derivatives: Derivatives,
     rows: Rows,
     unknowns: Unknowns,
     progress: Progress,
     load: wp.array[float],
 ):
-    """Writes the forces of elements on vertices that are solved for, in active worlds.
+    """Writes the forces of elements on vertices that are solved for.
 
     That of an earlier Newton step of the step is kept where it is about right: barriers that change converge slowly.
     """
-    world, p = unknowns.world[u], unknowns.particle[u]
-    if p < 0 or progress.active[world] == 0:
+    p = unknowns.particle[u]
+    if p < 0:
         return
     if unknowns.is_free[u] == 0:
         load[p] = 0.0

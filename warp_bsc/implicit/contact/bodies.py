@@ -201,17 +201,9 @@ def inertial_energy(bodies: SolvedBodies, motion: Motion, body: int, dt: wp.floa
 
 
 @wp.func
-def _is_active(bodies: SolvedBodies, unknowns: Unknowns, progress: Progress, body: int) -> bool:
-    """Returns whether a body is solved for in this Newton step."""
-    u = bodies.unknown[body]
-    if u < 0:
-        return False
-    return unknowns.is_free[u] != 0 and progress.active[unknowns.world[u]] != 0
-
-
-@wp.func
-def move_bodies(
-    body: int,
+def move_body(
+    u: int,
+    world: int,
     motion: Motion,
     unknowns: Unknowns,
     progress: Progress,
@@ -220,13 +212,11 @@ def move_bodies(
     is_taken: bool,
     bodies: SolvedBodies,
 ):
-    """Moves a body by what it and its world take of its displacement, for good if that ``is_taken``."""
-    if not _is_active(bodies, unknowns, progress, body):
+    """Moves the body of an unknown by what it and its world take of its displacement, for good if that ``is_taken``."""
+    body = unknowns.body[u]
+    if unknowns.is_free[u] == 0:
         return
-    u = bodies.unknown[body]
-    if progress.searches[unknowns.world[u]] == 0:
-        return
-    taken = progress.scale[unknowns.world[u]] * share[bodies.first_vertex[body]]
+    taken = progress.scale[world] * share[bodies.first_vertex[body]]
     pose, low = bodies.pose[body], bodies.low[body] + wp.vec3d()
     bodies.moved[body] = pose
     if taken > 0.0:
@@ -234,23 +224,22 @@ def move_bodies(
         bodies.moved[body] = turned_pose(motion.bodies, body, pose, shift, to_double(taken * solution[u + 1]))
         low = centre + shift - centre_of(motion.bodies, body, bodies.moved[body])
     bodies.low_moved[body] = low
-    if is_taken and takes(unknowns.world[u], progress):
+    if is_taken and takes(world, progress):
         bodies.pose[body] = bodies.moved[body]
         bodies.low[body] = low
 
 
 @wp.func
-def displace_bodies(
-    body: int,
+def displace_body(
+    u: int,
     motion: Motion,
     unknowns: Unknowns,
-    progress: Progress,
     solution: wp.array[wp.vec3],
     bodies: SolvedBodies,
 ):
-    """Moves a body by all of its displacement."""
-    if _is_active(bodies, unknowns, progress, body):
-        u = bodies.unknown[body]
+    """Moves the body of an unknown by all of its displacement."""
+    body = unknowns.body[u]
+    if unknowns.is_free[u] != 0:
         shift, turn = bodies.low[body] + to_double(solution[u]), to_double(solution[u + 1])
         bodies.moved[body] = turned_pose(motion.bodies, body, bodies.pose[body], shift, turn)
 

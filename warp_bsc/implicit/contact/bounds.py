@@ -19,7 +19,7 @@ from .pairs import (
     plane_at,
     stays_far,
 )
-from .system import Flag, Progress, kind_of_key, lower_to
+from .system import Progress, kind_of_key, lower_to
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,6 +49,7 @@ def _relative_way(p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.floa
 @wp.func
 def bound_by_pair(
     i: int,
+    world: int,
     candidates: Candidates,
     trial: Trial,
     progress: Progress,
@@ -61,9 +62,9 @@ def bound_by_pair(
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
     """
     # read side by side: most of the time is waiting for memory
-    world, before = candidates.world[i] + int(0), candidates.share[i] + float(0.0)
+    before = candidates.share[i] + float(0.0)
     stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
-    if progress.solving[world] == 0 or (before == FAR and (is_shorter or stays)):
+    if before == FAR and (is_shorter or stays):
         return
     corners = candidates.corners[i]
     if is_shorter and (before == 1.0 or before == FAR_TOGETHER):
@@ -115,7 +116,6 @@ def bound_by_pair(
     candidates.share[i] = share
     if share < 1.0:
         lower_to(progress.bound, world, share)
-        progress.flags[Flag.MEETS] = 1
         for j in range(4):
             lower_to(limit, corners[j], share)
             if trial.holder[corners[j]] != corners[j]:
@@ -125,6 +125,7 @@ def bound_by_pair(
 @wp.func
 def bound_by_planes(
     vertex: int,
+    world: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
@@ -134,8 +135,7 @@ def bound_by_planes(
     limit: wp.array[float],
 ):
     """Finds the share of displacements up to which a vertex meets no infinite plane, as :func:`bound_by_pair`."""
-    world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or progress.solving[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0:
         return
     scale, now = progress.scale[world], plane_share[world]
     for place in range(planes.of_worlds.shape[1]):
@@ -158,5 +158,4 @@ def bound_by_planes(
         if low - rate + flat < ZERO or (square > ZERO and rate > ZERO and rate < wp.float64(2.0) * flat):
             share = float(wp.float64(2.0) * low / (rate + wp.sqrt(wp.max(square, ZERO))))
             lower_to(progress.bound, world, share)
-            progress.flags[Flag.MEETS] = 1
             lower_to(limit, trial.holder[vertex], share)

@@ -401,7 +401,7 @@ _SOLVE = """
         sum(squared, of_product);
         if (count == 0) {
             limit = tolerance * tolerance * squared;
-            if (solves.data[0] == 0) team.limit.data[world] = (float)limit;
+            if (solves.data[world] == 0) team.limit.data[world] = (float)limit;
             else limit = wp::min(wp::max(limit, (real)team.limit.data[world]), (real)AGAIN * squared);
         }
         if (!(squared > limit)) break;
@@ -479,16 +479,20 @@ def _make_solve_kernel(bounds: int, parts: int, kept: int, shared: bool):
         vectors: Vectors,
         # out
         iterations: wp.array[int],
+        solves_next: wp.array[int],
     ):
         """Solves H d = -g in active worlds, until the norm of the residual, preconditioned, is a share of its first.
 
         The first of ``solves`` of a Newton step counts; those that follow it go on from there, with what is held since.
+        ``solves_next`` becomes 0.
         Where the matrix is found not to be positive definite, the solution so far ends the solve, or the preconditioned
         negative gradient if there is none: both are directions in which the energy falls. What is given stays given.
         """
         thread = wp.tid()
         number, lane = thread // wp.block_dim(), thread % wp.block_dim()
         world, block = number // team.blocks, number % team.blocks
+        if thread == 0:
+            solves_next[0] = 0
         if active[world] == 0:
             return
         count = solve(matrix, contacts, unknowns, tolerance[world], max_iterations, solves, team, vectors, world, block)

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ...response.state.structs import Motion
 from .system import Contacts, Unknowns, first_unknown
 
 wp.set_module_options({"enable_backward": False})
@@ -12,7 +11,7 @@ _COUPLES = wp.constant(wp.int64(1 << 61))
 
 
 @wp.func
-def count_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns):
+def count_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
     """Counts a contact in ``end`` of the unknowns that are solved for, and of its world if it couples."""
     for j in range(4):
         if contacts.weights[i][j] != 0.0:
@@ -23,35 +22,31 @@ def count_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns
                     if contacts.unknowns[i][j] < 0:
                         wp.atomic_add(contacts.end, u + 1, 1)
     if contacts.couples[i] != 0:
-        wp.atomic_add(contacts.coupled_end, motion.world[contacts.corners[i][0]], 1)
+        wp.atomic_add(contacts.coupled_end, world, 1)
 
 
 @wp.func
-def clear_lists(u: int, contacts: Contacts):
-    """Clears the lists of an unknown, and of the world of that number."""
-    if u == 0:
-        contacts.listed[0] = 0
-        contacts.listed[1] = 0
-    if u < contacts.coupled_end.shape[0]:
-        contacts.coupled_end[u] = 0
-    if u < contacts.end.shape[0]:
-        contacts.end[u] = 0
+def clear_lists(world: int, contacts: Contacts):
+    """Clears the number of entries of a world, and of contacts there that couple."""
+    contacts.listed[world] = 0
+    contacts.coupled_first[world] = contacts.start[world]
+    contacts.coupled_end[world] = 0
 
 
 @wp.func
-def place_entries(u: int, contacts: Contacts, lacks: wp.array[int]):
-    """Gives each unknown room for its contacts, anywhere; ``end`` becomes the first of them. So for each world."""
-    if u == 0 and contacts.count[0] > contacts.corners.shape[0]:
+def place_coupled(world: int, contacts: Contacts, lacks: wp.array[int]):
+    """Lets the list of contacts of a world that couple begin."""
+    if contacts.count[world] > contacts.start[world + 1] - contacts.start[world]:
         lacks[0] = 1
-    if u < contacts.coupled_first.shape[0]:
-        start = wp.atomic_add(contacts.listed, 1, contacts.coupled_end[u])
-        contacts.coupled_first[u] = start
-        contacts.coupled_end[u] = start
-    if u >= contacts.first.shape[0]:
-        return
+    contacts.coupled_end[world] = contacts.coupled_first[world]
+
+
+@wp.func
+def place_entries(u: int, world: int, contacts: Contacts):
+    """Gives an unknown room for its contacts, anywhere in that of its world; ``end`` becomes the first of them."""
     count = contacts.end[u]
     if count > 0:
-        first = wp.atomic_add(contacts.listed, 0, count)
+        first = contacts.entries_of_each * contacts.start[world] + wp.atomic_add(contacts.listed, world, count)
         contacts.first[u] = first
         contacts.end[u] = first
     else:
@@ -80,10 +75,10 @@ def _list_coupled(contacts: Contacts, world: int, i: int):
 
 
 @wp.func
-def list_entries(i: int, motion: Motion, contacts: Contacts, unknowns: Unknowns):
+def list_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
     """Lists a contact for its unknowns, behind their ``end``, which moves on, and for its world if it couples."""
     if contacts.couples[i] != 0:
-        _list_coupled(contacts, motion.world[contacts.corners[i][0]], i)
+        _list_coupled(contacts, world, i)
     for j in range(4):
         if contacts.weights[i][j] != 0.0:
             u = first_unknown(contacts.unknowns[i][j])

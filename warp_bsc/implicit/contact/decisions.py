@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .system import Flag, Progress, Unknowns, is_near_end
+from .system import Progress, Unknowns, is_near_end
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,33 +15,21 @@ _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 @wp.func
 def take_bound(w: int, progress: Progress):
-    """Takes the share of a world down to its bound, and says whether it takes less than all."""
+    """Takes the share of a world down to its bound."""
     progress.scale[w] = progress.scale[w] * progress.bound[w]
-    progress.bound[w] = 1.0
-    if may_cut(progress, w):
-        progress.flags[Flag.CUTS] = 1
 
 
 @wp.func
 def may_cut(progress: Progress, w: int) -> bool:
     """Returns whether cuts of vertices may let a world go further: not while something that a program moves comes."""
-    return progress.active[w] != 0 and progress.scale[w] < 1.0 and progress.remaining[w] == 0.0
-
-
-@wp.func
-def _may_hold(progress: Progress, w: int) -> bool:
-    """Returns whether something would meet in a world, and is to be held."""
-    return progress.active[w] != 0 and progress.bound[w] < 1.0
+    return progress.scale[w] < 1.0 and progress.remaining[w] == 0.0
 
 
 @wp.func
 def begin_hold(w: int, progress: Progress):
     """Lets a world in which something would meet solve once more, and clears its bound."""
-    progress.solving[w] = 0
-    if _may_hold(progress, w):
-        progress.solving[w] = 1
-        progress.bound[w] = 1.0
-        progress.held[w] = 1
+    progress.bound[w] = 1.0
+    progress.held[w] = 1
 
 
 @wp.func
@@ -52,27 +40,24 @@ def _falls(progress: Progress, w: int) -> bool:
 
 
 @wp.func
-def find_rises(w: int, progress: Progress):
-    """Lets a world be released in which the energy rises on displacements that are solved with pairs held."""
-    progress.solving[w] = 0
-    if progress.active[w] != 0 and progress.held[w] != 0 and progress.remaining[w] == 0.0 and not _falls(progress, w):
-        progress.solving[w] = 1
-        progress.flags[Flag.RISES] = 1
+def rises(w: int, progress: Progress) -> bool:
+    """Returns whether the energy of a world rises on displacements that are solved with pairs held."""
+    return progress.held[w] != 0 and progress.remaining[w] == 0.0 and not _falls(progress, w)
 
 
 @wp.func
 def begin_release(w: int, progress: Progress):
-    """Lets a world that is released search along its solution without pairs held, and no other."""
-    progress.searches[w] = progress.solving[w]
-    if progress.solving[w] != 0:
-        progress.scale[w] = 1.0
-        progress.trial[w] = wp.int64(0)
+    """Lets a world go along its solution without pairs held."""
+    progress.scale[w] = 1.0
+    progress.trial[w] = wp.int64(0)
 
 
 @wp.func
-def end_release(w: int, progress: Progress):
-    """Lets a world search again."""
-    progress.searches[w] = progress.active[w]
+def begin_cuts(w: int, whole: wp.array[float], progress: Progress):
+    """Lets a world that takes less than all of its displacements cut those of single vertices instead."""
+    whole[w] = progress.scale[w]
+    progress.scale[w] = 1.0
+    progress.bound[w] = 1.0
 
 
 @wp.func
@@ -86,14 +71,11 @@ def take_cut(w: int, progress: Progress):
 @wp.func
 def choose_truncation(w: int, whole: wp.array[float], progress: Progress):
     """Keeps the cuts of single vertices in a world whose energy is lower with them."""
-    if progress.active[w] == 0:
-        return
-    cuts = progress.searches[w] != 0 and progress.trial[w] < progress.uncut[w]
+    cuts = progress.trial[w] < progress.uncut[w]
     if not cuts:
         progress.trial[w] = progress.uncut[w]
         progress.scale[w] = whole[w]
     progress.cuts[w] = int(cuts)
-    progress.searches[w] = 1
 
 
 @wp.func
@@ -110,9 +92,6 @@ def is_far(w: int, far_change: float, progress: Progress) -> bool:
 @wp.func
 def begin_newton_step(w: int, progress: Progress):
     """Clears what a Newton step measures of a world."""
-    progress.solving[w] = progress.active[w]
-    if progress.active[w] == 0:
-        return
     progress.before[w] = wp.where(progress.scale[w] > 0.0, progress.scale[w] * progress.change[w], -1.0)
     progress.change[w] = 0.0
     progress.remaining[w] = 0.0
@@ -126,9 +105,8 @@ def begin_newton_step(w: int, progress: Progress):
 
 @wp.func
 def takes(w: int, progress: Progress) -> bool:
-    """Returns whether a world that searches takes its share: its energy falls, what a program moves comes, or none."""
-    may_rise = progress.remaining[w] > 0.0 or progress.scale[w] == 0.0
-    return progress.searches[w] != 0 and (may_rise or _falls(progress, w))
+    """Returns whether a world takes its share: its energy falls, what a program moves comes, or it takes none."""
+    return progress.remaining[w] > 0.0 or progress.scale[w] == 0.0 or _falls(progress, w)
 
 
 @wp.func
@@ -141,22 +119,19 @@ def decide(
     progress: Progress,
     plane_share: wp.array[float],
 ):
-    """Halves the share of a world that searches and has not taken it, or ends its Newton step.
+    """Halves the share of a world that has not taken it, or ends its Newton step.
 
     A world ends whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one. They
     are counted from when what a program moves arrives, if it does.
     """
     takes_share = takes(w, progress)
     progress.trial[w] = wp.int64(0)
-    if progress.searches[w] == 0:
-        return
+    progress.searches[w] = int(not takes_share)
     if not takes_share:
         progress.scale[w] = 0.5 * progress.scale[w]
         if progress.scale[w] < _LEAST_SCALE:
             progress.scale[w] = 0.0
-        progress.flags[Flag.SEARCHES] = 1
         return
-    progress.searches[w] = 0
     scale, was_far = progress.scale[w], is_far(w, far_change, progress)
     plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
     progress.steps[w] = progress.steps[w] + 1
@@ -170,9 +145,7 @@ def decide(
         ends = ends or was_far
     if ends or (steps >= max_late_steps and not arrived):
         progress.active[w] = 0
-        progress.solving[w] = 0
         return
-    progress.flags[Flag.GOES_ON] = 1
     begin_newton_step(w, progress)
 
 

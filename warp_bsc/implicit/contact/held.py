@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ...kernels.pipeline.queues import take_slot_int
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
@@ -11,7 +10,6 @@ from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at
 from .system import (
     Contacts,
-    Progress,
     Unknowns,
     couples,
     displacement,
@@ -19,6 +17,7 @@ from .system import (
     key_in_group,
     key_of_pair,
     kind_of_key,
+    take_contact,
     unknowns_of,
 )
 
@@ -36,6 +35,7 @@ def _hold(
     unknowns: Unknowns,
     trial: Trial,
     inverse: wp.array[wp.mat33],
+    world: int,
     corners: wp.vec4i,
     weights: wp.vec4d,
     normal: wp.vec3d,
@@ -61,8 +61,8 @@ def _hold(
             compliance += w * w * (wp.dot(n, inverse[-2 - u] * n) + wp.dot(turn, inverse[-1 - u] * turn))
     if not compliance > 0.0 or apart >= short:
         return
-    slot = take_slot_int(contacts.count)
-    if slot >= contacts.corners.shape[0]:
+    slot = take_contact(contacts, world)
+    if slot < 0:
         return
     stiffness = _STIFFER / compliance
     of_corners = unknowns_of(unknowns, corners)
@@ -79,12 +79,10 @@ def _hold(
 
 
 @wp.func
-def release_held(
-    i: int, motion: Motion, unknowns: Unknowns, solution: wp.array[wp.vec3], progress: Progress, contacts: Contacts
-):
+def release_held(i: int, unknowns: Unknowns, solution: wp.array[wp.vec3], contacts: Contacts):
     """Lets a pair go that is held and that the solution would pull together: it is not in the way."""
     corners, weights, n = contacts.corners[i], contacts.weights[i], contacts.normal[i]
-    if contacts.key[i] >= _FIRST_HELD and progress.solving[motion.world[corners[0]]] != 0:
+    if contacts.key[i] >= _FIRST_HELD:
         apart = wp.dot(n, contacts.gradient[i])
         for j in range(4):
             apart += weights[j] * wp.dot(contacts.hessian[i] * n, displacement(unknowns, corners[j], solution))
@@ -96,22 +94,20 @@ def release_held(
 @wp.func
 def hold_pair(
     i: int,
+    world: int,
     candidates: Candidates,
     trial: Trial,
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
-    progress: Progress,
     limit: wp.array[float],
     group: int,
     contacts: Contacts,
 ):
-    """Adds a contact that holds a candidate which would meet on the displacements, in worlds that solve.
+    """Adds a contact that holds a candidate which would meet on the displacements.
 
     Only one that is the first, by ``limit``, for one of its vertices: what would come later may not come at all.
     """
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
-    if progress.solving[candidates.world[i]] == 0:
-        return
     share = candidates.share[i] + float(0.0)
     if share >= 1.0:
         return
@@ -135,12 +131,13 @@ def hold_pair(
     normal = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / then
     goal = kept + barrier.goal_gap(gap, reach, wp.float64(candidates.floor[i]))
     now = wp.dot(normal, weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d)
-    _hold(contacts, unknowns, trial, inverse, corners, weights, normal, goal - now, key_in_group(group, key))
+    _hold(contacts, unknowns, trial, inverse, world, corners, weights, normal, goal - now, key_in_group(group, key))
 
 
 @wp.func
 def hold_at_planes(
     vertex: int,
+    world: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
@@ -148,13 +145,11 @@ def hold_at_planes(
     trial: Trial,
     unknowns: Unknowns,
     inverse: wp.array[wp.mat33],
-    progress: Progress,
     group: int,
     contacts: Contacts,
 ):
     """Adds contacts that hold a vertex which would enter infinite planes, as :func:`hold_pair`."""
-    world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or progress.solving[world] == 0:
+    if inverse_mass_of(motion, vertex) == 0.0:
         return
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]
@@ -173,4 +168,4 @@ def hold_at_planes(
             normal = wp.vec3d(end[0], end[1], end[2])
             weights = wp.vec4d(ONE, ZERO, ZERO, ZERO)
             key = key_of_pair(group, 7, vertex, i)
-            _hold(contacts, unknowns, trial, inverse, wp.vec4i(vertex), weights, normal, goal - now, key)
+            _hold(contacts, unknowns, trial, inverse, world, wp.vec4i(vertex), weights, normal, goal - now, key)

@@ -10,7 +10,7 @@ from ...response.state.structs import ContactKind, Step
 from ...response.state.vectors import ZERO, to_double, to_single
 from . import barrier
 from .pairs import BarrierSettings, Trial
-from .system import AT_PLANE, Contacts, contact_count, kind_of_key, second_of_key
+from .system import AT_PLANE, Contacts, end_of_contacts, kind_of_key, second_of_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,13 +25,17 @@ def publish_contacts(
     step: Step,
     sides: Sides,
     centres: wp.array[wp.vec3d],
+    threads: int,
     # out
     sums: ImpulseSums,
     rows: ContactRows,
-    threads: int,
 ):
-    """Adds the impulses of contacts at the end of a solve to all sums, and writes a row for each."""
-    for i in range(wp.tid(), contact_count(contacts), threads):
+    """Adds the impulses of contacts at the end of a solve to all sums, and writes a row for each.
+
+    So many threads share those of a world, in a launch over threads and worlds.
+    """
+    thread, world = wp.tid()
+    for i in range(contacts.start[world] + thread, end_of_contacts(contacts, world), threads):
         corners, load = contacts.corners[i], wp.float64(contacts.load[i])
         weights, normal = wp.vec4d(), to_double(contacts.normal[i])
         slid, predicted = wp.vec3d(), wp.vec3d()

@@ -43,17 +43,15 @@ def _sum_of_parts(value: wp.float64, lost: wp.float64, parts: int) -> float:
 
 
 @wp.func
-def _first_bucket(contacts: Contacts, feature: wp.vec3i) -> int:
+def _first_bucket(contacts: Contacts, world: int, feature: wp.vec3i) -> int:
     number = wp.uint32(feature[0]) * wp.uint32(73856093) + wp.uint32(feature[1]) * wp.uint32(19349663)
     number += wp.uint32(feature[2]) * wp.uint32(83492791)
-    return (
-        int((number ^ (number >> wp.uint32(15))) % wp.uint32(contacts.bucket.shape[0] // contacts.parts))
-        * contacts.parts
-    )
+    first, end = contacts.first_bucket[world], contacts.first_bucket[world + 1]
+    return contacts.parts * (first + int((number ^ (number >> wp.uint32(15))) % wp.uint32(end - first)))
 
 
 @wp.func
-def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4d):
+def link_contact(contacts: Contacts, world: int, i: int, corners: wp.vec4i, weights: wp.vec4d):
     """Notes the vertices of a contact, where it has no more than three, for :func:`merge_contact`."""
     low, high, count = wp.vec2i(2147483647), wp.vec2i(-1), wp.vec2i()
     for j in range(4):
@@ -67,13 +65,13 @@ def link_contact(contacts: Contacts, i: int, corners: wp.vec4i, weights: wp.vec4
         # a vertex, of two that of the lower number, and the other vertex twice or those of the edge
         one = int(count[0] > count[1] or (count[0] == count[1] and low[0] > low[1]))
         feature = wp.vec3i(low[one], low[1 - one], high[1 - one])
-        bucket = _first_bucket(contacts, feature) + i % contacts.parts
+        bucket = _first_bucket(contacts, world, feature) + i % contacts.parts
         contacts.feature[i] = feature
         contacts.next[i] = wp.atomic_exch(contacts.bucket, bucket, i + 1)
 
 
 @wp.func
-def merge_contact(i: int, part: int, contacts: Contacts):
+def merge_contact(i: int, part: int, world: int, contacts: Contacts):
     """Adds to a contact all that have its vertices, or takes its weights where another one, of a lower key, does so.
 
     The vector between the closest points is the other way round where the sides of the pair are. So many threads share
@@ -84,7 +82,7 @@ def merge_contact(i: int, part: int, contacts: Contacts):
         return
     gradient, hessian, limit, count = wp.vec3d(), wp.mat33d(), wp.float64(0.0), float(0.0)
     gradient_lost, hessian_lost, limit_lost = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
-    normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[_first_bucket(contacts, feature) + part] + int(0)
+    normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[_first_bucket(contacts, world, feature) + part] + int(0)
     lower, parts = float(0.0), contacts.parts
     while n > 0:
         k = n - 1

@@ -66,15 +66,18 @@ def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units:
 
 @wp.func
 def add_pair_energy(
-    i: int, motion: Motion, candidates: Candidates, settings: BarrierSettings, trial: Trial, progress: Progress
+    i: int,
+    world: int,
+    motion: Motion,
+    candidates: Candidates,
+    settings: BarrierSettings,
+    trial: Trial,
+    progress: Progress,
 ):
-    """Adds the energy of the barrier of a candidate at the displaced positions, in worlds that search."""
+    """Adds the energy of the barrier of a candidate at the displaced positions."""
     if candidates.share[i] >= FAR:
         return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
-    world = candidates.world[i]
-    if progress.searches[world] == 0:
-        return
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)
     if barrier.distance_of_boxes(kind, a, b, c, d) >= candidates.level[i] + reach:
@@ -91,7 +94,13 @@ def add_pair_energy(
 
 @wp.func
 def add_friction_energy(
-    i: int, motion: Motion, contacts: Contacts, settings: BarrierSettings, trial: Trial, energy: wp.array[wp.int64]
+    i: int,
+    world: int,
+    motion: Motion,
+    contacts: Contacts,
+    settings: BarrierSettings,
+    trial: Trial,
+    energy: wp.array[wp.int64],
 ):
     """Adds the work of friction over ``trial.moved``, under the load and along the plane of a contact."""
     corners, weights = contacts.corners[i], contacts.weights[i]
@@ -103,12 +112,13 @@ def add_friction_energy(
             slid += wp.float64(weights[j]) * (trial.moved[v] - to_double(motion.x0[v]))
         slid -= wp.dot(slid, normal) * normal
         value = wp.float64(limit) * barrier.friction_energy(wp.length(slid), settings.smoothing)
-        add_energy(energy, motion.world[corners[0]], value, settings.units)
+        add_energy(energy, world, value, settings.units)
 
 
 @wp.func
 def add_plane_energies(
     vertex: int,
+    world: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
@@ -116,9 +126,8 @@ def add_plane_energies(
     trial: Trial,
     progress: Progress,
 ):
-    """Adds the energies of a vertex at infinite planes at the displaced positions, in worlds that search."""
-    world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or progress.searches[world] == 0:
+    """Adds the energies of a vertex at infinite planes at the displaced positions."""
+    if inverse_mass_of(motion, vertex) == 0.0:
         return
     scale, now = progress.scale[world], plane_share[world]
     for place in range(planes.of_worlds.shape[1]):

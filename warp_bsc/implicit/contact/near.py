@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE
 from ...response.contacts.constraints import friction_on_plane, pair_friction
 from ...response.contacts.rules import inverse_mass_of
@@ -31,6 +30,7 @@ from .system import (
     is_solved,
     key_of_pair,
     kind_of_key,
+    take_contact,
     to_single_block,
     unknowns_of,
 )
@@ -56,6 +56,7 @@ def _add_contact(
     settings: BarrierSettings,
     trial: Trial,
     unknowns: Unknowns,
+    world: int,
     corners: wp.vec4i,
     weights: wp.vec4d,
     normal: wp.vec3d,
@@ -72,8 +73,8 @@ def _add_contact(
     ``shifted`` is how far the second point has moved since the start beside its corners, ``approach`` how far what a
     program moves goes along the normal in this Newton step.
     """
-    slot = take_slot_int(contacts.count)
-    if slot >= contacts.corners.shape[0]:
+    slot = take_contact(contacts, world)
+    if slot < 0:
         return
     load = -stiffness * barrier.barrier_slope(gap, reach)
     curvature = stiffness * barrier.barrier_curvature(gap, reach)
@@ -109,12 +110,13 @@ def _add_contact(
     contacts.hessian[slot] = to_single_block(hessian)
     contacts.key[slot] = key
     contacts.couples[slot] = couples(of_corners, weights)
-    link_contact(contacts, slot, corners, weights)
+    link_contact(contacts, world, slot, corners, weights)
 
 
 @wp.func
 def find_near(
     i: int,
+    world: int,
     motion: Motion,
     candidates: Candidates,
     settings: BarrierSettings,
@@ -123,13 +125,10 @@ def find_near(
     progress: Progress,
     contacts: Contacts,
 ):
-    """Adds a contact if a candidate is near each other, in worlds that solve, and its energy."""
+    """Adds a contact if a candidate is near each other, and its energy."""
     if candidates.share[i] >= FAR:
         return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
-    world = candidates.world[i]
-    if progress.solving[world] == 0:
-        return
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)
     a, b, c, d = corners_of(trial.exact, corners)
@@ -155,6 +154,7 @@ def find_near(
         settings,
         trial,
         unknowns,
+        world,
         corners,
         _merged(corners, weights),
         normal,
@@ -171,6 +171,7 @@ def find_near(
 @wp.func
 def find_near_planes(
     vertex: int,
+    world: int,
     motion: Motion,
     planes: MovingPlanes,
     plane_share: wp.array[float],
@@ -180,9 +181,8 @@ def find_near_planes(
     progress: Progress,
     contacts: Contacts,
 ):
-    """Adds contacts for a vertex that is near infinite planes, in worlds that solve, and their energies."""
-    world = motion.world[vertex]
-    if inverse_mass_of(motion, vertex) == 0.0 or progress.solving[world] == 0:
+    """Adds contacts for a vertex that is near infinite planes, and their energies."""
+    if inverse_mass_of(motion, vertex) == 0.0:
         return
     for place in range(planes.of_worlds.shape[1]):
         i = planes.of_worlds[world, place]
@@ -209,6 +209,7 @@ def find_near_planes(
             settings,
             trial,
             unknowns,
+            world,
             wp.vec4i(vertex),
             wp.vec4d(ONE, ZERO, ZERO, ZERO),
             normal,

@@ -29,14 +29,15 @@ from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
 from .rows import make_rows
 from .step_report import StepResults, note_overflow, write_results
-from .system import Contacts, Flag, Progress, Unknowns
+from .system import Contacts, Progress, Unknowns, Worlds
 
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
-"""Arrays of contacts with an element for each corner."""
+"""Arrays of contacts with several elements for each."""
 _PARTS = 8
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
-_MANY_VERTICES = 8192
-"""Vertices from which on threads have several pairs each: blocks have twice as many then, and threads share less."""
+_MANY_VERTICES = 1 / 4
+"""Vertices by thread of a team from which on they have several pairs each: blocks have twice as many threads then, and
+these share less."""
 _CONTACTS = 64
 """Contacts that fit at first, for each unknown: many times fewer than candidates in a pile, and of far more bytes."""
 _REACH_OF_EDGE = 0.1
@@ -66,6 +67,8 @@ _TOLERANCE = 1e-2
 _LIGHT = 0.01, 1e-4
 """Median of masses as a share of the mean, below which what is light asks for a smaller residual, and down to which."""
 _MAX_ITERATIONS = 200
+_PUBLISHING = 2**15
+"""Threads that publish contacts on a GPU, of all worlds."""
 LATE_STEPS = 16
 """Newton steps after which a step ends, even if something that a program moves has not arrived."""
 
@@ -115,12 +118,14 @@ class NewtonMethod:
         self._count = len(order)
         first = of_bodies[body_of_vertex]  # that of -1 is the last
         unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
-        self._sought = array(np.append(np.ones(particles), np.where(first < 0, 0, 2 + body_of_vertex)))
+        self._all_sought = array(np.append(np.ones(particles), np.where(first < 0, 0, 2 + body_of_vertex)))
+        self._sought = wp.clone(self._all_sought)
         unknowns.particle = array(np.where(order < particles, order, -1))
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
         unknowns.world = array(owner_world[order])
         of_worlds = np.searchsorted(owner_world[order], np.arange(work.worlds + 1))
         unknowns.of_worlds = array(of_worlds)
+        unknowns.first_of_bodies = array(of_worlds[:-1] + np.bincount(world, minlength=work.worlds))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
         unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
@@ -139,7 +144,7 @@ class NewtonMethod:
         row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
         self._vectors = allocate(Vectors, self._count, device)
-        self.progress = allocate(Progress, work.worlds, device, flags=len(Flag), way=work.worlds + 1)
+        self.progress = allocate(Progress, work.worlds, device)
         self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), vertices))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
@@ -147,9 +152,9 @@ class NewtonMethod:
         )
         limit = wp.full(vertices, 1.0, dtype=float, device=device)
         self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
-        whole = wp.zeros(max(vertices, work.worlds), dtype=float, device=device)
-        self._leaves = wp.zeros(work.worlds + 1, dtype=int, device=device)  # by world, then any
-        self._any_leaves = self._leaves[work.worlds :]
+        whole = wp.zeros(work.worlds, dtype=float, device=device)
+        self._leaves = wp.zeros(work.worlds, dtype=int, device=device)
+        self._any_leaves = wp.zeros(1, dtype=int, device=device)
         self._goes_back = wp.zeros(1, dtype=int, device=device)
         self._place = wp.zeros(work.worlds, dtype=int, device=device)
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
@@ -190,27 +195,52 @@ class NewtonMethod:
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
-        self._flow = allocate(Flow, 1, device)
-        self._is_many = device.is_cuda and vertices > _MANY_VERTICES
+        self._flow = allocate(Flow, work.worlds, device, solves_next=1, goes_on=1)
+        # teams of several blocks must all be running, one of these on a multiprocessor
+        self._blocks = max(1, device.sm_count // work.worlds) if device.is_cuda else 1
+        self._is_many = device.is_cuda and vertices > _MANY_VERTICES * 256 * self._blocks * work.worlds
         self._block = 512 if self._is_many else 256
-        self._advancing = device.sm_count * self._block if device.is_cuda else 1
+        self._team_size = self._blocks * self._block if device.is_cuda else 1
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
         p.vectors, p.unknowns, p.bodies = self._vectors, unknowns, self._bodies
         p.trial, p.progress, p.flow = self._trial, self.progress, self._flow
         p.goal, p.lower, p.upper, p.limit = self._goal, self._lower, self._upper, limit
-        p.plane_share, p.whole, p.leaves, p.lacks = self._plane_share, whole, self._leaves, self._lacks
+        p.plane_share, p.whole, p.lacks = self._plane_share, whole, self._lacks
+        p.leaves, p.any_leaves = self._leaves, self._any_leaves
         p.first = wp.zeros(self._count, dtype=wp.vec3, device=device)
-        p.element_count = sum(map(len, of_elements))
+        p.worlds = self._in_worlds(of_elements, unknowns)
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1
         p.turns = _PARTS if self._is_many else 1
         self._queues: list[PairQueue] = []
         self._captured, self._retired = False, []
+        self._of_worlds = of_worlds
         self._candidates, self._contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
-        self._allocate_contacts(max(MIN_CAPACITY, _CONTACTS * self._count))
+        self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(self._count, 1))))
+
+    def _in_worlds(self, of_elements, unknowns) -> Worlds:
+        """Returns what is in each world."""
+        found, count, device = Worlds(), self._work.worlds, self._work.device
+        world = self._mesh.device_world.numpy()
+        is_given = (unknowns.of_vertex.numpy() == -1).astype(int)
+        vertices = np.lexsort((is_given, world))
+        particle_world = world[: self._mesh.model.particle_count]
+        elements = np.concatenate([particle_world[v.max(axis=1)] for v in of_elements if len(v)] or [world[:0]])
+        order = np.argsort(elements, kind="stable")
+        numbers = np.arange(count + 1)
+        arrays = {
+            "vertices": vertices,
+            "first_vertex": np.searchsorted(world[vertices], numbers),
+            "first_given": np.searchsorted((2 * world + is_given)[vertices], 2 * numbers[:-1] + 1),
+            "elements": order,
+            "first_element": np.searchsorted(elements[order], numbers),
+        }
+        for name, values in arrays.items():
+            setattr(found, name, wp.array(values.astype(np.int32), dtype=int, device=device))
+        return found
 
     def _reach(self, mesh) -> np.ndarray:
         """Returns the gap from which each vertex pushes [m], infinite for shapes."""
@@ -284,6 +314,7 @@ class NewtonMethod:
         self._begin(end, 1.0)
         self.progress.active.zero_()
         self._find_end(end)
+        self._solve()
 
     def read_materials(self) -> None:
         """Reads the stiffness of tetrahedra again; not in a CUDA graph. All else is read in each step."""
@@ -307,7 +338,10 @@ class NewtonMethod:
             self._launch(attach, self._mesh.model.particle_count, inputs, outputs)
             wp.copy(self._poses, end.body_q)
         self.progress.active.zero_()
+        self.progress.given_moves.zero_()
+        self.progress.solving.zero_()
         self._flow.arrived.zero_()
+        wp.copy(self._sought, self._all_sought)
         self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
         inputs = [motion, self._margin, self._mesh.model.gravity, self._dt, self._unknowns, self._bodies]
         outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
@@ -327,8 +361,7 @@ class NewtonMethod:
         self._flow.goes_on.fill_(1)
         wp.capture_while(self._flow.goes_on, self._take_newton_steps)
         if self.keeps_contacts:
-            self._flow.phase.fill_(int(Phase.PUBLISH))
-            self._advance()
+            retry_until_fits(self._find_contacts_at_end, self, work.device)
         if len(self._bodies.unknown):
             self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
@@ -339,7 +372,10 @@ class NewtonMethod:
 
     def _renew_candidates(self):
         inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
-        self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper])
+        inputs += [int(self.keeps_contacts)]
+        self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
+        self._leaves.zero_()
+        self._any_leaves.zero_()
         self._find_candidates()
 
     def _find_candidates(self):
@@ -355,7 +391,20 @@ class NewtonMethod:
         queues = queues_of(detector, candidates=True)
         if [len(q.pairs) for q in self._queues] != [len(q.pairs) for q in queues]:
             self._allocate_candidates(queues)
+        self._place_candidates()
         self._prepare_candidates()
+
+    def _place_candidates(self):
+        """Gives each world its part of the candidates."""
+        work, candidates = self._work, self._candidates
+        if work.worlds == 1:
+            return
+        candidates.room.zero_()
+        candidates.used.zero_()
+        for k in range(0, len(self._queues), 2):
+            queues = self._queues[k : k + 2]
+            work.launch_over_entries(pairs.count_candidates, [self._mesh.device_world, *queues, candidates])
+        self._launch(pairs.place_candidates, work.worlds, [candidates], [])
 
     def _prepare_candidates(self):
         self._candidates.near.zero_()
@@ -374,18 +423,25 @@ class NewtonMethod:
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self._candidates)
-        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, near=1, far=1)
+        sizes = {**dict.fromkeys(("start", "room", "near", "far"), self._work.worlds), "used": 1}
+        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
+        self._candidates.room.fill_(capacity)
 
-    def _allocate_contacts(self, capacity):
+    def _allocate_contacts(self, of_unknown):
+        """Allocates contacts, so many for each unknown of a world."""
         self._retire(self._contacts)
-        sizes: dict = {"count": 1, "listed": 2, **dict.fromkeys(("first", "middle", "end"), self._count)}
+        start, device = of_unknown * self._of_worlds, self._work.device
+        capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
+        sizes: dict = dict.fromkeys(("first", "middle", "end"), self._count)
         parts = 1 if self._is_many else self._problem.parts
         sizes["bucket"] = parts * self._mesh.vertex_count
-        sizes |= dict.fromkeys(_OF_ENTRIES, 4 * capacity)
-        sizes |= dict.fromkeys(("coupled_first", "coupled_end"), self._work.worlds)
-        self._contacts = allocate(Contacts, capacity, self._work.device, **sizes)
-        self._contacts.parts = parts
-        self._problem.contacts = self._contacts
+        sizes |= dict.fromkeys(_OF_ENTRIES, of_each * capacity)
+        sizes |= dict.fromkeys(("count", "listed", "coupled_first", "coupled_end"), self._work.worlds)
+        contacts = allocate(Contacts, capacity, device, **sizes)
+        contacts.parts, contacts.entries_of_each = parts, of_each
+        contacts.start = wp.array(start.astype(np.int32), dtype=int, device=device)
+        contacts.first_bucket = self._problem.worlds.first_vertex
+        self._contacts = self._problem.contacts = contacts
 
     def _retire(self, buffers):
         if self._captured:
@@ -393,17 +449,27 @@ class NewtonMethod:
 
     def grow(self) -> bool:
         """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
-        contacts = self._contacts
-        found = int(contacts.count.numpy()[0])
-        if not self._problem.grows or found <= len(contacts.corners):
+        if not self._problem.grows:
             return False
-        self._allocate_contacts(capacity_for(found, "contacts"))
+        found, of_worlds = self._contacts.count.numpy(), np.diff(self._of_worlds)
+        if (found <= np.diff(self._contacts.start.numpy())).all():
+            return False
+        needed = int(np.max(-(-found[of_worlds > 0] // of_worlds[of_worlds > 0])))
+        capacity = capacity_for(needed * self._count, "contacts")
+        self._allocate_contacts(capacity // self._count)
         return True
 
     def _take_newton_steps(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
-        self._advance()
+        self._flow.goes_on.zero_()
+        self._advance(resumes=True)
         wp.capture_while(self._flow.solves_next, self._solve)
+        if not self._work.device.is_capturing:
+            self.grow()
+
+    def _find_contacts_at_end(self):
+        self._flow.phase.fill_(int(Phase.PUBLISH))
+        self._advance()
 
     def _solve(self):
         work, team = self._work, self._team
@@ -419,29 +485,29 @@ class NewtonMethod:
             self._flow.solves,
             team,
         ]
-        outputs = [self._vectors, self.iterations]
+        outputs = [self._vectors, self.iterations, self._flow.solves_next]
         options = {"device": work.device, "block_dim": self._threads}
         wp.launch(
             self._solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options
         )
         self._advance()
 
-    def _advance(self):
-        self._problem.grows = int(self._may_grow and not self._work.device.is_capturing)
-        retry_until_fits(self._launch_advance, self, self._work.device)
-
-    def _launch_advance(self):
+    def _advance(self, resumes=False):
         work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
+        self._problem.grows = int(self._may_grow and not work.device.is_capturing)
         changes = float(self._least_speed * self._dt), float(self._metre * _FAR_SPEED * self._dt)
-        inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most]
+        inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most, int(resumes)]
+        inputs += [self._problem, self._team_size, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
-        wp.launch(ADVANCE[self._block], self._advancing, inputs=[*inputs, self._problem, self._advancing], **options)
+        wp.launch(ADVANCE[self._block], work.worlds * self._team_size, inputs=inputs, **options)
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
+        work = self._work
+        threads = max(1, _PUBLISHING // work.worlds) if work.device.is_cuda else 1
         inputs = [self._contacts, self._settings, self._trial, self._goal]
-        inputs += [self._work.step, sides, centres, sums, rows]
-        self._work.launch_over_entries(publish_contacts, inputs)
+        inputs += [work.step, sides, centres, threads]
+        self._launch(publish_contacts, (threads, work.worlds), inputs, [sums, rows])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)

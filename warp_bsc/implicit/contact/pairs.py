@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...detection.approach_phase import KEPT, distances_of_pair
-from ...kernels.pipeline.queues import take_slot_int
+from ...kernels.pipeline.queues import take_slot_of
 from ...kernels.polynomials import VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
@@ -42,13 +42,16 @@ _PARTED_ROUNDED = wp.constant(2.0**-20)
 class Candidates:
     """Pairs of elements that may come near each other in the step, but for those that are excluded.
 
-    What would come within its reach if vertices went as far as in the step before comes first, the others from the end
-    backwards, each in any order: threads that run together then mostly do the same.
+    Those of a world follow each other. What would come within its reach if vertices went as far as in the step before
+    comes first there, the others from the end backwards, each in any order: threads that run together then mostly do
+    the same.
 
     Attributes:
-        near: Number of the first ones, shape [1].
-        far: Number of the others, shape [1].
-        world: World of each pair.
+        start: First of each world.
+        room: Room for those of each world.
+        near: Number of the first ones of each world.
+        far: Number of the others.
+        used: Room that worlds have taken, shape [1].
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
         apart: How far the vertices of a pair can go together before it is within its reach, negative if it is [m].
@@ -60,9 +63,11 @@ class Candidates:
         now: Distance where the Newton step begins, or less, of what was not far in the one before [m].
     """
 
+    start: wp.array[int]
+    room: wp.array[int]
     near: wp.array[int]
     far: wp.array[int]
-    world: wp.array[int]
+    used: wp.array[int]
     corners: wp.array[wp.vec4i]
     key: wp.array[wp.int64]
     apart: wp.array[float]
@@ -251,7 +256,7 @@ NO_FACE = wp.constant(2**31 - 1)
 def stays_far(apart: float, progress: Progress, world: int) -> bool:
     """Returns whether a pair is beyond its reach, whichever of the vertices of its world go the longest ways."""
     way = progress.way[world]
-    return apart >= way + wp.max(way, progress.way[progress.way.shape[0] - 1])
+    return apart >= way + wp.max(way, progress.given_way[world])
 
 
 @wp.func
@@ -294,18 +299,42 @@ def _prepare(
     slot = int(0)
     world, apart = motion.world[corners[0]], float((start - kept - reach) * ROUNDED_DOWN)
     if apart < 2.0 * progress.way_before[world]:
-        slot = take_slot_int(candidates.near)
+        slot = candidates.start[world] + take_slot_of(candidates.near, world)
     else:
-        slot = candidates.corners.shape[0] - 1 - take_slot_int(candidates.far)
+        slot = candidates.start[world] + candidates.room[world] - 1 - take_slot_of(candidates.far, world)
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
-    candidates.world[slot] = world
     candidates.apart[slot] = apart
     candidates.kept[slot] = kept
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
     candidates.share[slot] = wp.where(stays_far(apart, progress, world), FAR, 1.0)
+
+
+@wp.kernel
+def count_candidates(
+    # in
+    world: wp.array[int],
+    first: PairQueue,
+    second: PairQueue,
+    # in and out
+    candidates: Candidates,
+    threads: int,
+):
+    """Counts the pairs of each world in two queues."""
+    for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
+        if has_pair(first, i):
+            take_slot_of(candidates.room, world[vertices_of(first, i)[0]])
+        if has_pair(second, i):
+            take_slot_of(candidates.room, world[vertices_of(second, i)[0]])
+
+
+@wp.kernel
+def place_candidates(candidates: Candidates):
+    """Gives each world room for its pairs."""
+    w = wp.tid()
+    candidates.start[w] = wp.atomic_add(candidates.used, 0, candidates.room[w])
 
 
 @wp.kernel

@@ -7,10 +7,10 @@ from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
 from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, inertial_energy
 from .conjugate_gradients import Vectors
-from .decisions import may_cut, takes
+from .decisions import takes
 from .merit import add_energy
 from .pairs import BarrierSettings, Trial, moved
-from .system import Flag, Progress, Unknowns, displacement, is_solved, lower_to, raise_to, unknown_of_corner
+from .system import NOT_UNKNOWN, Progress, Unknowns, displacement, is_solved, lower_to, raise_to, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
 
@@ -95,7 +95,7 @@ def begin_step(
         progress.change[v] = 0.0
         progress.way_before[v] = progress.way[v]
         progress.way[v] = 0.0
-        progress.way[progress.way.shape[0] - 1] = 0.0
+        progress.given_way[v] = 0.0
         progress.remaining[v] = 0.0
         progress.late[v] = 0
         progress.driven[v] = 0.0
@@ -116,6 +116,8 @@ def begin_step(
         return
     pad = margin[v] + float(0.0)
     u = unknowns.of_vertex[v]
+    if u == NOT_UNKNOWN and not x1 == x0:
+        progress.given_moves[motion.world[v]] = 1
     if u < 0:
         goal[v] = x1
     elif unknowns.is_free[u] != 0:
@@ -158,25 +160,26 @@ def _way(motion: Motion, trial: Trial, v: int) -> float:
 @wp.func
 def find_remaining(
     v: int,
+    world: int,
     motion: Motion,
     unknowns: Unknowns,
     trial: Trial,
     progress: Progress,
 ):
     """Writes the ways that are left of what a program moves, before a solve."""
-    world = motion.world[v]
     trial.share[v] = 1.0
-    if progress.active[world] != 0 and not is_solved(unknowns, v) and wp.isfinite(trial.x[v]):
+    if not is_solved(unknowns, v) and wp.isfinite(trial.x[v]):
         d = motion.x1[v] - trial.x[v]
         trial.displaced[v] = d
         if wp.length_sq(d) > 0.0:
             raise_to(progress.remaining, world, wp.length(d))
-            raise_to(progress.way, progress.way.shape[0] - 1, _way(motion, trial, v))
+            raise_to(progress.given_way, world, _way(motion, trial, v))
 
 
 @wp.func
 def displace(
     v: int,
+    world: int,
     motion: Motion,
     unknowns: Unknowns,
     vectors: Vectors,
@@ -189,9 +192,6 @@ def displace(
     leaves: wp.array[int],
 ):
     """Writes the displacements of vertices after a solve, and whether some leave the boxes of the candidates."""
-    world = motion.world[v]
-    if progress.solving[world] == 0:
-        return
     limit[v] = 1.0
     if not is_solved(unknowns, v):
         return
@@ -204,7 +204,6 @@ def displace(
     if not (wp.isfinite(d) and wp.isfinite(gradient)):  # as a start is not: its world stands
         trial.displaced[v] = wp.vec3()
         progress.bound[world] = 0.0
-        progress.flags[Flag.MEETS] = 1
         progress.change[world] = wp.inf
         return
     trial.displaced[v] = d
@@ -212,9 +211,7 @@ def displace(
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
         lower_to(progress.bound, world, share)
-        progress.flags[Flag.MEETS] = 1
         leaves[world] = 1
-        leaves[leaves.shape[0] - 1] = 1
 
 
 @wp.kernel
@@ -225,17 +222,23 @@ def renew_boxes(
     margin: wp.array[float],
     trial: Trial,
     leaves: wp.array[int],
+    is_kept: int,
     # in and out
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
+    # out
+    sought: wp.array[int],
 ):
     """Makes the boxes of vertices those around their last displacement, from where they are now.
 
-    Only in worlds in which one left its box, so that each is as if it were alone. A displacement that is far longer
-    than what the step would take without forces counts in part: all may be near each other on ways of metres.
+    Only in worlds in which one left its box; the others have ended, and their pairs are not sought any more, unless
+    they ``is_kept``. A displacement that is far longer than what the step would take without forces counts in part: all
+    may be near each other on ways of metres.
     """
     v = wp.tid()
     if leaves[motion.world[v]] == 0:
+        if is_kept == 0:
+            sought[v] = 0
         return
     x, d = trial.x[v], trial.displaced[v] + wp.vec3()
     if not wp.isfinite(x):
@@ -270,36 +273,10 @@ def begin_truncation(
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
     trial: Trial,
-    progress: Progress,
-    whole: wp.array[float],
 ):
-    """Lets worlds that take less than all of their displacements try to cut those of single vertices instead."""
-    if v < progress.active.shape[0]:
-        progress.searches[v] = 0
-        progress.solving[v] = 0
-        if progress.active[v] != 0:
-            whole[v] = progress.scale[v]
-            if may_cut(progress, v):
-                progress.searches[v] = 1
-                progress.solving[v] = 1
-            progress.scale[v] = 1.0
-            progress.bound[v] = 1.0
-    if v >= trial.x.shape[0]:
-        return
+    """Takes the share of a vertex down to what stays in its box."""
     if is_solved(unknowns, v):
         lower_to(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
-
-
-@wp.func
-def undo_truncation(
-    v: int,
-    motion: Motion,
-    progress: Progress,
-    trial: Trial,
-):
-    """Lets vertices take all that their world takes, where it cuts none."""
-    if progress.cuts[motion.world[v]] == 0:
-        trial.share[v] = 1.0
 
 
 @wp.func
@@ -330,24 +307,23 @@ def add_inertia(
 @wp.func
 def write_moved(
     v: int,
+    scale: float,
     motion: Motion,
     unknowns: Unknowns,
     bodies: SolvedBodies,
-    progress: Progress,
     trial: Trial,
 ):
-    """Writes where a vertex is after its displacement."""
-    world = motion.world[v]
-    if progress.searches[world] != 0:
-        x = moved(trial, progress.scale[world], v)
-        if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
-            x = exact_on_body(bodies.moved, bodies.low_moved, motion, v)
-        trial.moved[v] = x
+    """Writes where a vertex is after a share of its displacement."""
+    x = moved(trial, scale, v)
+    if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
+        x = exact_on_body(bodies.moved, bodies.low_moved, motion, v)
+    trial.moved[v] = x
 
 
 @wp.func
 def take(
     v: int,
+    world: int,
     motion: Motion,
     unknowns: Unknowns,
     bodies: SolvedBodies,
@@ -355,7 +331,6 @@ def take(
     trial: Trial,
 ):
     """Moves a vertex by the share of its world, if that takes it; what a program moves arrives exactly."""
-    world = motion.world[v]
     if not takes(world, progress):
         return
     scale = progress.scale[world]

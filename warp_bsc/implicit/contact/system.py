@@ -1,9 +1,8 @@
 """The unknowns of a step, and what kernels know of them and of their worlds."""
 
-from enum import IntEnum
-
 import warp as wp
 
+from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO, to_single
 
 wp.set_module_options({"enable_backward": False})
@@ -21,7 +20,8 @@ class Unknowns:
         particle: Particle of each unknown, -1 of those of bodies.
         body: Body of each unknown, -1 of those of particles.
         world: World of each unknown.
-        of_worlds: First unknown of each world, and the end of the last.
+        of_worlds: First unknown of each world, and the end of the last. Those of bodies come last in a world.
+        first_of_bodies: First unknown of a body in each world, or where its unknowns end.
         is_free: 1 for each unknown that is solved for; the others are given.
         inertia: Mass over the square of the length of the step, and attachments, of each particle [N/m].
         arm: Of each vertex of a body that is solved for, from its centre of mass [m].
@@ -32,19 +32,27 @@ class Unknowns:
     body: wp.array[int]
     world: wp.array[int]
     of_worlds: wp.array[int]
+    first_of_bodies: wp.array[int]
     is_free: wp.array[int]
     inertia: wp.array[wp.float64]
     arm: wp.array[wp.vec3]
 
 
-class Flag(IntEnum):
-    """What a phase of a Newton step finds in some world, for all threads."""
+@wp.struct
+class Worlds:
+    """What is in each world; the first of it in each, and the end of the last.
 
-    MEETS = 0
-    RISES = 1
-    CUTS = 2
-    SEARCHES = 3
-    GOES_ON = 4
+    Attributes:
+        vertices, first_vertex: Vertices, those that are solved for, and all particles, first.
+        first_given: First of the others in each.
+        elements, first_element: Elements.
+    """
+
+    vertices: wp.array[int]
+    first_vertex: wp.array[int]
+    first_given: wp.array[int]
+    elements: wp.array[int]
+    first_element: wp.array[int]
 
 
 @wp.struct
@@ -53,26 +61,26 @@ class Progress:
 
     Attributes:
         active: 1 while a world takes another Newton step, shape [worlds], like all that follow.
-        solving: 1 while a world takes part in a solve, or in what follows from one.
+        solving: 1 of a world for which a solve comes next.
         steps: Newton steps so far.
         scale: Share of the displacements that is taken.
         bound: Share of the displacements before two elements meet.
-        searches: 1 while the share of the world is to be halved, as its energy has risen.
+        searches: 1 while the share is halved, as the energy has risen.
         energy: Energy at the positions, in units.
         trial: Energy at the displaced positions, in units.
         uncut: The same, before displacements of single vertices are cut.
         cuts: 1 if those are cut.
         change: Largest displacement of an unknown in the Newton step [m].
         before: The same in the one before it, as far as it was taken, -1 if it was not [m].
-        way: How far a vertex has been, or is led by the displacements, from where it was at the start of the
-            step [m]; the last is that of what a program moves, of all worlds.
-        way_before: The same in the step before, shape [worlds].
+        way: How far a vertex has been, or is led by the displacements, from where it was at the start of the step [m].
+        way_before: The same in the step before.
+        given_way: The same of what a program moves.
         remaining: Largest way of what a program moves that is left [m].
         held: 1 if pairs are held in the solve.
-        flags: What has been found in some world, see :class:`Flag`.
         late: Newton steps that began before what a program moves had arrived, but for the first of them.
         fall: How far gravity moves what is at rest in the step [m].
         driven: Largest way of what a program moves in the step [m].
+        given_moves: 1 if something moves in the step that is not solved for.
     """
 
     active: wp.array[int]
@@ -89,12 +97,13 @@ class Progress:
     before: wp.array[float]
     way: wp.array[float]
     way_before: wp.array[float]
+    given_way: wp.array[float]
     remaining: wp.array[float]
     held: wp.array[int]
-    flags: wp.array[int]
     late: wp.array[int]
     fall: wp.array[float]
     driven: wp.array[float]
+    given_moves: wp.array[int]
 
 
 @wp.func
@@ -125,7 +134,8 @@ class Contacts:
     The energy of one, as a function of the vector between the closest points, has ``gradient`` and ``hessian``.
 
     Attributes:
-        count: Number of contacts, shape [1].
+        count: Number of contacts of each world; those that did not fit are counted, but are not there.
+        start: Where those of each world begin, and the end of all room.
         corners: Vertices; of a particle at a plane, four times the particle.
         unknowns: The ``of_vertex`` of the corners.
         weights: Of the vertices in the vector from the second closest point to the first; all 0 of what is merged.
@@ -139,10 +149,12 @@ class Contacts:
             vertices of one element, are parts of the rows of elements.
         feature: Vertices of a contact of two vertices, or of one and an edge; -1 of others.
         parts: Threads that share a contact, and buckets of each hash of vertices.
+        first_bucket: First hash of each world, and the end of the last.
         bucket: 1 more than the first contact there, 0 for none; ``next`` has those that follow.
-        listed: Number of entries, shape [1].
+        listed: Number of entries of each world.
         first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
+        entries_of_each: Entries for which there is room, by contact.
         unsorted, row, order: The same in any order, its unknown, and the number by which it is ordered.
         coupled: Contacts that couple, those of a world from ``coupled_first`` to ``coupled_end``.
         coupled_unknowns: Of each of those, the ``of_vertex`` of its corners, -1 of corners without weight.
@@ -152,6 +164,7 @@ class Contacts:
     """
 
     count: wp.array[int]
+    start: wp.array[int]
     corners: wp.array[wp.vec4i]
     unknowns: wp.array[wp.vec4i]
     weights: wp.array[wp.vec4]
@@ -164,6 +177,7 @@ class Contacts:
     couples: wp.array[int]
     feature: wp.array[wp.vec3i]
     parts: int
+    first_bucket: wp.array[int]
     bucket: wp.array[int]
     next: wp.array[int]
     listed: wp.array[int]
@@ -171,6 +185,7 @@ class Contacts:
     middle: wp.array[int]
     end: wp.array[int]
     entries: wp.array[int]
+    entries_of_each: int
     unsorted: wp.array[int]
     row: wp.array[int]
     order: wp.array[wp.int64]
@@ -285,9 +300,16 @@ def displacement(unknowns: Unknowns, vertex: int, d: wp.array[wp.vec3]) -> wp.ve
 
 
 @wp.func
-def contact_count(contacts: Contacts) -> int:
-    """Returns the number of contacts; those that did not fit are counted, but are not there."""
-    return wp.min(contacts.count[0], contacts.corners.shape[0])
+def end_of_contacts(contacts: Contacts, world: int) -> int:
+    """Returns where the contacts of a world end."""
+    return wp.min(contacts.start[world] + contacts.count[world], contacts.start[world + 1])
+
+
+@wp.func
+def take_contact(contacts: Contacts, world: int) -> int:
+    """Returns a place for another contact of a world; -1 if there is none."""
+    slot = contacts.start[world] + take_slot_of(contacts.count, world)
+    return wp.where(slot < contacts.start[world + 1], slot, -1)
 
 
 @wp.func
