@@ -23,7 +23,7 @@ from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind
 from warp_bsc.implicit.contact.matrix import Matrix, make_matrix
 from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
-from warp_bsc.implicit.contact.system import Contacts, Progress, Unknowns
+from warp_bsc.implicit.contact.system import Contacts, Unknowns
 from warp_bsc.implicit.elastic import Elastic
 from warp_bsc.implicit.elements import with_gradient
 from warp_bsc.response.state.structs import Motion, allocate
@@ -51,7 +51,6 @@ def _add_blocks(
     unknowns: Unknowns,
     row_of_block: wp.array[int],
     x: wp.array[wp.vec3],
-    progress: Progress,
     rows: Rows,
     parts: int,
     turns: int,
@@ -61,6 +60,7 @@ def _add_blocks(
     i, trial, motion, bodies, dt = wp.tid(), Trial(), Motion(), SolvedBodies(), wp.float64(DT)
     add_blocks(
         i,
+        0,
         derivatives,
         contacts,
         unknowns,
@@ -70,7 +70,6 @@ def _add_blocks(
         motion,
         bodies,
         dt,
-        progress,
         rows,
         parts,
         turns,
@@ -229,9 +228,9 @@ def test_rows_are_the_sums_of_elements(scene):
     first, column = rows.first.numpy(), rows.column.numpy()
     row = np.repeat(np.arange(count), np.diff(first))
     unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
-    blocks_of, progress = make_matrix(rows, np.array([0, count]), parts=2, device=device), allocate(Progress, 1, device)
-    progress.solving.fill_(1)
-    inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array(scene.x), progress, rows]
+    unknowns.of_worlds = scene.array([0, count], int)
+    blocks_of = make_matrix(rows, np.array([0, count]), parts=2, device=device)
+    inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array(scene.x), rows]
     parts, turns = (8, 3) if wp.get_device(device).is_cuda else (1, 1)  # threads that share a block, and blocks they do
     threads = parts * -(-len(row) // turns)
     wp.launch(_add_blocks, threads, inputs=[*inputs, parts, turns], outputs=[blocks_of], device=device)

@@ -15,13 +15,13 @@ VERTICES = 25
 @wp.kernel(enable_backward=False)
 def _link(contacts: Contacts):
     i = wp.tid()
-    link_contact(contacts, i, contacts.corners[i], wp.vec4d(contacts.weights[i]))
+    link_contact(contacts, 0, i, contacts.corners[i], wp.vec4d(contacts.weights[i]))
 
 
 @wp.kernel(enable_backward=False)
 def _merge(contacts: Contacts):
     k = wp.tid()
-    merge_contact(k // contacts.parts, k % contacts.parts, contacts)
+    merge_contact(k // contacts.parts, k % contacts.parts, 0, contacts)
 
 
 def contacts_of_step(device, **options):
@@ -69,7 +69,7 @@ def merged(contacts, device, order):
     struct.feature = wp.zeros(count, dtype=wp.vec3i, device=device)
     struct.parts = 8 if device.is_cuda else 1
     struct.next, struct.bucket = (wp.zeros(n, dtype=int, device=device) for n in (count, struct.parts))
-    struct.count = wp.array([count], dtype=int, device=device)
+    struct.first_bucket = wp.array([0, 1], dtype=int, device=device)
     wp.launch(_link, count, inputs=[struct], device=device)
     wp.launch(_merge, count * struct.parts, inputs=[struct], device=device)
     left = np.flatnonzero(struct.weights.numpy().any(axis=1))

@@ -33,43 +33,46 @@ class Phase(IntEnum):
     DIFFERENTIATE = 1
     LOADS = 2
     RELEASE_HELD = 3
-    PAIRS = 4
-    COUNT = 5
-    PLACE = 6
-    LIST = 7
-    SORT = 8
-    BLOCKS = 9
-    ASSEMBLE = 10
-    DISPLACE = 11
-    BOUNDED = 12
-    HOLD = 13
-    TAKE_BOUND = 14
-    DISPLACED = 15
-    JUDGE = 16
-    BEGIN_RELEASE = 17
-    END_RELEASE = 18
-    BEGIN_CUTS = 19
-    CUT = 20
-    TAKE_CUT = 21
-    CHOOSE_CUTS = 22
-    UNDO_CUTS = 23
-    TAKE = 24
-    DECIDE = 25
-    NEXT = 26
-    PUBLISH = 27
-    SOLVE = 28
-    SEARCH_CANDIDATES = 29
-    GROW = 30
-    END = 31
+    BEGIN_LIST = 4
+    PAIRS = 5
+    COUNT = 6
+    PLACE = 7
+    LIST = 8
+    SORT = 9
+    BLOCKS = 10
+    ASSEMBLE = 11
+    DISPLACE = 12
+    BOUNDED = 13
+    HOLD = 14
+    TAKE_BOUND = 15
+    DISPLACED = 16
+    JUDGE = 17
+    BEGIN_RELEASE = 18
+    END_RELEASE = 19
+    BEGIN_CUTS = 20
+    CUT = 21
+    TAKE_CUT = 22
+    CHOOSE_CUTS = 23
+    UNDO_CUTS = 24
+    TAKE = 25
+    DECIDE = 26
+    NEXT = 27
+    PUBLISH = 28
+    SOLVE = 29
+    SEARCH_CANDIDATES = 30
+    GROW = 31
+    END = 32
 
 
 class Task(IntEnum):
     """What the phase over pairs does."""
 
-    FIND_NEAR = 0
-    HOLD = 1
-    BOUND = 2
-    ENERGY = 3
+    LIST_NEAR = 0
+    FIND_NEAR = 1
+    HOLD = 2
+    LIST = 3
+    BOUND = 4
+    ENERGY = 5
 
 
 @wp.struct
@@ -190,14 +193,25 @@ def _over_pairs(
     group = 1 + solves
     start, near_count = p.candidates.start[w], p.candidates.near[w]
     last = start + p.candidates.room[w] - 1
-    for k in range(t, near_count + p.candidates.far[w], n):
-        i = wp.where(k < near_count, start + k, last - (k - near_count))
+    # all candidates, with little to do for each, to list those with much
+    if task == Task.LIST_NEAR or task == Task.LIST:
+        for k in range(t, near_count + p.candidates.far[w], n):
+            i = wp.where(k < near_count, start + k, last - (k - near_count))
+            if task == Task.LIST_NEAR:
+                near.list_near(i, w, p.candidates, p.trial)
+            else:
+                bounds.list_pair(i, w, p.candidates, p.trial, p.progress, is_shorter)
+        return
+    for k in range(start + t, start + p.candidates.listed[w], n):
+        entry = p.candidates.list[k] + int(0)
+        i = entry >> 1
         if task == Task.FIND_NEAR:
             near.find_near(i, w, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
         elif task == Task.HOLD:
             held.hold_pair(i, w, p.candidates, p.trial, p.unknowns, p.vectors.inverse, p.limit, group, p.contacts)
         elif task == Task.BOUND:
-            bounds.bound_by_pair(i, w, p.candidates, p.trial, p.progress, p.limit, is_shorter)
+            if (entry & 1) != 0:
+                bounds.bound_by_pair(i, w, p.candidates, p.trial, p.progress, p.limit)
         else:
             merit.add_pair_energy(i, w, motion, p.candidates, settings, p.trial, p.progress)
     if p.vertices_at_planes == 0:
@@ -294,7 +308,7 @@ def _advance(
     first_contact = p.contacts.start[w] + int(0)
     # of the phase over pairs: what it does, and which phase follows
     task, then = int(Task.BOUND), int(Phase.BOUNDED)
-    passes, releases = int(0), bool(False)
+    passes, releases, is_listed = int(0), bool(False), bool(True)
     while phase < Phase.SOLVE:
         if phase == Phase.BEGIN:
             if t == 0:
@@ -312,8 +326,11 @@ def _advance(
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
             if progress.steps[w] == 0:
                 phase = int(Phase.END)
+            elif p.candidates.listed[w] < 0:
+                phase = int(Phase.BEGIN_LIST)
         elif phase == Phase.DIFFERENTIATE:
             solves = int(0)
+            is_listed = p.candidates.listed[w] >= 0
             for k in range(first_vertex + from_end, end_of_vertices, n):
                 steps.find_remaining(p.worlds.vertices[k], w, motion, p.unknowns, p.trial, progress)
             for k in range(
@@ -340,6 +357,12 @@ def _advance(
             for u in range(first_unknown + from_end, end_of_unknowns, n):
                 p.contacts.end[u] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.COUNT), int(Phase.PAIRS)
+            if not is_listed:
+                phase = int(Phase.BEGIN_LIST)
+        elif phase == Phase.BEGIN_LIST:
+            if t == 0:
+                p.candidates.listed[w] = 0
+            task, phase = int(Task.LIST_NEAR), int(Phase.PAIRS)
         elif phase == Phase.RELEASE_HELD:
             if t == 0:
                 decisions.begin_hold(w, progress)
@@ -359,7 +382,13 @@ def _advance(
                 for i in range(first_contact + from_middle, end_of_contacts(p.contacts, w), n):
                     merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, progress.trial)
             _over_pairs(task, passes > 0, p, motion, planes, settings, solves, w, t, n)
-            phase = then
+            # what was listed comes next
+            if task == Task.LIST_NEAR:
+                task = int(Task.FIND_NEAR)
+            elif task == Task.LIST:
+                task = int(Task.BOUND)
+            else:
+                phase = then
         elif phase == Phase.COUNT:
             for k in range(t, p.contacts.parts * (end_of_contacts(p.contacts, w) - first_contact), n):
                 i, part = first_contact + k // p.contacts.parts, k % p.contacts.parts
@@ -455,7 +484,9 @@ def _advance(
                     p.limit,
                     p.leaves,
                 )
-            task, then, phase = int(Task.BOUND), int(Phase.BOUNDED), int(Phase.PAIRS)
+            if t == 0:
+                p.candidates.listed[w] = 0
+            task, then, phase = int(Task.LIST), int(Phase.BOUNDED), int(Phase.PAIRS)
         elif phase == Phase.HOLD:  # what would meet on the displacements, and solve again
             for u in range(first_unknown + t, end_of_unknowns, n):
                 if solves == 0:
@@ -497,7 +528,9 @@ def _advance(
                 if t == 0:
                     progress.bound[w] = 1.0
                 then = int(Phase.TAKE_CUT)
-            task, phase = int(Task.BOUND), int(Phase.PAIRS)
+            if t == 0:
+                p.candidates.listed[w] = 0
+            task, phase = int(Task.LIST), int(Phase.PAIRS)
         elif phase == Phase.TAKE_CUT:
             if t == 0:
                 decisions.take_cut(w, progress)

@@ -14,6 +14,7 @@ from .pairs import (
     BarrierSettings,
     Candidates,
     Trial,
+    add_to_list,
     gap_at_plane,
     moved,
     plane_at,
@@ -47,16 +48,8 @@ def _relative_way(p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.floa
 
 
 @wp.func
-def bound_by_pair(
-    i: int,
-    world: int,
-    candidates: Candidates,
-    trial: Trial,
-    progress: Progress,
-    limit: wp.array[float],
-    is_shorter: bool,
-):
-    """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world.
+def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress: Progress, is_shorter: bool):
+    """Lists a candidate that displacements may bring within its reach, for :func:`bound_by_pair`.
 
     Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
@@ -72,20 +65,20 @@ def bound_by_pair(
         for j in range(4):
             cuts += trial.cut[trial.holder[corners[j]]]
         if cuts == 0:
+            if before == 1.0:
+                add_to_list(candidates, world, i, False)
             return
     candidates.share[i] = FAR
     if stays:
         return
     kind = kind_of_key(candidates.key[i])
-    kept = candidates.kept[i]
-    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
     if before >= FAR:
         candidates.now[i] = float(barrier.distance_of_boxes(kind, a, b, c, d) * ROUNDED_DOWN)
     now = wp.float64(candidates.now[i])
     bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
-    within = kept + reach + wp.float64(bend)
+    within = candidates.kept[i] + wp.float64(candidates.reach[i]) + wp.float64(bend)
     if now >= within:
         if not is_shorter and now >= within + _relative_way(p, q, r, s):
             candidates.share[i] = FAR_TOGETHER
@@ -93,6 +86,23 @@ def bound_by_pair(
         if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within:
             return
     candidates.share[i] = 1.0
+    add_to_list(candidates, world, i, True)
+
+
+@wp.func
+def bound_by_pair(
+    i: int,
+    world: int,
+    candidates: Candidates,
+    trial: Trial,
+    progress: Progress,
+    limit: wp.array[float],
+):
+    """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world."""
+    corners, kind, kept = candidates.corners[i], kind_of_key(candidates.key[i]), candidates.kept[i]
+    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
+    now = wp.float64(candidates.now[i])
+    a, b, c, d = corners_of(trial.x, corners)
     scale = progress.scale[world]
     p = to_double(to_single(moved(trial, scale, corners[0]))) - a
     q = to_double(to_single(moved(trial, scale, corners[1]))) - b

@@ -9,7 +9,6 @@ from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double
 from . import barrier
 from .pairs import (
-    FAR,
     BarrierSettings,
     Candidates,
     Trial,
@@ -75,8 +74,6 @@ def add_pair_energy(
     progress: Progress,
 ):
     """Adds the energy of the barrier of a candidate at the displaced positions."""
-    if candidates.share[i] >= FAR:
-        return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)

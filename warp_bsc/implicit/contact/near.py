@@ -17,6 +17,7 @@ from .pairs import (
     BarrierSettings,
     Candidates,
     Trial,
+    add_to_list,
     gap_at_plane,
     plane_at,
     stiffness_at_plane,
@@ -114,6 +115,18 @@ def _add_contact(
 
 
 @wp.func
+def list_near(i: int, world: int, candidates: Candidates, trial: Trial):
+    """Lists a candidate if it may be near each other, for :func:`find_near`, where no displacements told."""
+    if candidates.share[i] >= FAR:
+        return
+    a, b, c, d = corners_of(trial.exact, candidates.corners[i])
+    apart = barrier.distance_of_boxes(kind_of_key(candidates.key[i]), a, b, c, d)
+    candidates.now[i] = float(apart * ROUNDED_DOWN)
+    if apart < candidates.level[i] + wp.float64(candidates.reach[i]):
+        add_to_list(candidates, world, i, False)
+
+
+@wp.func
 def find_near(
     i: int,
     world: int,
@@ -126,8 +139,6 @@ def find_near(
     contacts: Contacts,
 ):
     """Adds a contact if a candidate is near each other, and its energy."""
-    if candidates.share[i] >= FAR:
-        return
     corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)

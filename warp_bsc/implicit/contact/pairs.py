@@ -52,6 +52,10 @@ class Candidates:
         near: Number of the first ones of each world.
         far: Number of the others.
         used: Room that worlds have taken, shape [1].
+        listed: Number of pairs of each world that the last displacements may bring within their reach, or that are;
+            -1 if they are not known.
+        list: Those from the start of each world, each twice, and 1 more of those that displacements may not bring
+            together yet, see :func:`.bounds.list_pair`.
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
         apart: How far the vertices of a pair can go together before it is within its reach, negative if it is [m].
@@ -68,6 +72,8 @@ class Candidates:
     near: wp.array[int]
     far: wp.array[int]
     used: wp.array[int]
+    listed: wp.array[int]
+    list: wp.array[int]
     corners: wp.array[wp.vec4i]
     key: wp.array[wp.int64]
     apart: wp.array[float]
@@ -234,6 +240,12 @@ def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, 
         least = barrier.FLOOR * whole
     level = wp.min(kept, start - least)
     return level, wp.min(whole, start - level + settings.recovery)
+
+
+@wp.func
+def add_to_list(candidates: Candidates, world: int, i: int, is_new: bool):
+    """Lists a pair of a world."""
+    candidates.list[candidates.start[world] + take_slot_of(candidates.listed, world)] = 2 * i + int(is_new)
 
 
 @wp.struct

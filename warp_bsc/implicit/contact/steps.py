@@ -116,7 +116,7 @@ def begin_step(
         return
     pad = margin[v] + float(0.0)
     u = unknowns.of_vertex[v]
-    if u == NOT_UNKNOWN and not x1 == x0:
+    if u == NOT_UNKNOWN and wp.length_sq(x1 - x0) > 0.0:
         progress.given_moves[motion.world[v]] = 1
     if u < 0:
         goal[v] = x1
