@@ -440,7 +440,9 @@ def _advance(
                 )
             phase = int(Phase.ASSEMBLE)
         elif phase == Phase.ASSEMBLE:
-            for i in range(t, p.parts * ((end_of_unknowns - first_unknown + p.turns - 1) // p.turns), n):
+            count = end_of_unknowns - first_unknown
+            turns = wp.where(p.parts * count <= n, 1, p.turns)
+            for i in range(t, p.parts * ((count + turns - 1) // turns), n):
                 assembly.assemble(
                     i,
                     w,
@@ -456,7 +458,7 @@ def _advance(
                     p.rows,
                     p.matrix,
                     p.parts,
-                    p.turns,
+                    turns,
                     p.vectors,
                 )
             if t == 0 and solves == 0:

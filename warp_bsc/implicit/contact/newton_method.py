@@ -33,7 +33,7 @@ from .system import Contacts, Progress, Unknowns, Worlds
 
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with several elements for each."""
-_PARTS = 8
+_PARTS = 4
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
 _MANY_VERTICES = 1 / 4
 """Vertices by thread of a team from which on they have several pairs each: blocks have twice as many threads then, and
