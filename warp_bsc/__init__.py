@@ -55,6 +55,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .replay.scene_intersections import SceneIntersections
     from .replay.scene_proximities import SceneProximities
     from .response.captured_steps import CapturedSteps
+    from .response.contact_sensor import ContactSensor
     from .response.layer.contact_layer import ContactLayer
     from .response.monitor import CollisionMonitor
     from .response.report import SolverReport
@@ -75,6 +76,7 @@ _MODULES = {
     "CollisionMonitor": "response.monitor",
     "Collisions": "detection.collisions",
     "ContactLayer": "response.layer.contact_layer",
+    "ContactSensor": "response.contact_sensor",
     "DetectionStats": "detection.collisions",
     "FrameRange": "usd.frames",
     "FrictionTable": "response.state.friction_table",
@@ -117,6 +119,7 @@ __all__ = [
     "CollisionMonitor",
     "Collisions",
     "ContactLayer",
+    "ContactSensor",
     "DetectionStats",
     "FrameRange",
     "FrictionTable",

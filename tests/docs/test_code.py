@@ -107,7 +107,7 @@ def test_contacts(tmp_path, capsys):
 
 def test_reports(tmp_path, capsys):
     names, output = run("newton/reports.md", tmp_path, capsys)
-    assert names["force"].shape == (3,) and "shape" in output
+    assert names["force"].shape == (3,) and "shape" in output and "[-0.88 -0.88]" in output
 
 
 @pytest.mark.filterwarnings("ignore:contacts strained", "ignore:in the state of the program")
