@@ -18,7 +18,16 @@ from . import kernels, pose_kernels, restore, structs
 from .arrays import copied, copied_materials, filled, launch_adjoint, materials_with_gradients, with_gradients
 from .structs import Move, Projection, RestoredStep
 
-_UNUSED_OF_CONSTRAINTS = {"count", "min_distance", "last_sweep", "active_set", "active_count"}
+_UNUSED_OF_CONSTRAINTS = {
+    "count",
+    "min_distance",
+    "last_sweep",
+    "active_set",
+    "active_count",
+    "of_worlds",
+    "first",
+    "number",
+}
 
 _MULTIPLIERS = "position_multiplier", "velocity_multiplier", "previous_multiplier"
 

@@ -9,7 +9,18 @@ import warp as wp
 
 from ..state.fixed_sum import with_delta
 from ..state.poses import centre_of, in_world
-from ..state.structs import DIVIDED, HELD, MASS, MOMENTS, Step, body_of, has_final_velocity
+from ..state.structs import (
+    DIVIDED,
+    HELD,
+    MASS,
+    MOMENTS,
+    Incidence,
+    Step,
+    body_of,
+    constraint_at,
+    constraint_count,
+    has_final_velocity,
+)
 from ..state.vectors import HALF, ONE, ZERO, relative, to_double, to_single
 from ..tuning import MAX_TURN
 
@@ -89,15 +100,17 @@ def is_held(step: Step, i: int) -> bool:
 
 
 @wp.func
-def add_torques(step: Step, thread: int, threads: int, sums: wp.array2d[wp.int64]):
+def add_torques(step: Step, begin: int, end: int, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the changes of angular momentum by contacts between free bodies, see :func:`torque_of`.
 
-    For one contact they cancel; for many at once, which share vertices, they need not. Each of ``threads`` threads sums
-    several contacts before it adds to the sums of their world, which all threads share.
+    For one contact they cancel; for many at once, which share vertices, they need not. A thread takes every
+    ``threads``-th place from ``begin`` to ``end``, and sums several contacts before it adds to the sums of their world,
+    which all threads share.
     """
     world = int(0)
     added = _Torque()
-    for i in range(thread, wp.min(step.constraints.count[0], step.constraints.vertices.shape[0]), threads):
+    for place in range(begin, end, threads):
+        i = constraint_at(step, place)
         own = step.motion.world[step.constraints.vertices[i][0]]
         if own != world:
             _add(sums, world, added)
@@ -116,7 +129,7 @@ def add_torques(step: Step, thread: int, threads: int, sums: wp.array2d[wp.int64
 @wp.kernel
 def sum_torques(step: Step, threads: int, sums: wp.array2d[wp.int64]):
     """Launches :func:`add_torques`."""
-    add_torques(step, wp.tid(), threads, sums)
+    add_torques(step, wp.tid(), constraint_count(step), threads, sums)
 
 
 @wp.func
@@ -147,15 +160,16 @@ def moments(step: Step, vertex: int) -> Moments:
 
 
 @wp.func
-def add_moments(step: Step, particles: int, thread: int, threads: int, sums: wp.array2d[wp.int64]):
+def add_moments(step: Step, particles: Incidence, begin: int, end: int, threads: int, sums: wp.array2d[wp.int64]):
     """Sums the moments of the vertices that collided, and the torques of those that were divided.
 
-    Threads are as in :func:`add_torques`.
+    A thread takes particles as contacts in :func:`add_torques`.
     """
     motion, vertices = step.motion, step.vertices
     world = int(0)
     added = _Sums()
-    for vertex in range(thread, particles, threads):
+    for place in range(begin, end, threads):
+        vertex = int(particles.items[place])
         own = motion.world[vertex]
         if own != world:
             _add(sums, world, added)
@@ -175,9 +189,9 @@ def add_moments(step: Step, particles: int, thread: int, threads: int, sums: wp.
 
 
 @wp.kernel
-def sum_moments(step: Step, particles: int, threads: int, sums: wp.array2d[wp.int64]):
+def sum_moments(step: Step, particles: Incidence, threads: int, sums: wp.array2d[wp.int64]):
     """Launches :func:`add_moments`."""
-    add_moments(step, particles, wp.tid(), threads, sums)
+    add_moments(step, particles, wp.tid(), particles.items.shape[0], threads, sums)
 
 
 @wp.func

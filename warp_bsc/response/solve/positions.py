@@ -1,5 +1,7 @@
 """Projection of positions: sweeps over the constraints that move vertices and bodies."""
 
+import functools
+
 import warp as wp
 
 from ..contacts.constraints import gap, min_distance_of, moves_body
@@ -8,7 +10,6 @@ from ..schedule import (
     SWEEPS_PER_BATCH,
     Loop,
     SolveStatus,
-    begin_sweeps,
     is_dividing,
     is_projecting,
     is_reversible,
@@ -16,20 +17,20 @@ from ..schedule import (
 )
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
-from ..state.structs import PROJECTED, ContactKind, Pace, Step, constraint_count
+from ..state.structs import PROJECTED, ContactKind, Incidence, Pace, Step, constraint_at, constraint_count
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
 from . import sweeps
 from .bodies import move_bodies, place_vertices
-from .cluster import BLOCK, CLUSTER, wait_for_others
+from .by_world import BLOCK, wait_for_others
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64, i: int):
-    """Adds a constraint to the active set for positions, if it is violated, or may pull something back.
+def _is_active(step: Step, status: SolveStatus, sweep: int, tolerance: wp.float64, i: int) -> bool:
+    """Returns whether a constraint is active for positions: it is violated, or may pull something back.
 
     Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities that planes divide
     afterwards, but for those at rest, which friction holds in place: projection knows nothing of elasticity, and in a
@@ -42,15 +43,15 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
     kind = constraints.kind[i]
     if kind > ContactKind.PLANE and is_dividing(status, world, status.loop[Loop.ITERATION]):
         if constraints.pace[i] != Pace.RESTING:
-            return
+            return False
         if kind == ContactKind.EDGE_EDGE_PROXIMITY:
             kept = min_distance_of(step, i)
             start = wp.dot(constraints.normal[i], relative(constraints.weights[i], corners, motion.x0))
             if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
-                return
-    past = status.loop[Loop.SWEEP] >= sweeps.max_position_sweeps(step, status, i)
+                return False
+    past = sweep >= sweeps.max_position_sweeps(step, status, i)
     if past or not is_projecting(status, world):
-        return
+        return False
     normal = constraints.normal[i]
     separation = constraints.separation[i]
     distance = gap(step, i)
@@ -70,24 +71,24 @@ def _activate_constraint(step: Step, status: SolveStatus, tolerance: wp.float64,
             active = distance > tolerance or not sweeps.is_held_by_friction(
                 multiplier, normal, path, friction, ZERO, tolerance
             )
-    if active:
-        sweeps.activate(step, i)
+    return active
 
 
 @wp.kernel
 def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp.float64, threads: int):
     """Fills the active set for positions."""
     for i in range(wp.tid(), constraint_count(step), threads):
-        _activate_constraint(step, status, tolerance, i)
+        if _is_active(step, status, status.loop[Loop.SWEEP], tolerance, i):
+            sweeps.activate(step, i, 0, 0)
 
 
 @wp.func
-def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, place: int):
+def _project_constraint(step: Step, status: SolveStatus, sweep: int, record: StepRecord, place: int):
     """Updates the position multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
     i = constraints.active_set[place]
     pushes_only = not is_reversible(status, constraints.pace[i] != Pace.FAST)
-    momentum = sweeps.momentum_of(step, status, i, sweeps.max_position_sweeps(step, status, i))
+    momentum = sweeps.momentum_of(step, sweep, i, sweeps.max_position_sweeps(step, status, i))
     if pushes_only:
         violated = gap(step, i) < ZERO
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
@@ -102,7 +103,7 @@ def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, pla
 def project_positions(step: Step, status: SolveStatus, record: StepRecord, threads: int):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
     for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):
-        _project_constraint(step, status, record, place)
+        _project_constraint(step, status, status.loop[Loop.SWEEP], record, place)
 
 
 @wp.func
@@ -115,60 +116,72 @@ def move_vertex(step: Step, vertex: int) -> bool:
 
 
 @wp.func
-def _update_vertex(step: Step, status: SolveStatus, record: StepRecord, last: bool, vertex: int):
-    """Moves a vertex by the sum of what its constraints did to it; the first one finishes the sweep."""
-    vertices = step.vertices
-    if sweeps.finish_sweep(step, status, record, last, vertex) and move_vertex(step, vertex):
-        vertices.changed[vertex] = 1
-        vertices.outcome[vertex] = vertices.outcome[vertex] | PROJECTED
+def _update_vertex(step: Step, vertex: int):
+    """Moves a vertex by the sum of what its constraints did to it."""
+    if move_vertex(step, vertex):
+        step.vertices.changed[vertex] = 1
+        step.vertices.outcome[vertex] = step.vertices.outcome[vertex] | PROJECTED
 
 
 @wp.kernel
 def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: bool):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
-    _update_vertex(step, status, record, last, wp.tid())
+    vertex = wp.tid()
+    if sweeps.finish_sweep(step, status, record, last, vertex):
+        _update_vertex(step, vertex)
 
 
-@wp.kernel(module="unique", enable_backward=False, cluster_dim=CLUSTER, launch_bounds=BLOCK)
-def _sweep(
-    step: Step,
-    status: SolveStatus,
-    record: StepRecord,
-    particle_count: int,
-    tolerance: wp.float64,
-    batches: int,
-    sweeps_per_batch: int,
-    threads: int,
-):
-    """Makes batches of sweeps in one launch, see :mod:`.cluster`."""
-    thread = wp.tid()
-    if thread == 0:
-        begin_sweeps(status)
-    wait_for_others()
-    count = constraint_count(step)
-    more = status.loop[Loop.MORE_SWEEPS]
-    batch = int(0)
-    while more == 1 and batch < batches:
-        for i in range(thread, count, threads):
-            _activate_constraint(step, status, tolerance, i)
-        wait_for_others()
-        active_count = int(step.constraints.active_count[0])
-        for sweep in range(sweeps_per_batch):
-            for place in range(thread, active_count, threads):
-                _project_constraint(step, status, record, place)
+@functools.cache
+def _sweep(cluster: int) -> wp.Kernel:
+    """Returns the kernel that makes sweeps over each world by one cluster of blocks, see :mod:`.by_world`."""
+
+    @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
+    def sweep_positions(
+        step: Step,
+        particles: Incidence,
+        status: SolveStatus,
+        tolerance: wp.float64,
+        most: int,
+        batch: int,
+        threads: int,
+    ):
+        """Makes at most so many sweeps, with a new active set after each ``batch`` of them."""
+        world = wp.tid() // threads
+        thread = wp.tid() - world * threads
+        constraints = step.constraints
+        first = int(constraints.first[world])
+        end = first + constraints.number[world]
+        record = StepRecord()  # which records nothing
+        sweep = int(wp.where(status.loop[Loop.MORE_SWEEPS] == 1 and end > first, 0, most))
+        while sweep < most:
+            if thread == 0:
+                constraints.active_count[world] = wp.int64(0)
             wait_for_others()
-            for vertex in range(thread, particle_count, threads):
-                _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
+            for place in range(first + thread, end, threads):
+                i = constraint_at(step, place)
+                if _is_active(step, status, sweep, tolerance, i):
+                    sweeps.activate(step, i, world, first)
             wait_for_others()
-        more = status.loop[Loop.MORE_SWEEPS]
-        batch += 1
+            active_end = first + int(constraints.active_count[world])
+            if active_end == first:
+                break
+            for i_of_batch in range(batch):
+                for place in range(first + thread, active_end, threads):
+                    _project_constraint(step, status, sweep, record, place)
+                wait_for_others()
+                for k in range(particles.first[world] + thread, particles.first[world + 1], threads):
+                    if sweeps.takes_changes(step, i_of_batch == batch - 1, particles.items[k]):
+                        _update_vertex(step, particles.items[k])
+                wait_for_others()
+                sweep += 1
+
+    return sweep_positions
 
 
 def project(work: Workspace) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met."""
     if work.sweeping_threads:
-        batches = int(MAX_SWEEPS) // int(SWEEPS_PER_BATCH)
-        work.sweep_at_once(_sweep, [work.tolerance, batches, int(SWEEPS_PER_BATCH)])
+        work.sweep_by_world(_sweep, [work.status, work.tolerance, int(MAX_SWEEPS), int(SWEEPS_PER_BATCH)])
         return
     work.repeat_sweeps(lambda: _activate(work), project_positions, _update)
 
@@ -180,7 +193,7 @@ def leave_planes(work: Workspace) -> None:
 
 def _leave_planes(work):
     if work.sweeping_threads:
-        work.sweep_at_once(_sweep, [work.tolerance, 1, 1])
+        work.sweep_by_world(_sweep, [work.status, work.tolerance, 1, 1])
         return
     work.launch(start_sweeps, 1, [work.status])
     work.sweep(1, lambda: _activate(work), project_positions, _update)

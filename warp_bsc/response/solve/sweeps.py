@@ -166,9 +166,12 @@ def count_active(step: Step, i: int):
 
 
 @wp.func
-def activate(step: Step, i: int):
-    """Adds a constraint to the active set, and counts it for the vertices and bodies that it moves."""
-    step.constraints.active_set[int(take_slot(step.constraints.active_count, 0))] = i
+def activate(step: Step, i: int, world: int, first: int):
+    """Adds a constraint to the active set, and counts it for the vertices and bodies that it moves.
+
+    The active set is that of a ``world``, from its ``first`` place on; where worlds are not swept apart, both are 0.
+    """
+    step.constraints.active_set[first + int(take_slot(step.constraints.active_count, world))] = i
     count_active(step, i)
 
 
@@ -180,12 +183,11 @@ def max_position_sweeps(step: Step, status: SolveStatus, i: int) -> int:
 
 
 @wp.func
-def momentum_of(step: Step, status: SolveStatus, i: int, most: int) -> wp.float64:
+def momentum_of(step: Step, sweep: int, i: int, most: int) -> wp.float64:
     """Returns the share of its last step that a multiplier repeats: it grows (Nesterov), and is 0 in the last sweep.
 
     That is the one after which there were the ``most`` sweeps.
     """
-    sweep = status.loop[Loop.SWEEP]
     last = step.constraints.last_sweep[i]
     step.constraints.last_sweep[i] = sweep
     if last != sweep - 1 or sweep == most - 1:
@@ -246,6 +248,12 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
             end_sweep(record, count)
         if last:
             step.constraints.active_count[0] = wp.int64(0)
+    return takes_changes(step, last, vertex)
+
+
+@wp.func
+def takes_changes(step: Step, last: bool, vertex: int) -> bool:
+    """Returns whether constraints of a sweep act on a vertex, of which the ``last`` sweep lets it go."""
     active = step.vertices.active[vertex] != 0
     if active and last:
         step.vertices.active[vertex] = 0

@@ -5,10 +5,10 @@ import functools
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
-from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, Loop, SolveStatus, begin_sweeps
+from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, Loop, SolveStatus
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
-from ..state.structs import Step, constraint_count, has_final_velocity
+from ..state.structs import Incidence, Step, constraint_at, constraint_count, has_final_velocity
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
 from ..tuning import TOLERANCE_OF_BODIES
@@ -24,7 +24,7 @@ from .angular_momentum import (
     turn_vertices,
 )
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
-from .cluster import BLOCK, CLUSTER, wait_for_others
+from .by_world import BLOCK, wait_for_others
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,14 +56,14 @@ def initialize_velocity_multipliers(step: Step, threads: int):
 
 
 @wp.func
-def _activate_constraint(step: Step, tolerance: wp.float64, i: int):
-    """Adds a constraint to the active set, if it pushed, and its contact points are still near each other."""
+def _is_active(step: Step, tolerance: wp.float64, i: int) -> bool:
+    """Returns whether a constraint is active: it pushed, and its contact points are still near each other."""
     constraints = step.constraints
     multiplier = constraints.velocity_multiplier[i]
     acts = wp.length_sq(multiplier) > ZERO
     if not acts:
         if not has_pushed(step, i) or gap(step, i) > constraints.separation[i] - min_distance_of(step, i):
-            return
+            return False
     tolerance = wp.where(moves_body(step, i), TOLERANCE_OF_BODIES, ONE) * tolerance / step.dt
     excess = sweeps.excess_speed(step, i)
     active = excess < -tolerance
@@ -73,23 +73,23 @@ def _activate_constraint(step: Step, tolerance: wp.float64, i: int):
         friction = wp.float64(constraints.friction[i])
         held = sweeps.is_held_by_friction(multiplier, constraints.normal[i], velocity, friction, least, tolerance)
         active = (acts and excess > tolerance) or not held
-    if active:
-        sweeps.activate(step, i)
+    return active
 
 
 @wp.kernel
 def activate_velocity_constraints(step: Step, tolerance: wp.float64, threads: int):
     """Fills the active set for velocities."""
     for i in range(wp.tid(), constraint_count(step), threads):
-        _activate_constraint(step, tolerance, i)
+        if _is_active(step, tolerance, i):
+            sweeps.activate(step, i, 0, 0)
 
 
 @wp.func
-def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, place: int):
+def _project_constraint(step: Step, sweep: int, record: StepRecord, place: int):
     """Updates the velocity multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
     i = constraints.active_set[place]
-    momentum = sweeps.momentum_of(step, status, i, MAX_SWEEPS)
+    momentum = sweeps.momentum_of(step, sweep, i, MAX_SWEEPS)
     multiplier = sweeps.velocity_multiplier_after(step, i)
     old = constraints.velocity_multiplier[i]
     new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
@@ -101,7 +101,7 @@ def _project_constraint(step: Step, status: SolveStatus, record: StepRecord, pla
 def project_velocities(step: Step, status: SolveStatus, record: StepRecord, threads: int):
     """Updates the velocity multipliers of the active set, in one Jacobi sweep."""
     for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):
-        _project_constraint(step, status, record, place)
+        _project_constraint(step, status.loop[Loop.SWEEP], record, place)
 
 
 @wp.func
@@ -114,65 +114,79 @@ def change_velocity(step: Step, vertex: int) -> bool:
     return is_free
 
 
-@wp.func
-def _update_vertex(step: Step, status: SolveStatus, record: StepRecord, last: bool, vertex: int):
-    """Changes the velocity of a vertex that was not truncated; the first one finishes the sweep."""
+@wp.kernel
+def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last: bool):
+    """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
+    vertex = wp.tid()
     if sweeps.finish_sweep(step, status, record, last, vertex):
         change_velocity(step, vertex)
 
 
-@wp.kernel
-def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last: bool):
-    """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
-    _update_vertex(step, status, record, last, wp.tid())
+@wp.func
+def _update_world(step: Step, particles: Incidence, world: int, last: bool, thread: int, threads: int):
+    """Changes the velocities of the vertices of a world that were not truncated."""
+    for k in range(particles.first[world] + thread, particles.first[world + 1], threads):
+        if sweeps.takes_changes(step, last, particles.items[k]):
+            change_velocity(step, particles.items[k])
 
 
-@wp.kernel(module="unique", enable_backward=False, cluster_dim=CLUSTER, launch_bounds=BLOCK)
-def _sweep(
-    step: Step,
-    status: SolveStatus,
-    record: StepRecord,
-    particle_count: int,
-    tolerance: wp.float64,
-    sweeps_per_batch: int,
-    sums: wp.array2d[wp.int64],
-    threads: int,
-):
-    """Solves velocities and restores angular momentum in one launch, see :mod:`.cluster`."""
-    thread = wp.tid()
-    for world in range(thread, sums.shape[0], threads):
-        for column in range(sums.shape[1]):
+@functools.cache
+def _sweep(cluster: int) -> wp.Kernel:
+    """Returns the kernel that solves velocities of each world by one cluster of blocks, see :mod:`.by_world`."""
+
+    @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
+    def sweep_velocities(
+        step: Step,
+        particles: Incidence,
+        tolerance: wp.float64,
+        batch: int,
+        sums: wp.array2d[wp.int64],
+        threads: int,
+    ):
+        """Solves velocities, with a new active set after each ``batch`` of sweeps, and restores angular momentum."""
+        world = wp.tid() // threads
+        thread = wp.tid() - world * threads
+        constraints = step.constraints
+        first = int(constraints.first[world])
+        end = first + constraints.number[world]
+        if end == first:
+            return
+        record = StepRecord()  # which records nothing
+        for column in range(thread, sums.shape[1], threads):
             sums[world, column] = wp.int64(0)
-    count = constraint_count(step)
-    for i in range(thread, count, threads):
-        _initialize_multiplier(step, i)
-    wait_for_others()
-    for vertex in range(thread, particle_count, threads):
-        _update_vertex(step, status, record, True, vertex)
-    wait_for_others()
-    if thread == 0:
-        begin_sweeps(status)
-    wait_for_others()
-    more = status.loop[Loop.MORE_SWEEPS]
-    while more == 1:
-        for i in range(thread, count, threads):
-            _activate_constraint(step, tolerance, i)
+        for place in range(first + thread, end, threads):
+            _initialize_multiplier(step, constraint_at(step, place))
         wait_for_others()
-        active_count = int(step.constraints.active_count[0])
-        for sweep in range(sweeps_per_batch):
-            for place in range(thread, active_count, threads):
-                _project_constraint(step, status, record, place)
+        _update_world(step, particles, world, True, thread, threads)
+        wait_for_others()
+        sweep = int(0)
+        while sweep < MAX_SWEEPS:
+            if thread == 0:
+                constraints.active_count[world] = wp.int64(0)
             wait_for_others()
-            for vertex in range(thread, particle_count, threads):
-                _update_vertex(step, status, record, sweep == sweeps_per_batch - 1, vertex)
+            for place in range(first + thread, end, threads):
+                i = constraint_at(step, place)
+                if _is_active(step, tolerance, i):
+                    sweeps.activate(step, i, world, first)
             wait_for_others()
-        more = status.loop[Loop.MORE_SWEEPS]
-    add_torques(step, thread, threads, sums)
-    wait_for_others()
-    add_moments(step, particle_count, thread, threads, sums)
-    wait_for_others()
-    for vertex in range(thread, particle_count, threads):
-        turn_vertex(step, sums, vertex)
+            active_end = first + int(constraints.active_count[world])
+            if active_end == first:
+                break
+            for i_of_batch in range(batch):
+                for place in range(first + thread, active_end, threads):
+                    _project_constraint(step, sweep, record, place)
+                wait_for_others()
+                _update_world(step, particles, world, i_of_batch == batch - 1, thread, threads)
+                wait_for_others()
+                sweep += 1
+        add_torques(step, first + thread, end, threads, sums)
+        wait_for_others()
+        add_moments(step, particles, particles.first[world] + thread, particles.first[world + 1], threads, sums)
+        wait_for_others()
+        for k in range(particles.first[world] + thread, particles.first[world + 1], threads):
+            turn_vertex(step, sums, particles.items[k])
+
+    return sweep_velocities
 
 
 def project(work: Workspace, dt: float) -> None:
@@ -183,7 +197,7 @@ def project(work: Workspace, dt: float) -> None:
     """
     work.step.dt = dt
     if work.sweeping_threads:
-        work.sweep_at_once(_sweep, [work.tolerance, int(SWEEPS_PER_BATCH), work.moments])
+        work.sweep_by_world(_sweep, [work.tolerance, int(SWEEPS_PER_BATCH), work.moments])
         return
     work.launch_over_bodies(move_to_end)
     work.launch_over_constraints(initialize_velocity_multipliers)
@@ -203,7 +217,7 @@ def _restore_angular_momentum(work):
     sums, threads = work.moments, work.summing_threads
     sums.zero_()
     work.launch(sum_torques, threads, [work.step, threads, sums])
-    work.launch(sum_moments, threads, [work.step, work.particle_count, threads, sums])
+    work.launch(sum_moments, threads, [work.step, work.particles, threads, sums])
     work.launch_over_bodies(sum_body_moments, sums)
     work.launch_over_particles(turn_vertices, sums)
     work.launch_over_bodies(turn_bodies, sums)

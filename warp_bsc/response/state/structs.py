@@ -171,8 +171,11 @@ class Constraints:
     velocity_multiplier: wp.array[wp.vec3d]  # [kg m/s]
     previous_multiplier: wp.array[wp.vec3d]  # either of the two after the last sweep, without momentum
     last_sweep: wp.array[int]  # in which it was active last, or NEVER_SWEPT
-    active_set: wp.array[int]  # indices of the active constraints
-    active_count: wp.array[wp.int64]
+    active_set: wp.array[int]  # indices of the active constraints; if worlds are swept apart, from ``first`` of each
+    active_count: wp.array[wp.int64]  # of each world that is swept apart, or of all
+    of_worlds: wp.array[int]  # indices of all constraints, world by world; empty if they are not swept apart
+    first: wp.array[int]  # of a world that is swept apart, where its constraints begin in of_worlds
+    number: wp.array[int]  # of its constraints, then of those in all worlds
 
 
 @wp.struct
@@ -192,6 +195,14 @@ class Step:
 def constraint_count(step: Step) -> int:
     """Returns the number of constraints; those that did not fit are counted, but are not there."""
     return wp.min(step.constraints.count[0], step.constraints.vertices.shape[0])
+
+
+@wp.func
+def constraint_at(step: Step, place: int) -> int:
+    """Returns the index of the constraint at a place of the list by worlds, which is the place if there is no list."""
+    if step.constraints.of_worlds:
+        return step.constraints.of_worlds[place]
+    return place
 
 
 @wp.struct

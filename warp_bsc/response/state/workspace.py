@@ -22,7 +22,7 @@ from ..schedule import (
     single_elements,
     start_sweeps,
 )
-from ..solve.cluster import BLOCK, threads_of_cluster
+from ..solve.by_world import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from ..tuning import DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, THREADS, TOLERANCE
 from .motion import ModelMotion, takes_part
 from .record import StepRecord, StepRecorder, record_offsets
@@ -34,6 +34,7 @@ from .structs import (
     SUMS,
     Constraints,
     DividingPlanes,
+    Incidence,
     MovedBodies,
     Step,
     Tetrahedra,
@@ -121,8 +122,9 @@ class Workspace:
         tetrahedra: The tetrahedra whose inversions are looked for, None if nobody asks.
         ends: Where particles ended before inversions were prevented; None if they are not.
         unmasked: Inverse masses of vertices and bodies while those that take no part have none.
-        sweeping_threads: Threads that make all sweeps in one launch; 0 if each is launched, as those of bodies and of
-            steps that may be recorded are.
+        particles: The particles of each world.
+        sweeping_threads: Threads of each world that make all its sweeps in one launch; 0 if each is launched, as those
+            of bodies and of steps that may be recorded are.
     """
 
     def __init__(
@@ -173,7 +175,11 @@ class Workspace:
         if motion.moves_bodies:
             size = self.body_count, 6
             step.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
-        step.constraints = allocate(Constraints, 0, device, count=1, active_count=1)
+        self.particles = self._find_particles()
+        at_once = not self.body_count and not differentiable
+        largest = int(np.diff(self.particles.first.numpy()).max())
+        self.sweeping_threads = threads_of_world(device, self.worlds, largest) if at_once else 0
+        step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
         self.dividing = DividingPlanes()
         if not differentiable:
@@ -195,8 +201,6 @@ class Workspace:
         self.kept = wp.zeros(1, dtype=int, device=device)
         self.moments = wp.zeros((self.worlds, int(SUMS)), dtype=wp.int64, device=device)
         self.summing_threads = 1 if device.is_cpu else 256 * device.sm_count
-        at_once = not self.body_count and not differentiable
-        self.sweeping_threads = threads_of_cluster(device, self.particle_count) if at_once else 0
         self._threads = 1 if device.is_cpu else THREADS * device.sm_count
 
     def write_arcs(self) -> None:
@@ -285,6 +289,21 @@ class Workspace:
         """Returns a capacity, or 0 without minimum distances."""
         return 0 if self.mesh.distances is None else capacity
 
+    def _allocate_constraints(self, capacity):
+        sizes = {"count": 1, "active_count": self.worlds, "min_distance": self._if_distances(capacity)}
+        sizes |= {"first": self.worlds, "number": self.worlds + 1}
+        sizes["of_worlds"] = capacity if self.sweeping_threads and self.worlds > 1 else 0
+        return allocate(Constraints, capacity, self.device, **sizes)
+
+    def _find_particles(self):
+        """Returns the particles of each world."""
+        world = self.mesh.device_world.numpy()[: self.particle_count]
+        particles = Incidence()
+        first = np.searchsorted(np.sort(world), np.arange(self.worlds + 1))
+        particles.first = wp.array(first, dtype=int, device=self.device)
+        particles.items = wp.array(np.argsort(world, kind="stable"), dtype=int, device=self.device)
+        return particles
+
     @property
     def max_contacts(self) -> int:
         """Contacts that a detection finds at most with its queues as they are."""
@@ -296,9 +315,7 @@ class Workspace:
             return
         filled = int(self.constraints.count.numpy()[0])
         if len(self.constraints.vertices) < filled + more:
-            capacity = filled + ITERATIONS_RESERVED * more
-            sizes = {"count": 1, "active_count": 1, "min_distance": self._if_distances(capacity)}
-            new = allocate(Constraints, capacity, self.device, **sizes)
+            new = self._allocate_constraints(filled + ITERATIONS_RESERVED * more)
             for name in Constraints.vars:
                 old = getattr(self.constraints, name)
                 if filled:
@@ -360,13 +377,22 @@ class Workspace:
         if self.body_count:
             self.launch(kernel, self.mesh.vertex_count - self.particle_count, [self.step, *inputs])
 
-    def sweep_at_once(self, kernel: wp.Kernel, inputs: Sequence) -> None:
-        """Launches a kernel that makes all sweeps, with the step as its first input; its last is its threads."""
+    def sweep_by_world(self, kernel: Callable[[int], wp.Kernel], inputs: Sequence) -> None:
+        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.solve.by_world`.
+
+        Its first inputs are the step and the particles of worlds, its last one is the threads of a world.
+        """
+        if self.worlds > 1:
+            self.constraints.number.zero_()
+            self.launch_over_constraints(count_constraints)
+        self.launch(begin_worlds, self.worlds, [self.step, self.status])
+        if self.worlds > 1:
+            self.launch_over_constraints(list_constraints)
         threads = self.sweeping_threads
         wp.launch(
-            kernel,
-            threads,
-            inputs=[self.step, self.status, self.record, max(1, self.particle_count), *inputs, threads],
+            kernel(max(1, threads // BLOCK)),
+            self.worlds * threads,
+            inputs=[self.step, self.particles, *inputs, threads],
             device=self.device,
             block_dim=min(threads, BLOCK),
         )

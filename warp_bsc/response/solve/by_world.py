@@ -1,0 +1,96 @@
+"""All sweeps over a world in one launch: the threads of a world wait for each other, and no world for another one.
+
+Sweeps over a small world take less time than their launches, and a world whose constraints are met is not looked at
+until those of all others are. On a GPU, the threads of a world are those of a thread block, or of a cluster of blocks
+that run together (compute capability 9.0); on a CPU there is one. Worlds without constraints cost nothing.
+"""
+
+import warp as wp
+
+from ..schedule import SolveStatus, begin_sweeps
+from ..state.structs import Step, constraint_count
+
+wp.set_module_options({"enable_backward": False})
+
+BLOCK = 256
+"""Threads of a block at most: each needs up to 255 registers, as many as there are for so many."""
+SMALLEST_BLOCK = 64
+"""Threads of a block at least."""
+CLUSTER = 8
+"""Blocks of a cluster, the most that every GPU has that has clusters."""
+PARTICLES = 4
+"""Most particles of a world for each thread: larger worlds need more of the GPU."""
+
+
+def threads_of_world(device: wp.Device, worlds: int, particles: int) -> int:
+    """Returns how many threads sweep over each world in one launch; 0 if a world has too many particles.
+
+    As many as run at once, for all worlds together, or as few as a block has.
+
+    Args:
+        device: The device.
+        worlds: Number of worlds.
+        particles: Particles of the largest world.
+    """
+    if device.is_cpu:
+        return 1
+    most = CLUSTER * BLOCK if device.arch >= 90 else BLOCK
+    if particles > PARTICLES * most:
+        return 0
+    at_once = BLOCK * device.sm_count // worlds
+    if at_once >= most or particles > PARTICLES * BLOCK:
+        return most
+    threads = BLOCK
+    while threads > max(SMALLEST_BLOCK, at_once) and particles <= PARTICLES * threads // 2:
+        threads //= 2
+    return threads
+
+
+@wp.func
+def _world_of(step: Step, i: int) -> int:
+    return step.motion.world[step.constraints.vertices[i][0]]
+
+
+@wp.kernel
+def count_constraints(step: Step, threads: int):
+    """Counts the constraints of each world; the counts are 0 before."""
+    for i in range(wp.tid(), constraint_count(step), threads):
+        wp.atomic_add(step.constraints.number, _world_of(step, i), 1)
+
+
+@wp.kernel
+def begin_worlds(step: Step, status: SolveStatus):
+    """Begins the sweeps of all worlds, and finds where the list of constraints of each begins, in any order."""
+    world = wp.tid()
+    constraints = step.constraints
+    if world == 0:
+        begin_sweeps(status)
+    if not constraints.of_worlds:
+        constraints.number[0] = constraint_count(step)
+        return
+    constraints.first[world] = wp.atomic_add(constraints.number, constraints.first.shape[0], constraints.number[world])
+    constraints.number[world] = 0
+
+
+@wp.kernel
+def list_constraints(step: Step, threads: int):
+    """Lists the constraints of each world, and counts them again."""
+    for i in range(wp.tid(), constraint_count(step), threads):
+        world = _world_of(step, i)
+        place = step.constraints.first[world] + wp.atomic_add(step.constraints.number, world, 1)
+        step.constraints.of_worlds[place] = i
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+    asm volatile("barrier.cluster.arrive.release;" ::: "memory");
+    asm volatile("barrier.cluster.wait.acquire;" ::: "memory");
+#elif defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+"""
+)
+def wait_for_others():
+    """Waits for all threads of the world; each then sees what the others wrote. All of them have to call it."""
+    ...
