@@ -62,11 +62,10 @@ def test_worlds_swept_apart_are_solved_as_by_a_launch_for_each_sweep_and_alone(o
         (90, 1, 8193, 0),  # and a large one the whole GPU
         (90, 64, 121, 256),  # as many threads as there are at once, in one block
         (90, 200, 121, 128),
-        (90, 1024, 121, 64),  # at least a block of two warps
-        (90, 1024, 400, 128),  # more for worlds with more particles
-        (90, 1024, 2000, 2048),
+        (90, 264, 400, 128),
+        (90, 265, 121, 0),  # fewer would not pay
         (75, 1, 121, 256),  # there are no clusters
-        (75, 1024, 121, 64),
+        (75, 1024, 121, 0),
         (75, 4, 1025, 0),
     ],
 )

@@ -180,6 +180,7 @@ def _spread(thread: int, n: int) -> int:
 @wp.func
 def _over_pairs(
     task: int,
+    at_once: bool,
     is_shorter: bool,
     p: Problem,
     motion: Motion,
@@ -193,34 +194,38 @@ def _over_pairs(
     group = 1 + solves
     start, near_count = p.candidates.start[w], p.candidates.near[w]
     last = start + p.candidates.room[w] - 1
-    # all candidates, with little to do for each, to list those with much
-    if task == Task.LIST_NEAR or task == Task.LIST:
-        for k in range(t, near_count + p.candidates.far[w], n):
+    # all candidates, with little to do for each, to list those with much: to be done at once by threads that have one
+    lists, count = task == Task.LIST_NEAR or task == Task.LIST, p.candidates.listed[w] + int(0)
+    if lists:
+        count = near_count + p.candidates.far[w]
+    for k in range(t, count, n):
+        i, is_new = int(0), bool(True)
+        if lists:
             i = wp.where(k < near_count, start + k, last - (k - near_count))
             if task == Task.LIST_NEAR:
-                near.list_near(i, w, p.candidates, p.trial)
+                is_new = near.list_near(i, w, p.candidates, p.trial)
             else:
-                bounds.list_pair(i, w, p.candidates, p.trial, p.progress, is_shorter)
-        return
-    for k in range(start + t, start + p.candidates.listed[w], n):
-        entry = p.candidates.list[k] + int(0)
-        i = entry >> 1
-        if task == Task.FIND_NEAR:
+                is_new = bounds.list_pair(i, w, p.candidates, p.trial, p.progress, is_shorter)
+        else:
+            i = p.candidates.list[start + k] >> 1
+            is_new = task != Task.BOUND or (p.candidates.list[start + k] & 1) != 0
+        if not is_new or (lists and not at_once):
+            continue
+        if task == Task.FIND_NEAR or task == Task.LIST_NEAR:
             near.find_near(i, w, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
         elif task == Task.HOLD:
             held.hold_pair(i, w, p.candidates, p.trial, p.unknowns, p.vectors.inverse, p.limit, group, p.contacts)
-        elif task == Task.BOUND:
-            if (entry & 1) != 0:
-                bounds.bound_by_pair(i, w, p.candidates, p.trial, p.progress, p.limit)
+        elif task == Task.BOUND or task == Task.LIST:
+            bounds.bound_by_pair(i, w, p.candidates, p.trial, p.progress, p.limit)
         else:
             merit.add_pair_energy(i, w, motion, p.candidates, settings, p.trial, p.progress)
-    if p.vertices_at_planes == 0:
+    if p.vertices_at_planes == 0 or (lists and not at_once):
         return
     for k in range(p.worlds.first_vertex[w] + t, p.worlds.first_given[w], n):
         v = p.worlds.vertices[k] + int(0)
         if v >= p.vertices_at_planes:
             continue
-        if task == Task.FIND_NEAR:
+        if task == Task.FIND_NEAR or task == Task.LIST_NEAR:
             near.find_near_planes(
                 v, w, motion, planes, p.plane_share, settings, p.trial, p.unknowns, p.progress, p.contacts
             )
@@ -238,7 +243,7 @@ def _over_pairs(
                 group,
                 p.contacts,
             )
-        elif task == Task.BOUND:
+        elif task == Task.BOUND or task == Task.LIST:
             bounds.bound_by_planes(v, w, motion, planes, p.plane_share, settings, p.trial, p.progress, p.limit)
         else:
             merit.add_plane_energies(v, w, motion, planes, p.plane_share, settings, p.trial, p.progress)
@@ -381,14 +386,14 @@ def _advance(
                     _add_inertia(u, w, p, motion, settings, progress.trial)
                 for i in range(first_contact + from_middle, end_of_contacts(p.contacts, w), n):
                     merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, progress.trial)
-            _over_pairs(task, passes > 0, p, motion, planes, settings, solves, w, t, n)
-            # what was listed comes next
+            at_once = n == 1 or p.candidates.near[w] + p.candidates.far[w] <= n
+            _over_pairs(task, at_once, passes > 0, p, motion, planes, settings, solves, w, t, n)
+            if at_once or (task != Task.LIST_NEAR and task != Task.LIST):
+                phase = then
             if task == Task.LIST_NEAR:
                 task = int(Task.FIND_NEAR)
             elif task == Task.LIST:
                 task = int(Task.BOUND)
-            else:
-                phase = then
         elif phase == Phase.COUNT:
             for k in range(t, p.contacts.parts * (end_of_contacts(p.contacts, w) - first_contact), n):
                 i, part = first_contact + k // p.contacts.parts, k % p.contacts.parts

@@ -48,8 +48,8 @@ def _relative_way(p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.floa
 
 
 @wp.func
-def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress: Progress, is_shorter: bool):
-    """Lists a candidate that displacements may bring within its reach, for :func:`bound_by_pair`.
+def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress: Progress, is_shorter: bool) -> bool:
+    """Lists a candidate that displacements may bring within its reach; returns whether :func:`bound_by_pair` follows.
 
     Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
@@ -58,7 +58,7 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     before = candidates.share[i] + float(0.0)
     stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
     if before == FAR and (is_shorter or stays):
-        return
+        return False
     corners = candidates.corners[i]
     if is_shorter and (before == 1.0 or before == FAR_TOGETHER):
         cuts = int(0)
@@ -67,10 +67,10 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
         if cuts == 0:
             if before == 1.0:
                 add_to_list(candidates, world, i, False)
-            return
+            return False
     candidates.share[i] = FAR
     if stays:
-        return
+        return False
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
@@ -82,11 +82,12 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     if now >= within:
         if not is_shorter and now >= within + _relative_way(p, q, r, s):
             candidates.share[i] = FAR_TOGETHER
-            return
+            return False
         if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within:
-            return
+            return False
     candidates.share[i] = 1.0
     add_to_list(candidates, world, i, True)
+    return True
 
 
 @wp.func

@@ -115,15 +115,17 @@ def _add_contact(
 
 
 @wp.func
-def list_near(i: int, world: int, candidates: Candidates, trial: Trial):
+def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
     """Lists a candidate if it may be near each other, for :func:`find_near`, where no displacements told."""
     if candidates.share[i] >= FAR:
-        return
+        return False
     a, b, c, d = corners_of(trial.exact, candidates.corners[i])
     apart = barrier.distance_of_boxes(kind_of_key(candidates.key[i]), a, b, c, d)
     candidates.now[i] = float(apart * ROUNDED_DOWN)
-    if apart < candidates.level[i] + wp.float64(candidates.reach[i]):
+    is_near = apart < candidates.level[i] + wp.float64(candidates.reach[i])
+    if is_near:
         add_to_list(candidates, world, i, False)
+    return is_near
 
 
 @wp.func

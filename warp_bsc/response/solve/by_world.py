@@ -14,8 +14,8 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
 """Threads of a block at most: each needs up to 255 registers, as many as there are for so many."""
-SMALLEST_BLOCK = 64
-"""Threads of a block at least."""
+SMALLEST_BLOCK = 128
+"""Threads of a block at least: 1,024 worlds of fewer, not all of which run at once, took longer than by launches."""
 CLUSTER = 8
 """Blocks of a cluster, the most that every GPU has that has clusters."""
 PARTICLES = 4
@@ -23,9 +23,9 @@ PARTICLES = 4
 
 
 def threads_of_world(device: wp.Device, worlds: int, particles: int) -> int:
-    """Returns how many threads sweep over each world in one launch; 0 if a world has too many particles.
+    """Returns how many threads sweep over each world in one launch; 0 if a world, or all together, ask for more.
 
-    As many as run at once, for all worlds together, or as few as a block has.
+    As many as run at once, for all worlds together.
 
     Args:
         device: The device.
@@ -38,6 +38,8 @@ def threads_of_world(device: wp.Device, worlds: int, particles: int) -> int:
     if particles > PARTICLES * most:
         return 0
     at_once = BLOCK * device.sm_count // worlds
+    if at_once < SMALLEST_BLOCK:
+        return 0
     if at_once >= most or particles > PARTICLES * BLOCK:
         return most
     threads = BLOCK
