@@ -6,6 +6,7 @@ import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
 from newton.solvers.experimental.coupled import CouplingInterface
 
+from ..._private_names.of_newton import COUPLERS_DECLARE_RESTARTS
 from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ..state.motion import ModelMotion, arrays_of, continues
@@ -127,7 +128,8 @@ class CouplingHooks(WrappedSolver):
 
         The first step starts where its state is: joints that the view of the entry lacks may place proxies.
         """
-        self._hook("coupling_notify_iteration_restarts")(enabled)
+        if COUPLERS_DECLARE_RESTARTS:
+            self._hook("coupling_notify_iteration_restarts")(enabled)
         self._motion.interrupt()
         self._coupled = _Coupled(self.model, self._motion, self._make_check(), restarts=enabled)
 
@@ -142,6 +144,8 @@ class CouplingHooks(WrappedSolver):
         nothing is delegated: VBD would begin the next step anew.
         """
         options = {"iteration_restart": iteration_restart, "dt": dt}
+        if self._coupled is None and not COUPLERS_DECLARE_RESTARTS:
+            self.coupling_notify_iteration_restarts(True)
         if self._coupled is not None and not iteration_restart:
             self._coupled.see(state, int(flags), dt)
             if dt <= 0.0 and self._coupled.has_stepped:
