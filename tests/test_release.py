@@ -21,12 +21,13 @@ def project():
 
 
 def test_the_recipe_has_the_version_and_the_dependencies_of_the_package(project):
+    """And OpenUSD, as packages have no extras there."""
     recipe = RECIPE.read_text()
     assert f'version: "{warp_bsc.__version__}"' in recipe
     listed = re.search(r"  run:\n(.*?)\n\n", recipe, re.DOTALL)[1]
     found = [line.strip().removeprefix("- ").replace(" ", "", 1) for line in listed.split("\n")]
     wanted = []
-    for requirement in project["dependencies"]:
+    for requirement in [*project["dependencies"], *project["optional-dependencies"]["usd"]]:
         name, bound = re.match(r"([\w-]+)(.*)", requirement).groups()
         wanted.append(ON_CONDA_FORGE.get(name, name) + bound)
     least, most = project["requires-python"].split(",")

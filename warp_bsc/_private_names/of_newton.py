@@ -16,7 +16,7 @@ from .versions import missing, version_of, warn_if_untested
 _CUTS = "pos_prev_collision_detection", "particle_displacements", "_penetration_free_truncation"
 
 COUPLERS_DECLARE_RESTARTS = hasattr(CouplingInterface, "coupling_notify_iteration_restarts")
-"""Whether couplers say, once and before any other hook, whether they restart steps: Newton 1.6 has no such hook."""
+"""Whether couplers say, once and before any other hook, whether they restart steps; Newton before 1.8 does not."""
 
 
 def replace_name(module: ModuleType, name: str, value: object) -> None:
