@@ -8,6 +8,7 @@ from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 from newton_versions import HAS_OBSERVABLES
 
 import warp_bsc as bsc
+from warp_bsc._private_names.of_newton import make_style3d
 from warp_bsc.response.contacts.constraints import NEVER_VIOLATED
 from warp_bsc.response.schedule import MAX_ITERATIONS
 from warp_bsc.response.state.structs import ContactKind
@@ -58,7 +59,7 @@ def test_style3d_is_an_inner_solver_too(device):
     contacts = newton.CollisionPipeline(model).contacts()
     collisions = []
     for ccd in (False, True):
-        solver = newton.solvers.SolverStyle3D(model, config=newton.solvers.SolverStyle3D.Config(iterations=4))
+        solver = make_style3d(model, 4)
         rollout = Rollout(model, bsc.SolverCCD(solver) if ccd else solver)
         for _ in range(8):
             rollout.step(contacts=contacts)

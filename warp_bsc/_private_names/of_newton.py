@@ -18,6 +18,9 @@ _CUTS = "pos_prev_collision_detection", "particle_displacements", "_penetration_
 COUPLERS_DECLARE_RESTARTS = hasattr(CouplingInterface, "coupling_notify_iteration_restarts")
 """Whether couplers say, once and before any other hook, whether they restart steps; Newton before 1.8 does not."""
 
+SHAPES_CHANGE = newton.ModelFlags.SHAPE_PROPERTIES | getattr(newton.ModelFlags, "SHAPE_TYPE_AND_SOURCE", 0)
+"""Flags of changes of shapes; in Newton 1.6 they keep their type and source."""
+
 
 def replace_name(module: ModuleType, name: str, value: object) -> None:
     """Replaces a function or a class of a module of Newton, for all that look it up there afterwards.
@@ -46,6 +49,13 @@ def check_observables(solver: SolverBase, observables: Any, contacts: newton.Con
         solver.validate_observables(observables, contacts)
     elif observables is not None:
         raise TypeError(f"observables: Newton {version_of('newton')} has none")
+
+
+def make_style3d(model: newton.Model, iterations: int) -> SolverStyle3D:
+    """Returns Style3D with a number of iterations, which before Newton 1.8 is an argument of its own."""
+    if not hasattr(SolverStyle3D, "Config"):
+        return SolverStyle3D(model, iterations=iterations)
+    return SolverStyle3D(model, config=SolverStyle3D.Config(iterations=iterations))
 
 
 class AttachmentArrays(NamedTuple):

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
-from newton.solvers.experimental.coupled import CouplingInterface
+from newton.solvers.experimental.coupled import CouplingInterface, ModelView
 
 from ..._private_names.of_newton import COUPLERS_DECLARE_RESTARTS
 from ..._private_names.of_warp import paused_tape
@@ -123,6 +123,11 @@ class CouplingHooks(WrappedSolver):
     _motion: ModelMotion
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
 
+    def _prepare_entry(self) -> None:
+        """Prepares for a coupled simulation at construction, if couplers do not declare one: they give views."""
+        if not COUPLERS_DECLARE_RESTARTS and isinstance(self.model, ModelView):
+            self.coupling_notify_iteration_restarts(True)
+
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Delegates to the inner solver, and prepares for a coupled simulation.
 
@@ -144,8 +149,6 @@ class CouplingHooks(WrappedSolver):
         nothing is delegated: VBD would begin the next step anew.
         """
         options = {"iteration_restart": iteration_restart, "dt": dt}
-        if self._coupled is None and not COUPLERS_DECLARE_RESTARTS:
-            self.coupling_notify_iteration_restarts(True)
         if self._coupled is not None and not iteration_restart:
             self._coupled.see(state, int(flags), dt)
             if dt <= 0.0 and self._coupled.has_stepped:
