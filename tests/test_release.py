@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import warp_bsc
+from warp_bsc._private_names.versions import TESTED_VERSIONS
 
 ROOT = Path(__file__).parents[1]
 RECIPE = ROOT / "conda" / "recipe" / "recipe.yaml"
@@ -34,6 +35,13 @@ def test_the_recipe_has_the_version_and_the_dependencies_of_the_package(project)
     assert f'python_min: "{least.removeprefix(">=")}"' in recipe
     assert found == [f"python>=${{{{ python_min }}}},{most}", *wanted]
     assert project["description"] in recipe
+
+
+def test_the_lowest_versions_of_warp_and_newton_are_tested_ones(project):
+    """The jobs named lowest-versions install them."""
+    bounds = dict(requirement.split(">=") for requirement in project["dependencies"])
+    for module, package in {"warp": "warp-lang", "newton": "newton"}.items():
+        assert ".".join(bounds[package].split(".")[:2]) == TESTED_VERSIONS[module][0]
 
 
 def test_all_files_name_one_repository(project):

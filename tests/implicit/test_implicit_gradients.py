@@ -14,7 +14,6 @@ from implicit_scenes import (
     soft_block,
     springs,
 )
-from newton_versions import needs_attachments
 from scipy.optimize import root
 
 MATERIALS = {
@@ -49,9 +48,7 @@ OPTIONS = {
 """Options of the rollout of a scene; shorter steps, as VBD cuts what moves too far towards other cloth."""
 
 
-@pytest.mark.parametrize(
-    "scene", [pytest.param(x, marks=needs_attachments) if x in (attached_cloth, held_cloth) else x for x in MATERIALS]
-)
+@pytest.mark.parametrize("scene", MATERIALS)
 def test_gradients_are_those_of_central_differences(scene, device):
     model = scene(device)
     for name in MATERIALS[scene]:

@@ -359,7 +359,6 @@ class TestRefusals:
         with pytest.raises(NotImplementedError, match="of a world and of none"), wp.Tape():
             solver.step(start, end, None, None, DT)
 
-    @needs_attachments
     def test_several_attachments_that_hold_a_particle(self, device):
         model = attached_cloth(device)
         vbd = newton.solvers.SolverVBD(model, iterations=1)

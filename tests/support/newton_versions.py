@@ -5,14 +5,16 @@ import inspect
 import newton
 import pytest
 
-__all__ = ["HAS_OBSERVABLES", "needs_attachments", "needs_truncation_before_shapes"]
+__all__ = ["HAS_ATTACHMENTS", "HAS_OBSERVABLES", "needs_attachments", "needs_truncation_before_shapes"]
 
 HAS_OBSERVABLES = hasattr(newton.solvers.SolverBase, "observables")
 """Whether solvers have observables: those of Newton 1.6 have none."""
 
+HAS_ATTACHMENTS = hasattr(newton.ModelBuilder, "add_attachment_particle_body")
+"""Whether particles can be attached to bodies: not in Newton 1.6."""
+
 needs_attachments = pytest.mark.skipif(
-    not hasattr(newton.ModelBuilder, "add_attachment_particle_body"),
-    reason="Newton 1.6 has no attachments of particles to bodies",
+    not HAS_ATTACHMENTS, reason="Newton 1.6 has no attachments of particles to bodies"
 )
 
 needs_truncation_before_shapes = pytest.mark.skipif(
