@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import DistanceRollout, Rollout, add_patch, bullet, strands
-from newton_versions import HAS_OBSERVABLES, needs_attachments
+from newton_versions import HAS_OBSERVABLES, needs_attachments, needs_hard_attachments
 
 import warp_bsc as bsc
 from warp_bsc.implicit.solver_implicit import SolverImplicit
@@ -190,7 +190,7 @@ def test_attachments_are_springs_with_damping(device):
     assert state.particle_q.numpy()[1, 2] == pytest.approx(free, abs=1e-4)
 
 
-@needs_attachments
+@needs_hard_attachments
 def test_attachments_of_infinite_stiffness_hold_particles(device):
     model = attached(device, stiffness=np.inf)
 
@@ -205,7 +205,7 @@ def test_attachments_of_infinite_stiffness_hold_particles(device):
     assert np.linalg.norm(state.particle_qd.numpy()[0]) > 0.1
 
 
-@needs_attachments
+@needs_hard_attachments
 def test_two_attachments_of_infinite_stiffness_are_refused(device):
     builder = newton.ModelBuilder()
     body = builder.add_body(is_kinematic=True)
