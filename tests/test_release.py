@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import warp_bsc
+from warp_bsc._private_names.versions import TESTED_VERSIONS
 
 ROOT = Path(__file__).parents[1]
 RECIPE = ROOT / "conda" / "recipe" / "recipe.yaml"
@@ -21,18 +22,26 @@ def project():
 
 
 def test_the_recipe_has_the_version_and_the_dependencies_of_the_package(project):
+    """And OpenUSD, as packages have no extras there."""
     recipe = RECIPE.read_text()
     assert f'version: "{warp_bsc.__version__}"' in recipe
     listed = re.search(r"  run:\n(.*?)\n\n", recipe, re.DOTALL)[1]
     found = [line.strip().removeprefix("- ").replace(" ", "", 1) for line in listed.split("\n")]
     wanted = []
-    for requirement in project["dependencies"]:
+    for requirement in [*project["dependencies"], *project["optional-dependencies"]["usd"]]:
         name, bound = re.match(r"([\w-]+)(.*)", requirement).groups()
         wanted.append(ON_CONDA_FORGE.get(name, name) + bound)
     least, most = project["requires-python"].split(",")
     assert f'python_min: "{least.removeprefix(">=")}"' in recipe
     assert found == [f"python>=${{{{ python_min }}}},{most}", *wanted]
     assert project["description"] in recipe
+
+
+def test_the_lowest_versions_of_warp_and_newton_are_tested_ones(project):
+    """The jobs named lowest-versions install them."""
+    bounds = dict(requirement.split(">=") for requirement in project["dependencies"])
+    for module, package in {"warp": "warp-lang", "newton": "newton"}.items():
+        assert ".".join(bounds[package].split(".")[:2]) == TESTED_VERSIONS[module][0]
 
 
 def test_all_files_name_one_repository(project):

@@ -34,6 +34,7 @@ from typing import Any
 
 import warp as wp
 
+from ..not_inlined import NOT_INLINED
 from .filters import (
     UNKNOWN,
     near_cubic_discriminant,
@@ -66,7 +67,7 @@ def last_sign(s0: int, s1: int, s2: int, s3: int) -> int:
     return wp.where(s3 != 0, s3, wp.where(s2 != 0, s2, wp.where(s1 != 0, s1, s0)))
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
     """Returns the number of positive roots of a quadratic, with multiplicity: 0, 1 or 2; 0 for the zero polynomial."""
     changes = sign_changes(sign(c0), sign(c1), sign(c2), 0)
@@ -78,7 +79,7 @@ def count_quadratic_roots(c0: Any, c1: Any, c2: Any) -> int:
     return changes
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def count_cubic_roots(c0: Any, c1: Any, c2: Any, c3: Any) -> int:
     """Returns the number of positive roots of a cubic, with multiplicity: 0 to 3; 0 for the zero polynomial.
 
@@ -107,7 +108,7 @@ def remainder(p0: Any, p1: Any, p2: Any, p3: Any, q0: Any, q1: Any, q2: Any):
     return minor(g0, q2, g2, q0), minor(g1, q2, g2, q1), minor(g0, q1, g1, q0)
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _signs_at_roots(p0: Any, p1: Any, p2: Any, p3: Any, c0: Any, c1: Any, a: Any, roots: int) -> wp.vec2i:
     """Returns :func:`signs_at_roots` of a quadratic whose leading coefficient a is not zero."""
     near = near_signs_at_roots(p0, p1, p2, p3, c0, c1, a, roots)
@@ -209,7 +210,7 @@ def signs_at_cubic_roots(
     return signs
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: int) -> int:
     """Returns the sign of a cubic in z at t = time / 2^digits, by Horner's rule in t."""
     near = near_sign_at_time(p0, p1, p2, p3, time, digits)
@@ -223,7 +224,7 @@ def _sign_at_time(p0: Any, p1: Any, p2: Any, p3: Any, time: wp.uint64, digits: i
     return sign(add(times(value, time), shift(widen(p0), 3 * digits)))
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def root_time(c0: Any, c1: Any, c2: Any, c3: Any, roots: int, index: int, digits: int) -> wp.float64:
     """Returns the last multiple of 2^-digits that is not after a root of a cubic, as a time t in [0, 1).
 

@@ -27,6 +27,7 @@ from typing import Any
 
 import warp as wp
 
+from ..not_inlined import NOT_INLINED
 from ..polynomials import EDGE_EDGE
 from ..signs import FREE, HIT, UNSURE
 from .polygon import coordinate, lowest_bits, make_polygon, widest
@@ -64,19 +65,19 @@ def _corner(polygon: wp.array[Any], corner: int, end: int):
     )
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _dot(x0: Any, x1: Any, x2: Any, y0: Any, y1: Any, y2: Any):
     """Returns the dot product of two vectors."""
     return add(product(x0, y0), add(product(x1, y1), product(x2, y2)))
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _cross(x0: Any, x1: Any, x2: Any, y0: Any, y1: Any, y2: Any):
     """Returns the cross product of two vectors."""
     return minor(x1, y2, x2, y1), minor(x2, y0, x0, y2), minor(x0, y1, x1, y0)
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _direction_to_side(polygon: wp.array[Any], first: int, second: int, end: int):
     """Returns whether a foot is in a side, and the direction to it."""
     q0, q1, q2 = _corner(polygon, first, end)
@@ -94,7 +95,7 @@ def _direction_to_side(polygon: wp.array[Any], first: int, second: int, end: int
     return inside, g0, g1, g2
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _direction_to_plane(polygon: wp.array[Any], corners: int, end: int):
     """Returns whether the foot in the plane is in the polygon, and the direction to it."""
     x0, x1, x2 = _corner(polygon, 0, end)
@@ -121,7 +122,7 @@ def _direction_to_plane(polygon: wp.array[Any], corners: int, end: int):
     return inside, g0, g1, g2
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _direction(polygon: wp.array[Any], corners: int, line: int, end: int):
     """Returns whether a foot is in a corner, a side or the plane, and the direction to it, four times as wide."""
     if line == 2 * corners:
@@ -133,7 +134,7 @@ def _direction(polygon: wp.array[Any], corners: int, line: int, end: int):
     return True, widen(widen(q0)), widen(widen(q1)), widen(widen(q2))
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _is_beyond(polygon: wp.array[Any], corner: int, end: int, g0: Any, g1: Any, g2: Any, needed: Any) -> bool:
     """Returns whether a corner x is farther than d along a direction: g.x > 0 and (g.x)^2 > d^2 g.g, ``needed``."""
     x0, x1, x2 = _corner(polygon, corner, end)
@@ -141,7 +142,7 @@ def _is_beyond(polygon: wp.array[Any], corner: int, end: int, g0: Any, g1: Any, 
     return sign(along) > 0 and sign(subtract(product(along, along), needed)) > 0
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _decide_at(polygon: wp.array[Any], corners: int, end: int, squared: Any, squared_at: Any) -> int:
     """Returns HIT if the distance is reached at a time, FREE if a direction of that time shows that it never is.
 

@@ -25,6 +25,7 @@ from typing import Any
 
 import warp as wp
 
+from ..not_inlined import NOT_INLINED
 from ..signs import FREE, HIT, UNSURE
 from .polygon import lowest_bits, top_bits
 from .wide_integers import SCALED, add, integer, minor, product, sign, subtract
@@ -79,13 +80,13 @@ for _limbs in BITS:
         ...
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _difference(points: wp.array[Any], end: int, start: int, axis: int):
     """Returns a coordinate of the difference of two points."""
     return subtract(points[3 * end + axis], points[3 * start + axis])
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _plane_minor(points: wp.array[Any], o: int, x: int, y: int, axis: int):
     """Returns a component of the cross product of x - o and y - o."""
     j = wp.where(axis == 2, 0, axis + 1)
@@ -98,7 +99,7 @@ def _plane_minor(points: wp.array[Any], o: int, x: int, y: int, axis: int):
     )
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _orientation(points: wp.array[Any], o: int, x: int, y: int, z: int) -> int:
     """Returns the sign of the determinant of x - o, y - o and z - o."""
     volume = product(_plane_minor(points, o, x, y, 0), _difference(points, z, o, 0))
@@ -109,7 +110,7 @@ def _orientation(points: wp.array[Any], o: int, x: int, y: int, z: int) -> int:
     return sign(volume)
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _plane_orientation(points: wp.array[Any], o: int, x: int, y: int, axis: int) -> int:
     """Returns the orientation of three points in the plane across an axis."""
     return sign(_plane_minor(points, o, x, y, axis))
@@ -121,7 +122,7 @@ def _next(side: int) -> int:
     return wp.where(side == 2, 0, side + 1)
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _separated_along(points: wp.array[Any], axis: int) -> bool:
     """Returns whether the edge and the face are strictly separated along an axis."""
     from_p = wp.vec3i(0, 0, 0)
@@ -134,7 +135,7 @@ def _separated_along(points: wp.array[Any], axis: int) -> bool:
     return wp.min(wp.min(from_p), wp.min(from_q)) > 0 or wp.max(wp.max(from_p), wp.max(from_q)) < 0
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _separated_across(points: wp.array[Any], axis: int) -> bool:
     """Returns whether a line along the edge or a side separates edge and face strictly in the plane across an axis."""
     low = int(1)

@@ -39,6 +39,7 @@ from typing import Any
 
 import warp as wp
 
+from ..not_inlined import NOT_INLINED
 from ..polynomials import EDGE_EDGE, VERTEX_FACE
 from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
 from .polygon import BITS, coordinate, cross_component, make_narrow_polygon, make_polygon, sign_at_end, spread, volume
@@ -60,7 +61,7 @@ def _next(corner: int, corners: int) -> int:
     return wp.where(corner + 1 == corners, 0, corner + 1)
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _touches_at_end(polygon: wp.array[Any], corners: int, end: int) -> int:
     """Returns whether a polygon coplanar with the origin at an end of the step contains it: 1, 0; -1 if collapsed."""
     axis = int(0)
@@ -81,7 +82,7 @@ def _touches_at_end(polygon: wp.array[Any], corners: int, end: int) -> int:
     return -1
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _edge_touches_at_end(polygon: wp.array[Any], first: int, second: int, end: int) -> bool:
     """Returns whether the edge between two corners contains the origin at one end of the step."""
     axis = int(0)
@@ -94,7 +95,7 @@ def _edge_touches_at_end(polygon: wp.array[Any], first: int, second: int, end: i
     return True
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _between_at_roots(
     polygon: wp.array[Any], first: int, second: int, axis: int, c0: Any, c1: Any, c2: Any, roots: int
 ):
@@ -138,7 +139,7 @@ def _between_at_roots(
     return at_first, at_second
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def edge_contact(polygon: wp.array[Any], first: int, second: int, digits: int) -> wp.float64:
     """Returns when an edge of the polygon first contains the origin, rounded down to a multiple of 2^-digits, or NONE.
 
@@ -190,7 +191,7 @@ def edge_contact(polygon: wp.array[Any], first: int, second: int, digits: int) -
     return result
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _component_signs(
     polygon: wp.array[Any],
     first: int,

@@ -27,6 +27,7 @@ from typing import Any
 
 import warp as wp
 
+from ..not_inlined import NOT_INLINED
 from ..polynomials import VERTEX_FACE
 from .wide_integers import LIMBS, SCALED, add, integer, lowest_bit, minor, product, sign, top_bit_of_difference
 
@@ -214,7 +215,7 @@ def spread(
     return lowest, wp.max(wp.max(bits), 0)
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def cross_component(polygon: wp.array[Any], first: int, second: int, axis: int):
     """Returns the coefficients in z of a component of the cross product of two corners."""
     j = wp.where(axis == 2, 0, axis + 1)
@@ -234,7 +235,7 @@ def cross_component(polygon: wp.array[Any], first: int, second: int, axis: int):
     )
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def volume(polygon: wp.array[Any], last: int):
     """Returns the coefficients in z of the cubic V, given the index of the last corner."""
     n0, n1, n2 = cross_component(polygon, 1, last, 0)

@@ -14,6 +14,7 @@ References:
 import warp as wp
 
 from ..motion import doubles
+from ..not_inlined import NOT_INLINED
 from ..polynomials import VERTEX_FACE
 
 _ADD = """
@@ -80,7 +81,7 @@ def plane_orientation(
     ...
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _turn(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, axis: int) -> int:
     """Returns the orientation of three points in the coordinate plane across an axis."""
     i = (axis + 1) % 3
@@ -88,7 +89,7 @@ def _turn(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, axis: int) -> int:
     return plane_orientation(a[i], a[j], b[i], b[j], c[i], c[j])
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _separated_across(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, axis: int) -> bool:
     """Returns whether the line of the edge p q or of a side of a b c separates both in the plane across an axis."""
     of_a = _turn(p, q, a, axis)
@@ -105,7 +106,7 @@ def _separated_across(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.
     return False
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def meet_at_rest(kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3, d: wp.vec3) -> bool:
     """Returns whether the features of a query that stands still meet, exactly; points are finite.
 

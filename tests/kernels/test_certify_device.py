@@ -25,6 +25,7 @@ from warp_bsc import checker
 from warp_bsc.kernels import ccd, classification
 from warp_bsc.kernels.exact import first_contact
 from warp_bsc.kernels.exact.algebraic import count_cubic_roots
+from warp_bsc.kernels.not_inlined import NOT_INLINED
 from warp_bsc.kernels.polynomials import Coplanarity, Motion
 from warp_bsc.kernels.polynomials import coplanarity as right_coplanarity
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
@@ -194,7 +195,7 @@ def test_a_wrong_sign_in_a_kernel_is_found(kernel, module, name, mutant, method,
     assert printed.count("; minimum distance") + sum(map(int, re.findall(r": (\d+) more", printed))) == failures
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def without_pairs_of_roots(c0: Any, c1: Any, c2: Any, c3: Any) -> int:
     roots = count_cubic_roots(c0, c1, c2, c3)
     return wp.where(roots == 2, 0, roots)

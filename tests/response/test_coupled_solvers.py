@@ -4,10 +4,18 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton.solvers.experimental.coupled import CouplingInterface, SolverCoupled, SolverCoupledADMM, SolverCoupledProxy
+from newton.solvers.experimental.coupled import (
+    CouplingInterface,
+    ModelView,
+    SolverCoupled,
+    SolverCoupledADMM,
+    SolverCoupledProxy,
+)
 from newton_scenes import DT, SOLVERS, Rollout, add_patch, bullet
+from newton_versions import needs_attachments
 
 import warp_bsc as bsc
+from warp_bsc.response.integration import coupling_interface
 
 
 def ball_builder(mass):
@@ -211,6 +219,7 @@ def test_shapes_that_an_entry_does_not_see_are_named(device):
         with_proxy(two_balls_over_sheet(device))
 
 
+@needs_attachments
 def test_a_body_hangs_on_cloth_over_a_sphere(device):
     """ADMM attaches a body of one solver to cloth of another, whose stage keeps it on a static sphere."""
     builder = newton.ModelBuilder()
@@ -241,11 +250,17 @@ def test_a_body_hangs_on_cloth_over_a_sphere(device):
     assert np.linalg.norm(q[corner] - pose[:3]) < 0.06 and pose[2] > 0.7 * free_fall
 
 
-def test_particles_feel_the_impulses_of_a_pass_once(device):
-    """A coupler in staggered mode rewinds no particles: what a contact has fed back is not fed back again."""
-    model = bullet(30.0, device=device)
+@pytest.mark.parametrize("declares", sorted({False, coupling_interface.COUPLERS_DECLARE_RESTARTS}))
+def test_particles_feel_the_impulses_of_a_pass_once(declares, device, monkeypatch):
+    """A coupler in staggered mode rewinds no particles: what a contact has fed back is not fed back again.
+
+    Couplers before Newton 1.8 do not declare whether they rewind.
+    """
+    monkeypatch.setattr(coupling_interface, "COUPLERS_DECLARE_RESTARTS", declares)
+    model = ModelView(bullet(30.0, device=device), "cloth")
     stage = bsc.SolverCCD(SOLVERS["vbd"](model))
-    stage.coupling_notify_iteration_restarts(False)
+    if declares:
+        stage.coupling_notify_iteration_restarts(False)
     proxies = wp.array(np.arange(model.particle_count), dtype=int, device=device)
     fed_back = []
     for speed in (1.0, 0.0):

@@ -19,7 +19,9 @@ __all__ = ["FOLDER", "QUICK", "compile_for_gpus", "compile_kernels_once", "compi
 FOLDER = os.path.dirname(__file__)
 """Folder from which a program that a test starts can import this module."""
 
-QUICK = {"cpu_compiler_flags": "-march=native -fno-vectorize -fno-slp-vectorize"}
+_IS_OLD = wp.__version__.startswith(("1.17.", "1.18."))  # which do not take the arguments below
+
+QUICK = {"cpu_compiler_flags": "-march=native" + " -fno-vectorize -fno-slp-vectorize" * (not _IS_OLD)}
 """Options of all kernels that the processes of the tests run: LLVM inlines by its own rules, not by Warp's, and does
 not look for loops to vectorize. Compilation takes six tenths of the time. Such kernels are slower, which does not
 matter in tests. Programs that tests start as users do compile as users do."""

@@ -4,7 +4,9 @@ import itertools
 
 import newton
 import numpy as np
+import pytest
 import warp as wp
+from newton_versions import HAS_ATTACHMENTS, HAS_HARD_ATTACHMENTS
 
 import warp_bsc as bsc
 from warp_bsc.implicit.contact.elasticity import ElementKind, elements_of_model
@@ -120,7 +122,9 @@ def springs(device):
 
 
 def attached_cloth(device, stiffness=30.0):
-    """A cloth of which one side hangs on damped attachments to a kinematic body."""
+    """A cloth of which one side hangs on damped attachments to a kinematic body. Skips where Newton has none."""
+    if not HAS_ATTACHMENTS:
+        pytest.skip("Newton 1.6 has no attachments of particles to bodies")
     builder = newton.ModelBuilder()
     body = builder.add_body(xform=wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat_identity()), is_kinematic=True)
     add_cloth(builder, 3, (0.0, 0.0, 1.0))
@@ -132,7 +136,9 @@ def attached_cloth(device, stiffness=30.0):
 
 
 def held_cloth(device):
-    """A cloth of which a kinematic body holds one side."""
+    """A cloth of which a kinematic body holds one side. Skips where Newton cannot have that."""
+    if not HAS_HARD_ATTACHMENTS:
+        pytest.skip("Newton before 1.8 has no attachments of infinite stiffness")
     return attached_cloth(device, stiffness=np.inf)
 
 

@@ -46,6 +46,7 @@ member 576 and 288 D^6 but degree 1, and the discriminant is below 1.3e5 D^12. S
 import warp as wp
 from compilation import QUICK
 
+from warp_bsc.kernels.not_inlined import NOT_INLINED
 from warp_bsc.kernels.polynomials import VERTEX_FACE
 from warp_bsc.kernels.signs import FREE, HIT
 
@@ -181,7 +182,7 @@ def _sturm(v: _vec4l) -> Sturm:
     return f
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _roots_after(f: Sturm, at: Root) -> int:
     """Returns the number of distinct roots of a polynomial that are larger than a number."""
     after = _variations(
@@ -256,7 +257,7 @@ def _at_rest(x: wp.vec3l, y: wp.vec3l, z: wp.vec3l) -> bool:
     return wp.dot(n, yz) >= _0 and wp.dot(n, zx) >= _0 and wp.dot(n, xy) >= _0
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _side_in_motion(x0: wp.vec3l, x1: wp.vec3l, y0: wp.vec3l, y1: wp.vec3l) -> bool:
     """Returns whether the segment xy contains the origin at a time between the ends, at both of which it does not."""
     for axis in range(3):
@@ -279,7 +280,7 @@ def _side_in_motion(x0: wp.vec3l, x1: wp.vec3l, y0: wp.vec3l, y1: wp.vec3l) -> b
     return d1 < _0 and d1 * d1 >= _4 * d0 * d2
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _triangle(x0: wp.vec3l, y0: wp.vec3l, z0: wp.vec3l, x1: wp.vec3l, y1: wp.vec3l, z1: wp.vec3l) -> bool:
     """Returns whether a moving triangle contains the origin at some time of the step."""
     if _at_rest(x0, y0, z0) or _at_rest(x1, y1, z1):

@@ -45,7 +45,7 @@ def semi_implicit(model):
 
 
 SOLVERS = {
-    "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False),
+    "vbd": lambda model: newton.solvers.SolverVBD(model, iterations=5, rigid_compliant_alm=True),
     "xpbd": lambda model: newton.solvers.SolverXPBD(model, iterations=5),
     "semi_implicit": semi_implicit,
 }

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 import warp_bsc as bsc
+from warp_bsc._private_names.of_newton import make_style3d
 
 __all__ = ["KINDS", "Scene", "Settings"]
 
@@ -171,8 +172,7 @@ class Scene:
                 # with the default relaxation, 0.9, XPBD bursts soft bodies by itself
                 solver = newton.solvers.SolverXPBD(model, iterations=10, soft_body_relaxation=0.2)
             case _:
-                config = newton.solvers.SolverStyle3D.Config(iterations=5)
-                solver = newton.solvers.SolverStyle3D(model, config=config)
+                solver = make_style3d(model, 5)
         # without Newton's contacts, nobody but the stage keeps bodies on the ground
         bodies = "separated" if model.body_count and not settings.contacts else "pushed"
         return bsc.SolverCCD(solver, bodies=bodies)

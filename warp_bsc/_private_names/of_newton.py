@@ -1,17 +1,25 @@
-"""Names and contracts of Newton."""
+"""Names and contracts of Newton, and what its versions differ in."""
 
 import contextlib
+import inspect
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import newton
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
+from newton.solvers.experimental.coupled import CouplingInterface
 
 from .versions import missing, version_of, warn_if_untested
 
 _CUTS = "pos_prev_collision_detection", "particle_displacements", "_penetration_free_truncation"
+
+COUPLERS_DECLARE_RESTARTS = hasattr(CouplingInterface, "coupling_notify_iteration_restarts")
+"""Whether couplers say, once and before any other hook, whether they restart steps; Newton before 1.8 does not."""
+
+SHAPES_CHANGE = newton.ModelFlags.SHAPE_PROPERTIES | getattr(newton.ModelFlags, "SHAPE_TYPE_AND_SOURCE", 0)
+"""Flags of changes of shapes; in Newton 1.6 they keep their type and source."""
 
 
 def replace_name(module: ModuleType, name: str, value: object) -> None:
@@ -29,11 +37,68 @@ def replace_name(module: ModuleType, name: str, value: object) -> None:
     setattr(module, name, value)
 
 
-def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array, Callable[..., None]]:
+def check_observables(solver: SolverBase, observables: Any, contacts: newton.Contacts | None) -> None:
+    """Raises what Newton raises if a step is to write observables that a solver does not have.
+
+    Newton 1.6 has no observables.
+
+    Raises:
+        TypeError: If it is to write any, and this version of Newton has none.
+    """
+    if hasattr(SolverBase, "validate_observables"):
+        solver.validate_observables(observables, contacts)
+    elif observables is not None:
+        raise TypeError(f"observables: Newton {version_of('newton')} has none")
+
+
+def make_style3d(model: newton.Model, iterations: int) -> SolverStyle3D:
+    """Returns Style3D with a number of iterations, which before Newton 1.8 is an argument of its own."""
+    if not hasattr(SolverStyle3D, "Config"):
+        return SolverStyle3D(model, iterations=iterations)
+    return SolverStyle3D(model, config=SolverStyle3D.Config(iterations=iterations))
+
+
+class AttachmentArrays(NamedTuple):
+    """Attachments of particles to points of bodies, arrays of one length.
+
+    Attributes:
+        particle: Particle of each, int32.
+        body: Body of each, int32.
+        body_point: Point in the frame of the body [m], vec3.
+        stiffness: Stiffness [N/m], float32; infinite if the particle is held.
+        damping: Damping [N s/m], float32.
+        enabled: Whether it acts, bool.
+    """
+
+    particle: wp.array
+    body: wp.array
+    body_point: wp.array
+    stiffness: wp.array
+    damping: wp.array
+    enabled: wp.array
+
+
+def attachment_arrays(model: newton.Model) -> AttachmentArrays | None:
+    """Returns the attachments of particles to bodies, None if there are none. Newton 1.6 has none."""
+    if not getattr(model, "attachment_particle_body_count", 0):
+        return None
+    return AttachmentArrays(*(getattr(model, f"attachment_particle_body_{name}") for name in AttachmentArrays._fields))
+
+
+def vbd_switch(solver: SolverVBD, name: str) -> bool:
+    """Returns whether VBD has switched something on, by the name of an attribute.
+
+    Newton 1.6 lacks ``rigid_soft_enable_dat``, ``rigid_soft_contact_use_log_barrier`` and what they switch on.
+    """
+    return bool(getattr(solver, name, False))
+
+
+def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array, Callable[[newton.State], None]]:
     """Returns where particles were at the last detection of self-contact, their displacements, and what cuts these.
 
     Contract: ``SolverVBD._penetration_free_truncation(state, None)`` cuts the displacements ``particle_displacements``
-    from the positions ``pos_prev_collision_detection``, and writes the sums to ``state.particle_q``.
+    from the positions ``pos_prev_collision_detection``, and writes the sums to ``state.particle_q``. That of Newton 1.6
+    has the array in place of the state, and no second argument.
 
     Raises:
         RuntimeError: If VBD has not all of them: polish could move particles through each other.
@@ -42,7 +107,8 @@ def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array
         if not hasattr(solver, name):
             raise missing("newton", f"SolverVBD.{name}", "polish has no use with self-contact")
     start, displacements, cut = (getattr(solver, name) for name in _CUTS)
-    return start, displacements, cut
+    takes_array = "particle_q_out" in inspect.signature(cut).parameters
+    return start, displacements, lambda state: cut(state.particle_q) if takes_array else cut(state, None)
 
 
 def has_external_rigid_solver(solver: SolverBase) -> bool:
@@ -118,11 +184,14 @@ def has_surface_contacts(contacts: newton.Contacts) -> bool:
     """Returns whether soft contacts may be of edges and faces, and not of particles alone.
 
     Contract: Then ``Contacts`` has the features of meshes that they are of, ``_soft_contact_mesh_features``; else None.
+    Contacts of Newton 1.6, which have no ``soft_contact_rigid_indices``, are of no features of meshes.
 
     Raises:
         RuntimeError: If this version of Newton has no such attribute.
     """
     name = "_soft_contact_mesh_features"
+    if not hasattr(contacts, "soft_contact_rigid_indices"):
+        return False
     if not hasattr(contacts, name):
         raise missing("newton", f"Contacts.{name}", "contacts of surfaces would have no gradients; pass no contacts")
     return getattr(contacts, name) is not None

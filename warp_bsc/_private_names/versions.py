@@ -5,7 +5,7 @@ import importlib
 
 from .._warnings import warn_caller
 
-TESTED_VERSIONS = {"warp": ("1.18", "1.19"), "newton": ("1.8",)}
+TESTED_VERSIONS = {"warp": ("1.17", "1.18", "1.19"), "newton": ("1.6", "1.7", "1.8")}
 """Versions with which the tests of this package have passed, by the name of the module."""
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import newton
 import numpy as np
 
+from .._private_names.of_newton import make_style3d
 from ..response.state.mesh import host_array
 from ..response.strain import edges_at_rest
 from .penetration_scenes import PenetrationScene
@@ -100,7 +101,7 @@ def _make_solver(built: PenetrationScene, solver: str, *, has_self_contact: bool
         # Newton has no example of tetrahedra with XPBD; with its default relaxation they burst in Newton itself
         return solvers.SolverXPBD(model, iterations=_ITERATIONS, soft_body_relaxation=0.2)
     if solver == "style3d":
-        return solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=_STYLE3D_ITERATIONS))
+        return make_style3d(model, _STYLE3D_ITERATIONS)
     if solver == "semi-implicit":
         return solvers.SolverSemiImplicit(model)
     own: dict[str, Any] = {}

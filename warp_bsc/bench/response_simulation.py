@@ -10,6 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from .._private_names.of_newton import make_style3d
 from ..implicit.solver_implicit import SolverImplicit
 from ..response.solver_ccd import SolverCCD
 from ..response.state.mesh import host_array
@@ -345,7 +346,7 @@ def _make_solver(scene: Scene, solver: str, *, has_self_contact: bool) -> Any:
         # corrections of tetrahedra are added up at their vertices: with the default relaxation, soft bodies burst
         return solvers.SolverXPBD(model, iterations=_ITERATIONS, soft_body_relaxation=0.2)
     if solver == "style3d":
-        return solvers.SolverStyle3D(model, config=solvers.SolverStyle3D.Config(iterations=_ITERATIONS))
+        return make_style3d(model, _ITERATIONS)
     if solver == "semi-implicit":
         return solvers.SolverSemiImplicit(model)
     own: dict[str, Any] = {}

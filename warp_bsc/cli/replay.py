@@ -31,10 +31,7 @@ def _run(arguments: argparse.Namespace) -> int:
         settings = {"method": arguments.method, "clearance": arguments.clearance, "options": options}
         baseline = Baseline(arguments.baseline, **settings)
     if isinstance(arguments.workers, str):
-        try:
-            device = device_of_cluster(arguments.workers, arguments.device)
-        except ModuleNotFoundError as error:  # wrong usage, not an unforeseen error
-            raise ValueError(str(error)) from error
+        device = device_of_cluster(arguments.workers, arguments.device)
     else:
         device = find_device(arguments.device)
         with loading_kernels(device):

@@ -12,6 +12,7 @@ from typing import Any, Literal
 from .._atomic_file import STDOUT
 from ..replay.workers import checked_address
 from ..usd.frames import FrameRange
+from ..usd.openusd import check_openusd
 from ..usd.scene import Scene
 from ..usd.selection import PURPOSES, Selection
 from .error_boundary import describe
@@ -137,10 +138,12 @@ def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = Fals
         options: Other arguments of the scene.
 
     Raises:
+        ImportError: If OpenUSD is missing or too old.
         OSError: If the file cannot be read.
         ValueError: If the options do not fit the scene, or the file is broken.
     """
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
+        check_openusd()
         importlib.import_module("warp_bsc.usd.find_meshes")
     INTERRUPTS.check()
     how = {"strict": arguments.strict, "allow_missing": arguments.allow_missing}

@@ -4,6 +4,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from .._private_names.of_newton import attachment_arrays
 from . import kernels
 from .bodies import Poses
 from .contact_forces import attachment_forces, hold_forces
@@ -27,11 +28,10 @@ class Attachments:
         self._model, self._is_fixed = model, is_fixed
         self.springs: list[Elements] = []
         self.holds: list[Elements] = []
-        particles = model.attachment_particle_body_particle
-        if not model.attachment_particle_body_count or particles is None:
+        found = attachment_arrays(model)
+        if found is None:
             return
-        names = "body", "body_point", "stiffness", "damping", "enabled"
-        body, point, stiffness, damping, enabled = (getattr(model, f"attachment_particle_body_{n}") for n in names)
+        particles, body, point, stiffness, damping, enabled = found
         vertices = particles.reshape((-1, 1))
         self.springs = [Elements(attachment_forces, vertices, [body, point, stiffness, damping, enabled, None, None])]
         mass = without_gradients(model.particle_mass)  # a scale of the force that is left, on which no end depends
@@ -57,10 +57,9 @@ def check_attachments(model: newton.Model) -> None:
     Raises:
         NotImplementedError: If they do.
     """
-    if not model.attachment_particle_body_count:
+    found = attachment_arrays(model)
+    if found is None:
         return
-    names = "particle", "stiffness", "enabled"
-    particle, stiffness, enabled = (getattr(model, f"attachment_particle_body_{name}").numpy() for name in names)
-    held = particle[np.isinf(stiffness) & enabled.astype(bool)]
+    held = found.particle.numpy()[np.isinf(found.stiffness.numpy()) & found.enabled.numpy().astype(bool)]
     if len(np.unique(held)) < len(held):
         raise NotImplementedError("solver: several attachments of infinite stiffness hold one particle of the model")

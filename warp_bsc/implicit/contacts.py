@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverVBD
 
+from .._private_names.of_newton import vbd_switch
 from . import element_kernels
 from .bodies import Poses
 from .contact_forces import ContactPlanes, ContactSettings, contact_forces
@@ -74,7 +75,7 @@ def record_pairs(solver: SolverVBD, worlds: Worlds) -> RecordedPairs | None:
     """
     if not solver.particle_enable_self_contact:
         return None
-    info, model, found, total = solver.trimesh_collision_info, solver.model, [], 0
+    info, model, found, total = solver.trimesh_collision_detector.collision_info, solver.model, [], 0
     device, fields = model.device, ("", "_offsets", "_buffer_sizes", "_count")
     of_kinds = ("vertex_colliding_triangles", model.tri_indices), ("edge_colliding_edges", model.edge_indices)
     for name, primitives in of_kinds:
@@ -127,7 +128,7 @@ class ContactElements:
         solver, model, settings = self._solver, self._solver.model, ContactSettings()
         settings.ke, settings.kd, settings.mu = model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu
         settings.friction_velocity = solver.friction_epsilon
-        settings.has_barrier = int(solver.rigid_soft_contact_use_log_barrier)
+        settings.has_barrier = int(vbd_switch(solver, "rigid_soft_contact_use_log_barrier"))
         settings.particle_radius = model.particle_radius
         settings.shape_ke, settings.shape_kd = model.shape_material_ke, model.shape_material_kd
         settings.shape_mu, settings.shape_margin = model.shape_material_mu, model.shape_margin

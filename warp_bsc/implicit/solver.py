@@ -11,7 +11,12 @@ from newton.solvers import SolverVBD
 
 from .._arguments import check_instance, checked_integer, checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import displacements_since_detection, has_surface_contacts
+from .._private_names.of_newton import (
+    attachment_arrays,
+    displacements_since_detection,
+    has_surface_contacts,
+    vbd_switch,
+)
 from .._private_names.of_warp import paused_tape
 from ..detection.host_function import run_on_host
 from ..response.adjoint.between_steps import BetweenSteps
@@ -195,7 +200,7 @@ class SolverImplicitAdjoint(WrappedSolver):
                 solver.particle_enable_self_contact and self._worlds.count > 1 and -1 in self._worlds.ids
             ),
             "contacts of a collision pipeline of VBD's own": solver.collision_pipeline is not None,
-            "truncation before shapes (rigid_soft_enable_dat)": solver.rigid_soft_enable_dat,
+            "truncation before shapes (rigid_soft_enable_dat)": vbd_switch(solver, "rigid_soft_enable_dat"),
             "penalties of contacts that grow (rigid_avbd_linear_beta)": solver.rigid_contact_k_start_value >= 0.0,
             "contacts with features of meshes": (
                 contacts is not None and contacts.soft_contact_max > 0 and has_surface_contacts(contacts)
@@ -246,7 +251,7 @@ class SolverImplicitAdjoint(WrappedSolver):
         if cuts is not None:  # VBD ends no step beyond its planes, and nor does polish
             start, displacements, cut = cuts
             self._launch(kernels.set_velocity, len(x1), [1.0, start, x1], [displacements])
-            cut(state_out, None)
+            cut(state_out)
             self._equations.load_end(x1)
         self._launch(kernels.set_velocity, len(x1), [float(dt), x0, x1], [state_out.particle_qd])
 
@@ -289,8 +294,10 @@ class SolverImplicitAdjoint(WrappedSolver):
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]
         names += [f"shape_material_{name}" for name in ("ke", "kd", "mu")]
-        names += [f"attachment_particle_body_{name}" for name in ("body_point", "stiffness", "damping")]
         arrays = [getattr(model, name) for name in names]
+        attached = attachment_arrays(model)
+        if attached is not None:
+            arrays += [attached.body_point, attached.stiffness, attached.damping]
         if contacts is not None and contacts.soft_contact_max:
             arrays += [getattr(contacts, f"soft_contact_{name}") for name in ("body_pos", "body_vel", "normal")]
             arrays.append(contacts.soft_contact_barycentric)

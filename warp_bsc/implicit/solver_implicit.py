@@ -11,6 +11,7 @@ from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
+from .._private_names.of_newton import attachment_arrays, check_observables
 from ..detection.host_function import run_on_host
 from ..response.schedule import Loop
 from ..response.solver_ccd import SolverCCD
@@ -63,7 +64,7 @@ class _Inertia(SolverBase):
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None):
         """Writes the positions and velocities that inertia leads to."""
-        self.validate_observables(observables, contacts)
+        check_observables(self, observables, contacts)
         model = self.model
         if self._bodies is not None:
             inputs = [state_in.body_q, state_in.body_qd, state_in.body_f, model.body_flags, model.gravity]
@@ -186,8 +187,9 @@ class SolverImplicit(SolverCCD):
                 "bodies only: in a coupled solver (newton.solvers.experimental.coupled), give the body and the joint "
                 "to another entry, and this one a proxy of it; or pass bodies='left' if something else writes poses"
             )
-        if moves and model.attachment_particle_body_count:
-            if _dynamic_bodies(model)[host_array(model.attachment_particle_body_body)].any():
+        attached = attachment_arrays(model) if moves else None
+        if attached is not None:
+            if _dynamic_bodies(model)[host_array(attached.body)].any():
                 raise NotImplementedError(
                     "model: it attaches particles to a body that SolverImplicit would move; make the body kinematic, "
                     "or pass bodies='left' if something else writes its pose"

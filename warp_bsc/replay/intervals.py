@@ -68,7 +68,7 @@ def replay(
             the scheduler of a Dask cluster, such as ``"tcp://head:8786"``, whose workers check them. Each process uses
             its share of the cores or, if ``device`` is ``"cuda"`` or None, one GPU. With more than one process, a
             program must have ``if __name__ == "__main__":`` around its statements, as :mod:`multiprocessing` requires.
-            The workers of a cluster open the scene by the same path, and need ``pip install 'warp-bsc[cluster]'``.
+            The workers of a cluster open the scene by the same path, and need ``pip install 'warp-bsc[usd,cluster]'``.
 
     Yields:
         IntervalResult: The collisions of one interval, in order, the same for any number of workers. Only the results

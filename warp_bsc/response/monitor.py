@@ -72,6 +72,7 @@ class CollisionMonitor(CollisionStage):
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
         if report_worlds:
             self._count_worlds()
+        self._prepare_entry()
 
     def _finish_step(self, state_in, state_out, contacts, dt, tape):
         end = arrays_of(state_out)

@@ -257,6 +257,7 @@ class SolverCCD(CollisionStage):
         self.report.impulses_elsewhere = self._pushes_before
         if options.report_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
+        self._prepare_entry()
 
     @one_at_a_time
     def step(

@@ -11,6 +11,7 @@ from newton.solvers.experimental.coupled import SolverCoupled
 
 from .._arguments import checked_number
 from .._one_thread import one_at_a_time
+from .._private_names.of_newton import SHAPES_CHANGE
 from .._private_names.of_warp import paused_tape
 from .._warnings import warn_caller
 from .adjoint.between_steps import BetweenSteps
@@ -259,7 +260,7 @@ class CollisionStage(CouplingHooks):
         """
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
-        if flags & (newton.ModelFlags.SHAPE_PROPERTIES | newton.ModelFlags.SHAPE_TYPE_AND_SOURCE):
+        if flags & SHAPES_CHANGE:
             self._follow_shapes()
         if self._between_steps is not None:
             self._between_steps.refresh()

@@ -74,6 +74,7 @@ from .interval import (
     message_warning,
 )
 from .jumps import JumpFinder
+from .openusd import check_openusd
 from .scene_options import Revealed, SceneOptions
 from .scene_times import find_times
 from .segment import Segment
@@ -169,11 +170,13 @@ class Scene:
                 have been compared, and their total.
 
         Raises:
+            ImportError: If OpenUSD is missing or too old.
             TypeError: If an argument has another type.
             FileNotFoundError: If there is no such file.
             ValueError: If the file is not USD, has no mesh, or no mesh is selected; if ``strict``, also if a
                 part cannot be read. The message names the argument, or the file, the prim and the time.
         """
+        check_openusd()
         stage, path = None, source
         if not isinstance(source, (str, os.PathLike)):
             from .stage import given_stage, name_of  # noqa: PLC0415 (imports pxr)
@@ -508,9 +511,11 @@ def _open_again(path, options, revealed, versions, contents) -> Scene:
     """Opens a scene that another process has opened.
 
     Raises:
+        ImportError: If OpenUSD is missing or too old here.
         OSError: If the file does not exist here.
         ValueError: If the file or the scene differs here.
     """
+    check_openusd()
     scene = Scene.__new__(Scene)
     scene._open(path, options, revealed)
     if changed := scene.files.differing(versions):

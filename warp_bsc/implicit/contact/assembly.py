@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...kernels.not_inlined import NOT_INLINED
 from ...response.state.structs import Motion
 from ...response.state.vectors import to_double, to_single
 from .bodies import SolvedBodies, inertia_of_body
@@ -15,7 +16,7 @@ from .system import Contacts, Progress, Unknowns, block_sum_of_parts, contact_bl
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func(inline=False)
+@wp.func(**NOT_INLINED)
 def _inverse(block: wp.mat33, least: float) -> wp.mat33:
     """Returns the inverse of a symmetric block; of its absolute value where that is not positive definite."""
     a, b = block[0, 0], block[0, 1]

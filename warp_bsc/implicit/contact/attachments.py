@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from ..._private_names.of_newton import attachment_arrays
 from ...response.state.motion import continues
 from ...response.state.poses import point_of
 from ...response.state.structs import Motion, Vertices
@@ -44,13 +45,13 @@ def attachments_of_model(model: newton.Model):
         NotImplementedError: If several attachments of infinite stiffness hold one particle.
     """
     check_attachments(model)
-    particle = model.attachment_particle_body_particle
-    if not model.attachment_particle_body_count or particle is None:
+    arrays = attachment_arrays(model)
+    if arrays is None:
         return None
     attachments = ParticleAttachments()
     for name in ("body", "body_point", "stiffness", "damping", "enabled"):
-        setattr(attachments, name, getattr(model, f"attachment_particle_body_{name}"))
-    of = particle.numpy()
+        setattr(attachments, name, getattr(arrays, name))
+    of = arrays.particle.numpy()
     order = np.argsort(of, kind="stable").astype(np.int32)
     first = np.searchsorted(of[order], np.arange(model.particle_count + 1)).astype(np.int32)
     attachments.items = wp.array(order, dtype=int, device=model.device)

@@ -14,6 +14,7 @@ References:
 import warp as wp
 
 from ...kernels.distance import closest_points
+from ...kernels.not_inlined import NOT_INLINED
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...response.state.vectors import HALF, ONE, ZERO
 
@@ -83,7 +84,7 @@ def friction_curvature(slid: wp.float64, smoothing: wp.float64) -> wp.float64:
     return wp.where(slid >= smoothing, ZERO, ONE / smoothing)
 
 
-@wp.func(inline=False)  # once in the code of a kernel, of which instructions are a large part of the time
+@wp.func(**NOT_INLINED)  # once in the code of a kernel, of which instructions are a large part of the time
 def closest_weights_and_gap(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Returns the weights of four points in the vector between the closest points of two elements, and its length."""
     if kind == EDGE_EDGE:

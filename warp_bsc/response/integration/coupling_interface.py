@@ -4,8 +4,9 @@ from typing import Any
 
 import warp as wp
 from newton import BodyFlags, ParticleFlags, StateFlags
-from newton.solvers.experimental.coupled import CouplingInterface
+from newton.solvers.experimental.coupled import CouplingInterface, ModelView
 
+from ..._private_names.of_newton import COUPLERS_DECLARE_RESTARTS
 from ..._private_names.of_warp import paused_tape
 from ...detection.host_function import run_on_host
 from ..state.motion import ModelMotion, arrays_of, continues
@@ -122,12 +123,18 @@ class CouplingHooks(WrappedSolver):
     _motion: ModelMotion
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
 
+    def _prepare_entry(self) -> None:
+        """Prepares for a coupled simulation at construction, if couplers do not declare one: they give views."""
+        if not COUPLERS_DECLARE_RESTARTS and isinstance(self.model, ModelView):
+            self.coupling_notify_iteration_restarts(True)
+
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Delegates to the inner solver, and prepares for a coupled simulation.
 
         The first step starts where its state is: joints that the view of the entry lacks may place proxies.
         """
-        self._hook("coupling_notify_iteration_restarts")(enabled)
+        if COUPLERS_DECLARE_RESTARTS:
+            self._hook("coupling_notify_iteration_restarts")(enabled)
         self._motion.interrupt()
         self._coupled = _Coupled(self.model, self._motion, self._make_check(), restarts=enabled)
 

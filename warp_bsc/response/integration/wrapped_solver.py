@@ -33,7 +33,7 @@ class WrappedSolver(SolverBase, CouplingInterface):
         super().__init__(solver.model)
         self.collision_pipeline = solver.collision_pipeline
         self.supports_collision_pipeline = solver.supports_collision_pipeline
-        self.supports_body_pair_reduced_contacts = solver.supports_body_pair_reduced_contacts
+        self.supports_body_pair_reduced_contacts = getattr(solver, "supports_body_pair_reduced_contacts", False)
 
     @property
     def contacts(self):
@@ -84,15 +84,17 @@ def _delegated_property(name):
 
 for _name in (
     "notify_model_changed",
-    "observables",
+    "observables",  # Newton 1.6 has none
     "reset",
     "set_collision_frequency",
     "update_contacts",
     "validate_observables",
 ):
-    setattr(WrappedSolver, _name, _delegated_method(_name, SolverBase))
+    if hasattr(SolverBase, _name):
+        setattr(WrappedSolver, _name, _delegated_method(_name, SolverBase))
 for _name in ("collision_frequency", "collision_frequency_type", "supported_observables"):
-    setattr(WrappedSolver, _name, _delegated_property(_name))
+    if hasattr(SolverBase, _name):
+        setattr(WrappedSolver, _name, _delegated_property(_name))
 for _name in dir(CouplingInterface):
     if _name.startswith("coupling_"):
         setattr(WrappedSolver, _name, _delegated_method(_name, CouplingInterface))

@@ -25,7 +25,7 @@ from newton.solvers import SolverBase
 
 from ..._arguments import checked_distance, checked_number
 from ..._one_thread import one_at_a_time
-from ..._private_names.of_newton import body_q_prev
+from ..._private_names.of_newton import SHAPES_CHANGE, body_q_prev
 from ..._private_names.of_warp import paused_tape
 from ..._warnings import warn_caller
 from ...detection.host_function import run_on_host
@@ -323,7 +323,7 @@ class ContactLayer(WrappedSolver):
         """Notifies the inner solver, and reads masses and shapes again, see :class:`..stage.CollisionStage`."""
         super().notify_model_changed(flags)
         self.mesh.refresh_inverse_masses()
-        if flags & (newton.ModelFlags.SHAPE_PROPERTIES | newton.ModelFlags.SHAPE_TYPE_AND_SOURCE):
+        if flags & SHAPES_CHANGE:
             self.mesh.follow_shapes(self._not_followed)  # the stage around the layer warns
             self._motion.friction.read_shapes(self.model)
 
