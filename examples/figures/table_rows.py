@@ -325,6 +325,7 @@ def worlds_throughput(found: Found) -> Rows:
         "VBD": "VBD, Newton's contacts",
         "VBD, self-contact": "with VBD's self-contact",
         "SolverCCD(VBD)": "`SolverCCD`",
+        "SolverImplicit": "`SolverImplicit`",
     }
     clock = "processor" if not found["record"]["gpus"] else "clock"
     cells = {

@@ -297,7 +297,7 @@ def test_arcs_worlds_and_inversions():
     assert [row[1] for row in rows] == ["7,200"] * 4 + ["45,000"] * 4
     assert rows[0][0].endswith("turns by 3 degrees a step") and rows[0][2:] == ("3 ms", "2 ms", "1.50")
 
-    solvers = "VBD", "VBD, self-contact", "SolverCCD(VBD)"
+    solvers = "VBD", "VBD, self-contact", "SolverCCD(VBD)", "SolverImplicit"
     rates = {"clock": 1234.0, "processor": 56.7}
     row = {"worlds": 1024, "steps_per_second": rates, "crossings": 5929}
     found = {"record": {"gpus": []}, "rows": [{"solver": name} | row for name in solvers]}

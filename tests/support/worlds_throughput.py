@@ -1,9 +1,9 @@
-"""Measures steps a second by the number of worlds: VBD, VBD with self-contact, and SolverCCD.
+"""Measures steps a second by the number of worlds: VBD, VBD with self-contact, SolverCCD, and SolverImplicit.
 
     python tests/support/worlds_throughput.py --worlds 1 64
 
 Each world has a cloth of 200 triangles that falls from its own place on a fixed sphere and the ground. VBD gets
-Newton's contacts, the stage none. The exact detector counts the edges that cross faces of cloth or sphere once a tenth
+Newton's contacts, the others none. The exact detector counts the edges that cross faces of cloth or sphere once a tenth
 of the steps. On a GPU, a pair of steps is a CUDA graph. ``--json`` writes the rows to a file as well.
 """
 
@@ -60,6 +60,7 @@ SOLVERS = {
     "VBD": vbd,
     "VBD, self-contact": lambda model: vbd(model, self_contact=True),
     "SolverCCD(VBD)": lambda model: bsc.SolverCCD(vbd(model)),
+    "SolverImplicit": bsc.SolverImplicit,
 }
 
 
