@@ -266,7 +266,7 @@ def test_capacities_for_a_number_of_pairs_a_face(n):
     """At first 32 and 96 pairs a face fit, at least 131,072, and 256 pairs of faces; the contacts are the same."""
     x0, x1, faces = crumpled(0, n)
     mesh = bsc.CollisionMesh(faces, len(x0))
-    pipeline, other = DetectionPipeline(mesh, pairs_per_face=128), DetectionPipeline(mesh)
+    pipeline, other = DetectionPipeline(mesh, pairs=128 * len(mesh.faces)), DetectionPipeline(mesh)
     for narrow_phase, pairs in zip(pipeline.narrow_phases, (32, 96), strict=True):
         expected = max(2**17, pairs * len(faces))
         capacities = narrow_phase.capacities

@@ -136,7 +136,7 @@ class DetectionPipeline:
         body: np.ndarray | None = None,
         arcs: "Arcs | None" = None,
         only_used_vertices: bool = False,
-        pairs_per_face: int | None = None,
+        pairs: int | None = None,
     ):
         """Allocates the buffers on the mesh's device.
 
@@ -154,10 +154,10 @@ class DetectionPipeline:
                 distances of ``min_distances`` or none. None if nothing turns.
             only_used_vertices: Whether positions of vertices that no face uses may be anything. Otherwise they are
                 counted too if they are not finite.
-            pairs_per_face: Pairs for each face that fit into both queues at first, a quarter of them of vertices and
-                faces, and at least :data:`MIN_CAPACITY` into each; twice as many pairs of faces, a half of them
-                survivors, an eighth contacts. A large capacity costs memory, but no time. Default: eight pairs of
-                faces, one vertex-face and two edge-edge pairs.
+            pairs: Pairs that fit into both queues at first, a quarter of them of vertices and faces, and at least
+                :data:`MIN_CAPACITY` into each; twice as many pairs of faces, a half of them survivors, an eighth
+                contacts. A large capacity costs memory, but no time. Default: for each face, eight pairs of faces, one
+                vertex-face and two edge-edge pairs.
 
         Raises:
             ValueError: If the method is unknown, or the tolerance, the distance or the rings are out of range.
@@ -199,9 +199,9 @@ class DetectionPipeline:
         self._padding_on_arcs = padding
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
-        if pairs_per_face is not None:
+        if pairs is not None:
             # of layers that lie on each other, three of four pairs are of edges, and most pairs of faces have none
-            sizes = [min(max(n * pairs_per_face * elements // 4, MIN_CAPACITY), 2**31 - 1) for n in (1, 3, 8)]
+            sizes = [min(max(n * pairs // 4, MIN_CAPACITY), 2**31 - 1) for n in (1, 3, 8)]
             vertex_face, edge_edge, face_pairs = sizes
         self._broad_phase = make_broad_phase(
             mesh,

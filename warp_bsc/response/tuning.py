@@ -120,9 +120,10 @@ SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
 
 # capacities
-PAIRS_PER_FACE = 96
-"""Capacity of the detector's queues on a GPU, for each face: those of a CUDA graph cannot grow. Four layers of cloth
-that lie on each other have some 50, and up to 160 in a Newton step in which they land."""
+PAIRS_PER_FACE, PAIRS_PER_STATIC_FACE = 96, 8
+"""Capacity of the detector's queues on a GPU, for each face that can move, and for others, which have pairs with those
+alone: queues of a CUDA graph cannot grow. Four layers of cloth that lie on each other have some 50, and up to 160 in a
+Newton step in which they land."""
 DIVIDING_PLANES = 32
 """Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
 ITERATIONS_RESERVED = 3

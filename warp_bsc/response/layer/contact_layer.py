@@ -152,8 +152,8 @@ class ContactLayer(WrappedSolver):
         rule.least = wp.full(4, np.inf, dtype=float, device=device)
         rule.largest = wp.full(4, -np.inf, dtype=float, device=device)
         self._chooses_thickness, self._checks_start = thickness is None, True
-        pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
-        self._detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=layer.distances)
+        pairs = None if device.is_cpu else PAIRS_PER_FACE * len(mesh.faces)
+        self._detector = DetectionPipeline(mesh, pairs=pairs, min_distances=layer.distances)
         self._y = wp.zeros(n, dtype=wp.vec3, device=device)
         self._share_sums = wp.zeros(n + body_count, dtype=wp.int64, device=device)
         layer.shares = wp.zeros(n + body_count, dtype=wp.float64, device=device)

@@ -23,7 +23,16 @@ from ..schedule import (
     start_sweeps,
 )
 from ..solve.by_world import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
-from ..tuning import DIVIDING_PLANES, ITERATIONS_RESERVED, MIN_ENTRIES, PAIRS_PER_FACE, THREADS, TOLERANCE
+from ..tuning import (
+    DIVIDING_PLANES,
+    ITERATIONS_RESERVED,
+    MIN_ENTRIES,
+    PAIRS_PER_FACE,
+    PAIRS_PER_STATIC_FACE,
+    THREADS,
+    TOLERANCE,
+)
+from .mesh import ModelMesh
 from .motion import ModelMotion, takes_part
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -95,6 +104,18 @@ def _forget_crossings(world_mask: wp.array[wp.bool], step: Step, last_crossings:
         last_crossings[edge] = _VERY_MANY
 
 
+def pairs_of(mesh: ModelMesh, can_move: np.ndarray) -> int:
+    """Returns how many pairs fit into the queues of a mesh on a GPU at first.
+
+    Args:
+        mesh: The mesh.
+        can_move: 1 of each vertex that can move.
+    """
+    elements = mesh.faces, mesh.edges[mesh.free_edges], mesh.points.reshape(-1, 1)
+    count, moving = sum(map(len, elements)), sum(int(can_move[e].any(axis=1).sum()) for e in elements)
+    return PAIRS_PER_FACE * moving + PAIRS_PER_STATIC_FACE * (count - moving)
+
+
 class Workspace:
     """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
@@ -114,7 +135,8 @@ class Workspace:
         differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
-        active: 1 of each vertex that takes part in the step, None if all do.
+        can_move: 1 of each vertex that is not of a static shape: pairs without one are not looked for.
+        active: The same, 0 of those that take no part in the step.
         turns: How bodies turn, None if no body has a shape.
         arcs: The arcs of vertices; without arrays if no body has a shape.
         on_arcs: Whether contacts are those on arcs. Steps that may be recorded are resolved by chords, and checked by
@@ -152,12 +174,14 @@ class Workspace:
         self.worlds = max(1, mesh.model.world_count)
         self.particle_count, device = mesh.model.particle_count, mesh.device
         self.body_count = mesh.model.body_count if motion.moves_bodies else 0
-        pairs_per_face = None if device.is_cpu else PAIRS_PER_FACE
+        can_move = np.append(np.ones(self.particle_count), mesh.shape_vertices.body >= 0).astype(np.int32)
+        self.active = self.can_move = wp.array(can_move, dtype=int, device=device)
+        pairs = None if device.is_cpu else pairs_of(mesh, can_move)
         self.turns = motion.turns
         self.arcs = Arcs() if self.turns is None else self.turns.turns.arcs
         self.on_arcs = self.turns is not None and not (differentiable and responds)
         arcs = None if self.turns is None else self.arcs
-        self.detector = DetectionPipeline(mesh, pairs_per_face=pairs_per_face, min_distances=mesh.distances, arcs=arcs)
+        self.detector = DetectionPipeline(mesh, pairs=pairs, min_distances=mesh.distances, arcs=arcs)
         self.crossing_candidates = CrossingCandidates(mesh)
         edges = len(mesh.edges)
         self.crossings_of_edges = wp.zeros(edges, dtype=int, device=device)
@@ -165,7 +189,6 @@ class Workspace:
         self.step = step = Step()
         step.mesh = mesh.connectivity
         self.motion = motion
-        self.active: wp.array[int] | None = None
         self.tetrahedra: Tetrahedra | None = None
         self.ends: wp.array[wp.vec3] | None = None
         self.unmasked: tuple[wp.array, wp.array] | None = None

@@ -60,7 +60,7 @@ class _Held:
     interrupted: wp.array[int]
     inverse_mass: wp.array[float]  # 0 in these worlds
     body_inverse_mass: wp.array[float]
-    active: wp.array[int]  # 1 of vertices in other worlds
+    active: wp.array[int]  # 1 of vertices in other worlds that can move
 
 
 @wp.kernel
@@ -69,6 +69,7 @@ def _hold(
     mask: wp.array[wp.bool],
     inverse_mass: wp.array[float],
     plane_world: wp.array[int],
+    can_move: wp.array[int],
     # in and out
     motion: Motion,
     plane_start: wp.array[wp.vec4d],
@@ -87,7 +88,7 @@ def _hold(
         held.body_inverse_mass[i] = wp.where(takes_part(mask, motion.bodies.world[i]), body_mass, 0.0)
     if i < motion.x0.shape[0]:
         active = takes_part(mask, motion.world[i])
-        held.active[i] = wp.where(active, 1, 0)
+        held.active[i] = wp.where(active, can_move[i], 0)
         held.inverse_mass[i] = wp.where(active, inverse_mass[i], 0.0)
         if not active:
             x = motion.x0[i]
@@ -187,7 +188,7 @@ class WorldMask:
         masses, body_masses = vertices.inverse_mass, vertices.bodies.inverse_mass
         size = max(len(vertices.x0), len(planes.start), len(vertices.interrupted), motion.mesh.model.body_count)
         outputs = [vertices, planes.start, planes.end, held]
-        work.launch(_hold, size, [mask, masses, planes.world], outputs)
+        work.launch(_hold, size, [mask, masses, planes.world, work.can_move], outputs)
         vertices.inverse_mass = held.inverse_mass
         if motion.moves_bodies:
             vertices.bodies.inverse_mass = held.body_inverse_mass
@@ -196,7 +197,7 @@ class WorldMask:
             yield
         finally:
             vertices.inverse_mass, vertices.bodies.inverse_mass = masses, body_masses
-            work.motion, work.active, work.unmasked = motion, None, None
+            work.motion, work.active, work.unmasked = motion, work.can_move, None
         outputs = [self._last, vertices.interrupted]
         work.launch(_release, max(len(world), len(vertices.interrupted)), [mask, world, held], outputs)
 
