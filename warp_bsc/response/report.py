@@ -193,7 +193,8 @@ class SolverReport(ReportViews, WorldsOfReport):
         """Pairs that filters left out of the last step, so that its certificate does not cover them.
 
         These are the pairs that ``collision_filter`` leaves out and whose boxes overlap in the motion that the inner
-        solver predicted, near each other or not, and particles in solids of infinite planes that it leaves out. With
+        solver predicted, near each other or not, but for those of static shapes alone, and particles in solids of
+        infinite planes that it leaves out. With
         ``bodies="separated"`` particles count with shapes that collide with shapes alone. If the response moves bodies,
         so do contacts of shapes whose flags, groups or ``shape_collision_filter_pairs`` keep them from colliding. In a
         CUDA graph the number is a lower bound if its queues are too small. :attr:`worlds` has the numbers by world.
