@@ -499,6 +499,8 @@ def calls_of_solvers() -> dict[str, Call]:
     }
     materials = without(bad_bits(count), "rows") | {"too large": 1, "two-dimensional": np.zeros((2, 2), dtype=int)}
     bits = without(bad_bits(count), "rows") | {"two-dimensional": np.ones((2, 2), dtype=int)}
+    reporting = bsc.SolverCCD(inner, report_contacts=True)
+    patterns = {"None": None, "number": 3, "string": "particles", "numbers": [3], "unknown": ["nothing"]}
     found = {
         "CollisionFilter": Call(
             bsc.CollisionFilter,
@@ -601,6 +603,18 @@ def calls_of_solvers() -> dict[str, Call]:
             },
             raises=bsc.CapturedSteps.__init__,
         ),
+        "ContactSensor": Call(
+            bsc.ContactSensor,
+            {"solver": reporting, "sensors": ["particles"]},
+            {
+                "solver": {**OBJECTS, "another": inner},
+                "sensors": {**patterns, "none": []},
+                "filters": patterns,
+                "history_length": NOT_COUNT | {"zero": 0},
+                "force_threshold": {**NUMBERS, "negative": -1.0},
+            },
+            raises=bsc.ContactSensor.__init__,
+        ),
         "repair_state": Call(
             bsc.repair_state,
             {"model": inner.model, "state": start},
@@ -613,6 +627,15 @@ def calls_of_solvers() -> dict[str, Call]:
             },
         ),
     }
+    masks = {
+        "list": [True, True],
+        "NumPy": np.ones(2, dtype=bool),
+        "integers": wp.ones(2, dtype=int, device="cpu"),
+        "shape": wp.ones(1, dtype=bool, device="cpu"),
+    }
+    sensor, lengths = bsc.ContactSensor(reporting, ["particles"]), {**NUMBERS, "zero": 0.0, "negative": -0.01}
+    found["ContactSensor.update"] = Call(sensor.update, {"dt": 0.01}, {"dt": lengths, "world_mask": masks})
+    found["ContactSensor.reset"] = Call(sensor.reset, {}, {"world_mask": masks})
     states = {"state_in": start, "state_out": end, "control": None, "contacts": None, "dt": 0.01}
     for name, cls in (
         ("SolverCCD", stage),
@@ -621,13 +644,7 @@ def calls_of_solvers() -> dict[str, Call]:
         ("ContactLayer", bsc.ContactLayer(inner)),
         ("SolverImplicitAdjoint", bsc.SolverImplicitAdjoint(vbd)),
     ):
-        masks = {
-            "list": [True, True],
-            "NumPy": np.ones(2, dtype=bool),
-            "integers": wp.ones(2, dtype=int, device="cpu"),
-            "shape": wp.ones(1, dtype=bool, device="cpu"),
-        }
-        bad = {"dt": {**NUMBERS, "zero": 0.0, "negative": -0.01}}
+        bad = {"dt": lengths}
         found[f"{name}.step"] = Call(
             cls.step,
             states,
