@@ -324,7 +324,9 @@ def test_without_bodies_no_kernel_of_bodies_is_launched(device, monkeypatch):
     monkeypatch.setattr(wp, "launch", recorded_launch)
     states = model.state(), model.state()
     solver.step(*states, None, None, DT)
-    assert solver.report.hits > 0 and {"_sweep", "project_positions"} & {key for _module, key in launched}
+    assert solver.report.hits > 0 and any(
+        "sweep_positions" in key or key == "project_positions" for _module, key in launched
+    )
     assert not [key for module, key in launched if "warp_bsc" in module and ("bod" in module or "bod" in key)]
 
 
