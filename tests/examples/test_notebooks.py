@@ -86,6 +86,7 @@ def test_first_steps(monkeypatch):
     assert pictures == 1
 
 
+@pytest.mark.slow
 def test_behind_newton(monkeypatch):
     values = ["passed(x_without[-1])", "passed(x_with[-1])", "float(on_sheet)", "float(on_patch)", "float(gained)"]
     values += [f"{stage}.report.totals.uncertified_steps" for stage in ("monitor", "solver")]
@@ -98,6 +99,7 @@ def test_behind_newton(monkeypatch):
     assert pictures == 2
 
 
+@pytest.mark.slow
 def test_repair_and_replay(monkeypatch):
     counts = ["hits", "intersections[0].crossings", "intersections[1].crossings"]
     values = [f"[[s.{count} for s in summaries[name]] for name in summaries]" for count in counts]
