@@ -9,6 +9,7 @@ import warp as wp
 from newton_scenes import add_patch
 
 import warp_bsc as bsc
+from warp_bsc.implicit.contact.flow import Phase
 
 DT = 1.0 / 60.0
 STEPS = 8
@@ -95,6 +96,26 @@ def stepped(device):
 def together(device):
     """Six worlds in one model, after their steps."""
     return stepped(str(device))
+
+
+def test_buffers_of_contacts_that_grow_change_no_bit(together):
+    """Also where a world waits for larger ones while another one needs new candidates."""
+    run, waits = Run(range(6), together.model.device), set()
+    newton_method = run.solver._newton
+    newton_method.keeps_contacts = False  # pairs of worlds that have ended are not sought again
+    renew = newton_method._renew_candidates
+
+    def renew_candidates():
+        waits.update(newton_method._flow.phase.numpy().tolist())
+        renew()
+
+    newton_method._renew_candidates = renew_candidates
+    for _ in range(STEPS):
+        newton_method._allocate_contacts(1)
+        run.step()
+    assert waits == {Phase.SEARCH_CANDIDATES, Phase.GROW, Phase.END}
+    moved, expected = ([[end[: len(ARRAYS)] for end in ends] for ends in r.ends] for r in (run, together))
+    assert all(map(same, moved, expected))
 
 
 def test_each_world_is_as_alone(together):

@@ -17,6 +17,7 @@ from warp_bsc.response.contacts.proximities import add_proximities
 from warp_bsc.response.schedule import Result
 from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import NEVER
+from warp_bsc.response.state.workspace import pairs_of
 
 CAPACITY = 4
 
@@ -38,6 +39,18 @@ def stage(model, monkeypatch, *, tiny, inner="vbd", make=bsc.SolverCCD, **option
         detector.capacities = detector._device_capacities()
         detector.grow = lambda: False
     return solver
+
+
+def test_static_faces_have_little_room_in_queues(device):
+    """And a body that a program moves as much as cloth has."""
+    builder = newton.ModelBuilder()
+    builder.add_cloth_grid(
+        pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), dim_x=2, dim_y=2, cell_x=0.1, cell_y=0.1, mass=0.01
+    )
+    builder.add_shape_box(-1, hx=0.1, hy=0.1, hz=0.1)
+    builder.add_shape_box(builder.add_body(is_kinematic=True), hx=0.1, hy=0.1, hz=0.1)
+    work = bsc.SolverImplicit(builder.finalize(device=device))._work
+    assert pairs_of(work.mesh, work.can_move.numpy()) == 96 * (8 + 12) + 8 * 12
 
 
 @pytest.mark.parametrize("speed", [10.0, 60.0])

@@ -5,18 +5,14 @@ finds decides which comes next: without a launch, a host, or a condition of a CU
 others only where it needs a search for candidates, until they end or need one as well.
 """
 
-from enum import IntEnum
-
 import warp as wp
 
 from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
 from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merge, merit, near, steps
-from .conjugate_gradients import Vectors
-from .matrix import Matrix
-from .pairs import BarrierSettings, Candidates, Trial
-from .rows import Rows
-from .system import Contacts, Progress, Unknowns, Worlds, end_of_contacts
+from .flow import Phase, Problem, Task, wait_for_team
+from .pairs import BarrierSettings
+from .system import end_of_contacts
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,148 +20,6 @@ _TRUNCATIONS = wp.constant(4)
 """Passes in which the displacements of single vertices are cut, before those of their world are."""
 _PREDICTIONS = wp.constant(2)
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
-
-
-class Phase(IntEnum):
-    """What all threads do until they wait for each other, or leave for what another kernel does."""
-
-    BEGIN = 0
-    DIFFERENTIATE = 1
-    LOADS = 2
-    RELEASE_HELD = 3
-    BEGIN_LIST = 4
-    PAIRS = 5
-    COUNT = 6
-    PLACE = 7
-    LIST = 8
-    SORT = 9
-    BLOCKS = 10
-    ASSEMBLE = 11
-    DISPLACE = 12
-    BOUNDED = 13
-    HOLD = 14
-    TAKE_BOUND = 15
-    DISPLACED = 16
-    JUDGE = 17
-    BEGIN_RELEASE = 18
-    END_RELEASE = 19
-    BEGIN_CUTS = 20
-    CUT = 21
-    TAKE_CUT = 22
-    CHOOSE_CUTS = 23
-    UNDO_CUTS = 24
-    TAKE = 25
-    DECIDE = 26
-    NEXT = 27
-    PUBLISH = 28
-    SOLVE = 29
-    SEARCH_CANDIDATES = 30
-    GROW = 31
-    END = 32
-
-
-class Task(IntEnum):
-    """What the phase over pairs does."""
-
-    LIST_NEAR = 0
-    FIND_NEAR = 1
-    HOLD = 2
-    LIST = 3
-    BOUND = 4
-    ENERGY = 5
-
-
-@wp.struct
-class Flow:
-    """Where the Newton steps are.
-
-    Attributes:
-        phase: The phase of each world that comes next.
-        solves: Solves of each world in its Newton step so far.
-        solves_next: 1 if a solve comes next for one, shape [1].
-        goes_on: 1 if a search for candidates or larger buffers come next for one, shape [1].
-        arrived: How often blocks of threads of each world have waited.
-    """
-
-    phase: wp.array[int]
-    solves: wp.array[int]
-    solves_next: wp.array[int]
-    goes_on: wp.array[int]
-    arrived: wp.array[int]
-
-
-@wp.struct
-class Problem:
-    """What Newton steps read and write.
-
-    Attributes:
-        row_of_block: Row of each block of ``rows``.
-        goal: Where inertia leads each vertex [m].
-        lower, upper: Boxes of vertices within which the candidates are all that may come near each other [m].
-        limit: Share of its displacement before each vertex meets something.
-        plane_share: Share of their ways that infinite planes have gone, by world.
-        whole: Share that each world takes without cuts of single vertices.
-        first: Solution of the Newton step before pairs are held.
-        leaves: 1 for each world of which a vertex leaves its box.
-        any_leaves: 1 if there is one, shape [1].
-        lacks: See :func:`.step_report.write_results`.
-        vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
-        parts: Threads that share rows and blocks.
-        turns: Rows or blocks that they share, one after the other, no more than they are.
-        grows: 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs.
-    """
-
-    elements: elasticity.Elements
-    derivatives: elasticity.Derivatives
-    rows: Rows
-    row_of_block: wp.array[int]
-    matrix: Matrix
-    vectors: Vectors
-    unknowns: Unknowns
-    bodies: bodies.SolvedBodies
-    candidates: Candidates
-    contacts: Contacts
-    trial: Trial
-    progress: Progress
-    flow: Flow
-    goal: wp.array[wp.vec3]
-    lower: wp.array[wp.vec3]
-    upper: wp.array[wp.vec3]
-    limit: wp.array[float]
-    plane_share: wp.array[float]
-    whole: wp.array[float]
-    first: wp.array[wp.vec3]
-    leaves: wp.array[int]
-    any_leaves: wp.array[int]
-    lacks: wp.array[int]
-    worlds: Worlds
-    vertices_at_planes: int
-    parts: int
-    turns: int
-    grows: int
-
-
-@wp.func_native(
-    snippet="""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-    if (blocks > 1) {
-        if (threadIdx.x == 0) {
-            __threadfence();
-            unsigned* count = (unsigned*)arrived.data + world;
-            const unsigned before = atomicAdd(count, 1u);
-            const unsigned all = (before / blocks + 1u) * blocks;
-            while ((int)(*(volatile unsigned*)count - all) < 0) {}
-            __threadfence();
-        }
-        __syncthreads();
-    }
-#endif
-"""
-)
-def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
-    """Waits until all threads of a world are here, and sees what they have written; its blocks must all be running."""
-    ...
 
 
 @wp.func
@@ -269,11 +123,6 @@ def _add_element_energy(
     merit.add_energy(energy, w, value, settings.units)
 
 
-@wp.func
-def _add_inertia(u: int, w: int, p: Problem, motion: Motion, settings: BarrierSettings, energy: wp.array[wp.int64]):
-    steps.add_inertia(u, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, w, energy)
-
-
 def _advance(
     # in
     motion: Motion,
@@ -298,7 +147,7 @@ def _advance(
     phase, solves = p.flow.phase[w] + int(0), p.flow.solves[w] + int(0)
     progress, arrived = p.progress, p.flow.arrived
     if resumes != 0 and phase > Phase.SOLVE and phase < Phase.END:
-        phase = wp.where(phase == Phase.GROW, int(Phase.BEGIN), int(Phase.DIFFERENTIATE))
+        phase = int(Phase.DIFFERENTIATE)
     if phase >= Phase.SOLVE or (progress.active[w] == 0 and phase != Phase.PUBLISH):
         return
     # things of different kinds in one phase are for different threads, so that they take place at the same time
@@ -320,12 +169,7 @@ def _advance(
                 decisions.begin_newton_step(w, progress)
             phase = int(Phase.DIFFERENTIATE)
         elif phase == Phase.PUBLISH:  # what is near at the end
-            for k in range(
-                p.contacts.parts * p.contacts.first_bucket[w] + t,
-                p.contacts.parts * p.contacts.first_bucket[w + 1],
-                n,
-            ):
-                p.contacts.bucket[k] = 0
+            merge.clear_buckets(w, t, n, p.contacts)
             if t == 0:
                 p.contacts.count[w] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.END), int(Phase.PAIRS)
@@ -338,12 +182,7 @@ def _advance(
             is_listed = p.candidates.listed[w] >= 0
             for k in range(first_vertex + from_end, end_of_vertices, n):
                 steps.find_remaining(p.worlds.vertices[k], w, motion, p.unknowns, p.trial, progress)
-            for k in range(
-                p.contacts.parts * p.contacts.first_bucket[w] + from_end,
-                p.contacts.parts * p.contacts.first_bucket[w + 1],
-                n,
-            ):
-                p.contacts.bucket[k] = 0
+            merge.clear_buckets(w, from_end, n, p.contacts)
             is_far = decisions.is_far(w, far_change, progress)
             for k in range(first_element + spread, end_of_elements, n):
                 _differentiate(k, 1, p, motion, settings, is_far)
@@ -358,7 +197,7 @@ def _advance(
                 contact_lists.clear_lists(w, p.contacts)
             for u in range(first_unknown + t, end_of_unknowns, n):
                 assembly.find_loads(u, w, p.derivatives, p.rows, p.unknowns, progress, settings.load)
-                _add_inertia(u, w, p, motion, settings, progress.energy)
+                steps.add_inertia(u, w, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, progress.energy)
             for u in range(first_unknown + from_end, end_of_unknowns, n):
                 p.contacts.end[u] = 0
             task, then, phase = int(Task.FIND_NEAR), int(Phase.COUNT), int(Phase.PAIRS)
@@ -383,10 +222,10 @@ def _advance(
                 for k in range(first_element + from_end, end_of_elements, n):
                     _add_element_energy(k, w, p, motion, settings, progress.trial)
                 for u in range(first_unknown + from_middle, end_of_unknowns, n):
-                    _add_inertia(u, w, p, motion, settings, progress.trial)
+                    steps.add_inertia(u, w, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, progress.trial)
                 for i in range(first_contact + from_middle, end_of_contacts(p.contacts, w), n):
                     merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, progress.trial)
-            at_once = n == 1 or p.candidates.near[w] + p.candidates.far[w] <= n
+            at_once = p.candidates.near[w] + p.candidates.far[w] <= n
             _over_pairs(task, at_once, passes > 0, p, motion, planes, settings, solves, w, t, n)
             if at_once or (task != Task.LIST_NEAR and task != Task.LIST):
                 phase = then
@@ -564,7 +403,7 @@ def _advance(
                 decisions.decide(w, least_change, far_change, max_steps, max_late_steps, progress, p.plane_share)
             phase = int(Phase.NEXT)
         wait_for_team(arrived, w, blocks)
-        if task == Task.FIND_NEAR and phase == then and p.grows != 0:
+        if (task == Task.FIND_NEAR or task == Task.HOLD) and phase == then and p.grows != 0:
             if end_of_contacts(p.contacts, w) - first_contact < p.contacts.count[w]:
                 phase = int(Phase.GROW)
         if phase == Phase.BOUNDED:
@@ -598,6 +437,8 @@ def _advance(
             p.leaves[w] = 0
         else:
             p.flow.goes_on[0] = 1
+            progress.energy[w] = wp.int64(0)  # the Newton step begins anew
+            progress.held[w] = 0
             if phase == Phase.SEARCH_CANDIDATES:
                 p.any_leaves[0] = 1
         p.flow.phase[w] = phase

@@ -125,7 +125,7 @@ def begin_bodies(
     unknowns.is_free[u + 1] = wp.where(wp.trace(of_motion.inverse_inertia[body]) > 0.0, is_free, 0)
     if is_free == 0:
         return
-    active[unknowns.world[u]] = 1
+    active[wp.max(of_motion.world[body], 0)] = 1
     start, goal = of_motion.start[body], of_motion.end[body]
     bodies.goal[body] = goal
     bodies.inertia[body] = in_world(of_motion.inertia[body], goal)

@@ -51,6 +51,14 @@ def _first_bucket(contacts: Contacts, world: int, feature: wp.vec3i) -> int:
 
 
 @wp.func
+def clear_buckets(world: int, thread: int, threads: int, contacts: Contacts):
+    """Empties the buckets of a world, as one of so many threads."""
+    first, end = contacts.first_bucket[world], contacts.first_bucket[world + 1]
+    for k in range(contacts.parts * first + thread, contacts.parts * end, threads):
+        contacts.bucket[k] = 0
+
+
+@wp.func
 def link_contact(contacts: Contacts, world: int, i: int, corners: wp.vec4i, weights: wp.vec4d):
     """Notes the vertices of a contact, where it has no more than three, for :func:`merge_contact`."""
     low, high, count = wp.vec2i(2147483647), wp.vec2i(-1), wp.vec2i()

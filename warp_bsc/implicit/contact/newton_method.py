@@ -15,15 +15,16 @@ from ...detection.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
 from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
-from ...response.state.mesh import ModelMesh, host_array
+from ...response.state.mesh import ModelMesh, grouped_by_world, host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import bodies, decisions, pairs, steps
-from .advance import ADVANCE, Flow, Phase, Problem
+from .advance import ADVANCE
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team
 from .elasticity import elements_of_model, make_derivatives
+from .flow import Flow, Phase, Problem
 from .impulses import publish_contacts
 from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
@@ -111,7 +112,7 @@ class NewtonMethod:
             body_world = np.maximum(host_array(model.body_world)[solved], 0)
         # in each world its particles, then a shift and a turn of each of its bodies
         owner_world = np.concatenate([world, np.repeat(body_world, 2)])
-        order = np.argsort(owner_world, kind="stable")
+        order, of_worlds = grouped_by_world(owner_world, work.worlds)
         number = np.argsort(order, kind="stable")
         unknown, of_bodies = number[:particles], np.full(model.body_count + 1, -1)
         of_bodies[solved] = number[particles::2]
@@ -122,8 +123,6 @@ class NewtonMethod:
         self._sought = wp.clone(self._all_sought)
         unknowns.particle = array(np.where(order < particles, order, -1))
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
-        unknowns.world = array(owner_world[order])
-        of_worlds = np.searchsorted(owner_world[order], np.arange(work.worlds + 1))
         unknowns.of_worlds = array(of_worlds)
         unknowns.first_of_bodies = array(of_worlds[:-1] + np.bincount(world, minlength=work.worlds))
         unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
@@ -226,18 +225,11 @@ class NewtonMethod:
         found, count, device = Worlds(), self._work.worlds, self._work.device
         world = self._mesh.device_world.numpy()
         is_given = (unknowns.of_vertex.numpy() == -1).astype(int)
-        vertices = np.lexsort((is_given, world))
-        particle_world = world[: self._mesh.model.particle_count]
-        elements = np.concatenate([particle_world[v.max(axis=1)] for v in of_elements if len(v)] or [world[:0]])
-        order = np.argsort(elements, kind="stable")
-        numbers = np.arange(count + 1)
-        arrays = {
-            "vertices": vertices,
-            "first_vertex": np.searchsorted(world[vertices], numbers),
-            "first_given": np.searchsorted((2 * world + is_given)[vertices], 2 * numbers[:-1] + 1),
-            "elements": order,
-            "first_element": np.searchsorted(elements[order], numbers),
-        }
+        vertices, first = grouped_by_world(2 * world + is_given, 2 * count)
+        of_elements = [world[v.max(axis=1)] for v in of_elements if len(v)] or [world[:0]]
+        elements, first_element = grouped_by_world(np.concatenate(of_elements), count)
+        arrays = {"vertices": vertices, "first_vertex": first[::2], "first_given": first[1::2]}
+        arrays |= {"elements": elements, "first_element": first_element}
         for name, values in arrays.items():
             setattr(found, name, wp.array(values.astype(np.int32), dtype=int, device=device))
         return found
@@ -339,7 +331,6 @@ class NewtonMethod:
             wp.copy(self._poses, end.body_q)
         self.progress.active.zero_()
         self.progress.given_moves.zero_()
-        self.progress.solving.zero_()
         self._flow.arrived.zero_()
         wp.copy(self._sought, self._all_sought)
         self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
@@ -372,7 +363,7 @@ class NewtonMethod:
 
     def _renew_candidates(self):
         inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
-        inputs += [int(self.keeps_contacts)]
+        inputs += [self.progress.active, int(self.keeps_contacts)]
         self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
         self._leaves.zero_()
         self._any_leaves.zero_()
@@ -535,6 +526,6 @@ def _metre_of(mesh: ModelMesh) -> float:
 
 def _of_worlds(function, values: np.ndarray, world: np.ndarray, worlds: int, default: float) -> np.ndarray:
     """Returns a function of the values of each world, which is as if the world were alone; the default of none."""
-    order = np.argsort(world, kind="stable")
-    parts = np.split(values[order], np.searchsorted(world[order], np.arange(1, worlds)))
+    order, first = grouped_by_world(world, worlds)
+    parts = np.split(values[order], first[1:-1])
     return np.array([function(part) if len(part) else default for part in parts], dtype=float)

@@ -90,6 +90,7 @@ def begin_step(
     v = wp.tid()
     if v < progress.active.shape[0]:
         progress.steps[v] = 0
+        progress.solving[v] = 0
         progress.scale[v] = 1.0
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
@@ -222,7 +223,8 @@ def renew_boxes(
     margin: wp.array[float],
     trial: Trial,
     leaves: wp.array[int],
-    is_kept: int,
+    active: wp.array[int],
+    keeps_ended: int,
     # in and out
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
@@ -231,13 +233,14 @@ def renew_boxes(
 ):
     """Makes the boxes of vertices those around their last displacement, from where they are now.
 
-    Only in worlds in which one left its box; the others have ended, and their pairs are not sought any more, unless
-    they ``is_kept``. A displacement that is far longer than what the step would take without forces counts in part: all
-    may be near each other on ways of metres.
+    Only in worlds in which one left its box. Pairs of those that have ended are not sought any more, unless they are to
+    be kept. A displacement that is far longer than what the step would take without forces counts in part: all may be
+    near each other on ways of metres.
     """
     v = wp.tid()
-    if leaves[motion.world[v]] == 0:
-        if is_kept == 0:
+    world = motion.world[v]
+    if leaves[world] == 0:
+        if active[world] == 0 and keeps_ended == 0:
             sought[v] = 0
         return
     x, d = trial.x[v], trial.displaced[v] + wp.vec3()
@@ -282,13 +285,13 @@ def begin_truncation(
 @wp.func
 def add_inertia(
     u: int,
+    world: int,
     motion: Motion,
     settings: BarrierSettings,
     trial: Trial,
     goal: wp.array[wp.vec3],
     unknowns: Unknowns,
     bodies: SolvedBodies,
-    world: int,
     energy: wp.array[wp.int64],
 ):
     """Adds the energy of inertia of an unknown at ``trial.moved`` to that of its world."""

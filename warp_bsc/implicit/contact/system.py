@@ -19,7 +19,6 @@ class Unknowns:
         of_vertex: Unknown of each vertex of the mesh; :data:`NOT_UNKNOWN`, or -2 less the first unknown of its body.
         particle: Particle of each unknown, -1 of those of bodies.
         body: Body of each unknown, -1 of those of particles.
-        world: World of each unknown.
         of_worlds: First unknown of each world, and the end of the last. Those of bodies come last in a world.
         first_of_bodies: First unknown of a body in each world, or where its unknowns end.
         is_free: 1 for each unknown that is solved for; the others are given.
@@ -30,7 +29,6 @@ class Unknowns:
     of_vertex: wp.array[int]
     particle: wp.array[int]
     body: wp.array[int]
-    world: wp.array[int]
     of_worlds: wp.array[int]
     first_of_bodies: wp.array[int]
     is_free: wp.array[int]

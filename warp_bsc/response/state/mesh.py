@@ -327,12 +327,19 @@ def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence
     return incidence
 
 
+def grouped_by_world(world: np.ndarray, worlds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns what there is, what is in all worlds (-1) first, then world by world; and where each begins and ends.
+
+    Both are indices, the first of those of ``world``, shape [n], the second of the first, shape [worlds + 1].
+    """
+    order = np.argsort(world, kind="stable")
+    return order, np.searchsorted(world[order], np.arange(worlds + 1))
+
+
 def members_of_worlds(world: np.ndarray, worlds: int) -> np.ndarray:
     """Returns what is in each world, what is in all (-1) first, then -1; int32, shape [worlds, n]."""
-    everywhere = np.flatnonzero(world < 0)
-    numbers = np.flatnonzero(world >= 0)
-    numbers = numbers[np.argsort(world[numbers], kind="stable")]
-    counts = np.bincount(world[numbers], minlength=worlds)
+    order, first = grouped_by_world(world, worlds)
+    everywhere, numbers, counts = order[: first[0]], order[first[0] :], np.diff(first)
     found = np.full((worlds, len(everywhere) + counts.max()), -1, dtype=np.int32)
     found[:, : len(everywhere)] = everywhere
     column = np.arange(len(numbers)) - np.repeat(np.cumsum(counts) - counts, counts)

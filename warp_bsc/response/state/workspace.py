@@ -32,7 +32,7 @@ from ..tuning import (
     THREADS,
     TOLERANCE,
 )
-from .mesh import ModelMesh
+from .mesh import ModelMesh, grouped_by_world
 from .motion import ModelMotion, takes_part
 from .record import StepRecord, StepRecorder, record_offsets
 from .structs import (
@@ -322,9 +322,9 @@ class Workspace:
         """Returns the particles of each world."""
         world = self.mesh.device_world.numpy()[: self.particle_count]
         particles = Incidence()
-        first = np.searchsorted(np.sort(world), np.arange(self.worlds + 1))
-        particles.first = wp.array(first, dtype=int, device=self.device)
-        particles.items = wp.array(np.argsort(world, kind="stable"), dtype=int, device=self.device)
+        particles.items, particles.first = (
+            wp.array(numbers, dtype=int, device=self.device) for numbers in grouped_by_world(world, self.worlds)
+        )
         return particles
 
     @property
