@@ -21,6 +21,7 @@ from .pairs import (
     stays_far,
 )
 from .system import Progress, kind_of_key, lower_to
+from .wide import integers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,7 +60,7 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
     if before == FAR and (is_shorter or stays):
         return False
-    corners = candidates.corners[i]
+    corners = integers_at(candidates.corners, i)
     if is_shorter and (before == 1.0 or before == FAR_TOGETHER):
         cuts = int(0)
         for j in range(4):
@@ -100,7 +101,7 @@ def bound_by_pair(
     limit: wp.array[float],
 ):
     """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world."""
-    corners, kind, kept = candidates.corners[i], kind_of_key(candidates.key[i]), candidates.kept[i]
+    corners, kind, kept = integers_at(candidates.corners, i), kind_of_key(candidates.key[i]), candidates.kept[i]
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     now = wp.float64(candidates.now[i])
     a, b, c, d = corners_of(trial.x, corners)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from .system import Contacts, Unknowns, first_unknown
+from .wide import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,13 +14,14 @@ _COUPLES = wp.constant(wp.int64(1 << 61))
 @wp.func
 def count_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
     """Counts a contact in ``end`` of the unknowns that are solved for, and of its world if it couples."""
+    weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
     for j in range(4):
-        if contacts.weights[i][j] != 0.0:
-            u = first_unknown(contacts.unknowns[i][j])
+        if weights[j] != 0.0:
+            u = first_unknown(of_corners[j])
             if u >= 0:
                 if unknowns.is_free[u] != 0:
                     wp.atomic_add(contacts.end, u, 1)
-                    if contacts.unknowns[i][j] < 0:
+                    if of_corners[j] < 0:
                         wp.atomic_add(contacts.end, u + 1, 1)
     if contacts.couples[i] != 0:
         wp.atomic_add(contacts.coupled_end, world, 1)
@@ -67,9 +69,9 @@ def _list_coupled(contacts: Contacts, world: int, i: int):
     n = wp.atomic_add(contacts.coupled_end, world, 1)
     contacts.coupled[n] = i
     contacts.place_in_coupled[i] = n - contacts.coupled_first[world]
-    of_corners = contacts.unknowns[i] + wp.vec4i()
+    of_corners, weights = integers_at(contacts.unknowns, i), numbers_at(contacts.weights, i)
     for j in range(4):
-        if contacts.weights[i][j] == 0.0:
+        if weights[j] == 0.0:
             of_corners[j] = -1
     contacts.coupled_unknowns[n] = of_corners
 
@@ -79,13 +81,14 @@ def list_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
     """Lists a contact for its unknowns, behind their ``end``, which moves on, and for its world if it couples."""
     if contacts.couples[i] != 0:
         _list_coupled(contacts, world, i)
+    weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
     for j in range(4):
-        if contacts.weights[i][j] != 0.0:
-            u = first_unknown(contacts.unknowns[i][j])
+        if weights[j] != 0.0:
+            u = first_unknown(of_corners[j])
             if u >= 0:
                 if unknowns.is_free[u] != 0:
                     _list_entry(contacts, u, 4 * i + j)
-                    if contacts.unknowns[i][j] < 0:
+                    if of_corners[j] < 0:
                         _list_entry(contacts, u + 1, 4 * i + j)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import warp as wp
 
 from ...response.state.vectors import HALF, ONE, ZERO, to_single
+from .wide import mat34, store_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,17 +78,18 @@ class Elements:
 
 @wp.struct
 class Derivatives:
-    """What :func:`find_gradient` and :func:`find_hessian` compute.
+    """What :func:`find_derivatives` computes.
 
     Attributes:
         gradient: Of each corner of each element [N], shape [corners].
-        block: Hessians of each two corners of each element but those of bending, row by row [N/m], shape [blocks].
+        block: Hessians of each two corners of each element but those of bending, row by row [N/m], shape [blocks],
+            each row with a fourth number without meaning, so that a GPU reads and writes it at once.
         turn: Derivatives of the angle of each element of bending by its corners [1/m], shape [4 count].
         curvature: Second derivative of its energy by the angle [J], shape [count].
     """
 
     gradient: wp.array[wp.vec3]
-    block: wp.array[wp.mat33]
+    block: wp.array[mat34]
     turn: wp.array[wp.vec3]
     curvature: wp.array[float]
 
@@ -127,7 +129,7 @@ def make_derivatives(vertices: list[np.ndarray], device: wp.Device) -> Derivativ
     derivatives, bends = Derivatives(), len(vertices[ElementKind.BENDING])
     blocks = sum(v.size * v.shape[1] for kind, v in enumerate(vertices) if kind != ElementKind.BENDING)
     derivatives.gradient = wp.zeros(sum(v.size for v in vertices), dtype=wp.vec3, device=device)
-    derivatives.block = wp.zeros(blocks, dtype=wp.mat33, device=device)
+    derivatives.block = wp.zeros(blocks, dtype=mat34, device=device)
     derivatives.turn = wp.zeros(4 * bends, dtype=wp.vec3, device=device)
     derivatives.curvature = wp.zeros(bends, dtype=float, device=device)
     return derivatives
@@ -218,9 +220,15 @@ def cross_matrix(a: wp.vec3d) -> wp.mat33d:
 
 
 @wp.func
-def _store(blocks: wp.array[Any], k: int, block: wp.mat33d):
-    """Writes a block in the precision of the array."""
-    blocks[k] = blocks.dtype(block)
+def _store(blocks: wp.array[wp.mat33d], k: int, block: wp.mat33d):
+    """Writes a block."""
+    blocks[k] = block
+
+
+@wp.func
+def _store(blocks: wp.array[mat34], k: int, block: wp.mat33d):
+    """Writes a block in single precision."""
+    store_block(blocks, k, block)
 
 
 @wp.func
@@ -688,34 +696,7 @@ def store_hessian(
 
 
 @wp.func
-def find_gradient(
-    i: int,
-    kind: int,
-    elements: Elements,
-    x: wp.array[wp.vec3d],
-    x0: wp.array[wp.vec3],
-    dt: wp.float64,
-    out: Derivatives,
-):
-    """Computes the gradient of an element, and all that the Hessian of bending is made of."""
-    e = i - elements.first[kind]
-    gradient, turn, curvature = mat43d(), mat43d(), ZERO
-    if kind != ElementKind.BENDING:
-        gradient = element_gradient(elements, kind, e, x, x0, dt)
-    else:
-        if has_energy(elements, kind, e, x):
-            turn, moment, curvature = bend(elements, e, x, x0, dt)
-            gradient = moment * turn
-        out.curvature[e] = float(curvature)
-        for j in range(4):
-            out.turn[4 * e + j] = to_single(turn[j])
-    corner = first_corner(elements, kind, e)
-    for j in range(element_size(kind)):
-        out.gradient[corner + j] = to_single(gradient[j])
-
-
-@wp.func
-def find_hessian(
+def find_derivatives(
     i: int,
     kind: int,
     elements: Elements,
@@ -724,10 +705,39 @@ def find_hessian(
     dt: wp.float64,
     is_convex: bool,
     out: Derivatives,
-):
-    """Computes the Hessian of an element, convex or exact; that of bending is made of what :func:`find_gradient` finds.
+) -> wp.float64:
+    """Computes the gradient and the Hessian of an element, convex or exact, and returns its energy [J].
 
-    The latter is that of Gauss and Newton: without the curvature of the angle.
+    That of bending is the Hessian of Gauss and Newton: without the curvature of the angle. All is read before anything
+    is written, so that a compiler reads it once.
     """
-    if kind != ElementKind.BENDING:
-        store_hessian(elements, kind, i - elements.first[kind], x, x0, dt, is_convex, out.block)
+    e = i - elements.first[kind]
+    has, energy, gradient = has_energy(elements, kind, e, x), ZERO, mat43d()
+    corner = first_corner(elements, kind, e)
+    if kind == ElementKind.MEMBRANE and has:
+        energy = _membrane_energy(elements, e, x, x0, dt)
+        gradient = _membrane_gradient(elements, e, x, x0, dt)
+        _store_membrane_hessian(elements, e, x, x0, dt, is_convex, out.block)
+    elif kind == ElementKind.BENDING:
+        turn, curvature = mat43d(), ZERO
+        if has:
+            energy = _bending_energy(elements, e, x, x0, dt)
+            turn, moment, curvature = bend(elements, e, x, x0, dt)
+            gradient = moment * turn
+        out.curvature[e] = float(curvature)
+        for j in range(4):
+            out.turn[4 * e + j] = to_single(turn[j])
+    elif kind == ElementKind.TETRAHEDRON and has:
+        energy = _tetrahedron_energy(elements, e, x, x0, dt)
+        gradient = _tetrahedron_gradient(elements, e, x, x0, dt)
+        _store_tetrahedron_hessian(elements, e, x, x0, dt, is_convex, out.block)
+    elif kind == ElementKind.SPRING and has:
+        energy = _spring_energy(elements, e, x, x0, dt)
+        gradient = element_gradient(elements, kind, e, x, x0, dt)
+        _store_spring_hessian(elements, e, x, x0, dt, is_convex, out.block)
+    else:
+        for k in range(element_size(kind) * element_size(kind)):
+            _store(out.block, first_block(elements, kind, e) + k, wp.mat33d())
+    for j in range(element_size(kind)):
+        out.gradient[corner + j] = to_single(gradient[j])
+    return energy

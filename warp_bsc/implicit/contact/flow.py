@@ -16,52 +16,50 @@ wp.set_module_options({"enable_backward": False})
 
 
 class Phase(IntEnum):
-    """What all threads do until they wait for each other, or leave for what another kernel does."""
+    """What all threads of a world do until they wait for each other, or leave for what another kernel does."""
 
     BEGIN = 0
     DIFFERENTIATE = 1
     LOADS = 2
-    RELEASE_HELD = 3
-    BEGIN_LIST = 4
-    PAIRS = 5
-    COUNT = 6
-    PLACE = 7
-    LIST = 8
-    SORT = 9
-    BLOCKS = 10
-    ASSEMBLE = 11
-    DISPLACE = 12
-    BOUNDED = 13
-    HOLD = 14
-    TAKE_BOUND = 15
-    DISPLACED = 16
-    JUDGE = 17
-    BEGIN_RELEASE = 18
-    END_RELEASE = 19
-    BEGIN_CUTS = 20
-    CUT = 21
-    TAKE_CUT = 22
-    CHOOSE_CUTS = 23
-    UNDO_CUTS = 24
-    TAKE = 25
-    DECIDE = 26
-    NEXT = 27
-    PUBLISH = 28
-    SOLVE = 29
-    SEARCH_CANDIDATES = 30
-    GROW = 31
-    END = 32
-
-
-class Task(IntEnum):
-    """What the phase over pairs does."""
-
-    LIST_NEAR = 0
-    FIND_NEAR = 1
-    HOLD = 2
-    LIST = 3
-    BOUND = 4
-    ENERGY = 5
+    BEGIN_LIST = 3
+    LIST_NEAR = 4
+    FIND_NEAR = 5
+    LIST_AND_FIND_NEAR = 6
+    COUNT = 7
+    PLACE = 8
+    LIST_CONTACTS = 9
+    SORT = 10
+    BLOCKS = 11
+    ASSEMBLE = 12
+    DISPLACE = 13
+    LIST_WAYS = 14
+    BOUND = 15
+    LIST_AND_BOUND = 16
+    HOLD = 17
+    RELEASE_HELD = 18
+    HOLD_PAIRS = 19
+    TAKE_BOUND = 20
+    MOVE = 21
+    ENERGY = 22
+    BEGIN_RELEASE = 23
+    BEGIN_CUTS = 24
+    CUT = 25
+    TAKE_CUT = 26
+    CHOOSE_CUTS = 27
+    UNDO_CUTS = 28
+    TAKE = 29
+    DECIDE = 30
+    PUBLISH = 31
+    SOLVE = 32
+    SEARCH_CANDIDATES = 33
+    GROW = 34
+    END = 35
+    # where what all threads have found decides what comes next
+    BOUNDED = 36
+    RELEASED = 37
+    JUDGE = 38
+    END_RELEASE = 39
+    NEXT = 40
 
 
 @wp.struct
@@ -84,6 +82,33 @@ class Flow:
 
 
 @wp.struct
+class Place:
+    """A thread in a phase of its world.
+
+    Attributes:
+        world: The world.
+        thread: Number of the thread.
+        threads: Threads of the world.
+        blocks: Their blocks.
+        spread: Number of the thread by which blocks take turns, warp by warp: each has its share of what is little.
+        phase: Phase of the world.
+        then: The one after those over pairs.
+        passes: Passes in which displacements were cut.
+        solves: Solves in the Newton step so far.
+    """
+
+    world: int
+    thread: int
+    threads: int
+    blocks: int
+    spread: int
+    phase: int
+    then: int
+    passes: int
+    solves: int
+
+
+@wp.struct
 class Problem:
     """What Newton steps read and write.
 
@@ -102,6 +127,9 @@ class Problem:
         parts: Threads that share rows and blocks.
         turns: Rows or blocks that they share, one after the other, no more than they are.
         grows: 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs.
+        least_change: Change by which no unknown changes any more where a step ends [m].
+        far_change: Change by which one that changes still is far from its end [m].
+        max_steps, max_late_steps: Newton steps of a step at most, and while something that a program moves comes.
     """
 
     elements: Elements
@@ -132,6 +160,10 @@ class Problem:
     parts: int
     turns: int
     grows: int
+    least_change: float
+    far_change: float
+    max_steps: int
+    max_late_steps: int
 
 
 @wp.func_native(

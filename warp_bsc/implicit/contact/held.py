@@ -20,6 +20,7 @@ from .system import (
     take_contact,
     unknowns_of,
 )
+from .wide import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -81,7 +82,7 @@ def _hold(
 @wp.func
 def release_held(i: int, unknowns: Unknowns, solution: wp.array[wp.vec3], contacts: Contacts):
     """Lets a pair go that is held and that the solution would pull together: it is not in the way."""
-    corners, weights, n = contacts.corners[i], contacts.weights[i], contacts.normal[i]
+    corners, weights, n = integers_at(contacts.corners, i), numbers_at(contacts.weights, i), contacts.normal[i]
     if contacts.key[i] >= _FIRST_HELD:
         apart = wp.dot(n, contacts.gradient[i])
         for j in range(4):
@@ -107,7 +108,7 @@ def hold_pair(
 
     Only one that is the first, by ``limit``, for one of its vertices: what would come later may not come at all.
     """
-    corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
+    corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     share = candidates.share[i] + float(0.0)
     if share >= 1.0:
         return

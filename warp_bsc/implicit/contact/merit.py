@@ -18,6 +18,7 @@ from .pairs import (
     stiffness_of_pair,
 )
 from .system import Contacts, Progress, kind_of_key
+from .wide import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -74,7 +75,7 @@ def add_pair_energy(
     progress: Progress,
 ):
     """Adds the energy of the barrier of a candidate at the displaced positions."""
-    corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
+    corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)
     if barrier.distance_of_boxes(kind, a, b, c, d) >= candidates.level[i] + reach:
@@ -100,7 +101,7 @@ def add_friction_energy(
     energy: wp.array[wp.int64],
 ):
     """Adds the work of friction over ``trial.moved``, under the load and along the plane of a contact."""
-    corners, weights = contacts.corners[i], contacts.weights[i]
+    corners, weights = integers_at(contacts.corners, i), numbers_at(contacts.weights, i)
     limit = wp.where(weights == wp.vec4(), 0.0, contacts.limit[i])  # 0 of what is merged
     if limit > 0.0:
         slid, normal = wp.vec3d(), to_double(contacts.normal[i])

@@ -35,6 +35,7 @@ from .system import (
     to_single_block,
     unknowns_of,
 )
+from .wide import integers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -119,7 +120,7 @@ def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
     """Lists a candidate if it may be near each other, for :func:`find_near`, where no displacements told."""
     if candidates.share[i] >= FAR:
         return False
-    a, b, c, d = corners_of(trial.exact, candidates.corners[i])
+    a, b, c, d = corners_of(trial.exact, integers_at(candidates.corners, i))
     apart = barrier.distance_of_boxes(kind_of_key(candidates.key[i]), a, b, c, d)
     candidates.now[i] = float(apart * ROUNDED_DOWN)
     is_near = apart < candidates.level[i] + wp.float64(candidates.reach[i])
@@ -141,7 +142,7 @@ def find_near(
     contacts: Contacts,
 ):
     """Adds a contact if a candidate is near each other, and its energy."""
-    corners, reach = candidates.corners[i], wp.float64(candidates.reach[i])
+    corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)
     a, b, c, d = corners_of(trial.exact, corners)

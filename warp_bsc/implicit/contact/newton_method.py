@@ -39,8 +39,10 @@ _PARTS = 4
 _MANY_VERTICES = 1 / 4
 """Vertices by thread of a team from which on they have several pairs each: blocks have twice as many threads then, and
 these share less."""
-_CONTACTS = 64
-"""Contacts that fit at first, for each unknown: many times fewer than candidates in a pile, and of far more bytes."""
+_CONTACTS = 16
+"""Contacts that fit at first, for each particle: where layers of cloth touch all over, they have 9."""
+_MORE_OF_BODIES = 4
+"""How many times as many those of a body are, for each of its two unknowns."""
 _REACH_OF_EDGE = 0.1
 """Reach of a barrier as a share of the median length of edges."""
 _USUAL_REACH = 1e-3
@@ -215,10 +217,11 @@ class NewtonMethod:
         p.turns = _PARTS if self._is_many else 1
         self._queues: list[PairQueue] = []
         self._captured, self._retired = False, []
-        self._of_worlds = of_worlds
+        rooms = np.append(0, np.cumsum(np.where(order < particles, 1, _MORE_OF_BODIES)))
+        self._rooms = rooms[of_worlds]  # of contacts, summed up by world
         self._candidates, self._contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
-        self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(self._count, 1))))
+        self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
 
     def _in_worlds(self, of_elements, unknowns) -> Worlds:
         """Returns what is in each world."""
@@ -323,6 +326,9 @@ class NewtonMethod:
         self._settings.dt = dt
         self._settings.recovery = self._metre * _RECOVERY_SPEED * dt
         self._settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
+        p = self._problem
+        p.least_change, p.far_change = self._least_speed * self._dt, self._metre * _FAR_SPEED * self._dt
+        p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
         self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
         if self._attachments is not None:
             inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
@@ -419,10 +425,10 @@ class NewtonMethod:
         self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self._candidates.room.fill_(capacity)
 
-    def _allocate_contacts(self, of_unknown):
-        """Allocates contacts, so many for each unknown of a world."""
+    def _allocate_contacts(self, of_room):
+        """Allocates contacts, so many for each particle of a world, and more for each body."""
         self._retire(self._contacts)
-        start, device = of_unknown * self._of_worlds, self._work.device
+        start, device = of_room * self._rooms, self._work.device
         capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
         sizes: dict = dict.fromkeys(("first", "middle", "end"), self._count)
         parts = 1 if self._is_many else self._problem.parts
@@ -443,12 +449,12 @@ class NewtonMethod:
         """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
         if not self._problem.grows:
             return False
-        found, of_worlds = self._contacts.count.numpy(), np.diff(self._of_worlds)
+        found, rooms = self._contacts.count.numpy(), np.diff(self._rooms)
         if (found <= np.diff(self._contacts.start.numpy())).all():
             return False
-        needed = int(np.max(-(-found[of_worlds > 0] // of_worlds[of_worlds > 0])))
-        capacity = capacity_for(needed * self._count, "contacts")
-        self._allocate_contacts(capacity // self._count)
+        needed = int(np.max(-(-found[rooms > 0] // rooms[rooms > 0])))
+        capacity = capacity_for(needed * int(self._rooms[-1]), "contacts")
+        self._allocate_contacts(capacity // int(self._rooms[-1]))
         return True
 
     def _take_newton_steps(self):
@@ -485,10 +491,9 @@ class NewtonMethod:
         self._advance()
 
     def _advance(self, resumes=False):
-        work, steps_at_most = self._work, (self.max_steps, max(LATE_STEPS, self.max_steps))
+        work = self._work
         self._problem.grows = int(self._may_grow and not work.device.is_capturing)
-        changes = float(self._least_speed * self._dt), float(self._metre * _FAR_SPEED * self._dt)
-        inputs = [work.step.motion, work.motion.planes, self._settings, *changes, *steps_at_most, int(resumes)]
+        inputs = [work.step.motion, work.motion.planes, self._settings, int(resumes)]
         inputs += [self._problem, self._team_size, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
         wp.launch(ADVANCE[self._block], work.worlds * self._team_size, inputs=inputs, **options)

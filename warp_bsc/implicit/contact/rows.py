@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from .elasticity import SIZES, Derivatives, ElementKind
+from .wide import stored_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -92,7 +93,7 @@ def sum_of_blocks(rows: Rows, derivatives: Derivatives, k: int, part: int, parts
     for n in range(rows.first_source[k] + part, rows.first_source[k + 1], parts):
         source = rows.source[n] + int(0)
         if source >= 0:
-            total += derivatives.block[source]
+            total += stored_block(derivatives.block, source)
         else:
             e = (-1 - source) >> 4
             i, j = ((-1 - source) >> 2) & 3, (-1 - source) & 3

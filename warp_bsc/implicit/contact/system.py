@@ -4,6 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO, to_single
+from .wide import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -317,8 +318,10 @@ def contact_block(contacts: Contacts, u: int, v: int, part: int, parts: int) -> 
     for n in range(contacts.first[u] + part, contacts.middle[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
-        of_corners, weights = contacts.unknowns[i], contacts.weights[i]
-        weight = float(0.0)
+        of_corners = integers_at(contacts.unknowns, i)
+        if of_corners[0] != v and of_corners[1] != v and of_corners[2] != v and of_corners[3] != v:
+            continue
+        weights, weight = numbers_at(contacts.weights, i), float(0.0)
         for j in range(4):
             if of_corners[j] == v:
                 weight += weights[j]
@@ -334,9 +337,9 @@ def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int, part: int, 
     for n in range(contacts.first[u] + part, contacts.end[u], parts):
         entry = contacts.entries[n]
         i = entry >> 2
-        weight = contacts.weights[i][entry & 3]
+        weight = numbers_at(contacts.weights, i)[entry & 3]
         force, hessian = weight * contacts.gradient[i], weight * weight * contacts.hessian[i]
-        if contacts.unknowns[i][entry & 3] == -1 - u:  # the turn of a body, which is behind its shift
+        if integers_at(contacts.unknowns, i)[entry & 3] == -1 - u:  # the turn of a body, which is behind its shift
             turn = wp.skew(unknowns.arm[contacts.corners[i][entry & 3]])
             force, hessian = turn * force, turn * hessian * wp.transpose(turn)
         gradient += force

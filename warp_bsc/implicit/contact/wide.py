@@ -1,0 +1,75 @@
+"""Reads and writes of 16 bytes at a time on GPUs, where Warp has those of 4: phases mostly wait for memory."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+mat34 = wp.types.matrix(shape=(3, 4), dtype=wp.float32)
+"""Rows of a 3 x 3 block, each with a fourth number without meaning."""
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const int4 v = *(const int4*)(values.data + i);
+    return wp::vec_t<4, int>(v.x, v.y, v.z, v.w);
+#else
+    return values.data[i];
+#endif
+"""
+)
+def integers_at(values: wp.array[wp.vec4i], i: int) -> wp.vec4i:
+    """Returns four integers, such as the corners of a pair."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    const float4 v = *(const float4*)(values.data + i);
+    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);
+#else
+    return values.data[i];
+#endif
+"""
+)
+def numbers_at(values: wp.array[wp.vec4], i: int) -> wp.vec4:
+    """Returns four numbers, such as the weights of corners."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    for (int row = 0; row < 3; ++row)
+        ((float4*)(blocks.data + k))[row] = make_float4(
+            (float)block.data[row][0], (float)block.data[row][1], (float)block.data[row][2], 0.0f);
+#else
+    for (int c = 0; c < 9; ++c)
+        blocks.data[k].data[c / 3][c % 3] = (float)block.data[c / 3][c % 3];
+#endif
+"""
+)
+def store_block(blocks: wp.array[mat34], k: int, block: wp.mat33d):
+    """Writes a block in single precision."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+    wp::mat_t<3, 3, float> block;
+#if defined(__CUDA_ARCH__)
+    for (int row = 0; row < 3; ++row) {
+        const float4 of_row = ((const float4*)(blocks.data + k))[row];
+        block.data[row][0] = of_row.x, block.data[row][1] = of_row.y, block.data[row][2] = of_row.z;
+    }
+#else
+    for (int c = 0; c < 9; ++c)
+        block.data[c / 3][c % 3] = blocks.data[k].data[c / 3][c % 3];
+#endif
+    return block;
+"""
+)
+def stored_block(blocks: wp.array[mat34], k: int) -> wp.mat33:
+    """Returns a block that was written."""
+    ...
