@@ -10,7 +10,7 @@ import warp as wp
 from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
 from . import decisions, phases
-from .flow import Phase, Place, Problem, wait_for_team
+from .flow import Flow, Phase, Place, Problem, count_block, wait_for_team
 from .pairs import BarrierSettings
 from .system import end_of_contacts
 
@@ -108,6 +108,9 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
     if phase == Phase.SOLVE:
         p.flow.solves_next[0] = 1
         phase = int(Phase.DISPLACE)
+        if p.flow.phase.shape[0] > 1:
+            following = 1 - p.flow.turn[0]
+            p.flow.listed[following * p.flow.phase.shape[0] + wp.atomic_add(p.flow.count, following, 1)] = w
     elif phase == Phase.END:
         p.leaves[w] = 0
     else:
@@ -119,12 +122,28 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
     p.flow.phase[w] = phase
 
 
+@wp.func
+def _end_launch(flow: Flow, lane: int, n: int, blocks: int):
+    """Lets the next launch have the list of worlds that this one has written, by the last block that ends."""
+    turn = flow.turn[0] + int(0)
+    if count_block(flow.ended) < blocks - 1:
+        return
+    for w in range(lane, flow.phase.shape[0], n):
+        flow.arrived[w] = 0
+    if lane == 0:
+        flow.count[turn] = 0
+        flow.turn[0] = 1 - turn
+        flow.taken[0] = 0
+        flow.ended[0] = 0
+
+
 def _advance(
     # in
     motion: Motion,
     planes: MovingPlanes,
     settings: BarrierSettings,
     resumes: int,
+    of_all: int,
     # in and out
     p: Problem,
     n: int,
@@ -132,34 +151,48 @@ def _advance(
 ):
     """Goes on with the Newton steps of worlds until a solve, a search for candidates, or their end comes next.
 
-    ``n`` threads, in so many blocks, are the team of a world. Those that waited for candidates or buffers go on where
-    it ``resumes``.
+    Blocks of ``n`` threads, which must all be running, take one world after the other, or several of them one together
+    where worlds are fewer: worlds that have been solved for, or it is ``of_all``. Those that waited for candidates or
+    buffers go on where it ``resumes``.
     """
-    w, t = wp.tid() // n, wp.tid() % n
-    phase = p.flow.phase[w] + int(0)
-    if resumes != 0 and phase > Phase.SOLVE and phase < Phase.END:
-        phase = int(Phase.DIFFERENTIATE)
-    if phase >= Phase.SOLVE or (p.progress.active[w] == 0 and phase != Phase.PUBLISH):
-        return
-    state = wp.vec4i(phase, int(Phase.BOUNDED), 0, p.flow.solves[w])
+    block, lane, worlds = wp.tid() // n, wp.tid() % n, p.flow.phase.shape[0]
+    turn, count = p.flow.turn[0] + int(0), int(worlds)
+    if of_all == 0:
+        count = p.flow.count[turn] + int(0)
+    together = wp.max(1, blocks // wp.max(1, count))
     at = Place()
-    at.world = w
-    at.thread = t
-    at.threads = n
-    at.blocks = blocks
-    at.spread = _spread(t, n)
-    while state[0] < Phase.SOLVE:
-        at.phase = state[0]
-        at.then = state[1]
-        at.passes = state[2]
-        at.solves = state[3]
-        for k in range(wp.static(len(_FUNCTIONS))):
-            if at.phase >= wp.static(_FIRST[k]) and at.phase <= wp.static(_LAST[k]):
-                state = wp.static(_FUNCTIONS[k])(at, p, motion, planes, settings)
-        wait_for_team(p.flow.arrived, w, blocks)
-        state = _next(at.phase, state, w, p)
-    if t == 0:
-        _leave(w, state, p)
+    at.thread = block % together * n + lane
+    at.threads = together * n
+    at.blocks = together
+    at.spread = _spread(at.thread, at.threads)
+    number = block // together
+    while number < count:
+        w = number
+        if of_all == 0:
+            w = p.flow.listed[turn * worlds + number] + int(0)
+        phase = p.flow.phase[w] + int(0)
+        if resumes != 0 and phase > Phase.SOLVE and phase < Phase.END:
+            phase = int(Phase.DIFFERENTIATE)
+        if phase < Phase.SOLVE and (p.progress.active[w] != 0 or phase == Phase.PUBLISH):
+            at.world = w
+            state = wp.vec4i(phase, int(Phase.BOUNDED), 0, p.flow.solves[w])
+            while state[0] < Phase.SOLVE:
+                at.phase = state[0]
+                at.then = state[1]
+                at.passes = state[2]
+                at.solves = state[3]
+                for k in range(wp.static(len(_FUNCTIONS))):
+                    if at.phase >= wp.static(_FIRST[k]) and at.phase <= wp.static(_LAST[k]):
+                        state = wp.static(_FUNCTIONS[k])(at, p, motion, planes, settings)
+                wait_for_team(p.flow.arrived, w, together)
+                state = _next(at.phase, state, w, p)
+            if at.thread == 0:
+                _leave(w, state, p)
+        number = int(count)
+        if together == 1:
+            number = blocks + count_block(p.flow.taken)
+    if worlds > 1:
+        _end_launch(p.flow, lane, n, blocks)
 
 
 ADVANCE = {

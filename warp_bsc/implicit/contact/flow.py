@@ -72,6 +72,11 @@ class Flow:
         solves_next: 1 if a solve comes next for one, shape [1].
         goes_on: 1 if a search for candidates or larger buffers come next for one, shape [1].
         arrived: How often blocks of threads of each world have waited.
+        listed: Worlds whose solve comes next, in any order: of this launch, and of the next one, shape [2 worlds].
+        turn: Which of both lists this launch has, shape [1].
+        count: Length of both lists, shape [2].
+        taken: Worlds that blocks have taken after their first ones, shape [1].
+        ended: Blocks that have ended, shape [1].
     """
 
     phase: wp.array[int]
@@ -79,6 +84,11 @@ class Flow:
     solves_next: wp.array[int]
     goes_on: wp.array[int]
     arrived: wp.array[int]
+    listed: wp.array[int]
+    turn: wp.array[int]
+    count: wp.array[int]
+    taken: wp.array[int]
+    ended: wp.array[int]
 
 
 @wp.struct
@@ -186,4 +196,27 @@ class Problem:
 )
 def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
     """Waits until all threads of a world are here, and sees what they have written; its blocks must all be running."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
+    __shared__ int number;
+    __syncthreads();
+    if (threadIdx.x == 0) {
+        __threadfence();
+        number = atomicAdd(values.data, 1);
+    }
+    __syncthreads();
+    const int found = number;
+    __syncthreads();
+    return found;
+#else
+    return values.data[0]++;
+#endif
+"""
+)
+def count_block(values: wp.array[int]) -> int:
+    """Adds 1 to a number for the block of a thread, where all of its threads are here, and returns what it was."""
     ...

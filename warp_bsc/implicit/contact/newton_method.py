@@ -196,12 +196,11 @@ class NewtonMethod:
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
-        self._flow = allocate(Flow, work.worlds, device, solves_next=1, goes_on=1)
-        # teams of several blocks must all be running, one of these on a multiprocessor
-        self._blocks = max(1, device.sm_count // work.worlds) if device.is_cuda else 1
-        self._is_many = device.is_cuda and vertices > _MANY_VERTICES * 256 * self._blocks * work.worlds
+        sizes = {**dict.fromkeys(("solves_next", "goes_on", "turn", "taken", "ended"), 1), "count": 2}
+        self._flow = allocate(Flow, work.worlds, device, **sizes, listed=2 * work.worlds)
+        self._blocks = device.sm_count if device.is_cuda else 1  # all running: blocks of a world wait for each other
+        self._is_many = device.is_cuda and vertices > _MANY_VERTICES * 256 * self._blocks
         self._block = 512 if self._is_many else 256
-        self._team_size = self._blocks * self._block if device.is_cuda else 1
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
@@ -460,14 +459,14 @@ class NewtonMethod:
     def _take_newton_steps(self):
         wp.capture_if(self._any_leaves, self._renew_candidates)
         self._flow.goes_on.zero_()
-        self._advance(resumes=True)
+        self._advance(resumes=True, of_all=True)
         wp.capture_while(self._flow.solves_next, self._solve)
         if not self._work.device.is_capturing:
             self.grow()
 
     def _find_contacts_at_end(self):
         self._flow.phase.fill_(int(Phase.PUBLISH))
-        self._advance()
+        self._advance(of_all=True)
 
     def _solve(self):
         work, team = self._work, self._team
@@ -490,13 +489,14 @@ class NewtonMethod:
         )
         self._advance()
 
-    def _advance(self, resumes=False):
+    def _advance(self, resumes=False, of_all=False):
         work = self._work
         self._problem.grows = int(self._may_grow and not work.device.is_capturing)
         inputs = [work.step.motion, work.motion.planes, self._settings, int(resumes)]
-        inputs += [self._problem, self._team_size, self._blocks]
+        threads = self._block if work.device.is_cuda else 1
+        inputs += [int(of_all or work.worlds == 1), self._problem, threads, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
-        wp.launch(ADVANCE[self._block], work.worlds * self._team_size, inputs=inputs, **options)
+        wp.launch(ADVANCE[self._block], self._blocks * threads, inputs=inputs, **options)
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""

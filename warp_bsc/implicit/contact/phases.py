@@ -216,7 +216,8 @@ def add_blocks(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
     """Adds up the blocks of the Hessian."""
     w = at.world
     count = p.rows.first[p.unknowns.of_worlds[w + 1]] - p.rows.first[p.unknowns.of_worlds[w]]
-    for i in range(at.thread, p.parts * ((count + p.turns - 1) // p.turns), at.threads):
+    turns = wp.where(p.parts * count <= at.threads, 1, p.turns)
+    for i in range(at.thread, p.parts * ((count + turns - 1) // turns), at.threads):
         assembly.add_blocks(
             i,
             w,
@@ -231,7 +232,7 @@ def add_blocks(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
             settings.dt,
             p.rows,
             p.parts,
-            p.turns,
+            turns,
             p.matrix,
         )
     return _to(at, Phase.ASSEMBLE)
