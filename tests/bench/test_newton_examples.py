@@ -303,6 +303,7 @@ def test_an_interrupt_ends_the_process(write_example, device, tmp_path):
         os.kill(int((tmp_path / "note").read_text()), 0)
 
 
+@pytest.mark.slow
 def test_the_solver_with_contact_inside_takes_the_place_of_vbd(in_this_process, device):
     """Newton's own; with XPBD there is nothing to replace."""
     example, other = find_examples(["cloth_hanging --width 8 --height 4", "cloth_hanging --solver xpbd --width 8"])

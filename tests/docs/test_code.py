@@ -110,6 +110,7 @@ def test_reports(tmp_path, capsys):
     assert names["force"].shape == (3,) and "shape" in output and "[-0.88 -0.88]" in output
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:contacts strained", "ignore:in the state of the program")
 def test_robots(tmp_path, capsys):
     """Only a stage in the coupled solver alone lets the arm into the cloth."""

@@ -67,6 +67,7 @@ def missing_names(site):
     return sorted(set(public) - anchors)
 
 
+@pytest.mark.slow
 @needs_extra
 def test_the_site_builds_without_a_warning_and_is_whole(tmp_path):
     """One test, as processes that share out tests would each build the site."""

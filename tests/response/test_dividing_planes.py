@@ -427,6 +427,7 @@ def test_a_contact_at_the_very_end_comes_before_none(i, device):
     assert before_never.numpy().all()
 
 
+@pytest.mark.slow
 def test_what_is_pressed_onto_the_ground_does_not_come_ever_nearer(device):
     """Under a held patch 5 micrometres above, its distance must not fall by a share in each step, down to 0."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))

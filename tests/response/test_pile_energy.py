@@ -5,6 +5,7 @@ import pytest
 from pile_energy import gained, rest
 
 
+@pytest.mark.slow
 def test_a_pile_gains_no_energy(device):
     """With planes that do not move, and all proximities projected, ten sheets gained 0.8%, and kept 1.8%."""
     totals, steps = rest(10, 70, device=device, show=lambda line: None)

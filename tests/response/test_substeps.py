@@ -293,6 +293,7 @@ def test_bodies_that_another_solver_moves_have_no_gradients_in_substeps(device):
         solver.step(model.state(), model.state(), None, None, DT)
 
 
+@pytest.mark.slow
 def test_friction_holds_and_slides_in_substeps(device):
     """Cloth on a ramp slides as a rigid body would, without friction and with it."""
     angle, time = np.radians(20.0), 0.25

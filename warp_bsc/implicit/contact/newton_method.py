@@ -39,8 +39,9 @@ _PARTS = 4
 _MANY_VERTICES = 1 / 4
 """Vertices by thread of a team from which on they have several pairs each: blocks have twice as many threads then, and
 these share less."""
-_CONTACTS = 16
-"""Contacts that fit at first, for each particle: where layers of cloth touch all over, they have 9."""
+_CONTACTS = 24
+"""Contacts that fit at first, for each particle: where two layers of cloth touch all over, they have 9, in a fold up to
+15."""
 _MORE_OF_BODIES = 4
 """How many times as many those of a body are, for each of its two unknowns."""
 _REACH_OF_EDGE = 0.1
