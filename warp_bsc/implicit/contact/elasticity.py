@@ -220,7 +220,7 @@ def cross_matrix(a: wp.vec3d) -> wp.mat33d:
 
 
 @wp.func
-def _store(blocks: wp.array[wp.mat33d], k: int, block: wp.mat33d):
+def _store(blocks: wp.array[wp.mat33d], k: int, block: wp.mat33d):  # pyright: ignore[reportRedeclaration] (overload)
     """Writes a block."""
     blocks[k] = block
 
