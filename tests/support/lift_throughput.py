@@ -40,7 +40,6 @@ DT, SUBSTEPS, DECIMATION = 1.0 / 120.0, 2, 4
 CLOSING, LIFTING, END = 0.4, 0.7, 1.6  # s, when fingers close, when they lift, and when an episode ends
 LIFTED = TOP + 0.06  # m: a cloth whose particles are higher than that in the mean is lifted
 CHANCE = 1.0 / 150.0  # that a world starts anew in a step of the environment
-PHYSX = "18,622 steps of 1,024 environments a second were reported for PhysX (Newton's issue 4141)"
 
 
 @wp.struct
@@ -305,7 +304,6 @@ def main():
                 print(f"{row}{ended:>10}{lifted:>8}", flush=True)
                 rows.append({"solver": name, "worlds": worlds, "env_steps_per_second": rate, "crossings": crossings})
                 rows[-1] |= {"uncertified_steps": uncertified, "episodes": ended, "lifted": lifted}
-        print(PHYSX)
         if options.json:
             found = {"benchmark": "lift_throughput", "steps": options.steps, "rows": rows}
             write_measurement(options.json, found, sys.argv, [wp.get_device()])

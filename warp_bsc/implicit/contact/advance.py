@@ -19,43 +19,43 @@ wp.set_module_options({"enable_backward": False})
 _PREDICTIONS = wp.constant(2)
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
 
-_FUNCTIONS = [
-    phases.begin,
-    phases.differentiate,
-    phases.find_loads,
-    phases.begin_list,
-    phases.list_near,
-    phases.find_near,
-    phases.count_contacts,
-    phases.place_contacts,
-    phases.list_contacts,
-    phases.sort_contacts,
-    phases.add_blocks,
-    phases.assemble,
-    phases.displace,
-    phases.list_ways,
-    phases.bound,
-    phases.hold,
-    phases.release_held,
-    phases.hold_pairs,
-    phases.take_bound,
-    phases.move,
-    phases.find_energy,
-    phases.begin_release,
-    phases.begin_cuts,
-    phases.cut,
-    phases.take_cut,
-    phases.choose_cuts,
-    phases.undo_cuts,
-    phases.take,
-    phases.decide,
-    phases.publish,
-]
-"""The functions of phases, in the order of :class:`.flow.Phase`."""
-_ALSO = {Phase.LIST_AND_FIND_NEAR: Phase.FIND_NEAR, Phase.LIST_AND_BOUND: Phase.BOUND}
-"""Phases that have the function of the one before them."""
-_FIRST = [int(phase) for phase in Phase if phase < Phase.SOLVE and phase not in _ALSO]
-_LAST = [next((int(also) for also, of in _ALSO.items() if of == first), first) for first in _FIRST]
+_FUNCTIONS = {
+    Phase.BEGIN: phases.begin,
+    Phase.DIFFERENTIATE: phases.differentiate,
+    Phase.LOADS: phases.find_loads,
+    Phase.BEGIN_LIST: phases.begin_list,
+    Phase.LIST_NEAR: phases.list_near,
+    Phase.FIND_NEAR: phases.find_near,
+    Phase.COUNT: phases.count_contacts,
+    Phase.PLACE: phases.place_contacts,
+    Phase.LIST_CONTACTS: phases.list_contacts,
+    Phase.SORT: phases.sort_contacts,
+    Phase.BLOCKS: phases.add_blocks,
+    Phase.ASSEMBLE: phases.assemble,
+    Phase.DISPLACE: phases.displace,
+    Phase.LIST_WAYS: phases.list_ways,
+    Phase.BOUND: phases.bound,
+    Phase.HOLD: phases.hold,
+    Phase.RELEASE_HELD: phases.release_held,
+    Phase.HOLD_PAIRS: phases.hold_pairs,
+    Phase.TAKE_BOUND: phases.take_bound,
+    Phase.MOVE: phases.move,
+    Phase.ENERGY: phases.find_energy,
+    Phase.BEGIN_RELEASE: phases.begin_release,
+    Phase.BEGIN_CUTS: phases.begin_cuts,
+    Phase.CUT: phases.cut,
+    Phase.TAKE_CUT: phases.take_cut,
+    Phase.CHOOSE_CUTS: phases.choose_cuts,
+    Phase.UNDO_CUTS: phases.undo_cuts,
+    Phase.TAKE: phases.take,
+    Phase.DECIDE: phases.decide,
+    Phase.PUBLISH: phases.publish,
+}
+_ALSO = {Phase.FIND_NEAR: Phase.LIST_AND_FIND_NEAR, Phase.BOUND: Phase.LIST_AND_BOUND}
+"""Phases that have the function of the one before them, whose code the kernel then has once."""
+_OF_PHASES = list(_FUNCTIONS.values())
+_FIRST = [int(phase) for phase in _FUNCTIONS]
+_LAST = [int(_ALSO.get(phase, phase)) for phase in _FUNCTIONS]
 
 
 @wp.func
@@ -181,9 +181,9 @@ def _advance(
                 at.then = state[1]
                 at.passes = state[2]
                 at.solves = state[3]
-                for k in range(wp.static(len(_FUNCTIONS))):
+                for k in range(wp.static(len(_OF_PHASES))):
                     if at.phase >= wp.static(_FIRST[k]) and at.phase <= wp.static(_LAST[k]):
-                        state = wp.static(_FUNCTIONS[k])(at, p, motion, planes, settings)
+                        state = wp.static(_OF_PHASES[k])(at, p, motion, planes, settings)
                 wait_for_team(p.flow.arrived, w, together)
                 state = _next(at.phase, state, w, p)
             if at.thread == 0:

@@ -21,7 +21,7 @@ from .pairs import (
     stays_far,
 )
 from .system import Progress, kind_of_key, lower_to
-from .wide import integers_at
+from .vector_access import integers_at
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .system import Contacts, Unknowns, first_unknown
-from .wide import integers_at, numbers_at
+from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 

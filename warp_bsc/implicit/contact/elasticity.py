@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ...response.state.vectors import HALF, ONE, ZERO, to_single
-from .wide import mat34, store_block
+from .vector_access import mat34, store_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -733,7 +733,8 @@ def find_derivatives(
         _store_tetrahedron_hessian(elements, e, x, x0, dt, is_convex, out.block)
     elif kind == ElementKind.SPRING and has:
         energy = _spring_energy(elements, e, x, x0, dt)
-        gradient = element_gradient(elements, kind, e, x, x0, dt)
+        along, _length, tension, _stiffness = _tension(elements, e, x, x0, dt)
+        gradient = wp.matrix_from_rows(tension * along, -tension * along, wp.vec3d(), wp.vec3d())
         _store_spring_hessian(elements, e, x, x0, dt, is_convex, out.block)
     else:
         for k in range(element_size(kind) * element_size(kind)):

@@ -20,7 +20,7 @@ from .system import (
     take_contact,
     unknowns_of,
 )
-from .wide import integers_at, numbers_at
+from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 

@@ -18,7 +18,7 @@ from .pairs import (
     stiffness_of_pair,
 )
 from .system import Contacts, Progress, kind_of_key
-from .wide import integers_at, numbers_at
+from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 

@@ -35,7 +35,7 @@ from .system import (
     to_single_block,
     unknowns_of,
 )
-from .wide import integers_at
+from .vector_access import integers_at
 
 wp.set_module_options({"enable_backward": False})
 

@@ -37,8 +37,8 @@ _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 _PARTS = 4
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
 _MANY_VERTICES = 1 / 4
-"""Vertices by thread of a team from which on they have several pairs each: blocks have twice as many threads then, and
-these share less."""
+"""Vertices by thread, of blocks of 256, from which on they have several pairs each: blocks have twice as many threads
+then, and these share less."""
 _CONTACTS = 24
 """Contacts that fit at first, for each particle: where two layers of cloth touch all over, they have 9, in a fold up to
 15."""

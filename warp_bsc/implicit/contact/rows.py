@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from .elasticity import SIZES, Derivatives, ElementKind
-from .wide import stored_block
+from .vector_access import stored_block
 
 wp.set_module_options({"enable_backward": False})
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO, to_single
-from .wide import integers_at, numbers_at
+from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 
