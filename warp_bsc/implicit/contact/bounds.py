@@ -15,6 +15,7 @@ from .pairs import (
     Candidates,
     Trial,
     add_to_list,
+    distance_bound,
     gap_at_plane,
     moved,
     plane_at,
@@ -72,20 +73,30 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     candidates.share[i] = FAR
     if stays:
         return False
-    kind = kind_of_key(candidates.key[i])
-    a, b, c, d = corners_of(trial.x, corners)
+    now, kind = wp.float64(candidates.now[i]), kind_of_key(candidates.key[i])
     p, q, r, s = corners_of(trial.displaced, corners)
-    if before >= FAR:
-        candidates.now[i] = float(barrier.distance_of_boxes(kind, a, b, c, d) * ROUNDED_DOWN)
-    now = wp.float64(candidates.now[i])
-    bend = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
-    within = candidates.kept[i] + wp.float64(candidates.reach[i]) + wp.float64(bend)
-    if now >= within:
-        if not is_shorter and now >= within + _relative_way(p, q, r, s):
-            candidates.share[i] = FAR_TOGETHER
-            return False
-        if barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within:
-            return False
+    bends = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
+    bend, way = wp.float64(bends), _relative_way(p, q, r, s)
+    within = candidates.kept[i] + wp.float64(candidates.reach[i]) + bend
+    left = now - way
+    if is_shorter or before != FAR_TOGETHER or left < within:  # positions are read where displacements do not tell
+        a, b, c, d = corners_of(trial.x, corners)
+        if before >= FAR:
+            now = distance_bound(candidates, i, kind, a, b, c, d)
+        left = ZERO
+        if now >= within and not is_shorter:
+            # what moves together is as far from each other along a vector as at the start or the end, or farther
+            n = candidates.normal[i] + wp.vec3()
+            at_start = barrier.distance_along(kind, n, a, b, c, d)
+            at_end = barrier.distance_along(kind, n, a + p, b + q, c + r, d + s)
+            left = wp.max(now - way, ROUNDED_DOWN * wp.min(at_start, at_end))
+    if left >= within:
+        candidates.share[i] = FAR_TOGETHER
+        candidates.now[i] = float(ROUNDED_DOWN * (left - bend))
+        return False
+    if now >= within and barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within:
+        return False
+    candidates.now[i] = float(now)
     candidates.share[i] = 1.0
     add_to_list(candidates, world, i, True)
     return True

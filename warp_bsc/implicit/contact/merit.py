@@ -12,6 +12,7 @@ from .pairs import (
     BarrierSettings,
     Candidates,
     Trial,
+    distance_bound,
     gap_at_plane,
     plane_at,
     stiffness_at_plane,
@@ -78,7 +79,7 @@ def add_pair_energy(
     corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     kind = kind_of_key(candidates.key[i])
     a, b, c, d = corners_of(trial.moved, corners)
-    if barrier.distance_of_boxes(kind, a, b, c, d) >= candidates.level[i] + reach:
+    if distance_bound(candidates, i, kind, a, b, c, d) >= candidates.level[i] + reach:
         return
     _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     gap = distance - candidates.level[i]

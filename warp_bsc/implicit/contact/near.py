@@ -18,6 +18,7 @@ from .pairs import (
     Candidates,
     Trial,
     add_to_list,
+    distance_bound,
     gap_at_plane,
     plane_at,
     stiffness_at_plane,
@@ -121,8 +122,8 @@ def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
     if candidates.share[i] >= FAR:
         return False
     a, b, c, d = corners_of(trial.exact, integers_at(candidates.corners, i))
-    apart = barrier.distance_of_boxes(kind_of_key(candidates.key[i]), a, b, c, d)
-    candidates.now[i] = float(apart * ROUNDED_DOWN)
+    apart = distance_bound(candidates, i, kind_of_key(candidates.key[i]), a, b, c, d)
+    candidates.now[i] = float(apart)
     is_near = apart < candidates.level[i] + wp.float64(candidates.reach[i])
     if is_near:
         add_to_list(candidates, world, i, False)
@@ -146,19 +147,20 @@ def find_near(
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)
     a, b, c, d = corners_of(trial.exact, corners)
-    apart = barrier.distance_of_boxes(kind, a, b, c, d)
-    candidates.now[i] = float(apart * ROUNDED_DOWN)
+    apart = distance_bound(candidates, i, kind, a, b, c, d)
+    candidates.now[i] = float(apart)
     if apart >= candidates.level[i] + reach:
         return
     weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     candidates.now[i] = float(distance * ROUNDED_DOWN)
     gap = distance - candidates.level[i]
-    if gap >= reach:
-        return
     if not gap > ZERO:
         add_energy(progress.energy, world, MEETS, settings.units)
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
+    candidates.normal[i] = to_single(normal)
+    if gap >= reach:
+        return
     stiffness = stiffness_of_pair(motion, settings, trial, progress, world, corners, kind == EDGE_EDGE, reach)
     add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
     friction = pair_friction(motion, corners)

@@ -64,7 +64,8 @@ class Candidates:
         reach: Gap beyond the level from which its barrier pushes [m].
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
-        now: Distance where the Newton step begins, or less, of what was not far in the one before [m].
+        now: Distance where the Newton step begins, or less, of what was not :data:`FAR` in the one before [m].
+        normal: Unit vector from the second closest point to the first where they were found last, 0 before.
     """
 
     start: wp.array[int]
@@ -83,6 +84,7 @@ class Candidates:
     floor: wp.array[float]
     share: wp.array[float]
     now: wp.array[float]
+    normal: wp.array[wp.vec3]
 
 
 @wp.struct
@@ -243,6 +245,16 @@ def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, 
 
 
 @wp.func
+def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Returns a lower bound of the distance of a pair: that of boxes, or along where closest points were found last.
+
+    The second is as good as the distance until the elements turn, and much faster to find.
+    """
+    along = barrier.distance_along(kind, candidates.normal[i], a, b, c, d)
+    return ROUNDED_DOWN * wp.max(along, barrier.distance_of_boxes(kind, a, b, c, d))
+
+
+@wp.func
 def add_to_list(candidates: Candidates, world: int, i: int, is_new: bool):
     """Lists a pair of a world."""
     candidates.list[candidates.start[world] + take_slot_of(candidates.listed, world)] = 2 * i + int(is_new)
@@ -322,6 +334,7 @@ def _prepare(
     candidates.reach[slot] = float(reach)
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
     candidates.share[slot] = wp.where(stays_far(apart, progress, world), FAR, 1.0)
+    candidates.normal[slot] = wp.vec3()
 
 
 @wp.kernel
