@@ -26,27 +26,26 @@ CLOTH = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-3, "edge_kd
 
 def build(worlds):
     """Returns a model of worlds in which cloths start at random places above spheres."""
-    builder, random = newton.ModelBuilder(), np.random.default_rng(0)
-    for _ in range(worlds):
-        world = newton.ModelBuilder()
-        world.add_ground_plane()
-        at = wp.transform(wp.vec3(0.0, 0.0, RADIUS), wp.quat_identity())
-        world.add_shape_sphere(-1, radius=RADIUS, xform=at)
-        cell = SIDE / CELLS
-        corner = random.uniform(-0.05, 0.05, 2) - 0.5 * SIDE
-        world.add_cloth_grid(
-            pos=wp.vec3(*corner, 2.05 * RADIUS),
-            rot=wp.quat_identity(),
-            vel=wp.vec3(),
-            dim_x=CELLS,
-            dim_y=CELLS,
-            cell_x=cell,
-            cell_y=cell,
-            mass=0.001,
-            **CLOTH,
-        )
-        builder.add_world(world)
-    builder.color()
+    world, cell = newton.ModelBuilder(), SIDE / CELLS
+    world.add_ground_plane()
+    world.add_shape_sphere(-1, radius=RADIUS, xform=wp.transform(wp.vec3(0.0, 0.0, RADIUS), wp.quat_identity()))
+    world.add_cloth_grid(
+        pos=wp.vec3(-0.5 * SIDE, -0.5 * SIDE, 2.05 * RADIUS),
+        rot=wp.quat_identity(),
+        vel=wp.vec3(),
+        dim_x=CELLS,
+        dim_y=CELLS,
+        cell_x=cell,
+        cell_y=cell,
+        mass=0.001,
+        **CLOTH,
+    )
+    world.color()  # of one world: that of all takes minutes
+    builder = newton.ModelBuilder()
+    builder.replicate(world, worlds)
+    positions = np.reshape(builder.particle_q, (worlds, -1, 3))
+    positions[:, :, :2] += np.random.default_rng(0).uniform(-0.05, 0.05, (worlds, 1, 2))
+    builder.particle_q = [wp.vec3(x) for x in positions.reshape(-1, 3)]
     return builder.finalize()
 
 

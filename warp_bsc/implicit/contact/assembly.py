@@ -66,35 +66,30 @@ def add_blocks(
     dt: wp.float64,
     rows: Rows,
     parts: int,
-    turns: int,
     matrix: Matrix,
 ):
     """Adds up blocks of elements, of contacts that do not couple, and of inertia, of a world.
 
-    So many threads add up one block together, as here and there an unknown has very many contacts: as many blocks as
-    they take ``turns``, of which each ends one.
+    So many threads add up one block together. Where each has one of its own, those of a row read the same contacts side
+    by side.
     """
-    first, part = rows.first[unknowns.of_worlds[world]] + i // parts * turns, i % parts
-    own, block = int(-1), wp.mat33()
-    for k in range(first, wp.min(first + turns, rows.first[unknowns.of_worlds[world + 1]])):
-        u, v = row_of_block[k], rows.column[k]
-        total = contact_block(contacts, u, v, part, parts) + sum_of_blocks(rows, derivatives, k, part, parts)
-        total = block_sum_of_parts(total, parts)
-        if k - first == part:
-            own, block = k, total
-    if own >= 0:
-        row = row_of_block[own]
-        if row == rows.column[own] and unknowns.is_free[row] != 0:
+    k, part = rows.first[unknowns.of_worlds[world]] + i // parts, i % parts
+    row, column = row_of_block[k] + int(0), rows.column[k] + int(0)
+    of_contacts = contact_block(contacts, contacts.first[row], contacts.middle[row], column, part, parts)
+    block = of_contacts + sum_of_blocks(
+        rows, derivatives, rows.first_source[k], rows.first_source[k + 1], part, parts
+    )
+    if part == 0:
+        if row == column and unknowns.is_free[row] != 0:
             _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, row)
             block += inertia
-        set_block(matrix, own, block)
+        set_block(matrix, k, block)
 
 
 @wp.func
 def assemble(
     i: int,
     world: int,
-    derivatives: Derivatives,
     contacts: Contacts,
     unknowns: Unknowns,
     trial: Trial,
@@ -112,13 +107,14 @@ def assemble(
     """Computes the gradient of the energy by unknowns of a world, and what preconditions.
 
     The first solve of a Newton step ``begins``: displacements are then 0, those of particles that a program moves their
-    ways. Later ones go on from where they are. Threads share unknowns as blocks in :func:`add_blocks`.
+    ways. Later ones go on from where they are. So many threads share unknowns, as here and there one has very many
+    contacts: as many unknowns as they take ``turns``, of which each ends one.
     """
     first, part = unknowns.of_worlds[world] + i // parts * turns, i % parts
     own, gradient, block = int(-1), wp.vec3(), wp.mat33()
     for u in range(first, wp.min(first + turns, unknowns.of_worlds[world + 1])):
         of_contacts, of_coupled = contact_gradient(contacts, unknowns, u, part, parts)
-        force = sum_of_parts(of_contacts + sum_of_corners(rows, derivatives, u, part, parts), parts)
+        force = sum_of_parts(of_contacts, parts) + vectors.elastic[u]
         of_coupled = block_sum_of_parts(of_coupled, parts)
         if u - first == part:
             own, gradient, block = u, force, of_coupled
@@ -148,8 +144,9 @@ def find_loads(
     unknowns: Unknowns,
     progress: Progress,
     load: wp.array[float],
+    elastic: wp.array[wp.vec3],
 ):
-    """Writes the forces of elements on vertices that are solved for.
+    """Writes the gradient of the energy of elements, and the forces on vertices that are solved for.
 
     That of an earlier Newton step of the step is kept where it is about right: barriers that change converge slowly.
     """
@@ -159,6 +156,8 @@ def find_loads(
     if unknowns.is_free[u] == 0:
         load[p] = 0.0
         return
-    force = wp.length(sum_of_corners(rows, derivatives, u, 0, 1))
+    gradient = sum_of_corners(rows, derivatives, rows.first_corner[u], rows.first_corner[u + 1], 0, 1)
+    elastic[u] = gradient
+    force = wp.length(gradient)
     if progress.steps[world] == 0 or force > 2.0 * load[p] or force < 0.25 * load[p]:
         load[p] = force

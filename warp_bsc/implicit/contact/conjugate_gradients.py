@@ -75,6 +75,7 @@ class Vectors:
     """Vectors of a solve, each of one vec3 by unknown.
 
     Attributes:
+        elastic: Gradient of the energy of elements [N].
         gradient: Of the energy [N].
         inverse: Inverted blocks of the diagonal, which precondition, shape [unknown_count].
         solution: The displacements [m]; those that are given, before.
@@ -83,6 +84,7 @@ class Vectors:
         direction, along: In which the solution changes, and the product with it.
     """
 
+    elastic: wp.array[wp.vec3]
     gradient: wp.array[wp.vec3]
     inverse: wp.array[wp.mat33]
     solution: wp.array[wp.vec3]

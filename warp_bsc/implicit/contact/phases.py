@@ -105,7 +105,7 @@ def find_loads(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
         p.contacts.count[w] = 0
         contact_lists.clear_lists(w, p.contacts)
     for u in range(first + t, end, n):
-        assembly.find_loads(u, w, p.derivatives, p.rows, p.unknowns, p.progress, settings.load)
+        assembly.find_loads(u, w, p.derivatives, p.rows, p.unknowns, p.progress, settings.load, p.vectors.elastic)
         steps.add_inertia(u, w, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, energy)
     for u in range(first + n - 1 - t, end, n):
         p.contacts.end[u] = 0
@@ -216,8 +216,8 @@ def add_blocks(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
     """Adds up the blocks of the Hessian."""
     w = at.world
     count = p.rows.first[p.unknowns.of_worlds[w + 1]] - p.rows.first[p.unknowns.of_worlds[w]]
-    turns = wp.where(p.parts * count <= at.threads, 1, p.turns)
-    for i in range(at.thread, p.parts * ((count + turns - 1) // turns), at.threads):
+    parts = wp.where(p.parts * count <= at.threads, p.parts, 1)
+    for i in range(at.thread, parts * count, at.threads):
         assembly.add_blocks(
             i,
             w,
@@ -231,8 +231,7 @@ def add_blocks(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
             p.bodies,
             settings.dt,
             p.rows,
-            p.parts,
-            turns,
+            parts,
             p.matrix,
         )
     return _to(at, Phase.ASSEMBLE)
@@ -248,7 +247,6 @@ def assemble(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settin
         assembly.assemble(
             i,
             w,
-            p.derivatives,
             p.contacts,
             p.unknowns,
             p.trial,

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from .elasticity import SIZES, Derivatives, ElementKind
-from .vector_access import stored_block
+from .sums import sum_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,25 +86,48 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
     return rows
 
 
-@wp.func
-def sum_of_blocks(rows: Rows, derivatives: Derivatives, k: int, part: int, parts: int) -> wp.mat33:
-    """Returns a block of the Hessian of all elements, or one of some parts of it [N/m]."""
-    total = wp.mat33()
-    for n in range(rows.first_source[k] + part, rows.first_source[k + 1], parts):
-        source = rows.source[n] + int(0)
-        if source >= 0:
-            total += stored_block(derivatives.block, source)
-        else:
-            e = (-1 - source) >> 4
-            i, j = ((-1 - source) >> 2) & 3, (-1 - source) & 3
-            total += derivatives.curvature[e] * wp.outer(derivatives.turn[4 * e + i], derivatives.turn[4 * e + j])
-    return total
+@wp.func_native(
+    snippet=sum_of(
+        "wp::mat_t<3, 3, float>",
+        9,
+        term="wp::mat_t<3, 3, float> block;",
+        read="""
+            const int source = rows.source.data[n];
+            if (source >= 0) {
+#if defined(__CUDA_ARCH__)
+                for (int row = 0; row < 3; ++row) {
+                    const float4 of_row = ((const float4*)(derivatives.block.data + source))[row];
+                    t.block.data[row][0] = of_row.x, t.block.data[row][1] = of_row.y, t.block.data[row][2] = of_row.z;
+                }
+#else
+                for (int c = 0; c < 9; ++c)
+                    t.block.data[c / 3][c % 3] = derivatives.block.data[source].data[c / 3][c % 3];
+#endif
+            } else {
+                const int corner = (-1 - source) >> 2, first_of_edge = corner & ~3;
+                const wp::vec3 a = derivatives.turn.data[corner];
+                const wp::vec3 b = derivatives.turn.data[first_of_edge + ((-1 - source) & 3)];
+                const float curvature = derivatives.curvature.data[corner >> 2];
+                for (int c = 0; c < 9; ++c) t.block.data[c / 3][c % 3] = curvature * (a[c / 3] * b[c % 3]);
+            }
+        """,
+        add="for (int c = 0; c < 9; ++c) sum[c] += t.block.data[c / 3][c % 3];",
+    )
+)
+def sum_of_blocks(rows: Rows, derivatives: Derivatives, first: int, end: int, part: int, parts: int) -> wp.mat33:
+    """Returns a block of the Hessian of elements [N/m], given its first source and the end."""
+    ...
 
 
-@wp.func
-def sum_of_corners(rows: Rows, derivatives: Derivatives, u: int, part: int, parts: int) -> wp.vec3:
-    """Returns the gradient of the energy of all elements by an unknown, or one of some parts of it [N]."""
-    total = wp.vec3()
-    for n in range(rows.first_corner[u] + part, rows.first_corner[u + 1], parts):
-        total += derivatives.gradient[rows.corner[n]]
-    return total
+@wp.func_native(
+    snippet=sum_of(
+        "wp::vec_t<3, float>",
+        3,
+        term="wp::vec3 force;",
+        read="t.force = derivatives.gradient.data[rows.corner.data[n]];",
+        add="for (int c = 0; c < 3; ++c) sum[c] += t.force[c];",
+    )
+)
+def sum_of_corners(rows: Rows, derivatives: Derivatives, first: int, end: int, part: int, parts: int) -> wp.vec3:
+    """Returns the gradient of the energy of elements by an unknown [N], given its first corner and the end."""
+    ...

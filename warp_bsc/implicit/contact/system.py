@@ -4,6 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO, to_single
+from .sums import sum_of
 from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
@@ -311,23 +312,35 @@ def take_contact(contacts: Contacts, world: int) -> int:
     return wp.where(slot < contacts.start[world + 1], slot, -1)
 
 
-@wp.func
-def contact_block(contacts: Contacts, u: int, v: int, part: int, parts: int) -> wp.mat33:
-    """Returns the block of two unknowns of the Hessian of contacts that do not couple, or one of some parts of it."""
-    block = wp.mat33()
-    for n in range(contacts.first[u] + part, contacts.middle[u], parts):
-        entry = contacts.entries[n]
-        i = entry >> 2
-        of_corners = integers_at(contacts.unknowns, i)
-        if of_corners[0] != v and of_corners[1] != v and of_corners[2] != v and of_corners[3] != v:
-            continue
-        weights, weight = numbers_at(contacts.weights, i), float(0.0)
-        for j in range(4):
-            if of_corners[j] == v:
-                weight += weights[j]
-        if weight != 0.0:
-            block += weights[entry & 3] * weight * contacts.hessian[i]
-    return block
+@wp.func_native(
+    snippet=sum_of(
+        "wp::mat_t<3, 3, float>",
+        9,
+        term="int place; wp::vec4i of; wp::vec4 weights; wp::mat33 hessian;",
+        read="""
+            const int entry = contacts.entries.data[n], i = entry >> 2;
+            t.place = entry & 3;
+#if defined(__CUDA_ARCH__)
+            const int4 of = *(const int4*)(contacts.unknowns.data + i);
+            const float4 w = *(const float4*)(contacts.weights.data + i);
+            t.of = wp::vec4i(of.x, of.y, of.z, of.w), t.weights = wp::vec4(w.x, w.y, w.z, w.w);
+#else
+            t.of = contacts.unknowns.data[i], t.weights = contacts.weights.data[i];
+#endif
+            t.hessian = contacts.hessian.data[i];
+        """,
+        add="""
+            float weight = 0.0f;
+            for (int j = 0; j < 4; ++j) weight += t.of[j] == v ? t.weights[j] : 0.0f;
+            if (weight == 0.0f) return;
+            weight *= t.weights[t.place];
+            for (int c = 0; c < 9; ++c) sum[c] += weight * t.hessian.data[c / 3][c % 3];
+        """,
+    )
+)
+def contact_block(contacts: Contacts, first: int, end: int, v: int, part: int, parts: int) -> wp.mat33:
+    """Returns the block of an unknown and another one of the Hessian of contacts, given its first entry and the end."""
+    ...
 
 
 @wp.func
