@@ -76,9 +76,7 @@ def add_blocks(
     k, part = rows.first[unknowns.of_worlds[world]] + i // parts, i % parts
     row, column = row_of_block[k] + int(0), rows.column[k] + int(0)
     of_contacts = contact_block(contacts, contacts.first[row], contacts.middle[row], column, part, parts)
-    block = of_contacts + sum_of_blocks(
-        rows, derivatives, rows.first_source[k], rows.first_source[k + 1], part, parts
-    )
+    block = of_contacts + sum_of_blocks(rows, derivatives, rows.first_source[k], rows.first_source[k + 1], part, parts)
     if part == 0:
         if row == column and unknowns.is_free[row] != 0:
             _pull, inertia = _inertia(unknowns, trial, goal, motion, bodies, dt, row)

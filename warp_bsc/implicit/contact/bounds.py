@@ -27,6 +27,10 @@ from .vector_access import integers_at
 wp.set_module_options({"enable_backward": False})
 
 
+_WAYS = wp.constant(wp.float64(6.0))
+"""How many displacements bring two elements nearer in :func:`_relative_way`, and more than arcs do beside them."""
+
+
 @wp.func
 def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
     """Returns how far shares of displacements may be off, as :func:`.barrier.safe_share` takes it."""
@@ -57,10 +61,17 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
     """
     # read side by side: most of the time is waiting for memory
-    before = candidates.share[i] + float(0.0)
+    before, now = candidates.share[i] + float(0.0), wp.float64(candidates.now[i])
+    kept, reach = candidates.kept[i] + ZERO, wp.float64(candidates.reach[i])
     stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
     if before == FAR and (is_shorter or stays):
         return False
+    if before == FAR_TOGETHER and not is_shorter:
+        # no displacements that long bring it within its reach, whichever of its vertices have them
+        left = now - _WAYS * wp.float64(progress.longest[world])
+        if left >= kept + reach:
+            candidates.now[i] = float(ROUNDED_DOWN * left)
+            return False
     corners = integers_at(candidates.corners, i)
     if is_shorter and (before == 1.0 or before == FAR_TOGETHER):
         cuts = int(0)
@@ -73,11 +84,11 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     candidates.share[i] = FAR
     if stays:
         return False
-    now, kind = wp.float64(candidates.now[i]), kind_of_key(candidates.key[i])
+    kind = kind_of_key(candidates.key[i])
     p, q, r, s = corners_of(trial.displaced, corners)
     bends = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
     bend, way = wp.float64(bends), _relative_way(p, q, r, s)
-    within = candidates.kept[i] + wp.float64(candidates.reach[i]) + bend
+    within = kept + reach + bend
     left = now - way
     if is_shorter or before != FAR_TOGETHER or left < within:  # positions are read where displacements do not tell
         a, b, c, d = corners_of(trial.x, corners)

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ...kernels.polynomials import EDGE_EDGE
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
@@ -69,7 +68,6 @@ def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units:
 def add_pair_energy(
     i: int,
     world: int,
-    motion: Motion,
     candidates: Candidates,
     settings: BarrierSettings,
     trial: Trial,
@@ -86,7 +84,7 @@ def add_pair_energy(
     if gap < reach:
         value = MEETS
         if gap > ZERO:
-            stiffness = stiffness_of_pair(motion, settings, trial, progress, world, corners, kind == EDGE_EDGE, reach)
+            stiffness = stiffness_of_pair(candidates.stiffness[i], settings, trial, corners, reach)
             value = stiffness * barrier.barrier_energy(gap, reach)
         add_energy(progress.trial, world, value, settings.units)
 

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from ...kernels.polynomials import EDGE_EDGE
 from ...response.contacts.constraints import friction_on_plane, pair_friction
 from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
@@ -161,7 +160,7 @@ def find_near(
     candidates.normal[i] = to_single(normal)
     if gap >= reach:
         return
-    stiffness = stiffness_of_pair(motion, settings, trial, progress, world, corners, kind == EDGE_EDGE, reach)
+    stiffness = stiffness_of_pair(candidates.stiffness[i], settings, trial, corners, reach)
     add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
     friction = pair_friction(motion, corners)
     _add_contact(

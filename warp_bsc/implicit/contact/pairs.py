@@ -4,7 +4,7 @@ import warp as wp
 
 from ...detection.approach_phase import KEPT, distances_of_pair
 from ...kernels.pipeline.queues import take_slot_of
-from ...kernels.polynomials import VERTEX_FACE
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane
 from ...response.contacts.queue import PairQueue, has_pair, pair_count, vertices_of
 from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_mass_of, owner_of
@@ -62,6 +62,7 @@ class Candidates:
         kept: Distance that each pair keeps in any case [m].
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m].
+        stiffness: Of its barrier, by what that pushes apart; negative of edges of faces [N/m].
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
         now: Distance where the Newton step begins, or less, of what was not :data:`FAR` in the one before [m].
@@ -81,6 +82,7 @@ class Candidates:
     kept: wp.array[wp.float64]
     level: wp.array[wp.float64]
     reach: wp.array[float]
+    stiffness: wp.array[wp.float64]
     floor: wp.array[float]
     share: wp.array[float]
     now: wp.array[float]
@@ -175,23 +177,16 @@ def _layers(progress: Progress, world: int, reach: wp.float64) -> wp.float64:
 
 
 @wp.func
-def stiffness_of_pair(
+def _stiffness_by_mass(
     motion: Motion,
     settings: BarrierSettings,
-    trial: Trial,
     progress: Progress,
     world: int,
     corners: wp.vec4i,
     is_edges: bool,
     reach: wp.float64,
 ) -> wp.float64:
-    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
-
-    It is more where elements, or many layers, push harder than that carries at the gap below which a pair hardly comes
-    nearer: what is taut, or under a pile, would otherwise be stuck there. It is less of edges of faces that are nearly
-    parallel where the Newton step begins, whose closest points jump from end to end: their ends are near these faces,
-    which push as well.
-    """
+    """Returns the stiffness of a barrier as :class:`Candidates` has it."""
     layers = _layers(progress, world, reach)
     first = _compliance(motion, settings, layers, corners[0])
     second = _compliance(motion, settings, layers, corners[2]) + _compliance(motion, settings, layers, corners[3])
@@ -200,13 +195,30 @@ def stiffness_of_pair(
         second = HALF * second
     else:
         second = (second + _compliance(motion, settings, layers, corners[1])) / wp.float64(3.0)
-    load, of_faces = float(0.0), int(1)
+    of_faces = int(1)
+    for j in range(4):
+        of_faces = of_faces & settings.is_of_face[corners[j]]
+    stiffness = ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF))
+    return wp.where(is_edges and of_faces != 0, -stiffness, stiffness)
+
+
+@wp.func
+def stiffness_of_pair(
+    by_mass: wp.float64, settings: BarrierSettings, trial: Trial, corners: wp.vec4i, reach: wp.float64
+) -> wp.float64:
+    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
+
+    It is more where elements, or many layers, push harder than that carries at the gap below which a pair hardly comes
+    nearer: what is taut, or under a pile, would otherwise be stuck there. It is less of edges of faces that are nearly
+    parallel where the Newton step begins, whose closest points jump from end to end: their ends are near these faces,
+    which push as well.
+    """
+    load = float(0.0)
     for j in range(4):
         load = wp.max(load, settings.load[corners[j]])
-        of_faces = of_faces & settings.is_of_face[corners[j]]
     needed = wp.float64(load) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
-    stiffness = wp.max(ONE / ((first + second) * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
-    if is_edges and of_faces != 0:
+    stiffness = wp.max(wp.abs(by_mass), needed)
+    if by_mass < ZERO:
         a, b, c, d = corners_of(trial.x, corners)
         u, v = b - a, d - c
         scaled = wp.length_sq(wp.cross(u, v)) / (_PARALLEL * wp.length_sq(u) * wp.length_sq(v))
@@ -332,6 +344,9 @@ def _prepare(
     candidates.kept[slot] = kept
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
+    candidates.stiffness[slot] = _stiffness_by_mass(
+        motion, settings, progress, world, corners, queue.kind == EDGE_EDGE, wp.float64(float(reach))
+    )
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
     candidates.share[slot] = wp.where(stays_far(apart, progress, world), FAR, 1.0)
     candidates.normal[slot] = wp.vec3()

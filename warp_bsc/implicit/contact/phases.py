@@ -261,8 +261,10 @@ def assemble(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settin
             turns,
             p.vectors,
         )
-    if at.thread == 0 and at.solves == 0:
-        p.leaves[w] = 0
+    if at.thread == 0:
+        p.progress.longest[w] = p.progress.remaining[w]
+        if at.solves == 0:
+            p.leaves[w] = 0
     return _to_pairs(at, Phase.SOLVE, Phase.BOUNDED)
 
 
@@ -427,7 +429,7 @@ def find_energy(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
         merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, energy)
     for k in range(t, _pair_count(p.candidates, at.world, False), n):
         i = p.candidates.list[p.candidates.start[w] + k] >> 1
-        merit.add_pair_energy(i, w, motion, p.candidates, settings, p.trial, p.progress)
+        merit.add_pair_energy(i, w, p.candidates, settings, p.trial, p.progress)
     for k in range(p.worlds.first_vertex[w] + t, _end_at_planes(p.worlds, p.vertices_at_planes, w), n):
         v = p.worlds.vertices[k] + int(0)
         if v < p.vertices_at_planes:

@@ -74,6 +74,7 @@ class Progress:
         before: The same in the one before it, as far as it was taken, -1 if it was not [m].
         way: How far a vertex has been, or is led by the displacements, from where it was at the start of the step [m].
         way_before: The same in the step before.
+        longest: Longest displacement of a vertex in the Newton step, or more [m].
         given_way: The same of what a program moves.
         remaining: Largest way of what a program moves that is left [m].
         held: 1 if pairs are held in the solve.
@@ -97,6 +98,7 @@ class Progress:
     before: wp.array[float]
     way: wp.array[float]
     way_before: wp.array[float]
+    longest: wp.array[float]
     given_way: wp.array[float]
     remaining: wp.array[float]
     held: wp.array[int]
