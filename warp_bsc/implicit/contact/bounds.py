@@ -27,8 +27,8 @@ from .vector_access import integers_at
 wp.set_module_options({"enable_backward": False})
 
 
-_WAYS = wp.constant(wp.float64(6.0))
-"""How many displacements bring two elements nearer in :func:`_relative_way`, and more than arcs do beside them."""
+_WAYS = wp.constant(wp.float64(6.0 * (1.0 + 2.0**-18)))
+"""So many displacements are in :func:`_relative_way` at most, and arcs beside them; and more than rounding changes."""
 
 
 @wp.func

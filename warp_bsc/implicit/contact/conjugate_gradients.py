@@ -206,7 +206,7 @@ _SOLVE = """
             coupled_columns[n] = make_ushort4(columns[0], columns[1], columns[2], columns[3]);
             coupled_weights[n] = make_float4(weights[0], weights[1], weights[2], weights[3]);
             const float* h = (float*)&contacts.hessian.data[i];
-            const int places[6] = {0, 4, 8, 1, 2, 5};  // of the diagonal, and above it
+            const int places[6] = {0, 5, 10, 1, 2, 6};  // of the diagonal, and above it
             for (int c = 0; c < 6; ++c) coupled_blocks[c * COUPLED + n] = h[places[c]];
         }
         if (lane == 0) entries = 0;
@@ -305,8 +305,9 @@ _SOLVE = """
                 if (u < -1)  // of a body: its turn follows its shift
                     apart += weight * wp::cross(vector_of(d, WIDE), unknowns.arm.data[contacts.corners.data[i][j]]);
             }
-            apart = wp::mul(contacts.hessian.data[i], apart);
-            for (int c = 0; c < 3; ++c) pulls[3 * n + c] = apart[c];
+            const auto& h = contacts.hessian.data[i].data;
+            for (int c = 0; c < 3; ++c)
+                pulls[3 * n + c] = h[c][0] * apart[0] + h[c][1] * apart[1] + h[c][2] * apart[2];
         }
         wait();
     };

@@ -20,7 +20,7 @@ from .system import (
     take_contact,
     unknowns_of,
 )
-from .vector_access import integers_at, numbers_at
+from .vector_access import integers_at, numbers_at, store_block, stored_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -74,7 +74,7 @@ def _hold(
     contacts.load[slot] = 0.0
     contacts.limit[slot] = 0.0
     contacts.gradient[slot] = (stiffness * float(given - short)) * n
-    contacts.hessian[slot] = stiffness * wp.outer(n, n)
+    store_block(contacts.hessian, slot, wp.mat33d(stiffness * wp.outer(n, n)))
     contacts.key[slot] = key
     contacts.couples[slot] = couples(of_corners, weights)
 
@@ -84,12 +84,12 @@ def release_held(i: int, unknowns: Unknowns, solution: wp.array[wp.vec3], contac
     """Lets a pair go that is held and that the solution would pull together: it is not in the way."""
     corners, weights, n = integers_at(contacts.corners, i), numbers_at(contacts.weights, i), contacts.normal[i]
     if contacts.key[i] >= _FIRST_HELD:
-        apart = wp.dot(n, contacts.gradient[i])
+        apart, pull = wp.dot(n, contacts.gradient[i]), stored_block(contacts.hessian, i) * n
         for j in range(4):
-            apart += weights[j] * wp.dot(contacts.hessian[i] * n, displacement(unknowns, corners[j], solution))
+            apart += weights[j] * wp.dot(pull, displacement(unknowns, corners[j], solution))
         if apart > 0.0:
             contacts.gradient[i] = wp.vec3()
-            contacts.hessian[i] = wp.mat33()
+            store_block(contacts.hessian, i, wp.mat33d())
 
 
 @wp.func

@@ -9,6 +9,7 @@ import warp as wp
 
 from ...response.state.vectors import ZERO, to_double
 from .system import Contacts, sum_of_parts
+from .vector_access import store_block, stored_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -100,7 +101,7 @@ def merge_contact(i: int, part: int, world: int, contacts: Contacts):
             contacts.feature[k] + wp.vec3i(),
             contacts.key[k] + wp.int64(0),
         )
-        of_gradient, of_hessian = to_double(contacts.gradient[k]), wp.mat33d(contacts.hessian[k])
+        of_gradient, of_hessian = to_double(contacts.gradient[k]), wp.mat33d(stored_block(contacts.hessian, k))
         of_limit, same = wp.float64(contacts.limit[k]), wp.float64(wp.sign(wp.dot(contacts.normal[k], normal)))
         if of_feature == feature:
             if of_key < key:
@@ -122,5 +123,5 @@ def merge_contact(i: int, part: int, world: int, contacts: Contacts):
             for b in range(3):
                 block[a, b] = _sum_of_parts(hessian[a, b], hessian_lost[a, b], parts)
         contacts.gradient[i] = total
-        contacts.hessian[i] = block
+        store_block(contacts.hessian, i, wp.mat33d(block))
         contacts.limit[i] = _sum_of_parts(limit, limit_lost, parts)

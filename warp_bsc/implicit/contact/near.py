@@ -32,10 +32,9 @@ from .system import (
     key_of_pair,
     kind_of_key,
     take_contact,
-    to_single_block,
     unknowns_of,
 )
-from .vector_access import integers_at
+from .vector_access import integers_at, store_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,7 +108,7 @@ def _add_contact(
     contacts.load[slot] = float(load)
     contacts.limit[slot] = friction * float(load)
     contacts.gradient[slot] = to_single(gradient)
-    contacts.hessian[slot] = to_single_block(hessian)
+    store_block(contacts.hessian, slot, hessian)
     contacts.key[slot] = key
     contacts.couples[slot] = couples(of_corners, weights)
     link_contact(contacts, world, slot, corners, weights)

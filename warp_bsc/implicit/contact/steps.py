@@ -209,7 +209,7 @@ def displace(
         return
     trial.displaced[v] = d
     raise_to(progress.way, world, _way(motion, trial, v))
-    raise_to(progress.longest, world, (1.0 + _ROUNDED) * wp.length(d) + trial.bend[v])
+    raise_to(progress.longest, world, wp.length(d) + trial.bend[v])
     share = _share_within(trial.x[v], d, lower[v], upper[v])
     if share < 1.0:
         lower_to(progress.bound, world, share)

@@ -5,7 +5,7 @@ import warp as wp
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO, to_single
 from .sums import sum_of
-from .vector_access import integers_at, numbers_at
+from .vector_access import integers_at, mat34, numbers_at, stored_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -174,7 +174,7 @@ class Contacts:
     load: wp.array[float]
     limit: wp.array[float]
     gradient: wp.array[wp.vec3]
-    hessian: wp.array[wp.mat33]
+    hessian: wp.array[mat34]
     key: wp.array[wp.int64]
     couples: wp.array[int]
     feature: wp.array[wp.vec3i]
@@ -318,7 +318,7 @@ def take_contact(contacts: Contacts, world: int) -> int:
     snippet=sum_of(
         "wp::mat_t<3, 3, float>",
         9,
-        term="int place; wp::vec4i of; wp::vec4 weights; wp::mat33 hessian;",
+        term="int place; wp::vec4i of; wp::vec4 weights; float hessian[9];",
         read="""
             const int entry = contacts.entries.data[n], i = entry >> 2;
             t.place = entry & 3;
@@ -326,17 +326,21 @@ def take_contact(contacts: Contacts, world: int) -> int:
             const int4 of = *(const int4*)(contacts.unknowns.data + i);
             const float4 w = *(const float4*)(contacts.weights.data + i);
             t.of = wp::vec4i(of.x, of.y, of.z, of.w), t.weights = wp::vec4(w.x, w.y, w.z, w.w);
+            for (int row = 0; row < 3; ++row) {
+                const float4 of_row = ((const float4*)(contacts.hessian.data + i))[row];
+                t.hessian[3 * row] = of_row.x, t.hessian[3 * row + 1] = of_row.y, t.hessian[3 * row + 2] = of_row.z;
+            }
 #else
             t.of = contacts.unknowns.data[i], t.weights = contacts.weights.data[i];
+            for (int c = 0; c < 9; ++c) t.hessian[c] = contacts.hessian.data[i].data[c / 3][c % 3];
 #endif
-            t.hessian = contacts.hessian.data[i];
         """,
         add="""
             float weight = 0.0f;
             for (int j = 0; j < 4; ++j) weight += t.of[j] == v ? t.weights[j] : 0.0f;
             if (weight == 0.0f) return;
             weight *= t.weights[t.place];
-            for (int c = 0; c < 9; ++c) sum[c] += weight * t.hessian.data[c / 3][c % 3];
+            for (int c = 0; c < 9; ++c) sum[c] += weight * t.hessian[c];
         """,
     )
 )
@@ -353,7 +357,7 @@ def contact_gradient(contacts: Contacts, unknowns: Unknowns, u: int, part: int, 
         entry = contacts.entries[n]
         i = entry >> 2
         weight = numbers_at(contacts.weights, i)[entry & 3]
-        force, hessian = weight * contacts.gradient[i], weight * weight * contacts.hessian[i]
+        force, hessian = weight * contacts.gradient[i], weight * weight * stored_block(contacts.hessian, i)
         if integers_at(contacts.unknowns, i)[entry & 3] == -1 - u:  # the turn of a body, which is behind its shift
             turn = wp.skew(unknowns.arm[contacts.corners[i][entry & 3]])
             force, hessian = turn * force, turn * hessian * wp.transpose(turn)
