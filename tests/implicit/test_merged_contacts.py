@@ -88,7 +88,7 @@ def sums(contacts):
         np.add.at(limits, corners, np.abs(weights) * limit)
         for a, w in zip(corners, weights, strict=True):
             for b, x in zip(corners, weights, strict=True):
-                hessian[a, :, b] += w * x * h
+                hessian[a, :, b] += w * x * h[:, :3]  # rows have a fourth number without meaning
     return gradient, hessian, limits
 
 

@@ -14,7 +14,7 @@ from ...response.state.poses import centre_of, in_world, point_of, turn_between,
 from ...response.state.structs import Bodies, Motion
 from ...response.state.vectors import HALF, ONE, to_double, to_single
 from .decisions import takes
-from .system import Progress, Unknowns, to_single_block
+from .system import Progress, Unknowns
 
 wp.set_module_options({"enable_backward": False})
 
@@ -189,7 +189,7 @@ def inertia_of_body(bodies: SolvedBodies, motion: Motion, body: int, u: int, dt:
             factor = ONE / (angle * angle) - HALF / (angle * wp.tan(HALF * angle))
         once = wp.cross(turned, gradient)
         gradient += HALF * once + factor * wp.cross(turned, once)
-    return to_single(gradient / (dt * dt)), to_single_block(block / (dt * dt))
+    return to_single(gradient / (dt * dt)), wp.mat33(block / (dt * dt))
 
 
 @wp.func

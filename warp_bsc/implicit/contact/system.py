@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
-from ...response.state.vectors import ZERO, to_single
+from ...response.state.vectors import ZERO
 from .sums import sum_of
 from .vector_access import integers_at, mat34, numbers_at, stored_block
 
@@ -399,9 +399,3 @@ def couples(of_corners: wp.vec4i, weights: wp.vec4d) -> int:
         if u >= 0 and weights[j] < ZERO:
             second = 1
     return first * second
-
-
-@wp.func
-def to_single_block(m: wp.mat33d) -> wp.mat33:
-    """Returns the nearest block in single precision."""
-    return wp.matrix_from_rows(to_single(m[0]), to_single(m[1]), to_single(m[2]))
