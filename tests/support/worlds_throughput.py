@@ -1,13 +1,16 @@
 """Measures steps a second by the number of worlds: VBD, VBD with self-contact, SolverCCD, and SolverImplicit.
 
     python tests/support/worlds_throughput.py --worlds 1 64
+    torchrun --nproc-per-node 2 tests/support/worlds_throughput.py --worlds 4096  # so many on each of two GPUs
 
 Each world has a cloth of 200 triangles that falls from its own place on a fixed sphere and the ground. VBD gets
 Newton's contacts, the others none. The exact detector counts the edges that cross faces of cloth or sphere once a tenth
-of the steps. On a GPU, a pair of steps is a CUDA graph. ``--json`` writes the rows to a file as well.
+of the steps. On a GPU, a pair of steps is a CUDA graph, and the memory of a solver and its states is measured.
+``--json`` writes the rows to a file as well.
 """
 
 import argparse
+import os
 import sys
 import time
 
@@ -96,9 +99,16 @@ class Run:
 
 
 def measure(make_solver, model, counter, steps):
-    """Returns steps a second by the clock and by processor time, crossings found, and steps not certified or None."""
-    run, device = Run(make_solver, model), model.device
+    """Returns rates, bytes on a GPU or None, crossings found, and steps not certified or None.
+
+    Rates are steps a second by the clock and by processor time.
+    """
+    device, memory = model.device, None
+    used = wp.get_mempool_used_mem_current(device) if device.is_mempool_enabled else None
+    run = Run(make_solver, model)
     run.take_pair()
+    if used is not None:
+        memory = wp.get_mempool_used_mem_current(device) - used
     crossings, clock, processor = 0, 0.0, 0.0
     for _ in range(10):
         wp.synchronize_device(device)
@@ -111,7 +121,7 @@ def measure(make_solver, model, counter, steps):
         crossings += counter.count(run.states[0])
     taken = 20 * (steps // 20)
     uncertified = run.solver.report.totals.uncertified_steps if isinstance(run.solver, bsc.SolverCCD) else None
-    return taken / clock, taken / processor, crossings, uncertified
+    return (taken / clock, taken / processor), memory, crossings, uncertified
 
 
 def main():
@@ -119,23 +129,33 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64], help="on a GPU, also 1024 4096")
     parser.add_argument("--steps", type=int, default=100, help="a multiple of 20")
-    parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
+    parser.add_argument(
+        "--only", nargs="+", choices=SOLVERS, default=SOLVERS, metavar="SOLVER", help="some of the rows"
+    )
+    default = "that of torchrun's LOCAL_RANK, else the first GPU, else cpu"
+    parser.add_argument("--device", help=f"Warp device, such as cpu or cuda:0 (default: {default})")
     parser.add_argument("--json", metavar="FILE", help="file to which the rows are written as well")
     options = parser.parse_args()
     if options.steps < 20 or options.steps % 20:
         parser.error(f"--steps must be a multiple of 20, not {options.steps}")
     wp.config.log_level = wp.LOG_WARNING
-    with wp.ScopedDevice(options.device or wp.get_preferred_device()):
+    rank = os.environ.get("LOCAL_RANK")
+    of_rank = None if rank is None else f"cuda:{rank}"
+    with wp.ScopedDevice(options.device or of_rank or wp.get_preferred_device()):
         rows = []
-        print(f"{'solver':30}{'worlds':>7}{'steps/s':>10}{'by processor':>14}{'crossings':>11}{'uncertified':>13}")
+        head = f"{'solver':20}{'worlds':>7}{'steps/s':>10}{'by processor':>14}{'MB/world':>10}{'crossings':>11}"
+        print(f"{head}{'uncertified':>13}")
         for worlds in options.worlds:
             model = build(worlds)
             counter = CrossingCounter(model)
-            for name, make_solver in SOLVERS.items():
-                by_clock, by_processor, crossings, uncertified = measure(make_solver, model, counter, options.steps)
-                row = f"{name:30}{worlds:>7}{by_clock:>10.3g}{by_processor:>14.3g}{crossings:>11}"
+            for name in options.only:
+                (by_clock, by_processor), memory, crossings, uncertified = measure(
+                    SOLVERS[name], model, counter, options.steps
+                )
+                of_world = "-" if memory is None else f"{memory / worlds / 1e6:.3g}"
+                row = f"{name:20}{worlds:>7}{by_clock:>10.3g}{by_processor:>14.3g}{of_world:>10}{crossings:>11}"
                 rates = {"clock": by_clock, "processor": by_processor}
-                rows.append({"solver": name, "worlds": worlds, "steps_per_second": rates})
+                rows.append({"solver": name, "worlds": worlds, "steps_per_second": rates, "bytes": memory})
                 rows[-1] |= {"crossings": crossings, "uncertified_steps": uncertified}
                 print(f"{row}{'-' if uncertified is None else uncertified:>13}", flush=True)
         if options.json:
