@@ -127,6 +127,7 @@ class SolverImplicit(SolverCCD):
     """
 
     _near = 0.0  # barriers do that
+    _has_few_contacts = True
     report: ImplicitStepReport
     _report_type = ImplicitStepReport
 

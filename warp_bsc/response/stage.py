@@ -43,6 +43,7 @@ class CollisionStage(CouplingHooks):
     mesh: ModelMesh
     report: SolverReport
     _report_type: type[SolverReport] = SolverReport
+    _has_few_contacts = False  # of a solver that leaves hardly any
     _between_steps: BetweenSteps | None = None  # of a stage whose steps carry gradients
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _mask: wp.array | None = None  # of the step in progress, if worlds take no part in it
@@ -58,7 +59,7 @@ class CollisionStage(CouplingHooks):
     ):
         """Allocates the workspace of steps, and makes the report."""
         self.mesh, self._motion, self._responds, model = motion.mesh, motion, responds, self.model
-        options = {"max_iterations": max_iterations, "responds": responds}
+        options = {"max_iterations": max_iterations, "responds": responds, "has_few_contacts": self._has_few_contacts}
         self._work = Workspace(motion, separation=separation, restitution=restitution, **options)
         motion.set_start(arrays_of(model))
         motion.set_end(arrays_of(model), 1.0)

@@ -120,13 +120,14 @@ SEGMENTS = 32
 """Triangles around a round shape; a multiple of four."""
 
 # capacities
-PAIRS_PER_FACE, PAIRS_PER_STATIC_FACE = 96, 8
+PAIRS_PER_FACE, PAIRS_PER_STATIC_FACE = 96, 2
 """Capacity of the detector's queues on a GPU, for each face that can move, and for others, which have pairs with those
 alone: queues of a CUDA graph cannot grow. Four layers of cloth that lie on each other have some 50, and up to 160 in a
 Newton step in which they land."""
-DIVIDING_PLANES = 32
-"""Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9."""
-ITERATIONS_RESERVED = 3
+DIVIDING_PLANES, DIVIDING_PLANES_IF_FEW = 32, 8
+"""Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9. The second where contacts are few, as
+behind a solver that leaves none."""
+ITERATIONS_RESERVED, ITERATIONS_RESERVED_IF_FEW = 3, 1
 """Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
 MIN_ENTRIES = 4096
 """Least capacity of a record for active constraints, summed over sweeps."""

@@ -17,6 +17,7 @@ from .pairs import (
     add_to_list,
     distance_bound,
     gap_at_plane,
+    kept_distance,
     moved,
     plane_at,
     stays_far,
@@ -62,7 +63,7 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     """
     # read side by side: most of the time is waiting for memory
     before, now = candidates.share[i] + float(0.0), wp.float64(candidates.now[i])
-    kept, reach = candidates.kept[i] + ZERO, wp.float64(candidates.reach[i])
+    kept, reach = kept_distance(candidates, i), wp.float64(candidates.reach[i])
     stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
     if before == FAR and (is_shorter or stays):
         return False
@@ -123,7 +124,11 @@ def bound_by_pair(
     limit: wp.array[float],
 ):
     """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world."""
-    corners, kind, kept = integers_at(candidates.corners, i), kind_of_key(candidates.key[i]), candidates.kept[i]
+    corners, kind, kept = (
+        integers_at(candidates.corners, i),
+        kind_of_key(candidates.key[i]),
+        kept_distance(candidates, i),
+    )
     reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
     now = wp.float64(candidates.now[i])
     a, b, c, d = corners_of(trial.x, corners)

@@ -7,7 +7,7 @@ from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
 from . import barrier
-from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, plane_at
+from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, kept_distance, plane_at
 from .system import (
     Contacts,
     Unknowns,
@@ -122,7 +122,7 @@ def hold_pair(
     a, b, c, d = corners_of(trial.x, corners)
     p, q, r, s = corners_of(trial.displaced, corners)
     time = wp.float64(share)
-    kept = candidates.kept[i]
+    kept = kept_distance(candidates, i)
     _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     gap = distance - kept
     e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s

@@ -147,7 +147,7 @@ class NewtonMethod:
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
         self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
-        self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), vertices))
+        self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles))
         self._trial.holder = array(holder)
         self._origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
@@ -422,6 +422,7 @@ class NewtonMethod:
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self._candidates)
         sizes = {**dict.fromkeys(("start", "room", "near", "far", "listed"), self._work.worlds), "used": 1}
+        sizes["kept"] = capacity if self._mesh.distances is not None else 0
         self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self._candidates.room.fill_(capacity)
 

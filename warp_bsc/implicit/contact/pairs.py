@@ -59,7 +59,7 @@ class Candidates:
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
         apart: How far the vertices of a pair can go together before it is within its reach, negative if it is [m].
-        kept: Distance that each pair keeps in any case [m].
+        kept: Distance that each pair keeps in any case [m]; without elements where all is 0.
         level: Distance at which its barrier is infinite [m], no more than that.
         reach: Gap beyond the level from which its barrier pushes [m].
         stiffness: Of its barrier, by what that pushes apart; negative of edges of faces [N/m].
@@ -129,7 +129,7 @@ class Trial:
         bend: How far arcs of vertices leave their displacements at most, by t (1 - t) at a share t of them [m].
         exact: Positions without rounding, which for friction is a large part of the way [m].
         moved: The same after displacements; where a Newton step begins, before them.
-        path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, vertices];
+        path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, particles];
             the last are those after the last of more.
     """
 
@@ -257,6 +257,15 @@ def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, 
 
 
 @wp.func
+def kept_distance(candidates: Candidates, i: int) -> wp.float64:
+    """Returns the distance that a pair keeps in any case [m]."""
+    kept = ZERO
+    if candidates.kept:
+        kept = candidates.kept[i] + ZERO
+    return kept
+
+
+@wp.func
 def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
     """Returns a lower bound of the distance of a pair: that of boxes, or along where closest points were found last.
 
@@ -341,7 +350,8 @@ def _prepare(
     candidates.corners[slot] = corners
     candidates.key[slot] = key_of_pair(0, queue.kind, pair[0], pair[1])
     candidates.apart[slot] = apart
-    candidates.kept[slot] = kept
+    if candidates.kept:
+        candidates.kept[slot] = kept
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
     candidates.stiffness[slot] = _stiffness_by_mass(

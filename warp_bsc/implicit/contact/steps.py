@@ -350,7 +350,8 @@ def take(
         trial.exact[v] = exact_on_body(bodies.pose, bodies.low, motion, v)
         unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
     trial.moved[v] = trial.exact[v]
-    trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
+    if unknowns.of_vertex[v] >= 0:
+        trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
     if not given:
         raise_to(progress.change, world, wp.length(trial.displaced[v]))
 

@@ -25,7 +25,9 @@ from ..schedule import (
 from ..solve.by_world import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from ..tuning import (
     DIVIDING_PLANES,
+    DIVIDING_PLANES_IF_FEW,
     ITERATIONS_RESERVED,
+    ITERATIONS_RESERVED_IF_FEW,
     MIN_ENTRIES,
     PAIRS_PER_FACE,
     PAIRS_PER_STATIC_FACE,
@@ -157,6 +159,7 @@ class Workspace:
         restitution: wp.array[float],
         max_iterations: int = MAX_ITERATIONS,
         responds: bool = True,
+        has_few_contacts: bool = False,
     ):
         """Allocates buffers.
 
@@ -166,6 +169,7 @@ class Workspace:
             restitution: As of :class:`.Step`.
             max_iterations: Iterations of detect and project, see :mod:`.schedule`.
             responds: Whether contacts are resolved, and not only counted.
+            has_few_contacts: Whether few contacts are to be expected, which takes less memory.
         """
         self.mesh = mesh = motion.mesh
         self.device, vertices = mesh.device, mesh.vertex_count
@@ -202,11 +206,12 @@ class Workspace:
         at_once = not self.body_count and not differentiable
         largest = int(np.diff(self.particles.first.numpy()).max())
         self.sweeping_threads = threads_of_world(device, self.worlds, largest) if at_once else 0
+        self._iterations_reserved = ITERATIONS_RESERVED_IF_FEW if has_few_contacts else ITERATIONS_RESERVED
         step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
         self.dividing = DividingPlanes()
         if not differentiable:
-            capacity = DIVIDING_PLANES * self.particle_count
+            capacity = (DIVIDING_PLANES_IF_FEW if has_few_contacts else DIVIDING_PLANES) * self.particle_count
             sizes = {"count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
             sizes |= dict.fromkeys(("first", "lacks", "placed", "wanted", "reached"), vertices)
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
@@ -333,12 +338,12 @@ class Workspace:
         return self.max_penetrations + sum(len(n.contacts.pairs) for n in self.detector.narrow_phases)
 
     def reserve(self, more: int) -> None:
-        """Reserves ``more`` constraints, and as many for later iterations; does nothing in a CUDA graph."""
+        """Reserves ``more`` constraints, and some for later iterations; does nothing in a CUDA graph."""
         if self.device.is_capturing:
             return
         filled = int(self.constraints.count.numpy()[0])
         if len(self.constraints.vertices) < filled + more:
-            new = self._allocate_constraints(filled + ITERATIONS_RESERVED * more)
+            new = self._allocate_constraints(filled + self._iterations_reserved * more)
             for name in Constraints.vars:
                 old = getattr(self.constraints, name)
                 if filled:
