@@ -116,9 +116,11 @@ def distance_of_boxes(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.ve
 
 
 @wp.func
-def distance_along(kind: int, normal: wp.vec3, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
-    """Returns the distance of two elements along a unit vector from the second to the first, at most their distance."""
-    n = wp.vec3d(normal)
+def distance_along(kind: int, n: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
+    """Returns the distance of two elements along a vector from the second to the first.
+
+    With one no longer than 1, it is at most their distance.
+    """
     ad, bd, cd = wp.dot(n, a - d), wp.dot(n, b - d), wp.dot(n, c - d)
     if kind == EDGE_EDGE:
         return wp.min(ad, bd) - wp.max(cd, ZERO)

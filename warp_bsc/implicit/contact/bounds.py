@@ -23,7 +23,7 @@ from .pairs import (
     stays_far,
 )
 from .system import Progress, kind_of_key, lower_to
-from .vector_access import integers_at
+from .vector_access import direction_of_bits, integers_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -98,7 +98,7 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
         left = ZERO
         if now >= within and not is_shorter:
             # what moves together is as far from each other along a vector as at the start or the end, or farther
-            n = candidates.normal[i] + wp.vec3()
+            n = direction_of_bits(candidates.normal[i])
             at_start = barrier.distance_along(kind, n, a, b, c, d)
             at_end = barrier.distance_along(kind, n, a + p, b + q, c + r, d + s)
             left = wp.max(now - way, ROUNDED_DOWN * wp.min(at_start, at_end))

@@ -34,7 +34,7 @@ from .system import (
     take_contact,
     unknowns_of,
 )
-from .vector_access import integers_at, store_block
+from .vector_access import direction_in_bits, integers_at, store_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -156,7 +156,7 @@ def find_near(
         add_energy(progress.energy, world, MEETS, settings.units)
         return
     normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    candidates.normal[i] = to_single(normal)
+    candidates.normal[i] = direction_in_bits(normal)
     if gap >= reach:
         return
     stiffness = stiffness_of_pair(candidates.stiffness[i], settings, trial, corners, reach)

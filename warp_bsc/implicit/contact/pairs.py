@@ -13,6 +13,7 @@ from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
 from . import barrier
 from .system import Progress, key_of_pair
+from .vector_access import direction_of_bits
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,7 +67,8 @@ class Candidates:
         floor: Gap below which it hardly comes nearer in the step [m], see :func:`.barrier.floor_gap`.
         share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
         now: Distance where the Newton step begins, or less, of what was not :data:`FAR` in the one before [m].
-        normal: Unit vector from the second closest point to the first where they were found last, 0 before.
+        normal: Direction from the second closest point to the first where they were found last, 0 before, see
+            :func:`.vector_access.direction_of_bits`.
     """
 
     start: wp.array[int]
@@ -86,7 +88,7 @@ class Candidates:
     floor: wp.array[float]
     share: wp.array[float]
     now: wp.array[float]
-    normal: wp.array[wp.vec3]
+    normal: wp.array[int]
 
 
 @wp.struct
@@ -271,7 +273,7 @@ def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3d, b: wp
 
     The second is as good as the distance until the elements turn, and much faster to find.
     """
-    along = barrier.distance_along(kind, candidates.normal[i], a, b, c, d)
+    along = barrier.distance_along(kind, direction_of_bits(candidates.normal[i]), a, b, c, d)
     return ROUNDED_DOWN * wp.max(along, barrier.distance_of_boxes(kind, a, b, c, d))
 
 
@@ -359,7 +361,7 @@ def _prepare(
     )
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
     candidates.share[slot] = wp.where(stays_far(apart, progress, world), FAR, 1.0)
-    candidates.normal[slot] = wp.vec3()
+    candidates.normal[slot] = 0
 
 
 @wp.kernel
