@@ -41,7 +41,7 @@ def test_steps_must_be_a_multiple_of_twenty(monkeypatch, capsys):
 
 
 def test_one_row_and_no_gpu_of_that_rank(device, monkeypatch, capsys):
-    arguments = ["worlds_throughput.py", "--worlds", "1", "--steps", "20", "--only", "VBD"]
+    arguments = ["worlds_throughput.py", "--worlds", "1", "--steps", "20", "--solvers", "VBD"]
     monkeypatch.setattr(sys, "argv", [*arguments, "--device", str(device)])
     monkeypatch.setenv("LOCAL_RANK", "99")  # an option goes first
     main()

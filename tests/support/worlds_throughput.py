@@ -43,7 +43,7 @@ def build(worlds):
         mass=0.001,
         **CLOTH,
     )
-    world.color()  # of one world: that of all takes minutes
+    world.color()  # of one world: to colour all together takes long
     builder = newton.ModelBuilder()
     builder.replicate(world, worlds)
     positions = np.reshape(builder.particle_q, (worlds, -1, 3))
@@ -129,9 +129,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, nargs="+", default=[1, 64], help="on a GPU, also 1024 4096")
     parser.add_argument("--steps", type=int, default=100, help="a multiple of 20")
-    parser.add_argument(
-        "--only", nargs="+", choices=SOLVERS, default=SOLVERS, metavar="SOLVER", help="some of the rows"
-    )
+    parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=list(SOLVERS))
     default = "that of torchrun's LOCAL_RANK, else the first GPU, else cpu"
     parser.add_argument("--device", help=f"Warp device, such as cpu or cuda:0 (default: {default})")
     parser.add_argument("--json", metavar="FILE", help="file to which the rows are written as well")
@@ -148,7 +146,7 @@ def main():
         for worlds in options.worlds:
             model = build(worlds)
             counter = CrossingCounter(model)
-            for name in options.only:
+            for name in options.solvers:
                 (by_clock, by_processor), memory, crossings, uncertified = measure(
                     SOLVERS[name], model, counter, options.steps
                 )

@@ -135,7 +135,7 @@ class Problem:
         lacks: See :func:`.step_report.write_results`.
         vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
         parts: Threads that share rows and blocks.
-        turns: Rows or blocks that they share, one after the other, no more than they are.
+        turns: Rows that they share, one after the other, no more than they are.
         grows: 1 if the host can enlarge the buffers of contacts, outside of CUDA graphs.
         least_change: Change by which no unknown changes any more where a step ends [m].
         far_change: Change by which one that changes still is far from its end [m].

@@ -78,8 +78,8 @@ def stored_block(blocks: wp.array[mat34], k: int) -> wp.mat33:
     ...
 
 
-_LARGEST = wp.constant(wp.float64(511.0))
-"""Of a component in ten bits."""
+_LARGEST, _UNIT = wp.constant(wp.float64(511.0)), wp.constant(wp.float64(1.0 / 511.0))
+"""Of a component in ten bits, and what 1 there stands for."""
 _SHORTER = wp.constant(wp.float64(1.0 - 2.0**-9))
 """With it, rounding to multiples of 1 / 511 leaves a unit vector no longer than 1."""
 
@@ -98,7 +98,7 @@ def direction_in_bits(n: wp.vec3d) -> int:
 @wp.func
 def _component_of(bits: int) -> wp.float64:
     within = bits & 1023
-    return wp.float64(wp.where(within > 511, within - 1024, within)) / _LARGEST
+    return _UNIT * wp.float64(wp.where(within > 511, within - 1024, within))
 
 
 @wp.func
