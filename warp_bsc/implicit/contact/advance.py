@@ -53,6 +53,8 @@ _FUNCTIONS = {
 }
 _ALSO = {Phase.FIND_NEAR: Phase.LIST_AND_FIND_NEAR, Phase.BOUND: Phase.LIST_AND_BOUND}
 """Phases that have the function of the one before them, whose code the kernel then has once."""
+_DECIDE = {Phase.FIND_NEAR, Phase.BOUND, Phase.HOLD_PAIRS, Phase.ENERGY, Phase.DECIDE}
+"""Phases after which what all threads have found decides."""
 _OF_PHASES = list(_FUNCTIONS.values())
 _FIRST = [int(phase) for phase in _FUNCTIONS]
 _LAST = [int(_ALSO.get(phase, phase)) for phase in _FUNCTIONS]
@@ -68,7 +70,7 @@ def _spread(thread: int, n: int) -> int:
 
 
 @wp.func
-def _next(before: int, found: wp.vec4i, w: int, p: Problem) -> wp.vec4i:
+def _decide(before: int, found: wp.vec4i, w: int, p: Problem) -> wp.vec4i:
     """Returns the phase that follows where what all threads have found decides about it."""
     phase, then, solves = found[0], found[1], found[3]
     progress = p.progress
@@ -176,16 +178,18 @@ def _advance(
         if phase < Phase.SOLVE and (p.progress.active[w] != 0 or phase == Phase.PUBLISH):
             at.world = w
             state = wp.vec4i(phase, int(Phase.BOUNDED), 0, p.flow.solves[w])
+            # most phases follow each other as they stand here, so that one pass through this code takes many
             while state[0] < Phase.SOLVE:
-                at.phase = state[0]
-                at.then = state[1]
-                at.passes = state[2]
-                at.solves = state[3]
                 for k in range(wp.static(len(_OF_PHASES))):
-                    if at.phase >= wp.static(_FIRST[k]) and at.phase <= wp.static(_LAST[k]):
+                    if state[0] >= wp.static(_FIRST[k]) and state[0] <= wp.static(_LAST[k]):
+                        at.phase = state[0]
+                        at.then = state[1]
+                        at.passes = state[2]
+                        at.solves = state[3]
                         state = wp.static(_OF_PHASES[k])(at, p, motion, planes, settings)
-                wait_for_team(p.flow.arrived, w, together)
-                state = _next(at.phase, state, w, p)
+                        wait_for_team(p.flow.arrived, w, together)
+                        if wp.static(_FIRST[k] in _DECIDE):
+                            state = _decide(at.phase, state, w, p)
             if at.thread == 0:
                 _leave(w, state, p)
         number = int(count)

@@ -10,7 +10,6 @@ from . import barrier
 from .pairs import (
     FAR,
     FAR_TOGETHER,
-    ROUNDED_DOWN,
     BarrierSettings,
     Candidates,
     Trial,
@@ -28,12 +27,12 @@ from .vector_access import direction_of_bits, integers_at
 wp.set_module_options({"enable_backward": False})
 
 
-_WAYS = wp.constant(wp.float64(6.0 * (1.0 + 2.0**-18)))
-"""So many displacements are in :func:`_relative_way` at most, and arcs beside them; and more than rounding changes."""
+_WAYS = wp.constant(float(6.0 * (1.0 + 2.0**-18)))
+"""So many displacements are in :func:`.barrier.way_together` at most, and arcs beside them; and more than rounding."""
 
 
 @wp.func
-def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
+def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2:
     """Returns how far shares of displacements may be off, as :func:`.barrier.safe_share` takes it."""
     first, second = float(0.0), float(0.0)
     for k in range(2):  # corners 0 and 3 are of different elements
@@ -45,13 +44,7 @@ def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2d:
     share = scale * trial.share[trial.holder[corners[0]]]
     other = scale * trial.share[trial.holder[corners[3]]]
     first, second = share * first, other * second
-    return wp.vec2d(wp.float64(first + second), wp.float64(share * first + other * second))
-
-
-@wp.func
-def _relative_way(p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.float64:
-    """Returns how much nearer displacements of corners bring two elements at most: what all do does not count."""
-    return wp.length(p - r) + wp.length(q - r) + wp.length(s - r)
+    return wp.vec2(first + second, share * first + other * second)
 
 
 @wp.func
@@ -62,55 +55,55 @@ def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
     """
     # read side by side: most of the time is waiting for memory
-    before, now = candidates.share[i] + float(0.0), wp.float64(candidates.now[i])
-    kept, reach = kept_distance(candidates, i), wp.float64(candidates.reach[i])
+    before, now = candidates.share[i] + float(0.0), candidates.now[i] + float(0.0)
+    within = barrier.ROUNDED_UP * (float(kept_distance(candidates, i)) + candidates.reach[i])
     stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
     if before == FAR and (is_shorter or stays):
         return False
     if before == FAR_TOGETHER and not is_shorter:
         # no displacements that long bring it within its reach, whichever of its vertices have them
-        left = now - _WAYS * wp.float64(progress.longest[world])
-        if left >= kept + reach:
-            candidates.now[i] = float(ROUNDED_DOWN * left)
+        left = barrier.ROUNDED_DOWN * now - _WAYS * progress.longest[world]
+        if left >= within:
+            candidates.now[i] = left
             return False
-    corners = integers_at(candidates.corners, i)
+    corners, kind = integers_at(candidates.corners, i), kind_of_key(candidates.key[i])
     if is_shorter and (before == 1.0 or before == FAR_TOGETHER):
         cuts = int(0)
         for j in range(4):
             cuts += trial.cut[trial.holder[corners[j]]]
         if cuts == 0:
             if before == 1.0:
-                add_to_list(candidates, world, i, False)
+                add_to_list(candidates, world, kind, i, False)
             return False
     candidates.share[i] = FAR
     if stays:
         return False
-    kind = kind_of_key(candidates.key[i])
-    p, q, r, s = corners_of(trial.displaced, corners)
+    p, q, r = barrier.seen_from_last(trial.displaced, corners)
     bends = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
-    bend, way = wp.float64(bends), _relative_way(p, q, r, s)
-    within = kept + reach + bend
-    left = now - way
+    bend, way = barrier.ROUNDED_UP * bends, barrier.way_together(kind, p, q, r)
+    within = barrier.ROUNDED_UP * (within + bend)
+    left = barrier.ROUNDED_DOWN * now - way
     if is_shorter or before != FAR_TOGETHER or left < within:  # positions are read where displacements do not tell
-        a, b, c, d = corners_of(trial.x, corners)
+        a, b, c = barrier.seen_from_last(trial.x, corners)
+        rounding = barrier.rounding_of(a, b, c) + barrier.rounding_of(p, q, r)
         if before >= FAR:
-            now = distance_bound(candidates, i, kind, a, b, c, d)
-        left = ZERO
+            now = distance_bound(candidates, i, kind, a, b, c)
+        left = 0.0
         if now >= within and not is_shorter:
             # what moves together is as far from each other along a vector as at the start or the end, or farther
             n = direction_of_bits(candidates.normal[i])
-            at_start = barrier.distance_along(kind, n, a, b, c, d)
-            at_end = barrier.distance_along(kind, n, a + p, b + q, c + r, d + s)
-            left = wp.max(now - way, ROUNDED_DOWN * wp.min(at_start, at_end))
+            at_start = barrier.distance_along(kind, n, a, b, c)
+            at_end = barrier.distance_along(kind, n, a + p, b + q, c + r)
+            left = wp.max(barrier.ROUNDED_DOWN * now - way, wp.min(at_start, at_end) - rounding)
     if left >= within:
         candidates.share[i] = FAR_TOGETHER
-        candidates.now[i] = float(ROUNDED_DOWN * (left - bend))
+        candidates.now[i] = barrier.ROUNDED_DOWN * left - bend
         return False
-    if now >= within and barrier.distance_of_ways(kind, a, b, c, d, p, q, r, s) >= within:
+    if now >= within and barrier.distance_of_ways(kind, a, b, c, p, q, r) - rounding >= within:
         return False
-    candidates.now[i] = float(now)
+    candidates.now[i] = now
     candidates.share[i] = 1.0
-    add_to_list(candidates, world, i, True)
+    add_to_list(candidates, world, kind, i, True)
     return True
 
 
@@ -129,29 +122,49 @@ def bound_by_pair(
         kind_of_key(candidates.key[i]),
         kept_distance(candidates, i),
     )
-    reach, floor = wp.float64(candidates.reach[i]), wp.float64(candidates.floor[i])
-    now = wp.float64(candidates.now[i])
-    a, b, c, d = corners_of(trial.x, corners)
+    reach, floor = candidates.reach[i] + float(0.0), candidates.floor[i] + float(0.0)
+    now = candidates.now[i] + float(0.0)
     scale = progress.scale[world]
-    p = to_double(to_single(moved(trial, scale, corners[0]))) - a
-    q = to_double(to_single(moved(trial, scale, corners[1]))) - b
-    r = to_double(to_single(moved(trial, scale, corners[2]))) - c
-    s = to_double(to_single(moved(trial, scale, corners[3]))) - d
+    d = trial.x[corners[3]] + wp.vec3()
+    a, b, c = trial.x[corners[0]] - d, trial.x[corners[1]] - d, trial.x[corners[2]] - d
+    p = to_single(moved(trial, scale, corners[0])) - trial.x[corners[0]]
+    q = to_single(moved(trial, scale, corners[1])) - trial.x[corners[1]]
+    r = to_single(moved(trial, scale, corners[2])) - trial.x[corners[2]]
+    s = to_single(moved(trial, scale, corners[3])) - d
     bends = _bends(trial, scale, corners)
-    way = _relative_way(p, q, r, s) + bends[0]
+    rounding = barrier.rounding_of(p, q, r) + barrier.rounding_of(s, s, s)
+    way = barrier.way_together(kind, p - s, q - s, r - s) + rounding + bends[0]
+    gap = barrier.ROUNDED_DOWN * now - barrier.ROUNDED_UP * float(kept)
     # the closest points are found for what comes near
-    if way <= now - kept - barrier.least_gap(now - kept, reach, floor):
+    if way <= barrier.ROUNDED_DOWN * (gap - barrier.least_gap(gap, reach, floor)):
         return
-    apart = barrier.distance_of_ways(kind, a, b, c, d, p - r, q - r, wp.vec3d(), s - r)
-    if apart >= kept + bends[0] + barrier.MOST_LEFT * reach:
+    apart = barrier.distance_of_ways(kind, a, b, c, p - s, q - s, r - s) - barrier.rounding_of(a, b, c) - rounding
+    if apart >= barrier.ROUNDED_UP * (float(kept) + bends[0] + barrier.MOST_LEFT * reach):
         return
-    _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
-    least = barrier.least_gap(distance - kept, reach, floor)
-    if way <= distance - kept - least:
+    e, f, g, h = corners_of(trial.x, corners)
+    _weights, distance = barrier.closest_weights_and_gap(kind, e, f, g, h)
+    least = barrier.least_gap(distance - kept, wp.float64(reach), wp.float64(floor))
+    if wp.float64(barrier.ROUNDED_UP * way) <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
-    share = float(barrier.safe_share(kind, a, b, c, d, p, q, r, s, kept + least, most, bends))
+    of_bends = wp.vec2d(wp.float64(bends[0]), wp.float64(bends[1]))
+    share = float(
+        barrier.safe_share(
+            kind,
+            e,
+            f,
+            g,
+            h,
+            to_double(to_single(moved(trial, scale, corners[0]))) - e,
+            to_double(to_single(moved(trial, scale, corners[1]))) - f,
+            to_double(to_single(moved(trial, scale, corners[2]))) - g,
+            to_double(to_single(moved(trial, scale, corners[3]))) - h,
+            kept + least,
+            most,
+            of_bends,
+        )
+    )
     candidates.share[i] = share
     if share < 1.0:
         lower_to(progress.bound, world, share)

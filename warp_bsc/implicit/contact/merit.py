@@ -76,9 +76,10 @@ def add_pair_energy(
     """Adds the energy of the barrier of a candidate at the displaced positions."""
     corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     kind = kind_of_key(candidates.key[i])
-    a, b, c, d = corners_of(trial.moved, corners)
-    if distance_bound(candidates, i, kind, a, b, c, d) >= candidates.level[i] + reach:
+    u, v, w = barrier.seen_from_last(trial.moved, corners)
+    if wp.float64(distance_bound(candidates, i, kind, u, v, w)) >= candidates.level[i] + reach:
         return
+    a, b, c, d = corners_of(trial.moved, corners)
     _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
     gap = distance - candidates.level[i]
     if gap < reach:

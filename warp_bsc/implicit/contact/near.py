@@ -12,7 +12,6 @@ from .merge import link_contact
 from .merit import MEETS, add_energy
 from .pairs import (
     FAR,
-    ROUNDED_DOWN,
     BarrierSettings,
     Candidates,
     Trial,
@@ -119,12 +118,13 @@ def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
     """Lists a candidate if it may be near each other, for :func:`find_near`, where no displacements told."""
     if candidates.share[i] >= FAR:
         return False
-    a, b, c, d = corners_of(trial.exact, integers_at(candidates.corners, i))
-    apart = distance_bound(candidates, i, kind_of_key(candidates.key[i]), a, b, c, d)
-    candidates.now[i] = float(apart)
-    is_near = apart < candidates.level[i] + wp.float64(candidates.reach[i])
+    kind = kind_of_key(candidates.key[i])
+    a, b, c = barrier.seen_from_last(trial.exact, integers_at(candidates.corners, i))
+    apart = distance_bound(candidates, i, kind, a, b, c)
+    candidates.now[i] = apart
+    is_near = wp.float64(apart) < candidates.level[i] + wp.float64(candidates.reach[i])
     if is_near:
-        add_to_list(candidates, world, i, False)
+        add_to_list(candidates, world, kind, i, False)
     return is_near
 
 
@@ -144,13 +144,14 @@ def find_near(
     corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)
-    a, b, c, d = corners_of(trial.exact, corners)
-    apart = distance_bound(candidates, i, kind, a, b, c, d)
-    candidates.now[i] = float(apart)
-    if apart >= candidates.level[i] + reach:
+    u, v, w = barrier.seen_from_last(trial.exact, corners)
+    apart = distance_bound(candidates, i, kind, u, v, w)
+    candidates.now[i] = apart
+    if wp.float64(apart) >= candidates.level[i] + reach:
         return
+    a, b, c, d = corners_of(trial.exact, corners)
     weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
-    candidates.now[i] = float(distance * ROUNDED_DOWN)
+    candidates.now[i] = float(distance * wp.float64(barrier.ROUNDED_DOWN))
     gap = distance - candidates.level[i]
     if not gap > ZERO:
         add_energy(progress.energy, world, MEETS, settings.units)

@@ -406,7 +406,8 @@ class NewtonMethod:
     def _prepare_candidates(self):
         self._candidates.near.zero_()
         self._candidates.far.zero_()
-        self._candidates.listed.fill_(-1)
+        self._candidates.listed_edges.fill_(-1)
+        self._candidates.listed_others.zero_()
         inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings, self.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
@@ -421,7 +422,8 @@ class NewtonMethod:
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self._candidates)
-        sizes = {**dict.fromkeys(("start", "room", "near", "far", "listed"), self._work.worlds), "used": 1}
+        sizes = dict.fromkeys(("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds)
+        sizes["used"] = 1
         sizes["kept"] = capacity if self._mesh.distances is not None else 0
         self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self._candidates.room.fill_(capacity)

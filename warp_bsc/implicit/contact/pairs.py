@@ -31,8 +31,6 @@ FAR = wp.constant(2.0)
 """In place of a share of the last displacements: no part of them brings a pair within its reach."""
 FAR_TOGETHER = wp.constant(3.0)
 """The same, as long as its vertices take the same part: displacements that hardly differ do not bring it nearer."""
-ROUNDED_DOWN = wp.constant(wp.float64(1.0 - 2.0**-20))
-"""What keeps a distance, as it is rounded, from being more than it is."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
@@ -53,10 +51,11 @@ class Candidates:
         near: Number of the first ones of each world.
         far: Number of the others.
         used: Room that worlds have taken, shape [1].
-        listed: Number of pairs of each world that the last displacements may bring within their reach, or that are;
-            -1 if they are not known.
-        list: Those from the start of each world, each twice, and 1 more of those that displacements may not bring
-            together yet, see :func:`.bounds.list_pair`.
+        listed_edges: Number of pairs of edges of each world that the last displacements may bring within their reach,
+            or that are; -1 if they are not known.
+        listed_others: Number of the other ones, or 0.
+        list: Those of each world, each twice, and 1 more of those that displacements may not bring together yet, see
+            :func:`.bounds.list_pair`: edges from the start, the others from the end backwards.
         corners: Vertices.
         key: Number of the pair, see :func:`.system.key_of_pair`.
         apart: How far the vertices of a pair can go together before it is within its reach, negative if it is [m].
@@ -76,7 +75,8 @@ class Candidates:
     near: wp.array[int]
     far: wp.array[int]
     used: wp.array[int]
-    listed: wp.array[int]
+    listed_edges: wp.array[int]
+    listed_others: wp.array[int]
     list: wp.array[int]
     corners: wp.array[wp.vec4i]
     key: wp.array[wp.int64]
@@ -268,19 +268,46 @@ def kept_distance(candidates: Candidates, i: int) -> wp.float64:
 
 
 @wp.func
-def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
     """Returns a lower bound of the distance of a pair: that of boxes, or along where closest points were found last.
 
-    The second is as good as the distance until the elements turn, and much faster to find.
+    The second is as good as the distance until the elements turn, and much faster to find. Points are seen from d.
     """
-    along = barrier.distance_along(kind, direction_of_bits(candidates.normal[i]), a, b, c, d)
-    return ROUNDED_DOWN * wp.max(along, barrier.distance_of_boxes(kind, a, b, c, d))
+    along = barrier.distance_along(kind, direction_of_bits(candidates.normal[i]), a, b, c)
+    return wp.max(along, barrier.distance_of_boxes(kind, a, b, c)) - barrier.rounding_of(a, b, c)
 
 
 @wp.func
-def add_to_list(candidates: Candidates, world: int, i: int, is_new: bool):
-    """Lists a pair of a world."""
-    candidates.list[candidates.start[world] + take_slot_of(candidates.listed, world)] = 2 * i + int(is_new)
+def add_to_list(candidates: Candidates, world: int, kind: int, i: int, is_new: bool):
+    """Lists a pair of a world: edges first, others from the end backwards."""
+    first = candidates.start[world] + int(0)
+    if kind == EDGE_EDGE:
+        first += take_slot_of(candidates.listed_edges, world)
+    else:
+        first += candidates.room[world] - 1 - take_slot_of(candidates.listed_others, world)
+    candidates.list[first] = 2 * i + int(is_new)
+
+
+@wp.func
+def clear_list(candidates: Candidates, world: int):
+    """Empties the list of a world."""
+    candidates.listed_edges[world] = 0
+    candidates.listed_others[world] = 0
+
+
+@wp.func
+def listed_count(candidates: Candidates, world: int) -> int:
+    """Returns the length of the list of a world, -1 if it is not known."""
+    return candidates.listed_edges[world] + candidates.listed_others[world]
+
+
+@wp.func
+def listed(candidates: Candidates, world: int, k: int) -> int:
+    """Returns an entry of the list of a world: threads that run together mostly have pairs of one kind."""
+    edges, place = candidates.listed_edges[world], k
+    if k >= edges:
+        place = candidates.room[world] - 1 - (k - edges)
+    return candidates.list[candidates.start[world] + place] + int(0)
 
 
 @wp.struct
@@ -329,7 +356,8 @@ def _prepare(
     if motion.distances.radius:
         start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
-        start = barrier.distance_of_boxes(queue.kind, a, b, c, d)
+        u, v, w = barrier.seen_from_last(origin, corners)
+        start = wp.float64(barrier.distance_of_boxes(queue.kind, u, v, w) - barrier.rounding_of(u, v, w))
         if not start >= wp.float64(whole):  # farther away, all is the same
             start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
@@ -344,7 +372,7 @@ def _prepare(
     level, reach = _barrier_of(settings, start, kept, whole)
     pair = queue.pairs[i]
     slot = int(0)
-    world, apart = motion.world[corners[0]], float((start - kept - reach) * ROUNDED_DOWN)
+    world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(barrier.ROUNDED_DOWN))
     if apart < 2.0 * progress.way_before[world]:
         slot = candidates.start[world] + take_slot_of(candidates.near, world)
     else:

@@ -10,7 +10,7 @@ from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
 from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merge, merit, near, steps
 from .flow import Phase, Place, Problem, wait_for_team
-from .pairs import BarrierSettings, Candidates
+from .pairs import BarrierSettings, Candidates, clear_list, listed, listed_count
 from .system import Progress, Worlds, end_of_contacts
 
 wp.set_module_options({"enable_backward": False})
@@ -63,7 +63,7 @@ def _pair_count(candidates: Candidates, w: int, of_all: bool) -> int:
     """Returns the number of all candidates of a world, or of those that are listed."""
     if of_all:
         return candidates.near[w] + candidates.far[w]
-    return candidates.listed[w]
+    return listed_count(candidates, w)
 
 
 # From the start of a Newton step to its solve
@@ -109,7 +109,7 @@ def find_loads(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
         steps.add_inertia(u, w, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, energy)
     for u in range(first + n - 1 - t, end, n):
         p.contacts.end[u] = 0
-    phase = wp.where(p.candidates.listed[w] >= 0, int(Phase.FIND_NEAR), int(Phase.BEGIN_LIST))
+    phase = wp.where(listed_count(p.candidates, w) >= 0, int(Phase.FIND_NEAR), int(Phase.BEGIN_LIST))
     return _to_pairs(at, phase, Phase.COUNT)
 
 
@@ -119,7 +119,7 @@ def publish(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setting
     merge.clear_buckets(at.world, at.thread, at.threads, p.contacts)
     if at.thread == 0:
         p.contacts.count[at.world] = 0
-    phase = wp.where(p.candidates.listed[at.world] >= 0, int(Phase.FIND_NEAR), int(Phase.BEGIN_LIST))
+    phase = wp.where(listed_count(p.candidates, at.world) >= 0, int(Phase.FIND_NEAR), int(Phase.BEGIN_LIST))
     if p.progress.steps[at.world] == 0:
         phase = int(Phase.END)
     return _to_pairs(at, phase, Phase.END)
@@ -129,7 +129,7 @@ def publish(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setting
 def begin_list(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Empties the list of candidates."""
     if at.thread == 0:
-        p.candidates.listed[at.world] = 0
+        clear_list(p.candidates, at.world)
     return _to(at, wp.where(_has_few(p.candidates, at), int(Phase.LIST_AND_FIND_NEAR), int(Phase.LIST_NEAR)))
 
 
@@ -151,7 +151,7 @@ def find_near(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setti
             i = _candidate(k, p.candidates, at.world)
             is_near = near.list_near(i, w, p.candidates, p.trial)
         else:
-            i = p.candidates.list[p.candidates.start[w] + k] >> 1
+            i = listed(p.candidates, w, k) >> 1
         if is_near:
             near.find_near(i, w, motion, p.candidates, settings, p.trial, p.unknowns, p.progress, p.contacts)
     for k in range(p.worlds.first_vertex[w] + at.thread, _end_at_planes(p.worlds, p.vertices_at_planes, w), at.threads):
@@ -298,7 +298,7 @@ def displace(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settin
             p.leaves,
         )
     if t == 0:
-        p.candidates.listed[w] = 0
+        clear_list(p.candidates, w)
     return _to(at, wp.where(_has_few(p.candidates, at), int(Phase.LIST_AND_BOUND), int(Phase.LIST_WAYS)))
 
 
@@ -322,7 +322,7 @@ def bound(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings:
             i = _candidate(k, p.candidates, at.world)
             is_new = bounds.list_pair(i, w, p.candidates, p.trial, p.progress, at.passes > 0)
         else:
-            entry = p.candidates.list[p.candidates.start[w] + k] + int(0)
+            entry = listed(p.candidates, w, k)
             i, is_new = entry >> 1, (entry & 1) != 0
         if is_new:
             bounds.bound_by_pair(i, w, p.candidates, p.trial, p.progress, p.limit)
@@ -362,7 +362,7 @@ def hold_pairs(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
     """Holds pairs that would meet."""
     w, group = at.world, 1 + at.solves
     for k in range(at.thread, _pair_count(p.candidates, at.world, False), at.threads):
-        i = p.candidates.list[p.candidates.start[w] + k] >> 1
+        i = listed(p.candidates, w, k) >> 1
         held.hold_pair(i, w, p.candidates, p.trial, p.unknowns, p.vectors.inverse, p.limit, group, p.contacts)
     for k in range(p.worlds.first_vertex[w] + at.thread, _end_at_planes(p.worlds, p.vertices_at_planes, w), at.threads):
         v = p.worlds.vertices[k] + int(0)
@@ -428,7 +428,7 @@ def find_energy(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
     for i in range(p.contacts.start[w] + from_middle, end_of_contacts(p.contacts, w), n):
         merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, energy)
     for k in range(t, _pair_count(p.candidates, at.world, False), n):
-        i = p.candidates.list[p.candidates.start[w] + k] >> 1
+        i = listed(p.candidates, w, k) >> 1
         merit.add_pair_energy(i, w, p.candidates, settings, p.trial, p.progress)
     for k in range(p.worlds.first_vertex[w] + t, _end_at_planes(p.worlds, p.vertices_at_planes, w), n):
         v = p.worlds.vertices[k] + int(0)
@@ -468,7 +468,7 @@ def cut(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: B
             p.progress.bound[w] = 1.0
         then = int(Phase.TAKE_CUT)
     if t == 0:
-        p.candidates.listed[w] = 0
+        clear_list(p.candidates, w)
     return wp.vec4i(
         wp.where(_has_few(p.candidates, at), int(Phase.LIST_AND_BOUND), int(Phase.LIST_WAYS)), then, passes, at.solves
     )

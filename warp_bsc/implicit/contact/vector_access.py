@@ -78,10 +78,10 @@ def stored_block(blocks: wp.array[mat34], k: int) -> wp.mat33:
     ...
 
 
-_LARGEST, _UNIT = wp.constant(wp.float64(511.0)), wp.constant(wp.float64(1.0 / 511.0))
+_LARGEST, _UNIT = wp.constant(wp.float64(511.0)), wp.constant(float(1.0 / 511.0))
 """Of a component in ten bits, and what 1 there stands for."""
 _SHORTER = wp.constant(wp.float64(1.0 - 2.0**-9))
-"""With it, rounding to multiples of 1 / 511 leaves a unit vector no longer than 1."""
+"""With it, rounding to multiples of 1 / 511 leaves a unit vector shorter than 1."""
 
 
 @wp.func
@@ -96,12 +96,11 @@ def direction_in_bits(n: wp.vec3d) -> int:
 
 
 @wp.func
-def _component_of(bits: int) -> wp.float64:
-    within = bits & 1023
-    return _UNIT * wp.float64(wp.where(within > 511, within - 1024, within))
+def _component_of(bits: int) -> float:
+    return _UNIT * float(((bits & 1023) ^ 512) - 512)
 
 
 @wp.func
-def direction_of_bits(bits: int) -> wp.vec3d:
+def direction_of_bits(bits: int) -> wp.vec3:
     """Returns a vector no longer than 1, within 0.005 of the unit vector; 0 for 0."""
-    return wp.vec3d(_component_of(bits), _component_of(bits >> 10), _component_of(bits >> 20))
+    return wp.vec3(_component_of(bits), _component_of(bits >> 10), _component_of(bits >> 20))

@@ -15,7 +15,7 @@ def to_double(x: Any) -> wp.vec3d:
 
 
 @wp.func
-def to_single(x: wp.vec3d) -> wp.vec3:
+def to_single(x: Any) -> wp.vec3:
     """Returns the nearest vector in single precision."""
     return wp.vec3(wp.float32(x[0]), wp.float32(x[1]), wp.float32(x[2]))
 
