@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from ...response.state.vectors import HALF, ONE, ZERO, to_single
-from .vector_access import mat34, store_block
+from .vector_access import mat34, store_block, store_numbers
 
 wp.set_module_options({"enable_backward": False})
 
@@ -84,14 +84,13 @@ class Derivatives:
         gradient: Of each corner of each element [N], shape [corners].
         block: Hessians of each two corners of each element but those of bending, row by row [N/m], shape [blocks],
             each row with a fourth number without meaning, so that a GPU reads and writes it at once.
-        turn: Derivatives of the angle of each element of bending by its corners [1/m], shape [4 count].
-        curvature: Second derivative of its energy by the angle [J], shape [count].
+        turn: Of each corner of each element of bending [sqrt(N/m)], shape [4 count]: the outer products of those of
+            two corners are blocks of its Hessian, the fourth number is without meaning.
     """
 
     gradient: wp.array[wp.vec3]
     block: wp.array[mat34]
-    turn: wp.array[wp.vec3]
-    curvature: wp.array[float]
+    turn: wp.array[wp.vec4]
 
 
 def elements_of_model(model: newton.Model) -> tuple[Elements, list[np.ndarray]]:
@@ -130,8 +129,7 @@ def make_derivatives(vertices: list[np.ndarray], device: wp.Device) -> Derivativ
     blocks = sum(v.size * v.shape[1] for kind, v in enumerate(vertices) if kind != ElementKind.BENDING)
     derivatives.gradient = wp.zeros(sum(v.size for v in vertices), dtype=wp.vec3, device=device)
     derivatives.block = wp.zeros(blocks, dtype=mat34, device=device)
-    derivatives.turn = wp.zeros(4 * bends, dtype=wp.vec3, device=device)
-    derivatives.curvature = wp.zeros(bends, dtype=float, device=device)
+    derivatives.turn = wp.zeros(4 * bends, dtype=wp.vec4, device=device)
     return derivatives
 
 
@@ -724,9 +722,9 @@ def find_derivatives(
             energy = _bending_energy(elements, e, x, x0, dt)
             turn, moment, curvature = bend(elements, e, x, x0, dt)
             gradient = moment * turn
-        out.curvature[e] = float(curvature)
+        root = wp.sqrt(wp.max(curvature, ZERO))
         for j in range(4):
-            out.turn[4 * e + j] = to_single(turn[j])
+            store_numbers(out.turn, 4 * e + j, to_single(root * turn[j]))
     elif kind == ElementKind.TETRAHEDRON and has:
         energy = _tetrahedron_energy(elements, e, x, x0, dt)
         gradient = _tetrahedron_gradient(elements, e, x, x0, dt)

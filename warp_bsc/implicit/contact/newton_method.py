@@ -23,7 +23,7 @@ from . import bodies, decisions, pairs, steps
 from .advance import ADVANCE
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team
-from .elasticity import elements_of_model, make_derivatives
+from .elasticity import ElementKind, elements_of_model, make_derivatives
 from .flow import Flow, Phase, Problem
 from .impulses import publish_contacts
 from .matrix import make_matrix
@@ -101,6 +101,8 @@ class NewtonMethod:
         model, device = mesh.model, mesh.device
         particles, vertices = model.particle_count, mesh.vertex_count
         self._elements, of_elements = elements_of_model(model)
+        bends = of_elements[ElementKind.BENDING]
+        bends[(bends < 0).any(axis=1)] = -1  # an edge at a border does not bend
         world = mesh.device_world.numpy()[:particles]
         if (np.diff(world) < 0).any():
             raise ValueError("particles of a world do not follow each other in the model")
@@ -229,9 +231,17 @@ class NewtonMethod:
         world = self._mesh.device_world.numpy()
         is_given = (unknowns.of_vertex.numpy() == -1).astype(int)
         vertices, first = grouped_by_world(2 * world + is_given, 2 * count)
-        of_elements = [world[v.max(axis=1)] for v in of_elements if len(v)] or [world[:0]]
-        elements, first_element = grouped_by_world(np.concatenate(of_elements), count)
         arrays = {"vertices": vertices, "first_vertex": first[::2], "first_given": first[1::2]}
+        # by world and kind, and on a GPU each kind begins with a warp of its own: the threads of one do the same
+        kinds = len(of_elements)
+        vertex = np.concatenate([v.max(axis=1, initial=-1) for v in of_elements])
+        kind = np.repeat(np.arange(kinds), [len(v) for v in of_elements])
+        numbers = np.flatnonzero(vertex >= 0)
+        of_kinds, first_of_kind = grouped_by_world(kinds * world[vertex[numbers]] + kind[numbers], kinds * count)
+        counts, warp = np.diff(first_of_kind), 32 if device.is_cuda else 1
+        start = np.append(0, np.cumsum(-(-counts // warp) * warp))
+        elements, first_element = np.full(start[-1], -1), start[::kinds]
+        elements[np.arange(len(numbers)) + np.repeat(start[:-1] - first_of_kind[:-1], counts)] = numbers[of_kinds]
         arrays |= {"elements": elements, "first_element": first_element}
         for name, values in arrays.items():
             setattr(found, name, wp.array(values.astype(np.int32), dtype=int, device=device))

@@ -41,9 +41,9 @@ _PARTED_ROUNDED = wp.constant(2.0**-20)
 class Candidates:
     """Pairs of elements that may come near each other in the step, but for those that are excluded.
 
-    Those of a world follow each other. What would come within its reach if vertices went as far as in the step before
-    comes first there, the others from the end backwards, each in any order: threads that run together then mostly do
-    the same.
+    Those of a world follow each other. What would come within its reach if vertices went a little farther than in the
+    step before comes first there, the others from the end backwards, each in any order: threads that run together then
+    mostly do the same, and where vertices do not go that far, only the first ones are looked at.
 
     Attributes:
         start: First of each world.
@@ -329,8 +329,25 @@ NO_FACE = wp.constant(2**31 - 1)
 @wp.func
 def stays_far(apart: float, progress: Progress, world: int) -> bool:
     """Returns whether a pair is beyond its reach, whichever of the vertices of its world go the longest ways."""
+    return apart >= _longest_ways(progress, world)
+
+
+@wp.func
+def far_ones_stay(progress: Progress, world: int) -> bool:
+    """Returns whether all candidates stay beyond their reach that were put to those that are far."""
+    return _far(progress, world) >= _longest_ways(progress, world)
+
+
+@wp.func
+def _longest_ways(progress: Progress, world: int) -> float:
     way = progress.way[world]
-    return apart >= way + wp.max(way, progress.given_way[world])
+    return way + wp.max(way, progress.given_way[world])
+
+
+@wp.func
+def _far(progress: Progress, world: int) -> float:
+    """Returns how far vertices can go together before a pair is within its reach that counts as far."""
+    return 2.5 * progress.way_before[world]
 
 
 @wp.func
@@ -373,7 +390,8 @@ def _prepare(
     pair = queue.pairs[i]
     slot = int(0)
     world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(barrier.ROUNDED_DOWN))
-    if apart < 2.0 * progress.way_before[world]:
+    is_far = stays_far(apart, progress, world)
+    if apart < _far(progress, world) or not is_far:
         slot = candidates.start[world] + take_slot_of(candidates.near, world)
     else:
         slot = candidates.start[world] + candidates.room[world] - 1 - take_slot_of(candidates.far, world)
@@ -388,7 +406,7 @@ def _prepare(
         motion, settings, progress, world, corners, queue.kind == EDGE_EDGE, wp.float64(float(reach))
     )
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
-    candidates.share[slot] = wp.where(stays_far(apart, progress, world), FAR, 1.0)
+    candidates.share[slot] = wp.where(is_far, FAR, 1.0)
     candidates.normal[slot] = 0
 
 

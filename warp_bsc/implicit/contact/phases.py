@@ -10,7 +10,7 @@ from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
 from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merge, merit, near, steps
 from .flow import Phase, Place, Problem, wait_for_team
-from .pairs import BarrierSettings, Candidates, clear_list, listed, listed_count
+from .pairs import BarrierSettings, Candidates, clear_list, far_ones_stay, listed, listed_count
 from .system import Progress, Worlds, end_of_contacts
 
 wp.set_module_options({"enable_backward": False})
@@ -59,11 +59,14 @@ def _candidate(k: int, candidates: Candidates, w: int) -> int:
 
 
 @wp.func
-def _pair_count(candidates: Candidates, w: int, of_all: bool) -> int:
-    """Returns the number of all candidates of a world, or of those that are listed."""
+def _pair_count(candidates: Candidates, progress: Progress, w: int, of_all: bool) -> int:
+    """Returns the number of listed candidates of a world, or of all but those that are far in any case."""
+    count = listed_count(candidates, w)
     if of_all:
-        return candidates.near[w] + candidates.far[w]
-    return listed_count(candidates, w)
+        count = candidates.near[w] + int(0)
+        if not far_ones_stay(progress, w):
+            count += candidates.far[w]
+    return count
 
 
 # From the start of a Newton step to its solve
@@ -88,6 +91,8 @@ def differentiate(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, s
     is_far = decisions.is_far(w, p.far_change, p.progress)
     for k in range(p.worlds.first_element[w] + at.spread, p.worlds.first_element[w + 1], n):
         i = p.worlds.elements[k] + int(0)
+        if i < 0:
+            continue
         kind = elasticity.kind_of(p.elements, i)
         energy = elasticity.find_derivatives(
             i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, is_far, p.derivatives
@@ -136,7 +141,7 @@ def begin_list(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
 @wp.func
 def list_near(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Lists candidates that may be near each other: little for each of all, so that what follows has few."""
-    for k in range(at.thread, _pair_count(p.candidates, at.world, True), at.threads):
+    for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, True), at.threads):
         near.list_near(_candidate(k, p.candidates, at.world), at.world, p.candidates, p.trial)
     return _to(at, Phase.FIND_NEAR)
 
@@ -145,7 +150,7 @@ def list_near(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setti
 def find_near(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Finds contacts, of listed candidates or of all."""
     w, at_once = at.world, at.phase == Phase.LIST_AND_FIND_NEAR
-    for k in range(at.thread, _pair_count(p.candidates, at.world, at_once), at.threads):
+    for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, at_once), at.threads):
         i, is_near = int(0), bool(True)
         if at_once:
             i = _candidate(k, p.candidates, at.world)
@@ -305,7 +310,7 @@ def displace(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settin
 @wp.func
 def list_ways(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Lists candidates that displacements may bring together."""
-    for k in range(at.thread, _pair_count(p.candidates, at.world, True), at.threads):
+    for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, True), at.threads):
         bounds.list_pair(
             _candidate(k, p.candidates, at.world), at.world, p.candidates, p.trial, p.progress, at.passes > 0
         )
@@ -316,7 +321,7 @@ def list_ways(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setti
 def bound(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Finds the share of displacements before something meets, by listed candidates or by all."""
     w, at_once = at.world, at.phase == Phase.LIST_AND_BOUND
-    for k in range(at.thread, _pair_count(p.candidates, at.world, at_once), at.threads):
+    for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, at_once), at.threads):
         i, is_new = int(0), bool(False)
         if at_once:
             i = _candidate(k, p.candidates, at.world)
@@ -361,7 +366,7 @@ def release_held(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, se
 def hold_pairs(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Holds pairs that would meet."""
     w, group = at.world, 1 + at.solves
-    for k in range(at.thread, _pair_count(p.candidates, at.world, False), at.threads):
+    for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, False), at.threads):
         i = listed(p.candidates, w, k) >> 1
         held.hold_pair(i, w, p.candidates, p.trial, p.unknowns, p.vectors.inverse, p.limit, group, p.contacts)
     for k in range(p.worlds.first_vertex[w] + at.thread, _end_at_planes(p.worlds, p.vertices_at_planes, w), at.threads):
@@ -420,6 +425,8 @@ def find_energy(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
     from_middle = (t + n // 2) % n
     for k in range(p.worlds.first_element[w] + n - 1 - t, p.worlds.first_element[w + 1], n):
         i = p.worlds.elements[k] + int(0)
+        if i < 0:
+            continue
         kind = elasticity.kind_of(p.elements, i)
         value = elasticity.element_energy(p.elements, i, kind, p.trial.moved, motion.x0, settings.dt)
         merit.add_energy(energy, w, value, settings.units)
@@ -427,7 +434,7 @@ def find_energy(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
         steps.add_inertia(u, w, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, energy)
     for i in range(p.contacts.start[w] + from_middle, end_of_contacts(p.contacts, w), n):
         merit.add_friction_energy(i, w, motion, p.contacts, settings, p.trial, energy)
-    for k in range(t, _pair_count(p.candidates, at.world, False), n):
+    for k in range(t, _pair_count(p.candidates, p.progress, at.world, False), n):
         i = listed(p.candidates, w, k) >> 1
         merit.add_pair_energy(i, w, p.candidates, settings, p.trial, p.progress)
     for k in range(p.worlds.first_vertex[w] + t, _end_at_planes(p.worlds, p.vertices_at_planes, w), n):

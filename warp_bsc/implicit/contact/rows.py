@@ -90,26 +90,32 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
     snippet=sum_of(
         "wp::mat_t<3, 3, float>",
         9,
+        places="rows.source.data",
         term="wp::mat_t<3, 3, float> block;",
         read="""
-            const int source = rows.source.data[n];
-            if (source >= 0) {
+            const int corner = (-1 - place) >> 2, other = (corner & ~3) + ((-1 - place) & 3);
 #if defined(__CUDA_ARCH__)
-                for (int row = 0; row < 3; ++row) {
-                    const float4 of_row = ((const float4*)(derivatives.block.data + source))[row];
-                    t.block.data[row][0] = of_row.x, t.block.data[row][1] = of_row.y, t.block.data[row][2] = of_row.z;
-                }
-#else
-                for (int c = 0; c < 9; ++c)
-                    t.block.data[c / 3][c % 3] = derivatives.block.data[source].data[c / 3][c % 3];
-#endif
+            const float4* const turn = (const float4*)derivatives.turn.data;
+            float4 rows_of_block[3];
+            if (place >= 0) {
+                for (int row = 0; row < 3; ++row)
+                    rows_of_block[row] = ((const float4*)(derivatives.block.data + place))[row];
             } else {
-                const int corner = (-1 - source) >> 2, first_of_edge = corner & ~3;
-                const wp::vec3 a = derivatives.turn.data[corner];
-                const wp::vec3 b = derivatives.turn.data[first_of_edge + ((-1 - source) & 3)];
-                const float curvature = derivatives.curvature.data[corner >> 2];
-                for (int c = 0; c < 9; ++c) t.block.data[c / 3][c % 3] = curvature * (a[c / 3] * b[c % 3]);
+                const float4 a = turn[corner], b = turn[other];
+                rows_of_block[0] = make_float4(a.x * b.x, a.x * b.y, a.x * b.z, 0.0f);
+                rows_of_block[1] = make_float4(a.y * b.x, a.y * b.y, a.y * b.z, 0.0f);
+                rows_of_block[2] = make_float4(a.z * b.x, a.z * b.y, a.z * b.z, 0.0f);
             }
+            for (int row = 0; row < 3; ++row) {
+                const float4 of_row = rows_of_block[row];
+                t.block.data[row][0] = of_row.x, t.block.data[row][1] = of_row.y, t.block.data[row][2] = of_row.z;
+            }
+#else
+            for (int c = 0; c < 9; ++c)
+                t.block.data[c / 3][c % 3] =
+                    place >= 0 ? derivatives.block.data[place].data[c / 3][c % 3]
+                               : derivatives.turn.data[corner][c / 3] * derivatives.turn.data[other][c % 3];
+#endif
         """,
         add="for (int c = 0; c < 9; ++c) sum[c] += t.block.data[c / 3][c % 3];",
     )
@@ -123,8 +129,9 @@ def sum_of_blocks(rows: Rows, derivatives: Derivatives, first: int, end: int, pa
     snippet=sum_of(
         "wp::vec_t<3, float>",
         3,
+        places="rows.corner.data",
         term="wp::vec3 force;",
-        read="t.force = derivatives.gradient.data[rows.corner.data[n]];",
+        read="t.force = derivatives.gradient.data[place];",
         add="for (int c = 0; c < 3; ++c) sum[c] += t.force[c];",
     )
 )

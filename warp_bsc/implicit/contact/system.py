@@ -318,10 +318,11 @@ def take_contact(contacts: Contacts, world: int) -> int:
     snippet=sum_of(
         "wp::mat_t<3, 3, float>",
         9,
-        term="int place; wp::vec4i of; wp::vec4 weights; float hessian[9];",
+        places="contacts.entries.data",
+        term="int corner; wp::vec4i of; wp::vec4 weights; float hessian[9];",
         read="""
-            const int entry = contacts.entries.data[n], i = entry >> 2;
-            t.place = entry & 3;
+            const int i = place >> 2;
+            t.corner = place & 3;
 #if defined(__CUDA_ARCH__)
             const int4 of = *(const int4*)(contacts.unknowns.data + i);
             const float4 w = *(const float4*)(contacts.weights.data + i);
@@ -339,7 +340,7 @@ def take_contact(contacts: Contacts, world: int) -> int:
             float weight = 0.0f;
             for (int j = 0; j < 4; ++j) weight += t.of[j] == v ? t.weights[j] : 0.0f;
             if (weight == 0.0f) return;
-            weight *= t.weights[t.place];
+            weight *= t.weights[t.corner];
             for (int c = 0; c < 9; ++c) sum[c] += weight * t.hessian[c];
         """,
     )

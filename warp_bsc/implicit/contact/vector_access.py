@@ -44,6 +44,20 @@ def numbers_at(values: wp.array[wp.vec4], i: int) -> wp.vec4:
 @wp.func_native(
     snippet="""
 #if defined(__CUDA_ARCH__)
+    *(float4*)(values.data + i) = make_float4(v[0], v[1], v[2], 0.0f);
+#else
+    values.data[i] = wp::vec4(v[0], v[1], v[2], 0.0f);
+#endif
+"""
+)
+def store_numbers(values: wp.array[wp.vec4], i: int, v: wp.vec3):
+    """Writes three numbers, and a fourth one without meaning."""
+    ...
+
+
+@wp.func_native(
+    snippet="""
+#if defined(__CUDA_ARCH__)
     for (int row = 0; row < 3; ++row)
         ((float4*)(blocks.data + k))[row] = make_float4(
             (float)block.data[row][0], (float)block.data[row][1], (float)block.data[row][2], 0.0f);
