@@ -134,8 +134,8 @@ class Scene:
             of_corners = gradient[corner : corner + v.size].reshape(len(v), size, 3)
             corner += v.size
             if kind == ElementKind.BENDING:
-                turn = out.turn.numpy().reshape(len(v), size, 3)
-                hessian = np.einsum("e,eia,ejb->eiajb", out.curvature.numpy(), turn, turn)
+                turn = out.turn.numpy().reshape(len(v), size, 4)[:, :, :3]
+                hessian = np.einsum("eia,ejb->eiajb", turn, turn)
             else:
                 blocks = block[place : place + v.size * size, :, :3].reshape(len(v), size, size, 3, 3)
                 hessian = blocks.transpose(0, 1, 3, 2, 4)
@@ -217,10 +217,11 @@ def test_rows_are_the_sums_of_elements(scene):
     unknowns.of_worlds = scene.array([0, count], int)
     blocks_of = make_matrix(rows, np.array([0, count]), parts=2, device=device)
     inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array(scene.x), rows]
-    wp.launch(_add_blocks, len(row), inputs=[*inputs, 1], outputs=[blocks_of], device=device)
+    numbers = -(-count // 32) * 32 + len(row)  # see block_count
+    wp.launch(_add_blocks, numbers, inputs=[*inputs, 1], outputs=[blocks_of], device=device)
     if wp.get_device(device).is_cuda:  # the same sums by four threads for each block
         values = blocks_of.value.numpy()
-        wp.launch(_add_blocks, 4 * len(row), inputs=[*inputs, 4], outputs=[blocks_of], device=device)
+        wp.launch(_add_blocks, 4 * numbers, inputs=[*inputs, 4], outputs=[blocks_of], device=device)
         np.testing.assert_array_equal(blocks_of.value.numpy(), values)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)

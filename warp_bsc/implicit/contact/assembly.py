@@ -52,6 +52,19 @@ def _inertia(
 
 
 @wp.func
+def _diagonal_count(unknowns: Unknowns, world: int) -> int:
+    """Returns the number of blocks of the diagonal of a world, up to that of the threads of its last warp."""
+    return (unknowns.of_worlds[world + 1] - unknowns.of_worlds[world] + 31) // 32 * 32
+
+
+@wp.func
+def block_count(rows: Rows, unknowns: Unknowns, world: int) -> int:
+    """Returns for how many numbers :func:`add_blocks` does something, or nothing, in a world."""
+    blocks = rows.first[unknowns.of_worlds[world + 1]] - rows.first[unknowns.of_worlds[world]]
+    return _diagonal_count(unknowns, world) + blocks
+
+
+@wp.func
 def add_blocks(
     i: int,
     world: int,
@@ -70,12 +83,21 @@ def add_blocks(
 ):
     """Adds up blocks of elements, of contacts that do not couple, and of inertia, of a world.
 
-    So many threads add up one block together. Where each has one of its own, those of a row read the same contacts side
-    by side.
+    So many threads add up one block together. Those of the diagonal, which have many terms, come before all others, in
+    warps of their own: of a world, there are :func:`block_count`.
     """
-    k, part = rows.first[unknowns.of_worlds[world]] + i // parts, i % parts
+    number, part = i // parts, i % parts
+    first_row, diagonals = unknowns.of_worlds[world] + int(0), _diagonal_count(unknowns, world)
+    k = rows.first[first_row] + number - diagonals
+    if number < diagonals:
+        if first_row + number >= unknowns.of_worlds[world + 1]:
+            return
+        k = rows.first[first_row + number] + int(0)
     row, column = row_of_block[k] + int(0), rows.column[k] + int(0)
-    of_contacts = contact_block(contacts, contacts.first[row], contacts.middle[row], column, part, parts)
+    if row == column and number >= diagonals:
+        return
+    first = wp.where(row == column, contacts.first[row], contacts.several[row])
+    of_contacts = contact_block(contacts, first, contacts.middle[row], column, part, parts)
     block = of_contacts + sum_of_blocks(rows, derivatives, rows.first_source[k], rows.first_source[k + 1], part, parts)
     if part == 0:
         if row == column and unknowns.is_free[row] != 0:

@@ -129,7 +129,7 @@ def seen_from_last(x: wp.array[Any], corners: wp.vec4i):
 @wp.func
 def rounding_of(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
     """Returns by how much more than they are rounding makes distances that are found from what is seen from d."""
-    return _ROUNDING * wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c)))
+    return _ROUNDING * wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c))) + _TINY
 
 
 @wp.func

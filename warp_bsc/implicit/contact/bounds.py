@@ -48,16 +48,23 @@ def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2:
 
 
 @wp.func
-def list_pair(i: int, world: int, candidates: Candidates, trial: Trial, progress: Progress, is_shorter: bool) -> bool:
+def last_of_pair(i: int, candidates: Candidates) -> wp.vec4:
+    """Returns what tells most candidates apart, for :func:`list_pair`: read ahead, as most of the time is waiting."""
+    within = barrier.ROUNDED_UP * (float(kept_distance(candidates, i)) + candidates.reach[i])
+    return wp.vec4(candidates.share[i], candidates.now[i], candidates.apart[i], within)
+
+
+@wp.func
+def list_pair(
+    i: int, last: wp.vec4, world: int, candidates: Candidates, trial: Trial, progress: Progress, is_shorter: bool
+) -> bool:
     """Lists a candidate that displacements may bring within its reach; returns whether :func:`bound_by_pair` follows.
 
     Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
     """
-    # read side by side: most of the time is waiting for memory
-    before, now = candidates.share[i] + float(0.0), candidates.now[i] + float(0.0)
-    within = barrier.ROUNDED_UP * (float(kept_distance(candidates, i)) + candidates.reach[i])
-    stays = stays_far(candidates.apart[i] + float(0.0), progress, world)
+    before, now, within = last[0], last[1], last[3]
+    stays = stays_far(last[2], progress, world)
     if before == FAR and (is_shorter or stays):
         return False
     if before == FAR_TOGETHER and not is_shorter:

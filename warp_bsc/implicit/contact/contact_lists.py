@@ -2,13 +2,15 @@
 
 import warp as wp
 
-from .system import Contacts, Unknowns, first_unknown
+from .system import NOT_UNKNOWN, Contacts, Unknowns, first_unknown
 from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 
 _COUPLES = wp.constant(wp.int64(1 << 61))
 """What is added to the number of a contact that couples, so that it comes last."""
+_ALONE = wp.constant(wp.int64(-(1 << 62)))
+"""The same where it has no other unknown, so that it comes first, and is no part of blocks beside the diagonal."""
 
 
 @wp.func
@@ -53,15 +55,17 @@ def place_entries(u: int, world: int, contacts: Contacts):
         contacts.end[u] = first
     else:
         contacts.first[u] = 0
+        contacts.several[u] = 0
         contacts.middle[u] = 0
 
 
 @wp.func
-def _list_entry(contacts: Contacts, u: int, entry: int):
+def _list_entry(contacts: Contacts, u: int, entry: int, count: int):
     n = wp.atomic_add(contacts.end, u, 1)
     contacts.unsorted[n] = entry
     contacts.row[n] = u
-    contacts.order[n] = wp.int64(contacts.couples[entry >> 2]) * _COUPLES + contacts.key[entry >> 2]
+    place = wp.where(contacts.couples[entry >> 2] != 0, _COUPLES, wp.where(count == 1, _ALONE, wp.int64(0)))
+    contacts.order[n] = place + contacts.key[entry >> 2]
 
 
 @wp.func
@@ -82,14 +86,22 @@ def list_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
     if contacts.couples[i] != 0:
         _list_coupled(contacts, world, i)
     weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
+    count = int(0)
     for j in range(4):
-        if weights[j] != 0.0:
-            u = first_unknown(of_corners[j])
-            if u >= 0:
-                if unknowns.is_free[u] != 0:
-                    _list_entry(contacts, u, 4 * i + j)
-                    if of_corners[j] < 0:
-                        _list_entry(contacts, u + 1, 4 * i + j)
+        if weights[j] == 0.0:
+            of_corners[j] = NOT_UNKNOWN
+        u = first_unknown(of_corners[j])
+        if u >= 0:
+            if unknowns.is_free[u] == 0:
+                of_corners[j] = NOT_UNKNOWN
+            else:
+                count += wp.where(of_corners[j] < 0, 2, 1)
+    for j in range(4):
+        u = first_unknown(of_corners[j])
+        if u >= 0:
+            _list_entry(contacts, u, 4 * i + j, count)
+            if of_corners[j] < 0:
+                _list_entry(contacts, u + 1, 4 * i + j, count)
 
 
 @wp.func
@@ -104,18 +116,20 @@ def _put_entry(contacts: Contacts, at: int, order: wp.int64, entry: int):
 def sort_entries(n: int, contacts: Contacts):
     """Puts an entry of an unknown to its place by its pair, so that sums do not depend on the order of threads.
 
-    Those that couple come last.
+    Those that have no other unknown come first, those that couple last.
     """
     u, own, entry = contacts.row[n], contacts.order[n] + wp.int64(0), contacts.unsorted[n] + int(0)
     first = contacts.first[u]
-    rank, single = int(0), int(0)
+    rank, alone, single = int(0), int(0), int(0)
     for m in range(first, contacts.end[u]):
         other = contacts.order[m] + wp.int64(0)
+        alone += wp.where(other < wp.int64(0), 1, 0)
         single += wp.where(other < _COUPLES, 1, 0)
         if other < own or (other == own and contacts.unsorted[m] < entry):
             rank += 1
     _put_entry(contacts, first + rank, own, entry)
     if rank == 0:
+        contacts.several[u] = first + alone
         contacts.middle[u] = first + single
 
 
@@ -140,10 +154,12 @@ def sort_list(u: int, contacts: Contacts):
                         at -= step
             contacts.order[at] = own
             contacts.unsorted[at] = entry
-    single = int(0)
+    alone, single = int(0), int(0)
     for n in range(first, end):
         order = contacts.order[n] + wp.int64(0)
+        alone += wp.where(order < wp.int64(0), 1, 0)
         single += wp.where(order < _COUPLES, 1, 0)
         _put_entry(contacts, n, order, contacts.unsorted[n])
     if end > first:
+        contacts.several[u] = first + alone
         contacts.middle[u] = first + single

@@ -86,37 +86,40 @@ def merge_contact(i: int, part: int, world: int, contacts: Contacts):
     The vector between the closest points is the other way round where the sides of the pair are. So many threads share
     a contact, each with a bucket.
     """
-    feature, key = contacts.feature[i], contacts.key[i]
+    feature, key = contacts.feature[i] + wp.vec3i(), contacts.key[i] + wp.int64(0)
     if feature[0] < 0:
         return
-    gradient, hessian, limit, count = wp.vec3d(), wp.mat33d(), wp.float64(0.0), float(0.0)
-    gradient_lost, hessian_lost, limit_lost = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
-    normal, n = contacts.normal[i] + wp.vec3(), contacts.bucket[_first_bucket(contacts, world, feature) + part] + int(0)
-    lower, parts = float(0.0), contacts.parts
+    first = contacts.bucket[_first_bucket(contacts, world, feature) + part] + int(0)
+    lower, count, n, parts = float(0.0), float(0.0), int(first), contacts.parts
     while n > 0:
-        k = n - 1
         # read side by side: most of the time is waiting for memory
-        n, of_feature, of_key = (
-            contacts.next[k] + int(0),
-            contacts.feature[k] + wp.vec3i(),
-            contacts.key[k] + wp.int64(0),
-        )
-        of_gradient, of_hessian = to_double(contacts.gradient[k]), wp.mat33d(stored_block(contacts.hessian, k))
-        of_limit, same = wp.float64(contacts.limit[k]), wp.float64(wp.sign(wp.dot(contacts.normal[k], normal)))
+        k = n - 1
+        of_feature, of_key = contacts.feature[k] + wp.vec3i(), contacts.key[k] + wp.int64(0)
+        n = contacts.next[k] + int(0)
         if of_feature == feature:
+            count += 1.0
             if of_key < key:
                 lower, n = 1.0, 0
-            count += 1.0
-            of_gradient = same * of_gradient
-            gradient_lost += _lost(gradient, of_gradient, gradient + of_gradient)
-            hessian_lost += _lost(hessian, of_hessian, hessian + of_hessian)
-            limit_lost += _lost(limit, of_limit, limit + of_limit)
-            gradient, hessian, limit = gradient + of_gradient, hessian + of_hessian, limit + of_limit
     found = sum_of_parts(wp.vec3(lower, count, 0.0), parts)
     if found[0] > 0.0:
         contacts.weights[i] = wp.vec4()
         contacts.couples[i] = 0
     elif found[1] > 1.0:
+        gradient, hessian, limit = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
+        gradient_lost, hessian_lost, limit_lost = wp.vec3d(), wp.mat33d(), wp.float64(0.0)
+        normal = contacts.normal[i] + wp.vec3()
+        n = first
+        while n > 0:
+            k = n - 1
+            n = contacts.next[k] + int(0)
+            if contacts.feature[k] == feature:
+                same = wp.float64(wp.sign(wp.dot(contacts.normal[k], normal)))
+                of_gradient = same * to_double(contacts.gradient[k])
+                of_hessian, of_limit = wp.mat33d(stored_block(contacts.hessian, k)), wp.float64(contacts.limit[k])
+                gradient_lost += _lost(gradient, of_gradient, gradient + of_gradient)
+                hessian_lost += _lost(hessian, of_hessian, hessian + of_hessian)
+                limit_lost += _lost(limit, of_limit, limit + of_limit)
+                gradient, hessian, limit = gradient + of_gradient, hessian + of_hessian, limit + of_limit
         total, block = wp.vec3(), wp.mat33()
         for a in range(3):
             total[a] = _sum_of_parts(gradient[a], gradient_lost[a], parts)

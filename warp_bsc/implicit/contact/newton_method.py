@@ -443,7 +443,7 @@ class NewtonMethod:
         self._retire(self._contacts)
         start, device = of_room * self._rooms, self._work.device
         capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
-        sizes: dict = dict.fromkeys(("first", "middle", "end"), self._count)
+        sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self._count)
         parts = 1 if self._is_many else self._problem.parts
         sizes["bucket"] = parts * self._mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, of_each * capacity)

@@ -220,7 +220,7 @@ def sort_contacts(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, s
 def add_blocks(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Adds up the blocks of the Hessian."""
     w = at.world
-    count = p.rows.first[p.unknowns.of_worlds[w + 1]] - p.rows.first[p.unknowns.of_worlds[w]]
+    count = assembly.block_count(p.rows, p.unknowns, w)
     parts = wp.where(p.parts * count <= at.threads, p.parts, 1)
     for i in range(at.thread, parts * count, at.threads):
         assembly.add_blocks(
@@ -310,10 +310,15 @@ def displace(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settin
 @wp.func
 def list_ways(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Lists candidates that displacements may bring together."""
-    for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, True), at.threads):
-        bounds.list_pair(
-            _candidate(k, p.candidates, at.world), at.world, p.candidates, p.trial, p.progress, at.passes > 0
-        )
+    w, count = at.world, _pair_count(p.candidates, p.progress, at.world, True)
+    following, of_following = int(0), wp.vec4()
+    for k in range(at.thread - at.threads, count, at.threads):
+        i, last = int(following), wp.vec4(of_following)
+        if k + at.threads < count:
+            following = _candidate(k + at.threads, p.candidates, w)
+            of_following = bounds.last_of_pair(following, p.candidates)
+        if k >= 0:
+            bounds.list_pair(i, last, w, p.candidates, p.trial, p.progress, at.passes > 0)
     return _to(at, Phase.BOUND)
 
 
@@ -325,7 +330,8 @@ def bound(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings:
         i, is_new = int(0), bool(False)
         if at_once:
             i = _candidate(k, p.candidates, at.world)
-            is_new = bounds.list_pair(i, w, p.candidates, p.trial, p.progress, at.passes > 0)
+            last = bounds.last_of_pair(i, p.candidates)
+            is_new = bounds.list_pair(i, last, w, p.candidates, p.trial, p.progress, at.passes > 0)
         else:
             entry = listed(p.candidates, w, k)
             i, is_new = entry >> 1, (entry & 1) != 0

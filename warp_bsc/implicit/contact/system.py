@@ -154,7 +154,8 @@ class Contacts:
         first_bucket: First hash of each world, and the end of the last.
         bucket: 1 more than the first contact there, 0 for none; ``next`` has those that follow.
         listed: Number of entries of each world.
-        first, middle, end: First entry of each unknown, the first of those that couple, and the end of them.
+        first, several, middle, end: First entry of each unknown, the first of those whose contacts have other unknowns
+            as well, the first of those that couple, and the end of them.
         entries: Contact and place of the vertex in it, as four times the contact plus the place.
         entries_of_each: Entries for which there is room, by contact.
         unsorted, row, order: The same in any order, its unknown, and the number by which it is ordered.
@@ -184,6 +185,7 @@ class Contacts:
     next: wp.array[int]
     listed: wp.array[int]
     first: wp.array[int]
+    several: wp.array[int]
     middle: wp.array[int]
     end: wp.array[int]
     entries: wp.array[int]
