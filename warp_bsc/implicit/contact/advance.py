@@ -199,8 +199,16 @@ def _advance(
         _end_launch(p.flow, lane, n, blocks)
 
 
+BLOCKS = {False: (256, 1), True: (512, 1)}
+"""Threads of a block on a GPU, and blocks of a multiprocessor, by whether there are many vertices for each thread: where
+there are few, threads have more registers each."""
 ADVANCE = {
-    threads: wp.kernel(_advance, enable_backward=False, module=f"{__name__}.blocks_of_{threads}", launch_bounds=threads)
-    for threads in (256, 512)
+    is_many: wp.kernel(
+        _advance,
+        enable_backward=False,
+        module=f"{__name__}.of_{'many' if is_many else 'few'}",
+        launch_bounds=blocks,
+    )
+    for is_many, blocks in BLOCKS.items()
 }
-"""The kernel by the threads of its blocks on a GPU, one a multiprocessor: fewer have more registers each."""
+"""The kernel for these blocks, all of which run at the same time."""

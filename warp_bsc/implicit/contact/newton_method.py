@@ -20,7 +20,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from . import bodies, decisions, pairs, steps
-from .advance import ADVANCE
+from .advance import ADVANCE, BLOCKS
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team
 from .elasticity import ElementKind, elements_of_model, make_derivatives
@@ -36,9 +36,8 @@ _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with several elements for each."""
 _PARTS = 4
 """Threads that share a row or a block of the Hessian on a GPU, while it is assembled."""
-_MANY_VERTICES = 1 / 4
-"""Vertices by thread, of blocks of 256, from which on they have several pairs each: blocks have twice as many threads
-then, and these share less."""
+_MANY_VERTICES = 64
+"""Vertices for each multiprocessor of a GPU from which on threads have several pairs each, and share less."""
 _CONTACTS = 24
 """Contacts that fit at first, for each particle: where two layers of cloth touch all over, they have 9, in a fold up to
 15."""
@@ -201,9 +200,10 @@ class NewtonMethod:
         self._results = [results, unconverged_steps]
         sizes = {**dict.fromkeys(("solves_next", "goes_on", "turn", "taken", "ended"), 1), "count": 2}
         self._flow = allocate(Flow, work.worlds, device, **sizes, listed=2 * work.worlds)
-        self._blocks = device.sm_count if device.is_cuda else 1  # all running: blocks of a world wait for each other
-        self._is_many = device.is_cuda and vertices > _MANY_VERTICES * 256 * self._blocks
-        self._block = 512 if self._is_many else 256
+        processors = device.sm_count if device.is_cuda else 1
+        self._is_many = device.is_cuda and vertices > _MANY_VERTICES * processors
+        self._block, blocks = BLOCKS[self._is_many]
+        self._blocks = blocks * processors if device.is_cuda else 1
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
@@ -510,7 +510,7 @@ class NewtonMethod:
         threads = self._block if work.device.is_cuda else 1
         inputs += [int(of_all or work.worlds == 1), self._problem, threads, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
-        wp.launch(ADVANCE[self._block], self._blocks * threads, inputs=inputs, **options)
+        wp.launch(ADVANCE[self._is_many], self._blocks * threads, inputs=inputs, **options)
 
     def publish(self, sides: Sides, centres: wp.array[wp.vec3d], sums: ImpulseSums, rows: ContactRows) -> None:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
