@@ -102,7 +102,7 @@ def _store_bending_hessian(
     turn, moment, curvature = elasticity.mat43d(), wp.float64(0.0), wp.float64(0.0)
     aa, bb, cc, ac, bc = wp.mat33d(), wp.mat33d(), wp.mat33d(), wp.mat33d(), wp.mat33d()
     if elasticity.has_energy(elements, ElementKind.BENDING, e, x1):
-        turn, moment, curvature = elasticity.bend(elements, e, x1, x0, dt)
+        turn, _energy, moment, curvature = elasticity.bend(elements, e, x1, x0, dt)
     if curvature > wp.float64(0.0):
         a, b, c, d = elasticity.edge_corners(elements, e, x1)
         n1, n2, edge = wp.cross(c - a, d - a), wp.cross(d - b, c - b), d - c

@@ -200,8 +200,8 @@ def _advance(
 
 
 BLOCKS = {False: (256, 1), True: (512, 1)}
-"""Threads of a block on a GPU, and blocks of a multiprocessor, by whether there are many vertices for each thread: where
-there are few, threads have more registers each."""
+"""Threads of a block on a GPU, and blocks of a multiprocessor, by whether there are many vertices for each thread: each
+has more registers where there are few."""
 ADVANCE = {
     is_many: wp.kernel(
         _advance,

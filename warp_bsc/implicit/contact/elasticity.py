@@ -427,26 +427,27 @@ def _bending_energy(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[A
 
 @wp.func
 def bend(elements: Elements, e: int, x: wp.array[Any], x0: wp.array[Any], dt: wp.float64):
-    """Returns the derivatives of the angle by corners, and both derivatives of the energy by the angle, or zeros."""
+    """Returns the derivatives of the angle by corners, the energy, and both its derivatives by the angle, or zeros."""
     a, b, c, d = edge_corners(elements, e, x)
     if _is_degenerate(a, b, c, d):
-        return mat43d(), ZERO, ZERO
+        return mat43d(), ZERO, ZERO, ZERO
     n1, n2, edge = wp.cross(c - a, d - a), wp.cross(d - b, c - b), d - c
     length = wp.length(edge)
     along = edge / length
     m1, m2 = n1 / wp.dot(n1, n1), n2 / wp.dot(n2, n2)
     angle = _dihedral_angle(a, b, c, d)
+    bent = angle - wp.float64(elements.edge_rest_angle[e])
     change, damping = _bending_change(elements, e, angle, x0)
-    rest = wp.float64(elements.edge_rest_length[e])
-    stiffness = wp.float64(elements.edge_properties[e, 0])
-    moment = rest * (stiffness * (angle - wp.float64(elements.edge_rest_angle[e])) + damping / dt * change)
+    rest, stiffness = wp.float64(elements.edge_rest_length[e]), wp.float64(elements.edge_properties[e, 0])
+    energy = HALF * rest * (stiffness * bent * bent + damping / dt * change * change)
+    moment = rest * (stiffness * bent + damping / dt * change)
     turn = wp.matrix_from_rows(
         -length * m1,
         -length * m2,
         -(wp.dot(a - d, along) * m1 + wp.dot(b - d, along) * m2),
         wp.dot(a - c, along) * m1 + wp.dot(b - c, along) * m2,
     )
-    return turn, moment, rest * (stiffness + damping / dt)
+    return turn, energy, moment, rest * (stiffness + damping / dt)
 
 
 # Tetrahedra
@@ -661,7 +662,7 @@ def element_gradient(
     if kind == ElementKind.MEMBRANE:
         return _membrane_gradient(elements, e, x, x0, dt)
     if kind == ElementKind.BENDING:
-        turn, moment, _curvature = bend(elements, e, x, x0, dt)
+        turn, _energy, moment, _curvature = bend(elements, e, x, x0, dt)
         return moment * turn
     if kind == ElementKind.TETRAHEDRON:
         return _tetrahedron_gradient(elements, e, x, x0, dt)
@@ -719,8 +720,7 @@ def find_derivatives(
     elif kind == ElementKind.BENDING:
         turn, curvature = mat43d(), ZERO
         if has:
-            energy = _bending_energy(elements, e, x, x0, dt)
-            turn, moment, curvature = bend(elements, e, x, x0, dt)
+            turn, energy, moment, curvature = bend(elements, e, x, x0, dt)
             gradient = moment * turn
         root = wp.sqrt(wp.max(curvature, ZERO))
         for j in range(4):
