@@ -53,7 +53,7 @@ _FUNCTIONS = {
 }
 _ALSO = {Phase.FIND_NEAR: Phase.LIST_AND_FIND_NEAR, Phase.BOUND: Phase.LIST_AND_BOUND}
 """Phases that have the function of the one before them, whose code the kernel then has once."""
-_DECIDE = {Phase.FIND_NEAR, Phase.BOUND, Phase.HOLD_PAIRS, Phase.ENERGY, Phase.DECIDE}
+_DECIDED_AFTER = {Phase.FIND_NEAR, Phase.BOUND, Phase.HOLD_PAIRS, Phase.ENERGY, Phase.DECIDE}
 """Phases after which what all threads have found decides."""
 _OF_PHASES = list(_FUNCTIONS.values())
 _FIRST = [int(phase) for phase in _FUNCTIONS]
@@ -188,7 +188,7 @@ def _advance(
                         at.solves = state[3]
                         state = wp.static(_OF_PHASES[k])(at, p, motion, planes, settings)
                         wait_for_team(p.flow.arrived, w, together)
-                        if wp.static(_FIRST[k] in _DECIDE):
+                        if wp.static(_FIRST[k] in _DECIDED_AFTER):
                             state = _decide(at.phase, state, w, p)
             if at.thread == 0:
                 _leave(w, state, p)
