@@ -432,7 +432,9 @@ class NewtonMethod:
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
         self._retire(self._candidates)
-        sizes = dict.fromkeys(("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds)
+        sizes: dict = dict.fromkeys(
+            ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
+        )
         sizes["used"] = 1
         sizes["kept"] = capacity if self._mesh.distances is not None else 0
         self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
