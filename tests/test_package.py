@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,15 @@ ROOT = Path(__file__).parents[1]
 def test_what_stands_beside_the_package_is_no_part_of_it(name):
     assert (ROOT / name).is_dir()
     assert importlib.util.find_spec(f"warp_bsc.{name}") is None
+
+
+def test_all_packages_are_installed():
+    """An editable installation finds folders that pyproject.toml does not name, a wheel does not have them."""
+    folders = [path.parent.relative_to(ROOT / "warp_bsc") for path in (ROOT / "warp_bsc").rglob("__init__.py")]
+    kernels = [path.parent.relative_to(ROOT) for path in (ROOT / "kernels").rglob("__init__.py")]
+    found = {".".join(("warp_bsc", *folder.parts)) for folder in folders + kernels}
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert found <= set(settings["packages"])
 
 
 def test_a_checkout_that_is_not_installed_has_its_own_kernels(tmp_path):

@@ -7,7 +7,6 @@ import warp as wp
 from implicit_scenes import exact_hessians
 from newton_scenes import DT
 
-from warp_bsc.implicit.contact import elasticity
 from warp_bsc.implicit.contact.assembly import add_blocks
 from warp_bsc.implicit.contact.barrier import (
     CURVATURE_AT_HALF,
@@ -19,12 +18,13 @@ from warp_bsc.implicit.contact.barrier import (
     friction_slope,
 )
 from warp_bsc.implicit.contact.bodies import SolvedBodies
-from warp_bsc.implicit.contact.elasticity import SIZES, Derivatives, ElementKind, Elements, make_derivatives
 from warp_bsc.implicit.contact.matrix import Matrix, make_matrix
 from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
 from warp_bsc.implicit.elastic import Elastic
+from warp_bsc.implicit.elasticity.derivatives import Derivatives, element_energy, find_derivatives, make_derivatives
+from warp_bsc.implicit.elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, kind_of
 from warp_bsc.implicit.elements import with_gradient
 from warp_bsc.response.state.structs import Motion, allocate
 
@@ -40,8 +40,8 @@ def _differentiate(
     energy: wp.array[wp.float64],
 ):
     i = wp.tid()
-    kind = elasticity.kind_of(elements, i)
-    energy[i] = elasticity.find_derivatives(i, kind, elements, x, x0, dt, is_convex, out)
+    kind = kind_of(elements, i)
+    energy[i] = find_derivatives(i, kind, elements, x, x0, dt, is_convex, out)
 
 
 @wp.kernel(enable_backward=False)
@@ -65,7 +65,7 @@ def _energies(
     elements: Elements, x: wp.array[wp.vec3d], x0: wp.array[wp.vec3], dt: wp.float64, energy: wp.array[wp.float64]
 ):
     i = wp.tid()
-    energy[i] = elasticity.element_energy(elements, i, elasticity.kind_of(elements, i), x, x0, dt)
+    energy[i] = element_energy(elements, i, kind_of(elements, i), x, x0, dt)
 
 
 @wp.kernel(enable_backward=False)
@@ -103,7 +103,7 @@ class Scene:
         for a, b in ((0, 12), (3, 17), (5, 6)):
             builder.add_spring(a, b, 10.0, 0.1, 0)
         self.model = builder.finalize(device=device)
-        self.elements, self.vertices = elasticity.elements_of_model(self.model)
+        self.elements, self.vertices = elements_of_model(self.model)
         self.count = sum(map(len, self.vertices))
         q = self.model.particle_q.numpy()
         self.x0 = (q + rng.normal(0.0, 0.02, q.shape)).astype(np.float32)

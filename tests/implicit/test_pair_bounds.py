@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_bsc.implicit.contact import barrier
-from warp_bsc.implicit.contact.vector_access import direction_in_bits, direction_of_bits
+from warp_bsc.implicit.vector_access import direction_in_bits, direction_of_bits
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
 

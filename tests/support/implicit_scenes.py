@@ -9,7 +9,7 @@ import warp as wp
 from newton_versions import HAS_ATTACHMENTS, HAS_HARD_ATTACHMENTS
 
 import warp_bsc as bsc
-from warp_bsc.implicit.contact.elasticity import ElementKind, elements_of_model
+from warp_bsc.implicit.elasticity.elements import ElementKind, elements_of_model
 
 __all__ = [
     "CLOTH",

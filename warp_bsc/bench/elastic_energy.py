@@ -4,7 +4,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..implicit.contact.elasticity import Elements, element_energy, elements_of_model, first_vertex, kind_of
+from ..implicit.elasticity.derivatives import element_energy
+from ..implicit.elasticity.elements import Elements, elements_of_model, first_vertex, kind_of
 from ..response.state.mesh import host_array
 
 __all__ = ["ElasticEnergy"]
@@ -14,7 +15,7 @@ class ElasticEnergy:
     """The elastic energy of triangles, pairs of them at edges, tetrahedra and springs of a model; 0 of those at rest.
 
     It is that of VBD: a stable neo-Hookean one of triangles and tetrahedra, that of dihedral angles, and that of
-    springs, see :mod:`..implicit.contact.elasticity`. Contacts have none here, nor do attachments.
+    springs, see :mod:`..implicit.elasticity`. Contacts have none here, nor do attachments.
     """
 
     def __init__(self, model: newton.Model):

@@ -7,9 +7,11 @@ import warp as wp
 from .._private_names.of_warp import struct_fields
 from ..response.adjoint.arrays import launch_adjoint
 from . import energies
-from .contact import elasticity
-from .contact.elasticity import SIZES, ElementKind, Elements, cross_matrix, identity
 from .contact.rows import Rows, make_rows
+from .elasticity.bending import bend, edge_corners
+from .elasticity.derivatives import store_hessian
+from .elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, has_energy, kind_of
+from .elasticity.matrices import cross_matrix, identity, mat43d
 from .element_kernels import gather
 
 wp.set_module_options({"enable_backward": False})
@@ -28,7 +30,7 @@ class Elastic:
 
     def __init__(self, model: newton.Model):
         """Allocates buffers."""
-        self._elements, vertices = elasticity.elements_of_model(model)
+        self._elements, vertices = elements_of_model(model)
         self.device, n = model.device, model.particle_count
         self.rows = make_rows(vertices, np.arange(n), n, model.device)
         self._count = sum(map(len, vertices))
@@ -99,12 +101,12 @@ def _store_bending_hessian(
     blocks: wp.array[wp.mat33d],
 ):
     """Writes the Hessian of a pair of triangles: that of Gauss and Newton, and moment times that of the angle."""
-    turn, moment, curvature = elasticity.mat43d(), wp.float64(0.0), wp.float64(0.0)
+    turn, moment, curvature = mat43d(), wp.float64(0.0), wp.float64(0.0)
     aa, bb, cc, ac, bc = wp.mat33d(), wp.mat33d(), wp.mat33d(), wp.mat33d(), wp.mat33d()
-    if elasticity.has_energy(elements, ElementKind.BENDING, e, x1):
-        turn, _energy, moment, curvature = elasticity.bend(elements, e, x1, x0, dt)
+    if has_energy(elements, ElementKind.BENDING, e, x1):
+        turn, _energy, moment, curvature = bend(elements, e, x1, x0, dt)
     if curvature > wp.float64(0.0):
-        a, b, c, d = elasticity.edge_corners(elements, e, x1)
+        a, b, c, d = edge_corners(elements, e, x1)
         n1, n2, edge = wp.cross(c - a, d - a), wp.cross(d - b, c - b), d - c
         square_1, square_2, length = wp.dot(n1, n1), wp.dot(n2, n2), wp.length(edge)
         m1, m2, along = n1 / square_1, n2 / square_2, edge / length
@@ -150,9 +152,9 @@ def _find_hessians(
 ):
     """Computes the Hessian of the energy of each element."""
     i = wp.tid()
-    kind = elasticity.kind_of(elements, i)
+    kind = kind_of(elements, i)
     e = i - elements.first[kind]
     if kind == ElementKind.BENDING:
         _store_bending_hessian(elements, e, x1, x0, dt, bends)
     else:
-        elasticity.store_hessian(elements, kind, e, x1, x0, dt, False, blocks)
+        store_hessian(elements, kind, e, x1, x0, dt, False, blocks)

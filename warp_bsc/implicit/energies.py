@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from .contact.elasticity import Elements, element_gradient, element_size, first_corner, kind_of
+from .elasticity.derivatives import element_gradient
+from .elasticity.elements import Elements, element_size, first_corner, kind_of
 
 
 @wp.kernel

@@ -5,9 +5,9 @@ import warp as wp
 from ...kernels.not_inlined import NOT_INLINED
 from ...response.state.structs import Motion
 from ...response.state.vectors import to_double, to_single
+from ..elasticity.derivatives import Derivatives
 from .bodies import SolvedBodies, inertia_of_body
 from .conjugate_gradients import Vectors
-from .elasticity import Derivatives
 from .matrix import Matrix, block_of, set_block
 from .pairs import Trial
 from .rows import Rows, sum_of_blocks, sum_of_corners

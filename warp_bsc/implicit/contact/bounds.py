@@ -6,6 +6,7 @@ from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
+from ..vector_access import direction_of_bits, integers_at
 from . import barrier
 from .pairs import (
     FAR,
@@ -22,7 +23,6 @@ from .pairs import (
     stays_far,
 )
 from .system import Progress, kind_of_key, lower_to
-from .vector_access import direction_of_bits, integers_at
 
 wp.set_module_options({"enable_backward": False})
 

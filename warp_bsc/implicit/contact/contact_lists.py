@@ -2,8 +2,8 @@
 
 import warp as wp
 
+from ..vector_access import integers_at, numbers_at
 from .system import NOT_UNKNOWN, Contacts, Unknowns, first_unknown
-from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 

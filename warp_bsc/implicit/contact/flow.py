@@ -4,9 +4,10 @@ from enum import IntEnum
 
 import warp as wp
 
+from ..elasticity.derivatives import Derivatives
+from ..elasticity.elements import Elements
 from .bodies import SolvedBodies
 from .conjugate_gradients import Vectors
-from .elasticity import Derivatives, Elements
 from .matrix import Matrix
 from .pairs import Candidates, Trial
 from .rows import Rows

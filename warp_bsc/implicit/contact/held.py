@@ -6,6 +6,7 @@ from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
+from ..vector_access import integers_at, numbers_at, store_block, stored_block
 from . import barrier
 from .pairs import BarrierSettings, Candidates, Trial, gap_at_plane, kept_distance, plane_at
 from .system import (
@@ -20,7 +21,6 @@ from .system import (
     take_contact,
     unknowns_of,
 )
-from .vector_access import integers_at, numbers_at, store_block, stored_block
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,8 +8,8 @@ from typing import Any
 import warp as wp
 
 from ...response.state.vectors import ZERO, to_double
+from ..vector_access import store_block, stored_block
 from .system import Contacts, sum_of_parts
-from .vector_access import store_block, stored_block
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,6 +6,7 @@ from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double
+from ..vector_access import integers_at, numbers_at
 from . import barrier
 from .pairs import (
     BarrierSettings,
@@ -18,7 +19,6 @@ from .pairs import (
     stiffness_of_pair,
 )
 from .system import Contacts, Progress, kind_of_key
-from .vector_access import integers_at, numbers_at
 
 wp.set_module_options({"enable_backward": False})
 

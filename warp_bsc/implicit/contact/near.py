@@ -7,6 +7,7 @@ from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
+from ..vector_access import direction_in_bits, integers_at, store_block
 from . import barrier
 from .merge import link_contact
 from .merit import MEETS, add_energy
@@ -33,7 +34,6 @@ from .system import (
     take_contact,
     unknowns_of,
 )
-from .vector_access import direction_in_bits, integers_at, store_block
 
 wp.set_module_options({"enable_backward": False})
 

@@ -19,11 +19,12 @@ from ...response.state.mesh import ModelMesh, grouped_by_world, host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
+from ..elasticity.derivatives import make_derivatives
+from ..elasticity.elements import ElementKind, elements_of_model
 from . import bodies, decisions, pairs, steps
 from .advance import ADVANCE, BLOCKS
 from .attachments import attach, attachments_of_model
 from .conjugate_gradients import Vectors, make_team
-from .elasticity import ElementKind, elements_of_model, make_derivatives
 from .flow import Flow, Phase, Problem
 from .impulses import publish_contacts
 from .matrix import make_matrix

@@ -11,9 +11,9 @@ from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_m
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
+from ..vector_access import direction_of_bits
 from . import barrier
 from .system import Progress, key_of_pair
-from .vector_access import direction_of_bits
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,7 +67,7 @@ class Candidates:
         share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
         now: Distance where the Newton step begins, or less, of what was not :data:`FAR` in the one before [m].
         normal: Direction from the second closest point to the first where they were found last, 0 before, see
-            :func:`.vector_access.direction_of_bits`.
+            :func:`..vector_access.direction_of_bits`.
     """
 
     start: wp.array[int]

@@ -8,7 +8,9 @@ import warp as wp
 
 from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
-from . import assembly, bodies, bounds, contact_lists, decisions, elasticity, held, merge, merit, near, steps
+from ..elasticity.derivatives import element_energy, find_derivatives
+from ..elasticity.elements import kind_of
+from . import assembly, bodies, bounds, contact_lists, decisions, held, merge, merit, near, steps
 from .flow import Phase, Place, Problem, wait_for_team
 from .pairs import BarrierSettings, Candidates, clear_list, far_ones_stay, listed, listed_count
 from .system import Progress, Worlds, end_of_contacts
@@ -93,10 +95,8 @@ def differentiate(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, s
         i = p.worlds.elements[k] + int(0)
         if i < 0:
             continue
-        kind = elasticity.kind_of(p.elements, i)
-        energy = elasticity.find_derivatives(
-            i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, is_far, p.derivatives
-        )
+        kind = kind_of(p.elements, i)
+        energy = find_derivatives(i, kind, p.elements, p.trial.exact, motion.x0, settings.dt, is_far, p.derivatives)
         merit.add_energy(p.progress.energy, w, energy, settings.units)
     return wp.vec4i(int(Phase.LOADS), at.then, 0, 0)
 
@@ -433,8 +433,8 @@ def find_energy(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
         i = p.worlds.elements[k] + int(0)
         if i < 0:
             continue
-        kind = elasticity.kind_of(p.elements, i)
-        value = elasticity.element_energy(p.elements, i, kind, p.trial.moved, motion.x0, settings.dt)
+        kind = kind_of(p.elements, i)
+        value = element_energy(p.elements, i, kind, p.trial.moved, motion.x0, settings.dt)
         merit.add_energy(energy, w, value, settings.units)
     for u in range(p.unknowns.of_worlds[w] + from_middle, p.unknowns.of_worlds[w + 1], n):
         steps.add_inertia(u, w, motion, settings, p.trial, p.goal, p.unknowns, p.bodies, energy)

@@ -3,7 +3,8 @@
 import numpy as np
 import warp as wp
 
-from .elasticity import SIZES, Derivatives, ElementKind
+from ..elasticity.derivatives import Derivatives
+from ..elasticity.elements import SIZES, ElementKind
 from .sums import sum_of
 
 wp.set_module_options({"enable_backward": False})

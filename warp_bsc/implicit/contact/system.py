@@ -4,8 +4,8 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO
+from ..vector_access import integers_at, mat34, numbers_at, stored_block
 from .sums import sum_of
-from .vector_access import integers_at, mat34, numbers_at, stored_block
 
 wp.set_module_options({"enable_backward": False})
 
