@@ -72,21 +72,25 @@ def store_block(blocks: wp.array[mat34], k: int, block: wp.mat33d):
     ...
 
 
-@wp.func_native(
-    snippet="""
-    wp::mat_t<3, 3, float> block;
+READ_BLOCK = """
+    auto read_block = [](const wp::mat_t<3, 4, float>* blocks, int k) {
+        wp::mat_t<3, 3, float> block;
 #if defined(__CUDA_ARCH__)
-    for (int row = 0; row < 3; ++row) {
-        const float4 of_row = ((const float4*)(blocks.data + k))[row];
-        block.data[row][0] = of_row.x, block.data[row][1] = of_row.y, block.data[row][2] = of_row.z;
-    }
+        for (int row = 0; row < 3; ++row) {
+            const float4 of_row = ((const float4*)(blocks + k))[row];
+            block.data[row][0] = of_row.x, block.data[row][1] = of_row.y, block.data[row][2] = of_row.z;
+        }
 #else
-    for (int c = 0; c < 9; ++c)
-        block.data[c / 3][c % 3] = blocks.data[k].data[c / 3][c % 3];
+        for (int c = 0; c < 9; ++c)
+            block.data[c / 3][c % 3] = blocks[k].data[c / 3][c % 3];
 #endif
-    return block;
+        return block;
+    };
 """
-)
+"""Code of a function of native code that reads a block."""
+
+
+@wp.func_native(snippet=READ_BLOCK + "    return read_block(blocks.data, k);\n")
 def stored_block(blocks: wp.array[mat34], k: int) -> wp.mat33:
     """Returns a block that was written."""
     ...

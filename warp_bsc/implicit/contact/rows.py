@@ -5,6 +5,7 @@ import warp as wp
 
 from ..elasticity.derivatives import Derivatives
 from ..elasticity.elements import SIZES, ElementKind
+from ..vector_access import READ_BLOCK
 from .sums import sum_of
 
 wp.set_module_options({"enable_backward": False})
@@ -93,30 +94,21 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
         9,
         places="rows.source.data",
         term="wp::mat_t<3, 3, float> block;",
-        read="""
-            const int corner = (-1 - place) >> 2, other = (corner & ~3) + ((-1 - place) & 3);
-#if defined(__CUDA_ARCH__)
-            const float4* const turn = (const float4*)derivatives.turn.data;
-            float4 rows_of_block[3];
+        read=READ_BLOCK
+        + """
             if (place >= 0) {
-                for (int row = 0; row < 3; ++row)
-                    rows_of_block[row] = ((const float4*)(derivatives.block.data + place))[row];
+                t.block = read_block(derivatives.block.data, place);
             } else {
-                const float4 a = turn[corner], b = turn[other];
-                rows_of_block[0] = make_float4(a.x * b.x, a.x * b.y, a.x * b.z, 0.0f);
-                rows_of_block[1] = make_float4(a.y * b.x, a.y * b.y, a.y * b.z, 0.0f);
-                rows_of_block[2] = make_float4(a.z * b.x, a.z * b.y, a.z * b.z, 0.0f);
-            }
-            for (int row = 0; row < 3; ++row) {
-                const float4 of_row = rows_of_block[row];
-                t.block.data[row][0] = of_row.x, t.block.data[row][1] = of_row.y, t.block.data[row][2] = of_row.z;
-            }
+                const int corner = (-1 - place) >> 2, other = (corner & ~3) + ((-1 - place) & 3);
+#if defined(__CUDA_ARCH__)
+                const float4 a = ((const float4*)derivatives.turn.data)[corner];
+                const float4 b = ((const float4*)derivatives.turn.data)[other];
+                const float of_a[3] = {a.x, a.y, a.z}, of_b[3] = {b.x, b.y, b.z};
 #else
-            for (int c = 0; c < 9; ++c)
-                t.block.data[c / 3][c % 3] =
-                    place >= 0 ? derivatives.block.data[place].data[c / 3][c % 3]
-                               : derivatives.turn.data[corner][c / 3] * derivatives.turn.data[other][c % 3];
+                const wp::vec4 of_a = derivatives.turn.data[corner], of_b = derivatives.turn.data[other];
 #endif
+                for (int c = 0; c < 9; ++c) t.block.data[c / 3][c % 3] = of_a[c / 3] * of_b[c % 3];
+            }
         """,
         add="for (int c = 0; c < 9; ++c) sum[c] += t.block.data[c / 3][c % 3];",
     )

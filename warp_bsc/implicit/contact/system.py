@@ -4,7 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO
-from ..vector_access import integers_at, mat34, numbers_at, stored_block
+from ..vector_access import READ_BLOCK, integers_at, mat34, numbers_at, stored_block
 from .sums import sum_of
 
 wp.set_module_options({"enable_backward": False})
@@ -321,21 +321,18 @@ def take_contact(contacts: Contacts, world: int) -> int:
         "wp::mat_t<3, 3, float>",
         9,
         places="contacts.entries.data",
-        term="int corner; wp::vec4i of; wp::vec4 weights; float hessian[9];",
-        read="""
+        term="int corner; wp::vec4i of; wp::vec4 weights; wp::mat_t<3, 3, float> hessian;",
+        read=READ_BLOCK
+        + """
             const int i = place >> 2;
             t.corner = place & 3;
+            t.hessian = read_block(contacts.hessian.data, i);
 #if defined(__CUDA_ARCH__)
             const int4 of = *(const int4*)(contacts.unknowns.data + i);
             const float4 w = *(const float4*)(contacts.weights.data + i);
             t.of = wp::vec4i(of.x, of.y, of.z, of.w), t.weights = wp::vec4(w.x, w.y, w.z, w.w);
-            for (int row = 0; row < 3; ++row) {
-                const float4 of_row = ((const float4*)(contacts.hessian.data + i))[row];
-                t.hessian[3 * row] = of_row.x, t.hessian[3 * row + 1] = of_row.y, t.hessian[3 * row + 2] = of_row.z;
-            }
 #else
             t.of = contacts.unknowns.data[i], t.weights = contacts.weights.data[i];
-            for (int c = 0; c < 9; ++c) t.hessian[c] = contacts.hessian.data[i].data[c / 3][c % 3];
 #endif
         """,
         add="""
@@ -343,7 +340,7 @@ def take_contact(contacts: Contacts, world: int) -> int:
             for (int j = 0; j < 4; ++j) weight += t.of[j] == v ? t.weights[j] : 0.0f;
             if (weight == 0.0f) return;
             weight *= t.weights[t.corner];
-            for (int c = 0; c < 9; ++c) sum[c] += weight * t.hessian[c];
+            for (int c = 0; c < 9; ++c) sum[c] += weight * t.hessian.data[c / 3][c % 3];
         """,
     )
 )
