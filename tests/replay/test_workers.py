@@ -275,6 +275,32 @@ def test_a_chunk_that_takes_long_is_cut(troubled, monkeypatch):
     assert len(found[0][1]) == 2 and calls[1] > calls[0]
 
 
+def test_what_breaks_later_is_not_known_earlier(tmp_path, monkeypatch):
+    """A worker that goes back to a chunk that was cut has found meshes to be broken of which nobody knows yet.
+
+    Which vertices coincide depends on how long all meshes are there.
+    """
+    stage = new_stage(tmp_path / "scene.usda")
+    add_sheet(stage, "/World/Breaks", 1.0, broken=9)
+    add_mesh(stage, "/World/SeamA", moved(FLOOR, (-2, 0, 0)))
+    floor = moved(FLOOR, (2, 0, 0))
+    add_mesh(stage, "/World/SeamB", {0: floor, 12: floor, FRAMES - 1: moved(floor, (0, 0, 0.3))})
+    path = save(stage)
+    monkeypatch.setattr(worker, "_local", (0, 1))
+    checks = checking.Checks(bsc.Selection(), "exact", "cpu", True, None, 0)
+    found = []
+    for count, seconds in ((1, 1000.0), (4, 0.0)):
+        monkeypatch.setattr(worker, "_opened", None)
+        monkeypatch.setattr(worker, "_CHUNK_SECONDS", seconds)
+        scene, inline = bsc.Scene(path), Inline()
+        inline.count = count
+        results = list(workers.check_in_workers(scene, checks, inline))
+        assert all(len(one.contacts.interval.x0) == one.contacts.segment.vertex_count for one in results)
+        found.append([(one.summary.mesh_pairs, one.contacts.segment.vertex_count) for one in results])
+        assert len(scene.left_out) == 1
+    assert found[0] == found[1]
+
+
 def test_an_error_in_a_worker(tmp_path, capsys):
     """The intervals before it are there, and the error reads as without workers."""
     stage = new_stage(tmp_path / "scene.usda")

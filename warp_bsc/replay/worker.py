@@ -10,7 +10,7 @@ import socket
 import threading
 import traceback
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,34 @@ _ONE_CHUNK = threading.Lock()
 _local: tuple[int, int] | None = None
 """Number of this worker and number of all workers on this machine, None in a worker of Dask."""
 
-_opened: tuple[bytes, IntervalChecker] | None = None
-"""The job of the last chunk of this worker, and its checker."""
+
+@dataclass
+class _Opened:
+    """The job of the last chunk of this worker.
+
+    Attributes:
+        job: The job.
+        checker: Its checker.
+        left_out: Number of meshes that the scene left out when it was opened.
+        stop: Number of the interval after the last one that was read.
+    """
+
+    job: bytes
+    checker: IntervalChecker
+    left_out: int
+    stop: int = 0
+
+    def serves(self, job: bytes, first: int) -> bool:
+        """Whether intervals of a job are read from ``first`` on as if no later one had been read before.
+
+        Which vertices coincide depends on how long all meshes are there, and nobody else knows yet of a mesh that is
+        found to be broken later.
+        """
+        goes_back = first < self.stop and len(self.checker.scene.left_out) > self.left_out
+        return job == self.job and not goes_back
+
+
+_opened: _Opened | None = None
 
 
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:
@@ -95,11 +121,13 @@ def check_chunk(job: bytes, first: int, stop: int) -> bytes:
     with _ONE_CHUNK:
         checker = None
         try:
-            checker = _open(job)
+            opened = _open(job, first)
+            checker = opened.checker
             with cores(_core_count()):
                 for result in checker.check(first, stop, _CHUNK_SECONDS):
                     checker.scene.files.check()
                     pickler.index = result.summary.index
+                    opened.stop = max(opened.stop, pickler.index + 1)
                     pickler.dump((pickler.index, result.contacts.interval.notes))
                     pickler.dump(result)
         except Exception as raised:
@@ -114,7 +142,9 @@ def find_selection_without_initial(job: bytes) -> Selection:
     """Returns the selection that also ignores the pairs that cross, or are inside each other, at the first time."""
     try:
         with _ONE_CHUNK, cores(_core_count()):
-            return _open(job).selection_without_initial()
+            opened = _open(job, 0)
+            opened.stop = max(opened.stop, 1)
+            return opened.checker.selection_without_initial()
     except Exception as error:
         raise _portable(error) from None
 
@@ -124,10 +154,10 @@ def name_device(name: str | None) -> str:
     return find_device(name).alias
 
 
-def _open(job: bytes) -> IntervalChecker:
-    """Returns the checker of a job, the last one if it is the same."""
+def _open(job: bytes, first: int) -> _Opened:
+    """Returns a job that is opened to check intervals from ``first`` on, the last one if it serves."""
     global _opened  # noqa: PLW0603
-    if _opened is None or _opened[0] != job:
+    if _opened is None or not _opened.serves(job, first):
         _opened = None  # before the next scene is opened, to free memory
         stream = io.BytesIO(job)
         version = pickle.load(stream)
@@ -138,8 +168,8 @@ def _open(job: bytes) -> IntervalChecker:
         if _local:
             device = device_of_worker(device, _local[0], gpu_count())
         checks = replace(checks, device=find_device(device).alias)
-        _opened = job, IntervalChecker(scene, checks, _worker_name())
-    return _opened[1]
+        _opened = _Opened(job, IntervalChecker(scene, checks, _worker_name()), len(scene.left_out))
+    return _opened
 
 
 def _core_count() -> int:
