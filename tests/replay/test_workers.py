@@ -301,6 +301,20 @@ def test_what_breaks_later_is_not_known_earlier(tmp_path, monkeypatch):
     assert found[0] == found[1]
 
 
+def test_what_breaks_at_the_first_time_is_told(tmp_path, monkeypatch):
+    """By the worker that has read it before, to find what to ignore."""
+    stage = new_stage(tmp_path / "scene.usda")
+    add_floor(stage)
+    add_sheet(stage, "/World/Breaks", 1.0, broken=1)
+    monkeypatch.setattr(worker, "_local", (0, 1))
+    monkeypatch.setattr(worker, "_opened", None)
+    scene, inline = bsc.Scene(save(stage)), Inline()
+    checks = checking.Checks(bsc.Selection(), "exact", "cpu", True, None, 0)
+    assert workers.selection_without_initial_in_workers(scene, checks, inline) == checks.selection
+    assert list(workers.check_in_workers(scene, checks, inline))
+    assert len(scene.left_out) == 1
+
+
 def test_an_error_in_a_worker(tmp_path, capsys):
     """The intervals before it are there, and the error reads as without workers."""
     stage = new_stage(tmp_path / "scene.usda")

@@ -1,7 +1,4 @@
-"""Reads and writes of 16 bytes at a time on GPUs, and directions in 4 bytes: phases mostly wait for memory.
-
-Warp reads and writes 4 bytes at a time.
-"""
+"""Reads and writes of 16 bytes at a time on GPUs, where Warp has those of 4: phases mostly wait for memory."""
 
 import warp as wp
 
@@ -94,31 +91,3 @@ READ_BLOCK = """
 def stored_block(blocks: wp.array[mat34], k: int) -> wp.mat33:
     """Returns a block that was written."""
     ...
-
-
-_LARGEST, _UNIT = wp.constant(wp.float64(511.0)), wp.constant(float(1.0 / 511.0))
-"""Of a component in ten bits, and what 1 there stands for."""
-_SHORTER = wp.constant(wp.float64(1.0 - 2.0**-9))
-"""With it, rounding to multiples of 1 / 511 leaves a unit vector shorter than 1."""
-
-
-@wp.func
-def _bits_of(component: wp.float64) -> int:
-    return int(wp.rint(_LARGEST * _SHORTER * component)) & 1023
-
-
-@wp.func
-def direction_in_bits(n: wp.vec3d) -> int:
-    """Returns a unit vector in 30 bits, for :func:`direction_of_bits`."""
-    return _bits_of(n[0]) | (_bits_of(n[1]) << 10) | (_bits_of(n[2]) << 20)
-
-
-@wp.func
-def _component_of(bits: int) -> float:
-    return _UNIT * float(((bits & 1023) ^ 512) - 512)
-
-
-@wp.func
-def direction_of_bits(bits: int) -> wp.vec3:
-    """Returns a vector no longer than 1, within 0.005 of the unit vector; 0 for 0."""
-    return wp.vec3(_component_of(bits), _component_of(bits >> 10), _component_of(bits >> 20))

@@ -71,6 +71,7 @@ class _Opened:
 
 
 _opened: _Opened | None = None
+"""What this worker has opened last."""
 
 
 def device_of_worker(name: str | None, number: int, gpu_count: int) -> str | None:

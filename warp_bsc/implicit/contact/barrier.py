@@ -18,7 +18,7 @@ import warp as wp
 from ...kernels.distance import closest_points, nearest_pair
 from ...kernels.not_inlined import NOT_INLINED
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ...response.state.vectors import HALF, ONE, ZERO, to_single
+from ...response.state.vectors import HALF, ONE, ZERO
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,12 +38,6 @@ MOST_LEFT = 0.3
 """Share of the reach that a pair keeps at most."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
-ROUNDED_DOWN, ROUNDED_UP = wp.constant(float(1.0 - 2.0**-20)), wp.constant(float(1.0 + 2.0**-20))
-"""What keeps numbers in single precision, as they are rounded, from being more or less than they are."""
-_ROUNDING = wp.constant(float(2.0**-18))
-"""More than rounding changes distances, as a share of the largest component of what they are found from."""
-_TINY = wp.constant(float(2.0**-60))
-"""Length below which the square of a component is rounded to 0 or nearly [m]."""
 
 
 @wp.func
@@ -113,78 +107,6 @@ def least_distance(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d
         return wp.max(distance - _TWO * error, ZERO)
     _there, found, rounding = closest_points(VERTEX_FACE, c - b, d - b, a - b)
     return wp.max(found - _TWO * rounding, ZERO)
-
-
-# Bounds of distances, of which many are found: in single precision, with points seen from the fourth one, so that
-# rounding hardly counts. On GPUs, that takes a fifth of the instructions.
-
-
-@wp.func
-def seen_from_last(x: wp.array[Any], corners: wp.vec4i):
-    """Returns the first three of four vertices as seen from the last one."""
-    d = x[corners[3]]
-    return to_single(x[corners[0]] - d), to_single(x[corners[1]] - d), to_single(x[corners[2]] - d)
-
-
-@wp.func
-def rounding_of(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Returns by how much more than they are rounding makes distances that are found from what is seen from d."""
-    return _ROUNDING * wp.max(wp.max(wp.max(wp.abs(a)), wp.max(wp.abs(b))), wp.max(wp.abs(c))) + _TINY
-
-
-@wp.func
-def distance_of_boxes(kind: int, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Returns the distance of the boxes around two elements, at most that of the elements, but for its rounding."""
-    of_first, of_second = wp.where(kind == EDGE_EDGE, b, a), wp.where(kind == EDGE_EDGE, c, b)
-    first, last = wp.min(a, of_first), wp.max(a, of_first)
-    lower, upper = wp.min(wp.min(of_second, c), wp.vec3()), wp.max(wp.max(of_second, c), wp.vec3())
-    return wp.length(wp.max(wp.max(lower - last, first - upper), wp.vec3()))
-
-
-@wp.func
-def distance_along(kind: int, n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> float:
-    """Returns the distance of two elements along a vector from the second to the first.
-
-    With one no longer than 1, it is at most their distance, but for its rounding.
-    """
-    along_a, along_b, along_c = wp.dot(n, a), wp.dot(n, b), wp.dot(n, c)
-    of_first = wp.where(kind == EDGE_EDGE, along_b, along_a)
-    of_second = wp.where(kind == EDGE_EDGE, along_c, along_b)
-    return wp.min(along_a, of_first) - wp.max(wp.max(of_second, along_c), 0.0)
-
-
-@wp.func
-def distance_of_ways(
-    kind: int,
-    # points
-    a: wp.vec3,
-    b: wp.vec3,
-    c: wp.vec3,
-    # their ways
-    p: wp.vec3,
-    q: wp.vec3,
-    r: wp.vec3,
-) -> float:
-    """Returns the distance of the boxes around the ways of two elements, at most that of the elements on them.
-
-    But for its rounding, and ways are seen from the fourth point as well.
-    """
-    low, high = wp.min(b, b + q), wp.max(b, b + q)
-    first, last = wp.min(a, a + p), wp.max(a, a + p)
-    lower, upper = wp.min(wp.min(c, c + r), wp.vec3()), wp.max(wp.max(c, c + r), wp.vec3())
-    if kind == EDGE_EDGE:
-        first, last = wp.min(first, low), wp.max(last, high)
-    else:
-        lower, upper = wp.min(lower, low), wp.max(upper, high)
-    return wp.length(wp.max(wp.max(lower - last, first - upper), wp.vec3()))
-
-
-@wp.func
-def way_together(kind: int, p: wp.vec3, q: wp.vec3, r: wp.vec3) -> float:
-    """Returns how much nearer ways of points bring two elements at most: what all do does not count."""
-    of_p, of_q, of_r = wp.length(p), wp.length(q), wp.length(r)
-    way = wp.where(kind == EDGE_EDGE, wp.max(of_p, of_q) + of_r, of_p + wp.max(of_q, of_r))
-    return ROUNDED_UP * way + _TINY
 
 
 @wp.func

@@ -6,8 +6,18 @@ from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
-from ..vector_access import direction_of_bits, integers_at
+from ..vector_access import integers_at
 from . import barrier
+from .distance_bounds import (
+    ROUNDED_DOWN,
+    ROUNDED_UP,
+    direction_of_bits,
+    distance_along,
+    distance_of_ways,
+    rounding_of,
+    seen_from_last,
+    way_together,
+)
 from .pairs import (
     FAR,
     FAR_TOGETHER,
@@ -28,7 +38,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 _WAYS = wp.constant(float(6.0 * (1.0 + 2.0**-18)))
-"""So many displacements are in :func:`.barrier.way_together` at most, and arcs beside them; and more than rounding."""
+"""So many displacements are in :func:`.distance_bounds.way_together` at most, and arcs beside them, with rounding."""
 
 
 @wp.func
@@ -48,9 +58,15 @@ def _bends(trial: Trial, scale: float, corners: wp.vec4i) -> wp.vec2:
 
 
 @wp.func
+def _end_of(trial: Trial, scale: float, vertex: int) -> wp.vec3:
+    """Returns where a vertex is after a share of its displacement, as it is kept."""
+    return to_single(moved(trial, scale, vertex))
+
+
+@wp.func
 def last_of_pair(i: int, candidates: Candidates) -> wp.vec4:
     """Returns what tells most candidates apart, for :func:`list_pair`: read ahead, as most of the time is waiting."""
-    within = barrier.ROUNDED_UP * (float(kept_distance(candidates, i)) + candidates.reach[i])
+    within = ROUNDED_UP * (float(kept_distance(candidates, i)) + candidates.reach[i])
     return wp.vec4(candidates.share[i], candidates.now[i], candidates.apart[i], within)
 
 
@@ -69,7 +85,7 @@ def list_pair(
         return False
     if before == FAR_TOGETHER and not is_shorter:
         # no displacements that long bring it within its reach, whichever of its vertices have them
-        left = barrier.ROUNDED_DOWN * now - _WAYS * progress.longest[world]
+        left = ROUNDED_DOWN * now - _WAYS * progress.longest[world]
         if left >= within:
             candidates.now[i] = left
             return False
@@ -85,28 +101,28 @@ def list_pair(
     candidates.share[i] = FAR
     if stays:
         return False
-    p, q, r = barrier.seen_from_last(trial.displaced, corners)
+    p, q, r = seen_from_last(trial.displaced, corners)
     bends = trial.bend[corners[0]] + trial.bend[corners[1]] + trial.bend[corners[2]] + trial.bend[corners[3]]
-    bend, way = barrier.ROUNDED_UP * bends, barrier.way_together(kind, p, q, r)
-    within = barrier.ROUNDED_UP * (within + bend)
-    left = barrier.ROUNDED_DOWN * now - way
+    bend, way = ROUNDED_UP * bends, way_together(kind, p, q, r)
+    within = ROUNDED_UP * (within + bend)
+    left = ROUNDED_DOWN * now - way
     if is_shorter or before != FAR_TOGETHER or left < within:  # positions are read where displacements do not tell
-        a, b, c = barrier.seen_from_last(trial.x, corners)
-        rounding = barrier.rounding_of(a, b, c) + barrier.rounding_of(p, q, r)
+        a, b, c = seen_from_last(trial.x, corners)
+        rounding = rounding_of(a, b, c) + rounding_of(p, q, r)
         if before >= FAR:
             now = distance_bound(candidates, i, kind, a, b, c)
         left = 0.0
         if now >= within and not is_shorter:
             # what moves together is as far from each other along a vector as at the start or the end, or farther
             n = direction_of_bits(candidates.normal[i])
-            at_start = barrier.distance_along(kind, n, a, b, c)
-            at_end = barrier.distance_along(kind, n, a + p, b + q, c + r)
-            left = wp.max(barrier.ROUNDED_DOWN * now - way, wp.min(at_start, at_end) - rounding)
+            at_start = distance_along(kind, n, a, b, c)
+            at_end = distance_along(kind, n, a + p, b + q, c + r)
+            left = wp.max(ROUNDED_DOWN * now - way, wp.min(at_start, at_end) - rounding)
     if left >= within:
         candidates.share[i] = FAR_TOGETHER
-        candidates.now[i] = barrier.ROUNDED_DOWN * left - bend
+        candidates.now[i] = ROUNDED_DOWN * left - bend
         return False
-    if now >= within and barrier.distance_of_ways(kind, a, b, c, p, q, r) - rounding >= within:
+    if now >= within and distance_of_ways(kind, a, b, c, p, q, r) - rounding >= within:
         return False
     candidates.now[i] = now
     candidates.share[i] = 1.0
@@ -132,26 +148,25 @@ def bound_by_pair(
     reach, floor = candidates.reach[i] + float(0.0), candidates.floor[i] + float(0.0)
     now = candidates.now[i] + float(0.0)
     scale = progress.scale[world]
-    d = trial.x[corners[3]] + wp.vec3()
-    a, b, c = trial.x[corners[0]] - d, trial.x[corners[1]] - d, trial.x[corners[2]] - d
-    p = to_single(moved(trial, scale, corners[0])) - trial.x[corners[0]]
-    q = to_single(moved(trial, scale, corners[1])) - trial.x[corners[1]]
-    r = to_single(moved(trial, scale, corners[2])) - trial.x[corners[2]]
-    s = to_single(moved(trial, scale, corners[3])) - d
+    a, b, c = seen_from_last(trial.x, corners)
+    p = _end_of(trial, scale, corners[0]) - trial.x[corners[0]]
+    q = _end_of(trial, scale, corners[1]) - trial.x[corners[1]]
+    r = _end_of(trial, scale, corners[2]) - trial.x[corners[2]]
+    s = _end_of(trial, scale, corners[3]) - trial.x[corners[3]]
     bends = _bends(trial, scale, corners)
-    rounding = barrier.rounding_of(p, q, r) + barrier.rounding_of(s, s, s)
-    way = barrier.way_together(kind, p - s, q - s, r - s) + rounding + bends[0]
-    gap = barrier.ROUNDED_DOWN * now - barrier.ROUNDED_UP * float(kept)
+    rounding = rounding_of(p, q, r) + rounding_of(s, s, s)
+    way = way_together(kind, p - s, q - s, r - s) + rounding + bends[0]
+    gap = ROUNDED_DOWN * now - ROUNDED_UP * float(kept)
     # the closest points are found for what comes near
-    if way <= barrier.ROUNDED_DOWN * (gap - barrier.least_gap(gap, reach, floor)):
+    if way <= ROUNDED_DOWN * (gap - barrier.least_gap(gap, reach, floor)):
         return
-    apart = barrier.distance_of_ways(kind, a, b, c, p - s, q - s, r - s) - barrier.rounding_of(a, b, c) - rounding
-    if apart >= barrier.ROUNDED_UP * (float(kept) + bends[0] + barrier.MOST_LEFT * reach):
+    apart = distance_of_ways(kind, a, b, c, p - s, q - s, r - s) - rounding_of(a, b, c) - rounding
+    if apart >= ROUNDED_UP * (float(kept) + bends[0] + barrier.MOST_LEFT * reach):
         return
     e, f, g, h = corners_of(trial.x, corners)
     _weights, distance = barrier.closest_weights_and_gap(kind, e, f, g, h)
     least = barrier.least_gap(distance - kept, wp.float64(reach), wp.float64(floor))
-    if wp.float64(barrier.ROUNDED_UP * way) <= distance - kept - least:
+    if wp.float64(ROUNDED_UP * way) <= distance - kept - least:
         return
     # what other pairs allow: more than that changes nothing
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
@@ -163,10 +178,10 @@ def bound_by_pair(
             f,
             g,
             h,
-            to_double(to_single(moved(trial, scale, corners[0]))) - e,
-            to_double(to_single(moved(trial, scale, corners[1]))) - f,
-            to_double(to_single(moved(trial, scale, corners[2]))) - g,
-            to_double(to_single(moved(trial, scale, corners[3]))) - h,
+            to_double(_end_of(trial, scale, corners[0])) - e,
+            to_double(_end_of(trial, scale, corners[1])) - f,
+            to_double(_end_of(trial, scale, corners[2])) - g,
+            to_double(_end_of(trial, scale, corners[3])) - h,
             kept + least,
             most,
             of_bends,

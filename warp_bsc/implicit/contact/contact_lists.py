@@ -61,6 +61,7 @@ def place_entries(u: int, world: int, contacts: Contacts):
 
 @wp.func
 def _list_entry(contacts: Contacts, u: int, entry: int, count: int):
+    """Lists an entry of a contact of so many unknowns."""
     n = wp.atomic_add(contacts.end, u, 1)
     contacts.unsorted[n] = entry
     contacts.row[n] = u

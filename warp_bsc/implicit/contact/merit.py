@@ -8,6 +8,7 @@ from ...response.state.structs import Motion
 from ...response.state.vectors import ZERO, corners_of, to_double
 from ..vector_access import integers_at, numbers_at
 from . import barrier
+from .distance_bounds import seen_from_last
 from .pairs import (
     BarrierSettings,
     Candidates,
@@ -76,7 +77,7 @@ def add_pair_energy(
     """Adds the energy of the barrier of a candidate at the displaced positions."""
     corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     kind = kind_of_key(candidates.key[i])
-    u, v, w = barrier.seen_from_last(trial.moved, corners)
+    u, v, w = seen_from_last(trial.moved, corners)
     if wp.float64(distance_bound(candidates, i, kind, u, v, w)) >= candidates.level[i] + reach:
         return
     a, b, c, d = corners_of(trial.moved, corners)

@@ -7,8 +7,9 @@ from ...response.contacts.rules import inverse_mass_of
 from ...response.state.planes import MovingPlanes, signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
-from ..vector_access import direction_in_bits, integers_at, store_block
+from ..vector_access import integers_at, store_block
 from . import barrier
+from .distance_bounds import ROUNDED_DOWN, direction_in_bits, seen_from_last
 from .merge import link_contact
 from .merit import MEETS, add_energy
 from .pairs import (
@@ -119,7 +120,7 @@ def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
     if candidates.share[i] >= FAR:
         return False
     kind = kind_of_key(candidates.key[i])
-    a, b, c = barrier.seen_from_last(trial.exact, integers_at(candidates.corners, i))
+    a, b, c = seen_from_last(trial.exact, integers_at(candidates.corners, i))
     apart = distance_bound(candidates, i, kind, a, b, c)
     candidates.now[i] = apart
     is_near = wp.float64(apart) < candidates.level[i] + wp.float64(candidates.reach[i])
@@ -144,14 +145,14 @@ def find_near(
     corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
     key = candidates.key[i] + wp.int64(0)
     kind = kind_of_key(key)
-    u, v, w = barrier.seen_from_last(trial.exact, corners)
+    u, v, w = seen_from_last(trial.exact, corners)
     apart = distance_bound(candidates, i, kind, u, v, w)
     candidates.now[i] = apart
     if wp.float64(apart) >= candidates.level[i] + reach:
         return
     a, b, c, d = corners_of(trial.exact, corners)
     weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
-    candidates.now[i] = float(distance * wp.float64(barrier.ROUNDED_DOWN))
+    candidates.now[i] = float(distance * wp.float64(ROUNDED_DOWN))
     gap = distance - candidates.level[i]
     if not gap > ZERO:
         add_energy(progress.energy, world, MEETS, settings.units)

@@ -204,7 +204,7 @@ class NewtonMethod:
         processors = device.sm_count if device.is_cuda else 1
         self._is_many = device.is_cuda and vertices > _MANY_VERTICES * processors
         self._block, blocks = BLOCKS[self._is_many]
-        self._blocks = blocks * processors if device.is_cuda else 1
+        self._blocks = blocks * processors
         p = self._problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix

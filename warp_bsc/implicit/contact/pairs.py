@@ -11,8 +11,15 @@ from ...response.contacts.rules import ContactClass, crossed_at_start, inverse_m
 from ...response.state.planes import MovingPlanes, is_filtered_by_plane, signed_distance
 from ...response.state.structs import Motion, Step, body_of
 from ...response.state.vectors import HALF, ONE, ZERO, corners_of, to_double
-from ..vector_access import direction_of_bits
 from . import barrier
+from .distance_bounds import (
+    ROUNDED_DOWN,
+    direction_of_bits,
+    distance_along,
+    distance_of_boxes,
+    rounding_of,
+    seen_from_last,
+)
 from .system import Progress, key_of_pair
 
 wp.set_module_options({"enable_backward": False})
@@ -31,6 +38,8 @@ FAR = wp.constant(2.0)
 """In place of a share of the last displacements: no part of them brings a pair within its reach."""
 FAR_TOGETHER = wp.constant(3.0)
 """The same, as long as its vertices take the same part: displacements that hardly differ do not bring it nearer."""
+_FARTHER = wp.constant(2.5)
+"""What comes within its reach if two vertices go so many times the way of the step before, together, is not far."""
 _PARTED = wp.constant(1e-3)
 """How far what touches a shape is moved off it, as a share of its reach."""
 _PARTED_ROUNDED = wp.constant(2.0**-20)
@@ -67,7 +76,7 @@ class Candidates:
         share: Share of the last displacements before it would meet, :data:`FAR` or :data:`FAR_TOGETHER`.
         now: Distance where the Newton step begins, or less, of what was not :data:`FAR` in the one before [m].
         normal: Direction from the second closest point to the first where they were found last, 0 before, see
-            :func:`..vector_access.direction_of_bits`.
+            :func:`.distance_bounds.direction_of_bits`.
     """
 
     start: wp.array[int]
@@ -273,8 +282,23 @@ def distance_bound(candidates: Candidates, i: int, kind: int, a: wp.vec3, b: wp.
 
     The second is as good as the distance until the elements turn, and much faster to find. Points are seen from d.
     """
-    along = barrier.distance_along(kind, direction_of_bits(candidates.normal[i]), a, b, c)
-    return wp.max(along, barrier.distance_of_boxes(kind, a, b, c)) - barrier.rounding_of(a, b, c)
+    along = distance_along(kind, direction_of_bits(candidates.normal[i]), a, b, c)
+    return wp.max(along, distance_of_boxes(kind, a, b, c)) - rounding_of(a, b, c)
+
+
+@wp.func
+def _place_of(candidates: Candidates, world: int, k: int, first_count: int) -> int:
+    """Returns the place of a number in the room of a world: so many stand first, the others from the end backwards."""
+    start, place = candidates.start[world], k
+    if k >= first_count:
+        place = candidates.room[world] - 1 - (k - first_count)
+    return start + place
+
+
+@wp.func
+def candidate(candidates: Candidates, world: int, k: int) -> int:
+    """Returns a candidate of a world by its number there."""
+    return _place_of(candidates, world, k, candidates.near[world])
 
 
 @wp.func
@@ -304,10 +328,7 @@ def listed_count(candidates: Candidates, world: int) -> int:
 @wp.func
 def listed(candidates: Candidates, world: int, k: int) -> int:
     """Returns an entry of the list of a world: threads that run together mostly have pairs of one kind."""
-    edges, place = candidates.listed_edges[world], k
-    if k >= edges:
-        place = candidates.room[world] - 1 - (k - edges)
-    return candidates.list[candidates.start[world] + place] + int(0)
+    return candidates.list[_place_of(candidates, world, k, candidates.listed_edges[world])] + int(0)
 
 
 @wp.struct
@@ -347,7 +368,7 @@ def _longest_ways(progress: Progress, world: int) -> float:
 @wp.func
 def _far(progress: Progress, world: int) -> float:
     """Returns how far vertices can go together before a pair is within its reach that counts as far."""
-    return 2.5 * progress.way_before[world]
+    return _FARTHER * progress.way_before[world]
 
 
 @wp.func
@@ -373,8 +394,8 @@ def _prepare(
     if motion.distances.radius:
         start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
-        u, v, w = barrier.seen_from_last(origin, corners)
-        start = wp.float64(barrier.distance_of_boxes(queue.kind, u, v, w) - barrier.rounding_of(u, v, w))
+        u, v, w = seen_from_last(origin, corners)
+        start = wp.float64(distance_of_boxes(queue.kind, u, v, w) - rounding_of(u, v, w))
         if not start >= wp.float64(whole):  # farther away, all is the same
             start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
@@ -389,7 +410,7 @@ def _prepare(
     level, reach = _barrier_of(settings, start, kept, whole)
     pair = queue.pairs[i]
     slot = int(0)
-    world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(barrier.ROUNDED_DOWN))
+    world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(ROUNDED_DOWN))
     is_far = stays_far(apart, progress, world)
     if apart < _far(progress, world) or not is_far:
         slot = candidates.start[world] + take_slot_of(candidates.near, world)

@@ -12,7 +12,7 @@ from ..elasticity.derivatives import element_energy, find_derivatives
 from ..elasticity.elements import kind_of
 from . import assembly, bodies, bounds, contact_lists, decisions, held, merge, merit, near, steps
 from .flow import Phase, Place, Problem, wait_for_team
-from .pairs import BarrierSettings, Candidates, clear_list, far_ones_stay, listed, listed_count
+from .pairs import BarrierSettings, Candidates, candidate, clear_list, far_ones_stay, listed, listed_count
 from .system import Progress, Worlds, end_of_contacts
 
 wp.set_module_options({"enable_backward": False})
@@ -51,13 +51,6 @@ def _end_at_planes(worlds: Worlds, vertices_at_planes: int, w: int) -> int:
 def _has_few(candidates: Candidates, at: Place) -> bool:
     """Returns whether threads have one candidate each at most: they list and do what comes then at once."""
     return candidates.near[at.world] + candidates.far[at.world] <= at.threads
-
-
-@wp.func
-def _candidate(k: int, candidates: Candidates, w: int) -> int:
-    """Returns a candidate by its number in its world."""
-    start, near_count = candidates.start[w], candidates.near[w]
-    return wp.where(k < near_count, start + k, start + candidates.room[w] - 1 - (k - near_count))
 
 
 @wp.func
@@ -142,7 +135,7 @@ def begin_list(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, sett
 def list_near(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Lists candidates that may be near each other: little for each of all, so that what follows has few."""
     for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, True), at.threads):
-        near.list_near(_candidate(k, p.candidates, at.world), at.world, p.candidates, p.trial)
+        near.list_near(candidate(p.candidates, at.world, k), at.world, p.candidates, p.trial)
     return _to(at, Phase.FIND_NEAR)
 
 
@@ -153,7 +146,7 @@ def find_near(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setti
     for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, at_once), at.threads):
         i, is_near = int(0), bool(True)
         if at_once:
-            i = _candidate(k, p.candidates, at.world)
+            i = candidate(p.candidates, at.world, k)
             is_near = near.list_near(i, w, p.candidates, p.trial)
         else:
             i = listed(p.candidates, w, k) >> 1
@@ -315,7 +308,7 @@ def list_ways(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setti
     for k in range(at.thread - at.threads, count, at.threads):
         i, last = int(following), wp.vec4(of_following)
         if k + at.threads < count:
-            following = _candidate(k + at.threads, p.candidates, w)
+            following = candidate(p.candidates, w, k + at.threads)
             of_following = bounds.last_of_pair(following, p.candidates)
         if k >= 0:
             bounds.list_pair(i, last, w, p.candidates, p.trial, p.progress, at.passes > 0)
@@ -329,7 +322,7 @@ def bound(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings:
     for k in range(at.thread, _pair_count(p.candidates, p.progress, at.world, at_once), at.threads):
         i, is_new = int(0), bool(False)
         if at_once:
-            i = _candidate(k, p.candidates, at.world)
+            i = candidate(p.candidates, at.world, k)
             last = bounds.last_of_pair(i, p.candidates)
             is_new = bounds.list_pair(i, last, w, p.candidates, p.trial, p.progress, at.passes > 0)
         else:

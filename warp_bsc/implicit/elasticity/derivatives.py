@@ -32,7 +32,7 @@ class Derivatives:
 
 
 def make_derivatives(vertices: list[np.ndarray], device: wp.Device) -> Derivatives:
-    """Returns buffers for the derivatives of elements with the particles that :func:`elements_of_model` returns."""
+    """Returns buffers for derivatives of elements with the particles of :func:`.elements.elements_of_model`."""
     derivatives, bends = Derivatives(), len(vertices[ElementKind.BENDING])
     blocks = sum(v.size * v.shape[1] for kind, v in enumerate(vertices) if kind != ElementKind.BENDING)
     derivatives.gradient = wp.zeros(sum(v.size for v in vertices), dtype=wp.vec3, device=device)

@@ -3,8 +3,8 @@
 import numpy as np
 import warp as wp
 
-from warp_bsc.implicit.contact import barrier
-from warp_bsc.implicit.vector_access import direction_in_bits, direction_of_bits
+from warp_bsc.implicit.contact import barrier, distance_bounds
+from warp_bsc.implicit.contact.distance_bounds import direction_in_bits, direction_of_bits
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
 
@@ -26,13 +26,13 @@ def _bound(
     other = direction_of_bits(direction_in_bits(others[i]))
     directions[i, 0] = n
     directions[i, 1] = wp.vec3d(kept)
-    u, v, w = barrier.seen_from_last(points, corners)
-    p, q, r = barrier.seen_from_last(ways, corners)
-    rounding = barrier.rounding_of(u, v, w)
+    u, v, w = distance_bounds.seen_from_last(points, corners)
+    p, q, r = distance_bounds.seen_from_last(ways, corners)
+    rounding = distance_bounds.rounding_of(u, v, w)
     values[i, 0] = distance
-    values[i, 1] = wp.float64(barrier.distance_along(kind, kept, u, v, w) - rounding)
-    values[i, 2] = wp.float64(barrier.distance_along(kind, other, u, v, w) - rounding)
-    values[i, 3] = wp.float64(barrier.distance_of_boxes(kind, u, v, w) - rounding)
+    values[i, 1] = wp.float64(distance_bounds.distance_along(kind, kept, u, v, w) - rounding)
+    values[i, 2] = wp.float64(distance_bounds.distance_along(kind, other, u, v, w) - rounding)
+    values[i, 3] = wp.float64(distance_bounds.distance_of_boxes(kind, u, v, w) - rounding)
     # the least of the distances on the ways of the points
     least = distance
     for k in range(1, 17):
@@ -42,9 +42,9 @@ def _bound(
         _weights, then = barrier.closest_weights_and_gap(kind, e, f, g, h)
         least = wp.min(least, then)
     values[i, 4] = least
-    rounding += barrier.rounding_of(p, q, r)
-    values[i, 5] = wp.float64(barrier.distance_of_ways(kind, u, v, w, p, q, r) - rounding)
-    values[i, 6] = distance - wp.float64(barrier.way_together(kind, p, q, r))
+    rounding += distance_bounds.rounding_of(p, q, r)
+    values[i, 5] = wp.float64(distance_bounds.distance_of_ways(kind, u, v, w, p, q, r) - rounding)
+    values[i, 6] = distance - wp.float64(distance_bounds.way_together(kind, p, q, r))
 
 
 @wp.kernel(enable_backward=False)
