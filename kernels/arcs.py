@@ -43,7 +43,7 @@ from .ccd import impact_at_distance
 from .closest import contact_at, contact_weights
 from .distance import closest_points
 from .motion import all_finite, double, doubles, relative_motion
-from .pipeline.pairs import distance_of_corners, firsts_of
+from .pairs import distance_of_corners, firsts_of
 from .polynomials import EDGE_EDGE, VERTEX_FACE
 from .signs import FREE, HIT, ROUNDOFF, UNSURE
 from .time_of_impact import Impact

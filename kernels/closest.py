@@ -5,7 +5,7 @@ None of this is certified: culling accepts any direction, and coordinates are ro
 
 import warp as wp
 
-from .pipeline.pairs import firsts_of
+from .pairs import firsts_of
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion
 
 _ZERO = wp.constant(wp.float64(0.0))

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from .pipeline.boxes import boxes_apart
+from .boxes import boxes_apart
 from .polynomials import VERTEX_FACE, Motion
 from .signs import UNDERFLOW
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_bsc._private_names import of_newton, of_warp, versions
 from warp_bsc._private_names.tape_access import Access, access_to
-from warp_bsc.detection.host_function import run_on_host
+from warp_bsc.detection.run.host_function import run_on_host
 
 
 @pytest.fixture

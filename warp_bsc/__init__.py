@@ -29,21 +29,21 @@ if not (Path(__file__).parent / "kernels").is_dir():
 
 if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from . import checker
+    from .detection.arcs.rigid_motion import RigidMotion
+    from .detection.at_rest.proximities import distances
     from .detection.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.detector import CollisionDetector
     from .detection.differentiable import CollisionArrays
     from .detection.mesh import CollisionMesh, leave_out
-    from .detection.proximities import distances
-    from .detection.query import (
+    from .detection.queries.query import (
         QueryResult,
         query_edge_edge,
         query_vertex_edge,
         query_vertex_face,
         query_vertex_vertex,
     )
-    from .detection.query_arrays import QueryArrays
-    from .detection.query_points import query_points
-    from .detection.rigid_motion import RigidMotion
+    from .detection.queries.query_arrays import QueryArrays
+    from .detection.queries.query_points import query_points
     from .implicit.solver import SolverImplicitAdjoint
     from .implicit.solver_implicit import SolverImplicit
     from .repair.repair import repair

@@ -13,8 +13,8 @@ import warp as wp
 
 from ..clearance import INFLATED, NORMAL_ERROR, PLANE_ERROR
 from ..min_distance import AWAY, SHORTEST, SMALLEST
+from ..pairs import ABOVE_SUM
 from ..signs import ROUNDOFF
-from .pairs import ABOVE_SUM
 from .simd import native_for_pairs
 from .simd_query import QUERY, QUERY_CONSTANTS
 

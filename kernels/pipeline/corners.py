@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from .boxes import BoxRows, lowered, raised, rounded, union_of_boxes
+from ..boxes import BoxRows, lowered, raised, rounded, union_of_boxes
 
 ROW, PADDED_ROW = 24, 40
 """Numbers of a row, without and with a padding."""

@@ -7,7 +7,7 @@ order, and each tests all children.
 
 import warp as wp
 
-from .boxes import BoxRows, boxes_apart, read_box, write_box
+from ..boxes import BoxRows, boxes_apart, read_box, write_box
 
 WIDTH = 32
 """Children of a node, and threads of a warp."""

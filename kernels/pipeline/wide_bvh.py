@@ -327,7 +327,7 @@ def fit_packet_of(dtype: type) -> wp.Function:
         Device function for the CPU. Its arguments are the packet, the number of its elements, the positions at both
         ends, the number of corners of an element, the mark of each vertex or None for 1, how far boxes reach
         beyond each vertex or None, and the elements. It writes the boxes, the packet's entry in its node, and the
-        marks of the elements. Boxes are rounded as by :func:`~warp_bsc.kernels.pipeline.boxes.rounded`. That of an
+        marks of the elements. Boxes are rounded as by :func:`~warp_bsc.kernels.boxes.rounded`. That of an
         element with a position that is not finite is empty. Indices are not checked.
     """
     snippet = _FIT_SNIPPET.format(scalar="float" if dtype is wp.vec3 else "double")

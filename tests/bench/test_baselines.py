@@ -7,8 +7,8 @@ from generators import GENERATORS
 
 from warp_bsc import checker
 from warp_bsc.bench.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
-from warp_bsc.detection.narrow_phase import NarrowPhase
-from warp_bsc.detection.settings import PairKind
+from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
+from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
 KINDS = ("vertex_face", "edge_edge")

@@ -17,8 +17,8 @@ from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
 from warp_bsc.bench.worst_case import find_worst
 from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
-from warp_bsc.detection.launch import cores
-from warp_bsc.detection.settings import PairKind
+from warp_bsc.detection.run.launch import cores
+from warp_bsc.detection.run.settings import PairKind
 
 TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries=50, repeat=1)
 

@@ -12,7 +12,7 @@ from warp_bsc.bench import queries as bench_queries
 from warp_bsc.bench import query_files
 from warp_bsc.bench.queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
 from warp_bsc.cli.main import main
-from warp_bsc.detection.settings import PairKind
+from warp_bsc.detection.run.settings import PairKind
 
 
 def measure(capsys, device, *arguments):

@@ -4,8 +4,8 @@ import pytest
 import warp as wp
 
 from warp_bsc.cli import device
-from warp_bsc.detection import compilation
 from warp_bsc.detection.pipeline import _add_deviations
+from warp_bsc.detection.run import compilation
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, ani
 from warp_bsc.cli import device
 from warp_bsc.cli.main import main
 from warp_bsc.cli.repair import add_to as add_repair
-from warp_bsc.detection import compilation
+from warp_bsc.detection.run import compilation
 
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 

@@ -10,7 +10,7 @@ from arc_truth import path, sampled_distances, speed_bounds
 from sheets import crumpled
 
 import warp_bsc as bsc
-from warp_bsc.detection import arc_pipeline
+from warp_bsc.detection.arcs import arc_pipeline
 
 KINDS = ("vertex_face", "edge_edge")
 X, Y, Z = np.eye(3)

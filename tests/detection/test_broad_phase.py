@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from sheets import crumpled, grid
 
 import warp_bsc as bsc
-from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
-from warp_bsc.detection.face_hierarchy import traversal_kernel
-from warp_bsc.detection.settings import Count
-from warp_bsc.detection.wide_tree import hilbert_transpose
+from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.detection.broad.broad_phase_simd import BroadPhaseSimd
+from warp_bsc.detection.broad.face_hierarchy import traversal_kernel
+from warp_bsc.detection.broad.wide_tree import hilbert_transpose
+from warp_bsc.detection.run.settings import Count
 from warp_bsc.kernels.pipeline.hierarchy import count_set_bits
 
 

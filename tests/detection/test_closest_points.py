@@ -3,7 +3,7 @@
 import numpy as np
 import trimesh
 
-from warp_bsc.detection.closest_points import ClosestPointFinder
+from warp_bsc.detection.at_rest.closest_points import ClosestPointFinder
 
 
 def test_closest_points_are_the_nearest_of_all_faces():

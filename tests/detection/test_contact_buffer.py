@@ -10,7 +10,7 @@ from collision_results import assert_same
 from sheets import crumpled, grid
 
 import warp_bsc as bsc
-from warp_bsc.detection.contact_buffer import ContactBuffer
+from warp_bsc.detection.narrow.contact_buffer import ContactBuffer
 
 METHODS = ("float", "conservative", "exact")
 

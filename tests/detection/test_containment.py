@@ -6,8 +6,8 @@ import trimesh
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection import containment
-from warp_bsc.detection.containment import ContainmentFinder
+from warp_bsc.detection.at_rest import containment
+from warp_bsc.detection.at_rest.containment import ContainmentFinder
 
 BOX = trimesh.creation.box(bounds=[(0, 0, 0), (1, 1, 1)])
 

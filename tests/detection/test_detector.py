@@ -10,11 +10,11 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from warp_bsc.detection.intersections import find_intersections
-from warp_bsc.detection.launch import retry_until_fits
+from warp_bsc.detection.at_rest.intersections import find_intersections
+from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.pipeline import DetectionPipeline
-from warp_bsc.detection.settings import Count
+from warp_bsc.detection.run.launch import retry_until_fits
+from warp_bsc.detection.run.settings import Count
 from warp_bsc.kernels.signs import FREE
 
 METHODS = ("float", "conservative", "exact")

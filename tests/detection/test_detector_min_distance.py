@@ -7,12 +7,13 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection import intersections, pipeline
-from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
-from warp_bsc.detection.distance_phase import pair_distances
-from warp_bsc.detection.rings import make_rings
-from warp_bsc.detection.settings import DistanceKind
+from warp_bsc.detection import pipeline
+from warp_bsc.detection.at_rest import intersections
+from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.detection.broad.broad_phase_simd import BroadPhaseSimd
+from warp_bsc.detection.narrow.distance_phase import pair_distances
+from warp_bsc.detection.narrow.rings import make_rings
+from warp_bsc.detection.run.settings import DistanceKind
 
 
 def scene(dtype, seed=1):

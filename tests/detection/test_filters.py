@@ -5,8 +5,8 @@ import pytest
 from filters import left_in, random_bits
 
 import warp_bsc as bsc
-from warp_bsc.detection.intersections import IntersectionFinder
-from warp_bsc.detection.settings import DistanceKind
+from warp_bsc.detection.at_rest.intersections import IntersectionFinder
+from warp_bsc.detection.run.settings import DistanceKind
 
 KINDS = [kind.label for kind in DistanceKind]
 

@@ -7,7 +7,7 @@ from sheets import grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.intersections import IntersectionFinder, find_intersections
+from warp_bsc.detection.at_rest.intersections import IntersectionFinder, find_intersections
 
 
 def test_intersections_are_exactly_those_of_all_pairs(broad_phase):

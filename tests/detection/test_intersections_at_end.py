@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from sheets import crumpled
 
 import warp_bsc as bsc
-from warp_bsc.detection import intersections
-from warp_bsc.detection.intersections import IntersectionFinder
+from warp_bsc.detection.at_rest import intersections
+from warp_bsc.detection.at_rest.intersections import IntersectionFinder
 
 _search = IntersectionFinder.find
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.detection.launch import _pool, cores, launch_over
+from warp_bsc.detection.run.launch import _pool, cores, launch_over
 
 
 @wp.kernel

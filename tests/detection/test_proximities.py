@@ -9,10 +9,10 @@ from distances import squared_distances
 from sheets import crumpled
 
 import warp_bsc as bsc
-from warp_bsc.detection import proximities
-from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from warp_bsc.detection.broad_phase_simd import BroadPhaseSimd
-from warp_bsc.detection.proximities import ProximityFinder
+from warp_bsc.detection.at_rest import proximities
+from warp_bsc.detection.at_rest.proximities import ProximityFinder
+from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.detection.broad.broad_phase_simd import BroadPhaseSimd
 from warp_bsc.kernels.distance import closest_points
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 

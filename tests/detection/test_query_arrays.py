@@ -6,7 +6,7 @@ import warp as wp
 from generators import GENERATORS
 
 import warp_bsc as bsc
-from warp_bsc.detection.launch import cores
+from warp_bsc.detection.run.launch import cores
 
 KINDS = ("vertex_face", "edge_edge")
 METHODS = ("float", "conservative", "exact")

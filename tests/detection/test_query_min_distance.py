@@ -7,8 +7,8 @@ from flushing import subnormals_flushed
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.launch import cores
-from warp_bsc.detection.proximities import ProximityFinder
+from warp_bsc.detection.at_rest.proximities import ProximityFinder
+from warp_bsc.detection.run.launch import cores
 
 KINDS = distances.KINDS
 QUERIES = {kind: getattr(bsc, f"query_{kind}") for kind in KINDS}

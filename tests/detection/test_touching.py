@@ -6,8 +6,8 @@ from sheets import grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.containment import ContainmentFinder
-from warp_bsc.detection.intersections import IntersectionFinder
+from warp_bsc.detection.at_rest.containment import ContainmentFinder
+from warp_bsc.detection.at_rest.intersections import IntersectionFinder
 
 _CHECKS = ("edge_face_crossings", "edges_pass_faces")
 

@@ -9,9 +9,9 @@ import warp as wp
 from sheets import crumpled
 
 import warp_bsc as bsc
-from warp_bsc.detection.launch import retry_until_fits
 from warp_bsc.detection.pipeline import DetectionPipeline
-from warp_bsc.detection.settings import DistanceKind
+from warp_bsc.detection.run.launch import retry_until_fits
+from warp_bsc.detection.run.settings import DistanceKind
 from warp_bsc.kernels.min_distance import _cleared_until
 from warp_bsc.kernels.motion import motion_and_distance
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_FACE

@@ -10,7 +10,7 @@ import warp as wp
 from arc_truth import path
 
 import warp_bsc as bsc
-from warp_bsc.detection.rigid_motion import ArcBounds
+from warp_bsc.detection.arcs.rigid_motion import ArcBounds
 
 
 def bounds_of(x0, x1, centre, turn, device):

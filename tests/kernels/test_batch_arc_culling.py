@@ -7,9 +7,9 @@ from generators import GENERATORS
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.kernels.bits import lowest_bit
 from warp_bsc.kernels.pipeline.batch_arc_culling import cull_arc_batch_of
 from warp_bsc.kernels.pipeline.batch_culling import BATCH
-from warp_bsc.kernels.pipeline.bits import lowest_bit
 
 KINDS = ("vertex_face", "edge_edge")
 _KERNEL = {"enable_backward": False, "module": "unique", "module_options": {"fuse_fp": False}}

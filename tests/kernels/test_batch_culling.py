@@ -7,7 +7,8 @@ from generators import GENERATORS
 
 from warp_bsc import checker
 from warp_bsc.bench.methods import Queries, QuerySet
-from warp_bsc.detection.settings import PairKind
+from warp_bsc.detection.run.settings import PairKind
+from warp_bsc.kernels.bits import lowest_bit
 from warp_bsc.kernels.culling import (
     centroid_direction,
     direction_separates,
@@ -16,7 +17,6 @@ from warp_bsc.kernels.culling import (
 )
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
 from warp_bsc.kernels.pipeline.batch_culling import BATCH, cull_batch_of
-from warp_bsc.kernels.pipeline.bits import lowest_bit
 from warp_bsc.kernels.polynomials import coplanarity
 from warp_bsc.kernels.signs import ROUNDOFF, certified_sign_cubic
 

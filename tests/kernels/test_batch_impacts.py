@@ -7,11 +7,11 @@ from generators import GENERATORS
 from simd_packets import in_normal_range
 
 from warp_bsc.bench.methods import Queries, QuerySet
-from warp_bsc.detection.settings import NO_FUSED_OPERATIONS, PairKind
+from warp_bsc.detection.run.settings import NO_FUSED_OPERATIONS, PairKind
+from warp_bsc.kernels.bits import lowest_bit
 from warp_bsc.kernels.classification import classify
 from warp_bsc.kernels.motion import relative_motion
 from warp_bsc.kernels.pipeline.batch_impacts import BATCH, impact_batch_of
-from warp_bsc.kernels.pipeline.bits import lowest_bit
 from warp_bsc.kernels.polynomials import coplanarity
 from warp_bsc.kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from warp_bsc.kernels.time_of_impact import clamped_tolerance, impact, power_of_two

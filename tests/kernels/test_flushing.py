@@ -10,7 +10,7 @@ from impacts import impact_kernel
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.launch import cores
+from warp_bsc.detection.run.launch import cores
 from warp_bsc.kernels import FREE, HIT, UNSURE, roots
 from warp_bsc.kernels.exact.polygon import BITS
 

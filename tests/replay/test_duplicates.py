@@ -11,7 +11,7 @@ from stages import add_mesh, find, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
-from warp_bsc.detection import containment
+from warp_bsc.detection.at_rest import containment
 
 
 def add_box(stage, path, size=1.0, by=(0, 0, 0), *, seed=None, counts=None, sides=SIDES):

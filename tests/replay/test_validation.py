@@ -5,8 +5,8 @@ import pytest
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.launch import retry_until_fits
 from warp_bsc.detection.pipeline import DetectionPipeline
+from warp_bsc.detection.run.launch import retry_until_fits
 from warp_bsc.replay import validation
 from warp_bsc.replay.validation import overlapping_boxes, validate
 

@@ -16,8 +16,8 @@ import warp as wp
 from test_solver import DT, SOLVERS, bullet
 
 import warp_bsc as bsc
-from warp_bsc.detection import host_function
-from warp_bsc.detection.host_function import run_on_host
+from warp_bsc.detection.run import host_function
+from warp_bsc.detection.run.host_function import run_on_host
 
 CPU = wp.get_device("cpu")
 

@@ -11,7 +11,7 @@ from sheets import crumpled
 
 import warp_bsc as bsc
 from warp_bsc.detection import pipeline
-from warp_bsc.detection.broad_phase_hierarchy import BroadPhaseHierarchy
+from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.response.contacts.detect import inspect
 from warp_bsc.response.contacts.proximities import add_proximities
 from warp_bsc.response.schedule import Result

@@ -26,8 +26,8 @@ from rich.table import Table
 import warp_bsc as bsc
 from warp_bsc.cli.main import _build_parser
 from warp_bsc.cli.options import natural, positive
-from warp_bsc.detection.intersections import IntersectionFinder, find_intersections
-from warp_bsc.detection.proximities import ProximityFinder
+from warp_bsc.detection.at_rest.intersections import IntersectionFinder, find_intersections
+from warp_bsc.detection.at_rest.proximities import ProximityFinder
 
 __all__ = ["Row", "main", "rows"]
 

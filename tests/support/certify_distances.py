@@ -25,12 +25,12 @@ from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.distance_phase import run_distance_phases
-from warp_bsc.detection.launch import cores
-from warp_bsc.detection.narrow_phase import NarrowPhase
-from warp_bsc.detection.rings import Rings
-from warp_bsc.detection.settings import Count, DistanceKind, PairCounts
-from warp_bsc.detection.stage_timer import StageTimer
+from warp_bsc.detection.narrow.distance_phase import run_distance_phases
+from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
+from warp_bsc.detection.narrow.rings import Rings
+from warp_bsc.detection.run.launch import cores
+from warp_bsc.detection.run.settings import Count, DistanceKind, PairCounts
+from warp_bsc.detection.run.stage_timer import StageTimer
 
 TOLERANCE = 2.0**-20
 ITERATIONS = 20000  # of Tight-Inclusion: with its own limit of 10^7, a few of the queries take minutes each

@@ -44,7 +44,7 @@ WITHOUT_GRADIENTS = [
 """Modules of Newton's kernels through which no test takes a gradient. Their adjoints take a minute to compile."""
 
 
-FOR_CPUS = {"warp_bsc.detection.batch_kernels", "warp_bsc.detection.wide_tree"}
+FOR_CPUS = {"warp_bsc.detection.narrow.batch_kernels", "warp_bsc.detection.broad.wide_tree"}
 """Modules of Python whose kernels run on CPUs alone."""
 
 

@@ -20,7 +20,7 @@ import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.bench.provenance import write_measurement
 from warp_bsc.bench.timing import limited_threads
-from warp_bsc.detection.launch import cores
+from warp_bsc.detection.run.launch import cores
 
 HEIGHT = float(np.float32(0.001))
 

@@ -10,8 +10,8 @@ import warp as wp
 from guarded_memory import guard_memory
 
 import warp_bsc as bsc
-from warp_bsc.detection.intersections import IntersectionFinder
-from warp_bsc.detection.proximities import ProximityFinder
+from warp_bsc.detection.at_rest.intersections import IntersectionFinder
+from warp_bsc.detection.at_rest.proximities import ProximityFinder
 
 
 def in_two_threads(work):

@@ -11,7 +11,7 @@ from .._arguments import checked_integer
 from ..detection.collisions import DetectionStats, StageCounts
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
-from ..detection.settings import Method
+from ..detection.run.settings import Method
 from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
 from .scenes import BenchmarkScene
 from .timing import replay_graph

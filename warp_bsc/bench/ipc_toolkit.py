@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.settings import PairKind
+from ..detection.run.settings import PairKind
 from .scenes import BenchmarkScene
 from .timing import count_threads
 

@@ -4,8 +4,8 @@ All methods read the same arrays, positions by the vertices of a pair's elements
 the two features meet. They differ as follows:
 
 - ``float``, ``conservative``, ``exact``: the detector's own narrow phase,
-  :class:`~warp_bsc.detection.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the results of the
-  contacts, without sorting. UNSURE is a collision. Pairs that are too wide for the device, which the detector leaves to
+  :class:`~warp_bsc.detection.narrow.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the
+  results of the contacts, without sorting. UNSURE is a collision. Pairs that are too wide for the device, which the detector leaves to
   the host, stay UNSURE. On a GPU the narrow phase compares boxes last, because the detector's broad phase has compared
   them already. The benchmark's queries are all candidates, also those that this comparison would have excluded, which
   favors ``cubic``.
@@ -28,17 +28,17 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch_over, launch_over_queue, retry_until_fits
-from ..detection.narrow_phase import NarrowPhase
-from ..detection.query_points import query_points
-from ..detection.settings import METHODS as NARROW_PHASE_METHODS
-from ..detection.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, PairCounts, PairKind
-from ..detection.stage_timer import StageTimer
+from ..detection.narrow.narrow_phase import NarrowPhase
+from ..detection.queries.query_points import query_points
+from ..detection.run.launch import launch_over, launch_over_queue, retry_until_fits
+from ..detection.run.settings import METHODS as NARROW_PHASE_METHODS
+from ..detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, PairCounts, PairKind
+from ..detection.run.stage_timer import StageTimer
+from ..kernels.bits import lowest_bit
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ..kernels.motion import edge_edge_motion, vertex_face_motion
 from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
-from ..kernels.pipeline.bits import lowest_bit
 from ..kernels.pipeline.queues import take_slot
 from ..kernels.polynomials import coplanarity
 from ..kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic

@@ -15,10 +15,10 @@ import numpy as np
 import warp as wp
 
 from .. import checker
-from ..detection.launch import cores, retry_until_fits
 from ..detection.mesh import CollisionMesh
 from ..detection.pipeline import DetectionPipeline
-from ..detection.settings import PairKind
+from ..detection.run.launch import cores, retry_until_fits
+from ..detection.run.settings import PairKind
 from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
 from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries

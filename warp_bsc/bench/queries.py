@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 from .._arguments import checked_integer
-from ..detection.launch import launch_over, launch_over_queue
-from ..detection.query import query_edge_edge, query_vertex_face
-from ..detection.query_arrays import QueryArrays
-from ..detection.settings import NO_FUSED_OPERATIONS, TOLERANCE, PairKind
+from ..detection.queries.query import query_edge_edge, query_vertex_face
+from ..detection.queries.query_arrays import QueryArrays
+from ..detection.run.launch import launch_over, launch_over_queue
+from ..detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, PairKind
 from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
 from ..kernels.classification import classify
 from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart

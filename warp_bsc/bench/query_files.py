@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from .._arguments import checked_integer
-from ..detection.settings import METHODS as NARROW_PHASE_METHODS
-from ..detection.settings import PairKind
+from ..detection.run.settings import METHODS as NARROW_PHASE_METHODS
+from ..detection.run.settings import PairKind
 from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
 
 __all__ = ["METHODS", "GivenQueries", "benchmark_given_queries"]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.intersections import IntersectionFinder
+from ..detection.at_rest.intersections import IntersectionFinder
 from ..detection.mesh import CollisionMesh
 from .mesh_files import read_mesh
 

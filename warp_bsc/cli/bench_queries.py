@@ -11,8 +11,8 @@ import warp as wp
 from ..bench.queries import MODES, SEED, QueryBenchmark, benchmark_copy, benchmark_queries, check_query_count
 from ..bench.query_files import METHODS, GivenQueries, benchmark_given_queries
 from ..bench.timing import count_threads, limited_threads
-from ..detection.launch import cores
-from ..detection.settings import PairKind
+from ..detection.run.launch import cores
+from ..detection.run.settings import PairKind
 from .bench import JSON_FILE, Benchmark, name_place, report_runs
 from .device import find_device, loading_kernels
 from .options import DEVICE, THREADS, number, positive, repeat_options, several

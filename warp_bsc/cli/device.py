@@ -9,12 +9,12 @@ import numpy.typing as npt
 import rich.console
 import warp as wp
 
-from ..detection import start
-from ..detection.compilation import duration, reported_to
+from ..detection.at_rest.proximities import ProximityFinder
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
-from ..detection.proximities import ProximityFinder
-from ..detection.settings import Method
+from ..detection.run import start
+from ..detection.run.compilation import duration, reported_to
+from ..detection.run.settings import Method
 from .progress import LOG_SECONDS
 from .tables import Console, say
 

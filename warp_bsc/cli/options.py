@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .._arguments import SMALLEST_DISTANCE
-from ..detection.settings import METHODS
+from ..detection.run.settings import METHODS
 
 __all__ = [
     "DEVICE",

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..detection.query import QueryResult, query_edge_edge, query_vertex_face
+from ..detection.queries.query import QueryResult, query_edge_edge, query_vertex_face
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import (

@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from ..detection.query import QueryResult
+from ..detection.queries.query import QueryResult
 from .query_file import QueryFile
 from .tables import Column, count, print_table, say
 

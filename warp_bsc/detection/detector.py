@@ -7,23 +7,23 @@ from numpy.typing import ArrayLike
 from .._arguments import as_numpy, check_finite, check_instance, checked_distance
 from .._one_thread import one_at_a_time
 from ..kernels.signs import UNSURE
-from .arc_pipeline import LARGEST_TURN, ArcPipeline
-from .arc_search import ArcSearch, join_contacts, straight_mesh
+from .arcs.arc_pipeline import LARGEST_TURN, ArcPipeline
+from .arcs.arc_search import ArcSearch, join_contacts, straight_mesh
+from .arcs.rigid_motion import ArcBounds, RigidMotion
+from .at_rest.intersections import IntersectionFinder, find_intersections
+from .at_rest.proximities import Proximities, ProximityFinder, least_distance
 from .collisions import Candidates, CapturedCollisions, Collisions, FreeStep
-from .contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
 from .differentiable import CollisionArrays
-from .distance_phase import decide_distances_on_host
-from .host_function import run_on_host
-from .intersections import IntersectionFinder, find_intersections
 from .inversions import Inversions, inversions_of_motion
-from .launch import retry_until_fits
 from .mesh import CollisionMesh
-from .narrow_phase import decide_on_host
+from .narrow.contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
+from .narrow.distance_phase import decide_distances_on_host
+from .narrow.narrow_phase import decide_on_host
 from .pipeline import DetectionPipeline
-from .proximities import Proximities, ProximityFinder, least_distance
-from .rigid_motion import ArcBounds, RigidMotion
-from .settings import TOLERANCE, Counts, DistanceKind, Method, PairKind, add_counts
-from .stage_timer import StageTimer, StageTimers
+from .run.host_function import run_on_host
+from .run.launch import retry_until_fits
+from .run.settings import TOLERANCE, Counts, DistanceKind, Method, PairKind, add_counts
+from .run.stage_timer import StageTimer, StageTimers
 
 __all__ = ["CollisionDetector"]
 

@@ -4,8 +4,8 @@ import numpy as np
 import warp as wp
 
 from ..kernels.pipeline.hierarchy import WIDTH
-from .launch import launch, launch_over
-from .settings import NO_GRADIENTS
+from .run.launch import launch, launch_over
+from .run.settings import NO_GRADIENTS
 
 __all__ = ["CLUSTER", "GROUP", "order_faces"]
 

@@ -12,9 +12,9 @@ from ..kernels.exact.polygon import BITS
 from ..kernels.inversion import first_inversion
 from ..kernels.motion import doubles
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
-from .launch import launch_over, made_once
 from .mesh import CollisionMesh
-from .settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Method
+from .run.launch import launch_over, made_once
+from .run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Method
 
 __all__ = ["Inversions", "inversions_of_motion"]
 

@@ -8,10 +8,10 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from .._arguments import as_numpy, checked_bits, checked_distances, checked_flag, checked_integer, checked_shape
-from ..kernels.pipeline.pairs import PairFilter
+from ..kernels.pairs import PairFilter
 from .face_order import order_faces
-from .settings import DistanceKind, PairKind
-from .start import checked_device
+from .run.settings import DistanceKind, PairKind
+from .run.start import checked_device
 
 __all__ = ["CollisionMesh", "DevicePlaces", "leave_out"]
 
@@ -51,7 +51,7 @@ class CollisionMesh:
             is the largest one of its vertices.
         face_edges: Edges of the faces, edge i from corner i to the next, -1 where both are one vertex, int32, shape
             [face_count, 3].
-        owned: What each face is the representative of, see :mod:`warp_bsc.kernels.pipeline.pairs`, int32, shape
+        owned: What each face is the representative of, see :mod:`warp_bsc.kernels.pairs`, int32, shape
             [face_count].
         tets: Vertex indices of the tetrahedra, int32, shape [tet_count, 4].
         vertices: Indices of the vertices that faces and edges use, and of the points, sorted, int32, shape

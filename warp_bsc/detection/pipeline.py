@@ -5,16 +5,16 @@ import warp as wp
 
 from .._arguments import checked_choice, checked_distance, checked_integer
 from ..kernels.arcs import Arcs
-from ..kernels.pipeline.pairs import ABOVE_SUM
-from .approach_phase import MinDistances, run_approach_phases
-from .arc_phase import run_arc_phases
-from .broad_phase import BroadPhase, make_broad_phase
-from .distance_phase import run_distance_phases
-from .launch import launch, made_once
+from ..kernels.pairs import ABOVE_SUM
+from .broad.broad_phase import BroadPhase, make_broad_phase
 from .mesh import CollisionMesh
-from .narrow_phase import NarrowPhase, run_narrow_phases
-from .rings import Rings, make_rings
-from .settings import (
+from .narrow.approach_phase import MinDistances, run_approach_phases
+from .narrow.arc_phase import run_arc_phases
+from .narrow.distance_phase import run_distance_phases
+from .narrow.narrow_phase import NarrowPhase, run_narrow_phases
+from .narrow.rings import Rings, make_rings
+from .run.launch import launch, made_once
+from .run.settings import (
     METHODS,
     NO_GRADIENTS,
     TOLERANCE,
@@ -26,7 +26,7 @@ from .settings import (
     PairKind,
     checked_tolerance,
 )
-from .stage_timer import StageTimer
+from .run.stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
 

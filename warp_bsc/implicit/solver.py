@@ -18,7 +18,7 @@ from .._private_names.of_newton import (
     vbd_switch,
 )
 from .._private_names.of_warp import paused_tape
-from ..detection.host_function import run_on_host
+from ..detection.run.host_function import run_on_host
 from ..response.adjoint.between_steps import BetweenSteps
 from ..response.integration.wrapped_solver import WrappedSolver
 from . import kernels, matrix_kernels

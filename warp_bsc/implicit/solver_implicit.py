@@ -12,7 +12,7 @@ from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
-from ..detection.host_function import run_on_host
+from ..detection.run.host_function import run_on_host
 from ..response.schedule import Loop
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter

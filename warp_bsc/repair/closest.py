@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch
+from ..detection.run.launch import launch
 from .kernels import find_closest, find_exits
 from .surface import Surface
 

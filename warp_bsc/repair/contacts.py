@@ -6,8 +6,8 @@ import numpy as np
 import warp as wp
 
 from ..detection.collisions import Collisions
-from ..detection.launch import launch_repeatedly
 from ..detection.mesh import CollisionMesh
+from ..detection.run.launch import launch_repeatedly
 from .kernels import Planes, find_shortfalls, move_apart
 
 __all__ = ["Contacts", "as_contacts", "as_planes", "projected"]

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch, launch_in_turn
+from ..detection.run.launch import launch, launch_in_turn
 from .contacts import Contacts, as_planes
 from .kernels import Planes, grow_ring, relax_springs, spread_moves
 from .surface import Surface

@@ -5,9 +5,9 @@ import numpy as np
 import warp as wp
 
 from .._arguments import check_finite
-from ..detection.body_parts import connect_cells
-from ..detection.launch import launch
+from ..detection.at_rest.body_parts import connect_cells
 from ..detection.mesh import CollisionMesh
+from ..detection.run.launch import launch
 from ..response.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.planes import transformed_plane

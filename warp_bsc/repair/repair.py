@@ -7,7 +7,7 @@ import warp as wp
 
 from .._arguments import check_finite, checked_distance, checked_number, checked_shape
 from ..detection.mesh import CollisionMesh
-from ..detection.start import checked_device
+from ..detection.run.start import checked_device
 from .approach import approach
 from .arguments import checked_layers, checked_mask
 from .elastic import Springs

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.launch import launch
+from ..detection.run.launch import launch
 from .contours import faces_of_edges, trace_contours
 from .elastic import Springs, near, within
 from .kernels import contour_gradients

@@ -11,15 +11,15 @@ from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
+from ..detection.arcs.rigid_motion import RigidMotion
+from ..detection.at_rest.containment import ContainmentFinder
+from ..detection.at_rest.intersections import Intersections
+from ..detection.at_rest.proximities import Proximities, ProximityFinder
 from ..detection.collisions import Collisions, add_stats
-from ..detection.containment import ContainmentFinder
 from ..detection.detector import CollisionDetector
-from ..detection.intersections import Intersections
 from ..detection.mesh import CollisionMesh
-from ..detection.proximities import Proximities, ProximityFinder
-from ..detection.rigid_motion import RigidMotion
-from ..detection.settings import Method
-from ..detection.start import is_cpu
+from ..detection.run.settings import Method
+from ..detection.run.start import is_cpu
 from ..usd.interval import Interval
 from ..usd.scene import Scene
 from ..usd.segment import Segment

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..detection.body_parts import connect_cells
-from ..detection.closest_points import ClosestPointFinder
+from ..detection.at_rest.body_parts import connect_cells
+from ..detection.at_rest.closest_points import ClosestPointFinder
 from ..usd.segment import Segment
 from .scene_intersections import SceneIntersections
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable, Iterable
 import numpy as np
 
 from .._sorted_keys import distinct
-from ..detection.body_parts import expand_ranges
-from ..detection.containment import Containment
+from ..detection.at_rest.body_parts import expand_ranges
+from ..detection.at_rest.containment import Containment
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 

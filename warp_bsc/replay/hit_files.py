@@ -13,7 +13,7 @@ import numpy as np
 import orjson
 
 from .._version import __version__
-from ..detection.settings import DistanceKind, PairKind
+from ..detection.run.settings import DistanceKind, PairKind
 from ..usd.scene import Scene
 from .hit_records import (
     head_line,

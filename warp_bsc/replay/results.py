@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..detection.collisions import DetectionStats, StageCounts
-from ..detection.settings import DistanceKind
+from ..detection.run.settings import DistanceKind
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, count_by_meshes

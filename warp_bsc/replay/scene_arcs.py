@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..detection.rigid_motion import RigidMotion, points_on_arcs
+from ..detection.arcs.rigid_motion import RigidMotion, points_on_arcs
 from ..usd.interval import Interval
 
 __all__ = ["arcs_of", "positions_at"]

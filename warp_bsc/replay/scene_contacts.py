@@ -7,9 +7,9 @@ from typing import ClassVar
 import numpy as np
 
 from .._sorted_keys import search
+from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.detector import Collisions
 from ..detection.mesh import CollisionMesh
-from ..detection.rigid_motion import RigidMotion
 from ..usd.interval import Interval
 from ..usd.selection import Selection
 from .scene_arcs import positions_at

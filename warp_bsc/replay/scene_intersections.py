@@ -7,8 +7,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from .._sorted_keys import distinct
-from ..detection.containment import Containment
-from ..detection.intersections import Intersections
+from ..detection.at_rest.containment import Containment
+from ..detection.at_rest.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection

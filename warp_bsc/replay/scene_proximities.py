@@ -5,8 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from ..detection.at_rest.proximities import Proximities
 from ..detection.mesh import CollisionMesh
-from ..detection.proximities import Proximities
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .scene_pairs import NO_PAIRS, ScenePairs, are_stiff_pairs, name_elements

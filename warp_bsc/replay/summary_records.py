@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ..detection.collisions import DetectionStats, StageCounts
-from ..detection.settings import DistanceKind
+from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
 from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .scene_contacts import PHASES

@@ -7,7 +7,7 @@ import numpy as np
 
 from .. import checker
 from ..detection.detector import CollisionDetector, Collisions
-from ..detection.query_points import query_points
+from ..detection.queries.query_points import query_points
 
 __all__ = ["Validation", "overlapping_boxes", "validate"]
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from .._version import __version__
-from ..detection.launch import cores
-from ..detection.start import find_device, gpu_count
+from ..detection.run.launch import cores
+from ..detection.run.start import find_device, gpu_count
 from ..usd.interval import ReadingNotes
 from ..usd.scene import Scene
 from ..usd.segment import Segment

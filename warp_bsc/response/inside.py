@@ -9,8 +9,8 @@ import warp as wp
 from newton import BodyFlags, ParticleFlags
 
 from .._arguments import as_numpy
-from ..detection.body_parts import connect_cells
-from ..detection.containment import ContainmentFinder
+from ..detection.at_rest.body_parts import connect_cells
+from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.mesh import CollisionMesh
 from .state.mesh import ModelMesh, elements_of, outer_sides
 

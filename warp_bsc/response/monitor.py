@@ -8,7 +8,7 @@ from newton.solvers import SolverBase
 
 from .._arguments import checked_flag
 from .._one_thread import one_at_a_time
-from ..detection.host_function import run_on_host
+from ..detection.run.host_function import run_on_host
 from .contacts.detect import inspect
 from .options import default_separation, friction_of
 from .stage import CollisionStage

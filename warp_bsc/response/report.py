@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from .._warnings import warn_caller
-from ..detection.intersections import find_intersections
+from ..detection.at_rest.intersections import find_intersections
 from .adjoint.between_steps import AMBIGUOUS_MOVES
 from .inside import Inside, InsideFinder
 from .report_text import revoked_warning, set_bodies_warning, shape_name

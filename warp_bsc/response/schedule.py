@@ -38,7 +38,7 @@ from enum import IntEnum
 
 import warp as wp
 
-from ..detection.settings import FILTERED_COUNTS
+from ..detection.run.settings import FILTERED_COUNTS
 from ..kernels.pipeline.queues import has_overflowed
 from .state.structs import Step
 

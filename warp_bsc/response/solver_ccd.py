@@ -12,7 +12,7 @@ from .._arguments import checked_number
 from .._one_thread import one_at_a_time
 from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, with_contacts
 from .._private_names.of_warp import paused_tape
-from ..detection.host_function import run_on_host
+from ..detection.run.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
 from .forces.contact_forces import ContactForces

@@ -9,9 +9,9 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ...detection.launch import retry_until_fits
 from ...detection.pipeline import MIN_CAPACITY
-from ...detection.settings import capacity_for
+from ...detection.run.launch import retry_until_fits
+from ...detection.run.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
 from ...response.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies

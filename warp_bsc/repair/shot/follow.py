@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from ...detection.arcs.rigid_motion import RigidMotion, points_on_arcs
 from ...detection.detector import CollisionDetector
-from ...detection.launch import launch, launch_in_turn
 from ...detection.mesh import CollisionMesh
-from ...detection.rigid_motion import RigidMotion, points_on_arcs
+from ...detection.run.launch import launch, launch_in_turn
 from ..contacts import Contacts, as_contacts, projected
 from .follow_kernels import find_directions, normalize, smooth
 

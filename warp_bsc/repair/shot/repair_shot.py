@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..._arguments import check_instance, checked_distance, checked_integer
+from ...detection.arcs.rigid_motion import RigidMotion
 from ...detection.mesh import CollisionMesh
-from ...detection.rigid_motion import RigidMotion
 from ...replay.scene_arcs import arcs_of
 from ...usd.interval import Interval
 from ...usd.points_layer import MovedFrame

@@ -6,7 +6,7 @@ step loses its certificate.
 
 import warp as wp
 
-from ...detection.launch import retry_until_fits
+from ...detection.run.launch import retry_until_fits
 from ...kernels.arcs import Arcs, turns
 from ...kernels.pipeline.queues import has_overflowed
 from ..schedule import Result, SolveStatus

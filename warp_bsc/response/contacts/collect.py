@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ...detection.approach_phase import KEPT
-from ...detection.settings import Count
+from ...detection.narrow.approach_phase import KEPT
+from ...detection.run.settings import Count
 from ...kernels.arcs import Arcs
 from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import filled_entries, has_overflowed
@@ -108,7 +108,7 @@ def offset_from(step: Step, planes: MovingPlanes, i: int, vertex: int, status: S
 def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int):
     """Returns the distance that a vertex is kept at from a plane, and how much farther away it is near [m].
 
-    Like a pair, a particle may come as near as it was at the start, see :mod:`warp_bsc.detection.approach_phase`.
+    Like a pair, a particle may come as near as it was at the start, see :mod:`.narrow.approach_phase`.
     """
     if body_of(motion, vertex) >= 0:
         return level(motion, planes, i, vertex), ZERO

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from ...detection.launch import retry_until_fits
+from ...detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from ...detection.run.launch import retry_until_fits
 from ..schedule import Loop, Result, decide, decide_worlds
 from ..state.workspace import Workspace
 from ..write_back import finish_inspection

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...kernels.pipeline.pairs import firsts_of
+from ...kernels.pairs import firsts_of
 from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Step
 from ..state.vectors import HALF, ZERO, to_double

@@ -2,13 +2,13 @@
 
 import warp as wp
 
-from ...detection.face_hierarchy import FaceHierarchy
+from ...detection.broad.face_hierarchy import FaceHierarchy
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 
 
 @wp.func
 def pair_of_bit(mesh: FaceHierarchy, place: int, other: int, bit: int):
-    """Returns kind, elements and vertices of a pair of :class:`warp_bsc.detection.element_pairs.PairFunctions`."""
+    """Returns kind, elements and vertices of a pair of :class:`.broad.element_pairs.PairFunctions`."""
     if bit < 6:
         of = wp.where(bit < 3, place, other)
         face = wp.where(bit < 3, other, place)

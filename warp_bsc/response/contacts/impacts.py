@@ -2,12 +2,12 @@
 
 import warp as wp
 
-from ...detection.approach_phase import KEPT
-from ...detection.rings import are_within_rings
-from ...detection.settings import TOLERANCE
+from ...detection.narrow.approach_phase import KEPT
+from ...detection.narrow.rings import are_within_rings
+from ...detection.run.settings import TOLERANCE
 from ...kernels.closest import closest_weights, contact_weights
 from ...kernels.gradients import SQUARE_SINE, with_gradients
-from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
+from ...kernels.pairs import distance_of_corners, firsts_of
 from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import Impact
 from ..state.record import StepRecord

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...detection.settings import TOLERANCE
+from ...detection.run.settings import TOLERANCE
 from ...kernels.inversion import inversion_tetrahedron
 from ...kernels.signs import FREE
 from ..schedule import Result, SolveStatus, count_inversion

@@ -4,8 +4,8 @@ import functools
 
 import warp as wp
 
-from ...detection.element_pairs import filtered_pairs, pair_functions
-from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
+from ...detection.broad.element_pairs import filtered_pairs, pair_functions
+from ...detection.broad.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.polynomials import VERTEX_FACE

@@ -3,8 +3,8 @@
 import numpy as np
 import warp as wp
 
-from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from ...detection.launch import retry_until_fits
+from ...detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from ...detection.run.launch import retry_until_fits
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE

@@ -3,8 +3,8 @@
 import warp as wp
 
 from ...detection.pipeline import DetectionPipeline
-from ...detection.settings import Count
-from ...kernels.pipeline.pairs import points_of_pair
+from ...detection.run.settings import Count
+from ...kernels.pairs import points_of_pair
 from ...kernels.pipeline.queues import filled_entries, is_filled
 
 

@@ -7,7 +7,7 @@ from newton import ShapeFlags
 
 from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
-from ...kernels.pipeline.pairs import is_filtered
+from ...kernels.pairs import is_filtered
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
 from ..state.structs import Bodies, Motion, Step, body_of, can_move

@@ -4,18 +4,18 @@ import functools
 
 import warp as wp
 
-from ...detection.approach_phase import impact_on_arcs_at_distance
-from ...detection.broad_phase_hierarchy import BroadPhaseHierarchy
-from ...detection.element_pairs import filtered_pairs, pair_functions
-from ...detection.face_hierarchy import FaceHierarchy, traversal_kernel
-from ...detection.settings import TOLERANCE
+from ...detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
+from ...detection.broad.element_pairs import filtered_pairs, pair_functions
+from ...detection.broad.face_hierarchy import FaceHierarchy, traversal_kernel
+from ...detection.narrow.approach_phase import impact_on_arcs_at_distance
+from ...detection.run.settings import TOLERANCE
 from ...kernels.arcs import Arcs, are_of_one_group, impact_on_arcs, turns
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
 from ...kernels.motion import motion_and_distance, relative_motion
+from ...kernels.pairs import ABOVE_SUM, distance_of_corners
 from ...kernels.pipeline.hierarchy import lowest_set_bit
-from ...kernels.pipeline.pairs import ABOVE_SUM, distance_of_corners
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import Impact, impact

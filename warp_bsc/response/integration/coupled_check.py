@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags, Model, ParticleFlags, ShapeFlags
 
-from ...detection.intersections import find_intersections
+from ...detection.at_rest.intersections import find_intersections
 from ..contacts.detect import inspect
 from ..report_totals import StepTotals
 from ..schedule import Loop, Result, SolveStatus

@@ -8,7 +8,7 @@ from newton.solvers.experimental.coupled import CouplingInterface, ModelView
 
 from ..._private_names.of_newton import COUPLERS_DECLARE_RESTARTS
 from ..._private_names.of_warp import paused_tape
-from ...detection.host_function import run_on_host
+from ...detection.run.host_function import run_on_host
 from ..state.motion import ModelMotion, arrays_of, continues
 from ..state.poses import in_world
 from ..state.structs import Motion, Vertices

@@ -16,7 +16,7 @@ contacts closer, but those of the first iterations threw layers apart.
 import newton
 import warp as wp
 
-from ...detection.host_function import run_on_host
+from ...detection.run.host_function import run_on_host
 from ..state.motion import ModelMotion, StateArrays, arrays_of
 from ..state.structs import Constraints, Motion
 from ..state.vectors import ZERO, to_double, to_single

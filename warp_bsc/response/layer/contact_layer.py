@@ -28,9 +28,9 @@ from ..._one_thread import one_at_a_time
 from ..._private_names.of_newton import SHAPES_CHANGE, body_q_prev
 from ..._private_names.of_warp import paused_tape
 from ..._warnings import warn_caller
-from ...detection.host_function import run_on_host
-from ...detection.launch import retry_until_fits
 from ...detection.pipeline import DetectionPipeline
+from ...detection.run.host_function import run_on_host
+from ...detection.run.launch import retry_until_fits
 from ..adjoint.arrays import filled
 from ..adjoint.pose_kernels import set_centres
 from ..adjoint.structs import StateGradients

@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from ...detection.approach_phase import MinDistances
-from ...detection.rings import are_within_rings
+from ...detection.narrow.approach_phase import MinDistances
+from ...detection.narrow.rings import are_within_rings
 from ...kernels.closest import closest_weights
-from ...kernels.pipeline.pairs import distance_of_corners, firsts_of
+from ...kernels.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE
 from ..contacts.closest import closest_vector
 from ..contacts.constraints import friction_on_plane

@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from ...kernels.pipeline.pairs import PairFilter, groups_meet
+from ...kernels.pairs import PairFilter, groups_meet
 from .structs import Motion
 from .vectors import ONE, ZERO, to_double
 

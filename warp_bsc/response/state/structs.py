@@ -6,8 +6,8 @@ from enum import IntEnum
 import warp as wp
 
 from ..._private_names.of_warp import struct_type
-from ...detection.approach_phase import MinDistances
-from ...kernels.pipeline.pairs import PairFilter
+from ...detection.narrow.approach_phase import MinDistances
+from ...kernels.pairs import PairFilter
 
 
 class ContactKind(IntEnum):

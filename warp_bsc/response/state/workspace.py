@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from ...detection.intersections import CrossingCandidates
+from ...detection.at_rest.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
-from ...detection.settings import capacity_for
+from ...detection.run.settings import capacity_for
 from ...kernels.arcs import Arcs
 from ..schedule import (
     MAX_ITERATIONS,

@@ -1,0 +1,1 @@
+"""Detection of vertices that move on arcs, with rigid bodies that turn."""

@@ -1,0 +1,1 @@
+"""Detection in one configuration: intersections, containment, and pairs that are near."""

@@ -1,0 +1,109 @@
+"""The broad phase on the CPU: wide BVHs of packets of eight boxes, one for each kind of element."""
+
+import threading
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from ..mesh import CollisionMesh
+from ..run.settings import UNLIMITED
+from .wide_tree import WideTree, sort_trees
+
+__all__ = ["BroadPhaseSimd"]
+
+
+class BroadPhaseSimd:
+    """The broad phase by wide BVHs, one for each kind of element, see :class:`.broad_phase.BroadPhase`.
+
+    It pairs elements directly, and has no queue for pairs of faces. Points and the edges that no face has, whose pairs
+    count with a minimum distance only, have trees of their own. For a mesh with ``only_free``, only the trees of these
+    edges and of vertices that no face has are paired with the others.
+    """
+
+    buffers: tuple[wp.array, ...] = ()
+    capacity: int = UNLIMITED
+
+    def __init__(self, mesh: CollisionMesh, count: wp.array, *, padding: wp.array | None = None):
+        """Allocates trees over the vertices, the edges and the faces of a mesh.
+
+        Args:
+            mesh: The mesh.
+            count: Not used.
+            padding: How far the boxes of each vertex and its elements reach beyond them, array of float64, or None.
+        """
+        self.lock = threading.RLock()
+        self._filtered_of_worlds: wp.array | None = None
+        shared = mesh.world, padding, mesh.pair_filter
+
+        def of_vertices(vertices: np.ndarray) -> WideTree:
+            return WideTree(vertices.reshape(-1, 1), vertices, *shared)
+
+        def of_edges(edges: np.ndarray) -> WideTree:
+            return WideTree(mesh.edges[edges], edges, *shared)
+
+        self._used = mesh.vertices if len(mesh.vertices) < mesh.vertex_count else slice(None)
+        self._faces = WideTree(mesh.faces, np.arange(len(mesh.faces)), *shared)
+        self._edges_of_faces = self._points = self._free_edges = None
+        if mesh.only_free:
+            self._vertices = of_vertices(np.setdiff1d(mesh.vertices, mesh.faces))
+            self._edges = of_edges(mesh.free_edges)
+            self._edges_of_faces = of_edges(np.setdiff1d(np.arange(len(mesh.edges)), mesh.free_edges))
+        else:
+            self._vertices = of_vertices(mesh.vertices)
+            self._edges = of_edges(np.arange(len(mesh.edges)))
+        if len(mesh.points):
+            self._points, self._free_edges = of_vertices(mesh.points), of_edges(mesh.free_edges)
+
+    def grow(self, count: int) -> None:
+        """Does nothing, as there is no queue."""
+
+    def count_filtered_by_world(self, counts: wp.array) -> None:
+        """Makes runs count the pairs that groups and masks leave out by world as well."""
+        self._filtered_of_worlds = counts
+
+    def pair_elements(
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
+    ) -> None:
+        """Enqueues the candidates."""
+        trees = [self._vertices, self._edges, self._faces]
+        if self._edges_of_faces:
+            trees.append(self._edges_of_faces)
+        self._build(trees, x0, x1, changed)
+        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
+        self._vertices.pair(self._faces, *out[:2], **options)
+        self._edges.pair(self._edges, *out[2:], ordered=True, **options)
+        if self._edges_of_faces:
+            self._edges.pair(self._edges_of_faces, *out[2:], ordered=True, **options)
+
+    def pair_points(
+        self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
+    ) -> None:
+        """Enqueues the candidates of points with edges that no face has, and with points."""
+        if self._points is None or self._free_edges is None:
+            return
+        self._build([self._points, self._free_edges], x0, x1, changed)
+        options = {"keep_separated": keep_separated, "filtered_of_worlds": self._filtered_of_worlds}
+        self._points.pair(self._free_edges, *out[:2], **options)
+        self._points.pair(self._points, *out[2:], ordered=True, **options)
+
+    def pair_vertices_with_faces(self, counts: wp.array, pairs: wp.array) -> None:
+        """Enqueues the (vertex, face) whose boxes in the last run overlap, with arguments as of the others."""
+        self._vertices.pair(self._faces, counts, pairs, keep_separated=True)
+
+    def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap."""
+        if not is_end:
+            self._build([self._edges, self._faces], x, x)
+        self._edges.pair(self._faces, counts, pairs, at_end=True)
+
+    def _build(self, trees: Sequence[WideTree], x0: wp.array, x1: wp.array, changed: wp.array | None = None) -> None:
+        """Fits the boxes of trees to a motion; sorts trees that never were, or whose boxes have become loose."""
+        if all(tree.is_sorted for tree in trees):
+            for tree in trees:
+                tree.fit(x0, x1, changed)
+            if not any(tree.is_loose for tree in trees):
+                return
+        sort_trees(trees, x0, x1, self._used)
+        for tree in trees:
+            tree.fit(x0, x1, changed)

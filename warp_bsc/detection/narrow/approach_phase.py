@@ -1,0 +1,303 @@
+"""The narrow phase of a response with minimum distances: pairs that come too near, and proximities.
+
+A pair may come as near as its minimum distance, the sum of two radii, see :mod:`.distance_phase`, or as it was at the
+start, if it was nearer, less the rounding of distances. On arcs of bodies that turn, it comes nearer by a 64th, but not
+at the end of the step. Pairs that an edge of the mesh joins must only not touch:
+neighbours are always near. Proximities are the other pairs that come within the reach beyond these distances.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ...kernels.arcs import Arcs, any_turns, are_of_one_group, distance_at, impact_on_arcs, turns
+from ...kernels.ccd import impact_at_distance
+from ...kernels.distance import closest_points
+from ...kernels.min_distance import clears_at_once, closest_at
+from ...kernels.motion import doubles, motion_and_distance
+from ...kernels.pairs import ABOVE_SUM, distance_of_corners, firsts_of, points_of_pair
+from ...kernels.pipeline.queues import append, is_filled, take_slot
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...kernels.signs import FREE, ROUNDOFF
+from ...kernels.time_of_impact import Impact
+from ..mesh import CollisionMesh
+from ..run.launch import launch_over_queue, made_once
+from ..run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count
+from ..run.stage_timer import StageTimer
+from .narrow_phase import NarrowPhase
+from .pair_kernels import PairStages, write_impact
+from .rings import Rings, are_within_rings, make_rings
+
+__all__ = [
+    "MinDistances",
+    "distances_of_pair",
+    "impact_on_arcs_at_distance",
+    "make_min_distances",
+    "run_approach_phases",
+]
+
+_QUEUED = wp.constant(int(Count.QUEUED))
+_SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
+KEPT = wp.constant(wp.float64(1.0 - 2.0**-20))
+"""Share of its distance at the start that a pair must keep which starts within its minimum distance.
+
+The search certifies it for a pair at rest, also where that is pressed from both sides, and moves by rounding.
+"""
+SHARE_ON_ARCS = wp.constant(wp.float64(1.0 - 2.0**-6))
+"""Share of its minimum distance that a pair keeps on arcs, between the start and the end of the step."""
+_ZERO = wp.constant(wp.float64(0.0))
+_TWO = wp.constant(wp.float64(2.0))
+
+_RINGS = 1
+
+
+@wp.struct
+class MinDistances:
+    """The minimum distances of a mesh; without arrays there are none.
+
+    Attributes:
+        radius: Radius of each vertex, half of the minimum distance included [m].
+        of_planes: Radius of each infinite plane, half of the minimum distance included [m].
+        reach: Largest distance of proximities beyond their minimum distance [m].
+        rings: Vertices whose elements have no minimum distance.
+        group: Group of each vertex; pairs within a group are skipped. -1 for none.
+    """
+
+    radius: wp.array[wp.float64]
+    of_planes: wp.array[wp.float64]
+    reach: wp.float64
+    rings: Rings
+    group: wp.array[int]
+
+
+def make_min_distances(
+    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, group: np.ndarray
+) -> MinDistances:
+    """Returns the minimum distances of a mesh on its device, see :class:`MinDistances`.
+
+    Args:
+        mesh: The mesh.
+        radius: Radius of each vertex, float64, shape [vertex_count].
+        of_planes: Radius of each infinite plane, float64, shape [plane_count].
+        reach: Largest distance of proximities beyond their minimum distance.
+        group: Group of each vertex, int, shape [vertex_count].
+    """
+    distances = MinDistances()
+    distances.radius = wp.array(radius, dtype=wp.float64, device=mesh.device)
+    distances.of_planes = wp.array(of_planes, dtype=wp.float64, device=mesh.device)
+    distances.reach = reach
+    distances.rings = make_rings(mesh, _RINGS)
+    distances.group = wp.array(group, dtype=int, device=mesh.device)
+    return distances
+
+
+@wp.func
+def distances_of_pair(
+    distances: MinDistances, kind: int, corners: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d
+):
+    """Returns the distance of a pair at the start, from its points there, and its minimum distance in the step [m].
+
+    The first is a lower bound; it is 0 if the elements may touch. The second is less, unless the first is 0.
+    """
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
+    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
+    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
+    _at, found, error = closest_points(points, u, v, w)
+    start = wp.max(found - _TWO * error, _ZERO)
+    if are_within_rings(corners, firsts_of(kind), distances.rings):
+        return start, _ZERO
+    return start, wp.min(distance_of_corners(kind, corners, distances.radius), KEPT * start)
+
+
+@wp.func
+def impact_on_arcs_at_distance(
+    kind: int,
+    v: wp.vec4i,
+    # points at the start
+    a0: Any,
+    b0: Any,
+    c0: Any,
+    d0: Any,
+    # points at the end
+    a1: Any,
+    b1: Any,
+    c1: Any,
+    d1: Any,
+    arcs: Arcs,
+    kept: wp.float64,
+) -> Impact:
+    """Returns the first time at which a pair comes nearer on its arcs than it may, as of :func:`.impact_on_arcs`.
+
+    It keeps its minimum distance ``kept`` at the end of the step, and :data:`SHARE_ON_ARCS` of it on the way. A pair
+    that rests at its distance would otherwise have to be followed in ever shorter parts.
+    """
+    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    a, b, c, d = doubles(a1, b1, c1, d1)
+    found, error = distance_at(points, a, b, c, d)
+    least = wp.where(found - error >= kept, SHARE_ON_ARCS * kept, kept)
+    return impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, least)
+
+
+@made_once
+def _kernels(dtype: type, turning: bool) -> tuple[wp.Kernel, wp.Kernel]:
+    """Returns the kernels that cull and decide the pairs with a turning vertex or the others, for one type of position.
+
+    Kernels for both take more registers, which costs more than launches over queues in which nothing turns.
+    """
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def cull_approaches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        distances: MinDistances,
+        arcs: Arcs,
+        kind: int,
+        # in and out
+        stages: PairStages,
+    ):
+        if wp.static(turning):
+            if not any_turns(arcs):
+                return
+        i = first + wp.tid()
+        if not is_filled(i, stages.queue, stages.counts, _QUEUED):
+            return
+        pair = stages.queue[i]
+        v = points_of_pair(kind, stages.elements, pair)
+        if turns(arcs, v) != wp.static(turning):
+            return
+        group = distances.group[v[0]]
+        if group >= 0 and distances.group[v[3]] == group:
+            return
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = distance_of_corners(kind, v, distances.radius) + distances.reach
+        reach = distances.reach
+        if wp.static(turning):
+            if are_of_one_group(arcs, v):
+                return
+            deviation = distance_of_corners(kind, v, arcs.deviation)
+            distance = ABOVE_SUM * (distance + deviation)
+            reach = ABOVE_SUM * (reach + deviation)
+        motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
+        if clears_at_once(motion, scaled):
+            return
+        if are_within_rings(v, firsts_of(kind), distances.rings):
+            _same, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+            if clears_at_once(motion, scaled):
+                return
+        append(pair, stages.survivors, stages.counts, _SURVIVORS)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_approaches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        distances: MinDistances,
+        arcs: Arcs,
+        kind: int,
+        proximities: bool,
+        tolerance: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        if wp.static(turning):
+            if not any_turns(arcs):
+                return
+        i = first + wp.tid()
+        if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
+            return
+        pair = stages.survivors[i]
+        v = points_of_pair(kind, stages.elements, pair)
+        if turns(arcs, v) != wp.static(turning):
+            return
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        a, b, c, d = doubles(a0, b0, c0, d0)
+        start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
+        result = Impact()
+        if wp.static(turning):
+            result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
+        else:
+            result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
+        status = result.status
+        if proximities:
+            reach = distances.reach
+            if not are_within_rings(v, firsts_of(kind), distances.rings):
+                reach += distance_of_corners(kind, v, distances.radius)
+            if start < reach:
+                points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+                motion, _scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+                coordinates, normal = closest_at(kind, motion, _ZERO)
+                result.coordinates = coordinates
+                result.normal = normal
+            elif not wp.static(turning) or status == FREE:
+                near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
+                if near.status == FREE:
+                    return
+                result.coordinates = near.coordinates
+                result.normal = near.normal
+        elif status == FREE:
+            return
+        slot = take_slot(stages.counts, _CONTACTS)
+        take_slot(stages.counts, _FOUND)
+        if slot < wp.int64(stages.contacts.pairs.shape[0]):
+            k = wp.int32(slot)
+            stages.contacts.pairs[k] = pair
+            write_impact(k, result, stages)
+
+    return cull_approaches, decide_approaches
+
+
+def run_approach_phases(
+    phases: Sequence[tuple[NarrowPhase, wp.array]],
+    x0: wp.array,
+    x1: wp.array,
+    distances: MinDistances,
+    *,
+    proximities: bool,
+    tolerance: float = TOLERANCE,
+    arcs: "Arcs | None" = None,
+    timer: StageTimer,
+) -> None:
+    """Launches all stages over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
+
+    The status of a proximity is FREE. Times of impact are those at which a pair comes nearer than it may, 2 if it does
+    not. With ``proximities``, coordinates and normals are those at which the pair comes within reach, at the start if
+    it is within reach then: they depend continuously on the motion, and the direction to move the pair apart vanishes
+    with the distance that it is to be moved.
+
+    Args:
+        phases: The buffers of each kind, a :class:`DistanceKind`, with the vertex indices of its second elements.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        distances: The minimum distances.
+        proximities: Whether to report proximities.
+        tolerance: Of the times of impact, as a share of the step.
+        arcs: The arcs of bodies that turn; None if nothing turns.
+        timer: Measures the stages.
+    """
+    # pairs with a turning vertex last; on the CPU only where there are some
+    some_turn = arcs is not None and not (x0.device.is_cpu and not arcs.turning.numpy()[0])
+    kernels = [_kernels(x0.dtype, turning) for turning in ((False, True) if some_turn else (False,))]
+    arcs = Arcs() if arcs is None else arcs
+    with timer.stage("cull"):
+        for phase, elements in phases:
+            stages, inputs = phase.stages(elements), [x0, x1, distances, arcs, int(phase.kind)]
+            for cull, _decide in kernels:
+                launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
+    with timer.stage("classify"):
+        for phase, elements in phases:
+            stages, counts = phase.stages(elements), phase.counts
+            options = {"outputs": [stages], "block_dim": 64}
+            options["inputs"] = [x0, x1, distances, arcs, int(phase.kind), proximities, tolerance]
+            for _cull, decide in kernels:
+                launch_over_queue(decide, stages.survivors, counts, Count.SURVIVORS, **options)

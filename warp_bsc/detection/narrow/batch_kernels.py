@@ -1,0 +1,228 @@
+"""The kernels of the narrow phase on a CPU: culls, classification and times of impact of many pairs at once.
+
+They decide as those of :mod:`.kernels`, pair by pair where SIMD instructions leave one open.
+"""
+
+import warp as wp
+
+from ...kernels.arcs import Arcs, any_turns, are_of_one_group, turns
+from ...kernels.bits import count_bits, lowest_bit
+from ...kernels.classification import classify
+from ...kernels.motion import relative_motion
+from ...kernels.pairs import vertices_of_pair
+from ...kernels.pipeline.batch_arc_culling import cull_arc_batch_of
+from ...kernels.pipeline.batch_classification import BATCH as CLASSIFIED
+from ...kernels.pipeline.batch_classification import OPEN, classify_batch_of
+from ...kernels.pipeline.batch_culling import BATCH, cull_batch_of
+from ...kernels.pipeline.batch_impacts import BATCH as DECIDED
+from ...kernels.pipeline.batch_impacts import impact_batch_of
+from ...kernels.pipeline.queues import filled_entries, raise_count, take_slots, write
+from ...kernels.polynomials import coplanarity
+from ...kernels.signs import FREE, UNSURE
+from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
+from ..run.launch import made_once
+from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
+from .pair_kernels import PairStages, write_impact
+
+__all__ = ["batch_classification_kernel", "batch_culling_kernel", "batch_impact_kernel"]
+
+_QUEUED = wp.constant(int(Count.QUEUED))
+_SURVIVORS = wp.constant(int(Count.SURVIVORS))
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOUND = wp.constant(int(Count.FOUND))
+_UNSURE = wp.constant(int(Count.UNSURE))
+_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
+_LOWER_BITS = wp.constant(wp.uint64(0x5555555555555555))
+"""The lower of the two bits of each status of a batch."""
+
+
+@wp.func
+def _move_turning_pairs(kind: int, stages: PairStages, arcs: Arcs, first: int, count: int) -> int:
+    """Moves the pairs with a turning vertex to the end of a part of the queue, and returns the number of the others."""
+    straight = int(0)
+    end = int(count)
+    while straight < end:
+        pair = stages.queue[first + straight]
+        if turns(arcs, vertices_of_pair(kind, stages.elements, pair)):
+            end -= 1
+            stages.queue[first + straight] = stages.queue[first + end]
+            stages.queue[first + end] = pair
+        else:
+            straight += 1
+    return straight
+
+
+@made_once
+def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bool) -> wp.Kernel:
+    """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position.
+
+    If a vertex turns, each batch of the queue then begins with the pairs on arcs that are left, for :mod:`.arc_phase`,
+    and (-1, -1) after them. Without ``on_arcs`` nothing turns.
+    """
+    cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+    cull_arc_batch = cull_arc_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+    kind_number = int(kind)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def cull_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        arcs: Arcs,
+        # in and out
+        stages: PairStages,
+    ):
+        i = BATCH * (first + wp.tid())
+        filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
+        count = wp.min(BATCH, filled - i)
+        straight = count
+        if wp.static(on_arcs):
+            if any_turns(arcs):
+                straight = _move_turning_pairs(kind_number, stages, arcs, i, count)
+        left = cull_batch(x0, x1, stages.elements, stages.queue, i, straight, roundoff)
+        slot = take_slots(stages.counts, _SURVIVORS, count_bits(left))
+        while left != wp.uint64(0):
+            write(stages.queue[i + lowest_bit(left)], stages.survivors, slot)
+            slot += wp.int64(1)
+            left = left & (left - wp.uint64(1))
+        if wp.static(on_arcs):
+            if any_turns(arcs):
+                kept = int(0)
+                turning = i + straight
+                left = cull_arc_batch(x0, x1, stages.elements, stages.queue, arcs.deviation, turning, count - straight)
+                while left != wp.uint64(0):
+                    pair = stages.queue[turning + lowest_bit(left)]
+                    if not are_of_one_group(arcs, vertices_of_pair(kind_number, stages.elements, pair)):
+                        stages.queue[i + kept] = pair
+                        kept += 1
+                    left = left & (left - wp.uint64(1))
+                if kept < count:
+                    stages.queue[i + kept] = wp.vec2i(-1, -1)
+
+    return cull_batches
+
+
+@made_once
+def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that classifies survivors on the CPU, in batches, for one kind and one type of position."""
+    kind_number = int(kind)
+    classify_batch = classify_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def classify_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        i = CLASSIFIED * (first + wp.tid())
+        number = wp.min(CLASSIFIED, filled_entries(stages.survivors, stages.counts, _SURVIVORS) - i)
+        statuses = classify_batch(x0, x1, stages.elements, stages.survivors, i, number, roundoff)
+        left = statuses & (statuses >> wp.uint64(1)) & _LOWER_BITS
+        while left != wp.uint64(0):
+            bit = lowest_bit(left)
+            v = vertices_of_pair(kind_number, stages.elements, stages.survivors[i + bit // 2])
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            status = classify(motion, coplanarity(motion))
+            statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
+            left = left & (left - wp.uint64(1))
+        contacts = (statuses | (statuses >> wp.uint64(1))) & _LOWER_BITS
+        slot = take_slots(stages.counts, _CONTACTS, count_bits(contacts))
+        while contacts != wp.uint64(0):
+            bit = lowest_bit(contacts)
+            if slot < wp.int64(stages.contacts.pairs.shape[0]):
+                stages.contacts.pairs[wp.int32(slot)] = stages.survivors[i + bit // 2]
+                stages.contacts.status[wp.int32(slot)] = wp.int8((statuses >> wp.uint64(bit)) & wp.uint64(3))
+            slot += wp.int64(1)
+            contacts = contacts & (contacts - wp.uint64(1))
+
+    return classify_batches
+
+
+@wp.func
+def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
+    """Decides contacts as the kernel of a GPU does, with one atomic operation for each count."""
+    contacts = stages.contacts
+    found = int(0)
+    unsure = int(0)
+    for_exact = int(0)
+    for i in range(first, first + count):
+        status = contacts.status[i]
+        contacts.decided[i] = status
+        stages.order[i] = i
+        key = stages.last_key
+        if status != wp.int8(FREE):
+            pair = contacts.pairs[i]
+            key = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+            found += 1
+            if status == wp.int8(UNSURE):
+                unsure += 1
+            if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
+                for_exact += 1
+        stages.keys[i] = key
+    raise_count(stages.counts, _FOUND, found)
+    raise_count(stages.counts, _UNSURE, unsure)
+    if for_exact > 0:
+        slot = wp.int32(take_slots(stages.counts, _FOR_EXACT, for_exact))
+        for i in range(first, first + count):
+            status = contacts.status[i]
+            if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
+                stages.for_exact[slot] = i
+                slot += 1
+
+
+@made_once
+def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
+    """Returns the kernel that finds times of impact on the CPU, in batches, for one kind and one type of position."""
+    kind_number = int(kind)
+    impact_batch = impact_batch_of(dtype, kind == PairKind.VERTEX_FACE)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_impact_batches(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        # in and out
+        stages: PairStages,
+    ):
+        contacts = stages.contacts
+        i = DECIDED * (first + wp.tid())
+        number = wp.min(DECIDED, filled_entries(contacts.pairs, stages.counts, _CONTACTS) - i)
+        left = impact_batch(
+            x0,
+            x1,
+            stages.elements,
+            contacts.pairs,
+            i,
+            number,
+            roundoff,
+            timed,
+            power_of_two(clamped_tolerance(tolerance)),
+            contacts.status,
+            contacts.within_tolerance,
+            contacts.toi,
+            contacts.coordinates,
+            contacts.normal,
+        )
+        while left != wp.uint64(0):
+            row = i + lowest_bit(left)
+            v = vertices_of_pair(kind_number, stages.elements, contacts.pairs[row])
+            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), stages)
+            left = left & (left - wp.uint64(1))
+        _decide_batch(i, number, timed, stages)
+
+    return find_impact_batches

@@ -1,0 +1,259 @@
+"""The exact stage: wide integers decide, on the device, the contacts that floating point cannot.
+
+Contacts that the previous stage has enqueued are decided in integers of one limb a coordinate, see
+:mod:`warp_bsc.kernels.exact.first_contact`. Those whose exponents are too far apart for that go to the next queue,
+for two limbs, on a CPU then to that for four, and at last to the queue for eight, which suffice for every query in
+single precision. Contacts that are too wide for eight limbs are counted and left to the host. Each width has its own
+kernel, so that the usual one stays small.
+
+Contacts with a minimum distance are decided as far as :mod:`warp_bsc.kernels.exact.distance` can. The host decides the
+others, and those that are too wide.
+"""
+
+import math
+
+import numpy as np
+import warp as wp
+
+from ...kernels.closest import contact_at
+from ...kernels.exact.distance import BITS as DISTANCE_BITS
+from ...kernels.exact.distance import decide_distance_in
+from ...kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
+from ...kernels.exact.polygon import BITS
+from ...kernels.motion import doubles, relative_motion
+from ...kernels.pairs import distance_of_corners, points_of_pair, vertices_of_pair
+from ...kernels.pipeline.queues import take_slot
+from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ...kernels.signs import FREE, HIT, UNSURE
+from ...kernels.time_of_impact import MIN_DIGITS
+from ..run.launch import launch_over_queue, made_once
+from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
+from .contact_buffer import ContactBuffer, make_contact_buffer
+from .pair_kernels import PairStages
+
+__all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_stage"]
+
+_WIDTHS_ON_GPU = (1, 2, 8)
+"""Limbs of the integers on a GPU, where a launch over an empty queue takes longer than four limbs would save."""
+
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
+_REFUTED = wp.constant(int(Count.REFUTED))
+
+
+@made_once
+def _kernel(dtype: type, limbs: int) -> wp.Kernel:
+    """Returns the kernel for one type of position and one width, in a module of its own."""
+    decide = decide_in(limbs)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_contacts(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        elements: wp.array2d[int],
+        kind: int,
+        timed: bool,
+        digits: int,
+        # in
+        queue: wp.array[int],
+        filled: int,
+        too_wide: int,
+        refuted: int,
+        last_key: wp.int64,
+        # in and out
+        counts: wp.array[wp.int64],
+        contacts: ContactBuffer,
+        # out
+        keys: wp.array[wp.int64],
+        left: wp.array[int],
+    ):
+        slot = first + wp.tid()
+        if wp.int64(slot) >= counts[filled]:
+            return
+        i = queue[slot]
+        v = vertices_of_pair(kind, elements, contacts.pairs[i])
+        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
+        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        time = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
+        if time == TOO_WIDE:
+            left[wp.int32(take_slot(counts, too_wide))] = i
+        elif time == NONE:
+            contacts.decided[i] = wp.int8(FREE)
+            keys[i] = last_key
+            take_slot(counts, refuted)
+        else:
+            contacts.decided[i] = wp.int8(HIT)
+            if timed:
+                # the time at which floating point has stopped is a lower bound too
+                time = wp.max(time, contacts.toi[i])
+                motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+                at, direction = contact_at(motion, time)
+                contacts.within_tolerance[i] = True
+                contacts.toi[i] = time
+                contacts.coordinates[i] = at
+                contacts.normal[i] = direction
+
+    return decide_contacts
+
+
+@made_once
+def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
+    """Returns the kernel for contacts with a minimum distance, for one type of position and one width."""
+    decide = decide_distance_in(limbs)
+    is_last = limbs == max(DISTANCE_BITS)
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def decide_distances(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        radius: wp.array[wp.float64],
+        kind: int,
+        timed: bool,
+        digits: int,
+        # in and out
+        stages: PairStages,
+    ):
+        k = first + wp.tid()
+        contacts = stages.contacts
+        if k >= contacts.pairs.shape[0] or wp.int64(k) >= stages.counts[_CONTACTS]:
+            return
+        known = int(contacts.decided[k])
+        if known == FREE or (known == HIT and (contacts.within_tolerance[k] or not timed)):
+            return
+        v = points_of_pair(kind, stages.elements, contacts.pairs[k])
+        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
+        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distance = distance_of_corners(kind, v, radius)
+        status = decide(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, contacts.toi[k], digits, timed)
+        if status == FREE:
+            contacts.decided[k] = wp.int8(status)
+            stages.keys[k] = stages.last_key
+            take_slot(stages.counts, _REFUTED)
+        elif status == HIT:
+            # coordinates and normal are those at the time of impact already
+            contacts.decided[k] = wp.int8(status)
+            contacts.within_tolerance[k] = timed
+        elif wp.static(is_last):
+            take_slot(stages.counts, _TOO_WIDE)
+
+    return decide_distances
+
+
+def are_within_distance(
+    kind: DistanceKind, x: wp.array, elements: wp.array, pairs: np.ndarray, distance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns which pairs at rest are within a distance, and which pairs are decided; bool, each of shape [n].
+
+    Args:
+        kind: The kind of pair.
+        x: Positions, array of vec3 or vec3d.
+        elements: Vertex indices of the faces or edges, two-dimensional array of int.
+        pairs: The pairs, int32, shape [n, 2].
+        distance: The distance, more than 0.
+    """
+    n, device = len(pairs), x.device
+    stages = PairStages()
+    stages.elements = elements
+    stages.counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+    stages.counts[_CONTACTS : _CONTACTS + 1].fill_(n)
+    stages.contacts = make_contact_buffer(n, device)
+    stages.contacts.pairs.assign(pairs)
+    stages.contacts.decided.fill_(int(UNSURE))
+    stages.contacts.toi.zero_()
+    stages.keys = wp.empty(n, dtype=wp.int64, device=device)
+    half = wp.full(len(x), 0.5 * distance, dtype=wp.float64, device=device)  # whose double is exact
+    if 2.0 * (0.5 * distance) == distance:
+        launch_exact_distances(x, x, half, kind, timed=False, tolerance=1.0, stages=stages)
+    decided = stages.contacts.decided.numpy()
+    return decided == HIT, decided != UNSURE
+
+
+def launch_exact_distances(
+    x0: wp.array,
+    x1: wp.array,
+    radius: wp.array,
+    kind: DistanceKind,
+    *,
+    timed: bool,
+    tolerance: float,
+    stages: PairStages,
+) -> None:
+    """Decides contacts with a minimum distance exactly, and counts those left to the host; does not synchronize.
+
+    Args:
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        radius: Radius of each vertex, array of float64.
+        kind: The kind of pair.
+        timed: Whether to find times of impact.
+        tolerance: Of the times of impact, as a share of the step.
+        stages: The buffers of the narrow phase.
+    """
+    digits = 1 + max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
+    for limbs in DISTANCE_BITS:
+        launch_over_queue(
+            _distance_kernel(x0.dtype, limbs),
+            stages.contacts.pairs,
+            stages.counts,
+            Count.CONTACTS,
+            inputs=[x0, x1, radius, int(kind), timed, digits],
+            outputs=[stages],
+            block_dim=64,
+        )
+
+
+def launch_exact_stage(
+    kind: PairKind | DistanceKind,
+    x0: wp.array,
+    x1: wp.array,
+    elements: wp.array,
+    *,
+    timed: bool,
+    tolerance: float,
+    queues: list[wp.array],
+    counts: wp.array,
+    filled: int,
+    too_wide: dict[int, int],
+    refuted: int,
+    contacts: ContactBuffer,
+    keys: wp.array,
+    last_key: int,
+) -> None:
+    """Decides contacts exactly, without synchronizing with a GPU.
+
+    Args:
+        kind: The kind of pair.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        elements: Vertex indices of the faces or edges, two-dimensional array of int.
+        timed: Whether to find times of impact, coordinates and normals of hits.
+        tolerance: Of the times of impact, as a share of the step.
+        queues: Rows of the contacts to decide, and a queue for those that are too wide; both are overwritten. Arrays
+            of int.
+        counts: Counts of the narrow phase, array of int64.
+        filled: Index of the number of contacts to decide in it.
+        too_wide: Indices of the numbers of those too wide for each number of limbs.
+        refuted: Index of the number of those decided to be free.
+        contacts: The contacts; without times only ``pairs`` and ``decided`` are used.
+        keys: Sorting keys of the contacts, array of int64.
+        last_key: Key of a contact that is refuted.
+    """
+    digits = max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
+    queue, left = queues
+    for limbs in BITS if queue.device.is_cpu else _WIDTHS_ON_GPU:
+        indices = [int(filled), int(too_wide[limbs]), int(refuted)]
+        launch_over_queue(
+            _kernel(x0.dtype, limbs),
+            queue,
+            counts,
+            filled,
+            inputs=[x0, x1, elements, int(kind), timed, digits, queue, *indices, last_key],
+            outputs=[counts, contacts, keys, left],
+            block_dim=64,
+        )
+        queue, left, filled = left, queue, too_wide[limbs]

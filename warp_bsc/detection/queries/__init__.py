@@ -1,0 +1,1 @@
+"""Elementary queries: arrays of points to answers, without a mesh."""

@@ -1,0 +1,338 @@
+"""Elementary queries: many pairs of vertices, edges and faces at once, each given by its points."""
+
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike
+
+from ..._arguments import check_finite, check_instance, checked_choice, checked_distances, checked_flag, checked_shape
+from ...kernels.signs import FREE, HIT, UNSURE
+from ..narrow.contact_buffer import HostContacts, read_contacts
+from ..narrow.distance_phase import decide_distances_on_host, run_distance_phases
+from ..narrow.narrow_phase import NarrowPhase, decide_on_host
+from ..narrow.rings import Rings
+from ..run.launch import retry_until_fits
+from ..run.settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
+from ..run.stage_timer import StageTimer
+from ..run.start import checked_device
+from .query_arrays import QueryArrays, query_into
+from .query_points import mesh_of_rows
+
+__all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_face", "query_vertex_vertex"]
+
+
+@dataclass(frozen=True)
+class QueryResult:
+    """The results of elementary queries, one row each, without gradients: :mod:`warp_bsc.kernels` has those.
+
+    Attributes:
+        hit: Whether the query collides, by the method, bool, shape [n].
+        status: Certified status by floating point, for any method: 0 FREE, 1 HIT, 2 UNSURE, int8, shape [n].
+        toi: Time of impact as a share of the step, a lower bound, float64, shape [n]; 2.0 where there is no hit. None
+            for a query without times.
+        coordinates: Where they touch or come within the minimum distance, float64, shape [n, 3]: barycentric
+            coordinates in the face, (s, r, 0) along the edges, (s, 0, 0) along the edge of a vertex-edge pair; NaN
+            where there is no hit. None for a query without times.
+        normal: Unit normal of the face, or of both edges, against the velocity of the vertex or first edge
+            relative to the other feature, see :attr:`.Collisions.vertex_face_normal` for motion in one plane; with a
+            minimum distance from the other feature to it. float64, shape [n, 3]; NaN where there is no hit. None for a
+            query without times.
+    """
+
+    hit: np.ndarray
+    status: np.ndarray
+    toi: np.ndarray | None
+    coordinates: np.ndarray | None
+    normal: np.ndarray | None
+
+
+@overload
+def query_vertex_face(
+    points: ArrayLike | wp.array,
+    *,
+    min_distance: ArrayLike = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+    out: None = None,
+) -> QueryResult: ...
+@overload
+def query_vertex_face(
+    points: wp.array,
+    *,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    out: QueryArrays,
+) -> QueryArrays: ...
+def query_vertex_face(
+    points: ArrayLike | wp.array,
+    *,
+    min_distance: ArrayLike = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+    out: QueryArrays | None = None,
+) -> QueryResult | QueryArrays:
+    """Returns which moving vertices meet their moving triangles.
+
+    Args:
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows p0 a0 b0 c0 p1 a1 b1 c1:
+            vertex p and triangle a b c at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: Distance up to which a pair collides, in the unit of the positions, 0 or at least 2^-1021, taken
+            as exact: one for all queries, or one each, shape [n].
+        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
+        toi: Whether to find times of impact, coordinates and normals as well.
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+        out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
+            call, see :class:`QueryArrays`. The points must be a contiguous Warp array on the same device, and there
+            must be no minimum distance.
+
+    Returns:
+        QueryResult: One row a query; or ``out``.
+
+    Raises:
+        TypeError: If an argument has another type.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
+            tolerance is out of range, or the method is unknown. With ``out``: if the points are not
+            as it has rows, elsewhere or not contiguous, ``toi`` is not as in it, or there is a minimum distance.
+        RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
+    """
+    if out is not None:
+        return _query_into(out, PairKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
+    return _query(DistanceKind.VERTEX_FACE, points, min_distance, method, toi, tolerance, device)
+
+
+@overload
+def query_edge_edge(
+    points: ArrayLike | wp.array,
+    *,
+    min_distance: ArrayLike = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+    out: None = None,
+) -> QueryResult: ...
+@overload
+def query_edge_edge(
+    points: wp.array,
+    *,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    out: QueryArrays,
+) -> QueryArrays: ...
+def query_edge_edge(
+    points: ArrayLike | wp.array,
+    *,
+    min_distance: ArrayLike = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+    out: QueryArrays | None = None,
+) -> QueryResult | QueryArrays:
+    """Returns which pairs of moving edges meet.
+
+    Args:
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
+            edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: Distance up to which a pair collides, in the unit of the positions, 0 or at least 2^-1021, taken
+            as exact: one for all queries, or one each, shape [n].
+        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
+        toi: Whether to find times of impact, coordinates and normals as well.
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+        out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
+            call, see :class:`QueryArrays`. The points must be a contiguous Warp array on the same device, and there
+            must be no minimum distance.
+
+    Returns:
+        QueryResult: One row a query; or ``out``.
+
+    Raises:
+        TypeError: If an argument has another type.
+        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
+            tolerance is out of range, or the method is unknown. With ``out``: if the points are not
+            as it has rows, elsewhere or not contiguous, ``toi`` is not as in it, or there is a minimum distance.
+        RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
+    """
+    if out is not None:
+        return _query_into(out, PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
+    return _query(DistanceKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
+
+
+def query_vertex_edge(
+    points: ArrayLike | wp.array,
+    *,
+    min_distance: ArrayLike = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+) -> QueryResult:
+    """Returns which moving vertices come within a distance of their moving edges.
+
+    Args:
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 6, 3], rows p0 a0 b0 p1 a1 b1: vertex p
+            and edge a b at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: As of :func:`query_vertex_face`.
+        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
+        toi: Whether to find times of impact, coordinates and normals as well.
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+
+    Returns:
+        QueryResult: One row a query.
+
+    Raises:
+        TypeError: As :func:`query_vertex_face`.
+        ValueError: As :func:`query_vertex_face`.
+    """
+    return _query(DistanceKind.VERTEX_EDGE, points, min_distance, method, toi, tolerance, device)
+
+
+def query_vertex_vertex(
+    points: ArrayLike | wp.array,
+    *,
+    min_distance: ArrayLike = 0.0,
+    method: Method = "exact",
+    toi: bool = True,
+    tolerance: float = TOLERANCE,
+    device: wp.DeviceLike = None,
+) -> QueryResult:
+    """Returns which pairs of moving vertices come within a distance of each other.
+
+    Args:
+        points: Positions, float32 or float64, NumPy or Warp array of shape [n, 4, 3], rows p0 q0 p1 q1: vertices p and
+            q at the start (0) and at the end (1) of the step. Any unit of length.
+        min_distance: As of :func:`query_vertex_face`.
+        method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
+        toi: Whether to find times of impact, coordinates and normals as well.
+        tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
+        device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
+
+    Returns:
+        QueryResult: One row a query.
+
+    Raises:
+        TypeError: As :func:`query_vertex_face`.
+        ValueError: As :func:`query_vertex_face`.
+    """
+    return _query(DistanceKind.VERTEX_VERTEX, points, min_distance, method, toi, tolerance, device)
+
+
+def _query_into(
+    out: QueryArrays,
+    kind: PairKind,
+    points: ArrayLike | wp.array,
+    min_distance: ArrayLike,
+    method: Method,
+    timed: bool,
+    tolerance: float,
+    device: wp.DeviceLike,
+) -> QueryArrays:
+    """Decides queries whose results stay on the device."""
+    check_instance(out, "out", QueryArrays, "a QueryArrays")
+    if not isinstance(points, wp.array):
+        raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
+    checked_choice(method, "method", METHODS)
+    if checked_flag(timed, "toi") != (out.toi is not None):
+        raise ValueError(f"toi must be {out.toi is not None}, as out was made with")
+    if device is not None and checked_device(device) != out.device:
+        raise ValueError(f"device must be that of out, {out.device}, not {device}")
+    if not isinstance(min_distance, (int, float)) or min_distance != 0.0:
+        raise ValueError("min_distance must be 0 if there is out")
+    query_into(out, kind, points, method, checked_tolerance(tolerance))
+    return out
+
+
+def _query(
+    kind: DistanceKind,
+    points: ArrayLike | wp.array,
+    min_distance: ArrayLike,
+    method: Method,
+    timed: bool,
+    tolerance: float,
+    device: wp.DeviceLike,
+) -> QueryResult:
+    checked_choice(method, "method", METHODS)
+    tolerance = checked_tolerance(tolerance)
+    timed = checked_flag(timed, "toi")
+    if isinstance(points, wp.array):
+        device = points.device if device is None else device
+        points = points.numpy()
+    points = checked_shape(points, (2 * kind.points, 3), "points")
+    n = len(points)
+    if n >= 2**29:  # their vertices are numbered by int32
+        raise ValueError(f"points must have at most 2^29 - 1 rows, not {n}")
+    check_finite(points, "points")
+    distance = checked_distances(min_distance, "min_distance", n)
+    device = checked_device(device)
+    half = kind.points
+    x0, elements, pairs = mesh_of_rows(kind, points[:, :half], device)
+    x1 = mesh_of_rows(kind, points[:, half:], device)[0]
+    counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+    narrow_phase = NarrowPhase(kind, counts, n, pairs[-1] + 1 if n else (1, 1))
+    narrow_phase.queue.assign(pairs)
+    all_queued = PairCounts(queued=n).values()
+    # without a distance: the narrow phase of contacts
+    contact = kind in (DistanceKind.VERTEX_FACE, DistanceKind.EDGE_EDGE) and not distance.any()
+    radius = np.zeros((n, half))
+    radius[:, 0] = distance  # those of the other vertices are 0, so that the sum of two is exact
+    if kind == DistanceKind.EDGE_EDGE:
+        radius[:, 1] = distance
+    radius = radius.ravel()
+    device_radius = wp.array(radius, dtype=wp.float64, device=device)
+
+    def solve(method: Method) -> tuple[HostContacts, np.ndarray]:
+        """Returns the contacts by a method, and the query of each."""
+        # the exact stage also finds the times of certified hits that floating point did not find within the tolerance
+        stages = "exact" if method == "conservative" and timed else method
+
+        def launch() -> None:
+            counts.assign(all_queued)
+            options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
+            if contact:
+                narrow_phase.run(x0, x1, elements, **options)
+            else:
+                run_distance_phases([(narrow_phase, elements)], x0, x1, device_radius, Rings(), **options)
+
+        retry_until_fits(launch, narrow_phase, device)
+        contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
+        contacts = contacts.rows(contacts.status != FREE)
+        if method == "conservative":
+            contacts.decided[:] = HIT  # also those that the exact stage has refuted
+        if method != "float":
+            left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
+            if method == "exact":
+                left |= contacts.decided == UNSURE
+            if contact:
+                decide_on_host(PairKind(kind), x0, x1, elements, contacts, left, timed=timed)
+            else:
+                decide_distances_on_host(kind, x0, x1, elements, radius, contacts, left, timed=timed)
+        return contacts, contacts.pairs[:, 0] // (2 if kind == DistanceKind.EDGE_EDGE else half)
+
+    certified, certified_rows = solve("conservative" if method == "float" else method)
+    status = np.zeros(n, dtype=np.int8)
+    status[certified_rows] = certified.status
+    decided, decided_rows = solve("float") if method == "float" else (certified, certified_rows)
+    found = decided.hit
+    decided_rows = decided_rows[found]
+    hit = np.zeros(n, dtype=bool)
+    hit[decided_rows] = True
+    if not timed:
+        return QueryResult(hit, status, None, None, None)
+    toi = np.full(n, 2.0)
+    coordinates = np.full((n, 3), np.nan)
+    normal = np.full((n, 3), np.nan)
+    toi[decided_rows] = decided.toi[found]
+    coordinates[decided_rows] = decided.coordinates[found]
+    normal[decided_rows] = decided.normal[found]
+    return QueryResult(hit, status, toi, coordinates, normal)

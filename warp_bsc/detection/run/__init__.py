@@ -1,0 +1,1 @@
+"""Settings of a detection, and how kernels are launched, timed and compiled."""

@@ -1,0 +1,48 @@
+"""Says that kernels are compiled, and for how long, where they are not in Warp's cache."""
+
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+
+import warp as wp
+
+from ..._private_names.of_warp import on_compilation
+
+__all__ = ["duration", "reported_to"]
+
+_listeners: list[Callable[[], None]] = []
+
+
+@contextlib.contextmanager
+def reported_to(listener: Callable[[], None]) -> Iterator[None]:
+    """Has a function called before each compilation of a module of kernels of this package in the block."""
+    _listeners.append(listener)
+    try:
+        yield
+    finally:
+        _listeners.remove(listener)
+
+
+def duration(is_cpu: bool) -> str:
+    """Returns about how long the compilation of all kernels of a step or of a replay takes, in words."""
+    return "about half a minute of processor time" if is_cpu else "up to a few minutes"
+
+
+@functools.cache
+def _say(is_cpu: bool) -> None:
+    device = "the CPU" if is_cpu else "the GPU"
+    print(
+        f"warp-bsc: compiling kernels for {device}, once for each version: {duration(is_cpu)}. "
+        f"They are kept in {wp.config.kernel_cache_dir}"
+    )
+
+
+def _report(is_cpu: bool) -> None:
+    """Prints one line in each process, where Warp prints one for each module that it loads, and tells listeners."""
+    if wp.config.log_level <= wp.LOG_INFO:
+        _say(is_cpu)
+    for listener in _listeners:
+        listener()
+
+
+on_compilation(_report)

@@ -1,0 +1,276 @@
+"""Settings and counters that all parts of the detection share: kinds of pairs, methods, tolerances, kernel options."""
+
+import enum
+from dataclasses import dataclass, fields, replace
+from typing import Literal, get_args
+
+import numpy as np
+import warp as wp
+
+from ..._arguments import checked_number
+from ...kernels import polynomials
+
+__all__ = [
+    "FILTERED_COUNTS",
+    "METHODS",
+    "NO_FUSED_OPERATIONS",
+    "NO_GRADIENTS",
+    "TOLERANCE",
+    "UNLIMITED",
+    "Count",
+    "Counters",
+    "Counts",
+    "DistanceKind",
+    "Method",
+    "PairCounts",
+    "PairKind",
+    "add_counts",
+    "capacity_for",
+    "checked_tolerance",
+]
+
+Method = Literal["float", "conservative", "exact"]
+"""What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
+arithmetic decides."""
+
+METHODS: tuple[Method, ...] = get_args(Method)
+"""The methods."""
+
+TOLERANCE = 2.0**-20
+"""Default tolerance of the time of impact, as a share of the step."""
+
+UNLIMITED = 2**62
+"""Capacity for entries that are only counted."""
+
+NO_GRADIENTS = {"enable_backward": False, "module": "unique"}
+"""Options of a kernel without gradients, in a module of its own."""
+
+NO_FUSED_OPERATIONS = NO_GRADIENTS | {"module_options": {"fuse_fp": False}}
+"""The same for a kernel that decides: without fused operations every device computes the same bits."""
+
+
+class _Kind(enum.IntEnum):
+    """A kind of pairs, with its number in kernels."""
+
+    @property
+    def label(self) -> str:
+        """The name in attributes of results and in the checker: "vertex_face" and so on."""
+        return self.name.lower()
+
+    @property
+    def display_name(self) -> str:
+        """The name in tables and messages: "vertex-face" and so on."""
+        return self.label.replace("_", "-")
+
+
+class PairKind(_Kind):
+    """The two kinds of pairs, with their numbers in kernels."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+
+
+class DistanceKind(_Kind):
+    """The kinds of pairs that may have a minimum distance, with their numbers in kernels."""
+
+    VERTEX_FACE = int(polynomials.VERTEX_FACE)
+    EDGE_EDGE = int(polynomials.EDGE_EDGE)
+    VERTEX_EDGE = int(polynomials.VERTEX_EDGE)
+    VERTEX_VERTEX = int(polynomials.VERTEX_VERTEX)
+
+    @property
+    def point_order(self) -> list[int]:
+        """The point of the pair for each of the four arguments of kernels: p a b a, p q q q."""
+        if self == DistanceKind.VERTEX_EDGE:
+            return [0, 1, 2, 1]
+        return [0, 1, 1, 1] if self == DistanceKind.VERTEX_VERTEX else [0, 1, 2, 3]
+
+    @property
+    def points(self) -> int:
+        """Number of points of a pair."""
+        return max(self.point_order) + 1
+
+
+def checked_tolerance(tolerance: float) -> float:
+    """Returns a tolerance; raises TypeError or ValueError if it is not in [2^-38, 1]."""
+    return checked_number(tolerance, "tolerance", 2.0**-38, 1.0)
+
+
+def capacity_for(count: int, buffer: str) -> int:
+    """Returns the capacity of a buffer that is to hold ``count`` entries, with a quarter to spare.
+
+    Raises:
+        ValueError: If the capacity would be out of range; names the buffer.
+    """
+    capacity = int(count) + int(count) // 4
+    if capacity >= 2**31:
+        raise ValueError(f"buffer {buffer!r} must hold {count} pairs, more than its largest capacity, {2**31 - 1}")
+    return capacity
+
+
+class Count(enum.IntEnum):
+    """Indices of the counts of one kind of pair in an array, in the order of the stages.
+
+    Attributes:
+        QUEUED: Pairs enqueued for the narrow phase, the candidates: they share no vertex, their swept boxes overlap,
+            and no coordinate axis separates them at the start and at the end, on the same side.
+        SURVIVORS: Queued pairs that no cull decides.
+        CONTACTS: Survivors that classification, or advancement with a minimum distance, does not certify free.
+        FOUND: Contacts that are not certified free when their time of impact is sought either.
+        UNSURE: Found pairs that are not certified hits either.
+        FOR_EXACT: Found pairs that the exact stage decides, or whose times it finds.
+        TOO_WIDE_1: Pairs of the exact stage whose exponents are too far apart for one limb.
+        TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
+        TOO_WIDE_4: Pairs of the exact stage whose exponents are too far apart for four limbs, on a CPU.
+        TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs or, with a minimum
+            distance, that it does not decide: left to the host.
+        REFUTED: Found pairs that the exact stage decides to be free.
+        SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
+        FILTERED: Pairs that would be candidates, but are left out by groups and masks.
+    """
+
+    QUEUED = 0
+    SURVIVORS = 1
+    CONTACTS = 2
+    FOUND = 3
+    UNSURE = 4
+    FOR_EXACT = 5
+    TOO_WIDE_1 = 6
+    TOO_WIDE_2 = 7
+    TOO_WIDE_4 = 8
+    TOO_WIDE_8 = 9
+    REFUTED = 10
+    SUBDIVIDED = 11
+    FILTERED = 12
+
+
+@dataclass(frozen=True)
+class PairCounts:
+    """Counts of one kind of pair, or capacities for them, on the host; the attributes are those of :class:`Count`."""
+
+    queued: int = 0
+    survivors: int = 0
+    contacts: int = 0
+    found: int = 0
+    unsure: int = 0
+    for_exact: int = 0
+    too_wide_1: int = 0
+    too_wide_2: int = 0
+    too_wide_4: int = 0
+    too_wide_8: int = 0
+    refuted: int = 0
+    subdivided: int = 0
+    filtered: int = 0
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> "PairCounts":
+        """Returns the counts in an array of int64 by :class:`Count`."""
+        return cls(*map(int, values))
+
+    def values(self) -> list[int]:
+        """Returns the counts in the order of :class:`Count`."""
+        return [getattr(self, field.name) for field in fields(self)]
+
+    @property
+    def collisions(self) -> int:
+        """Number of pairs that are reported."""
+        return self.found - self.refuted
+
+    def overflows(self, capacities: "PairCounts", kind: PairKind | DistanceKind) -> list[str]:
+        """Names each buffer of a kind that is too small for these counts, with count and capacity."""
+        return [
+            f"{kind.label} {count.name.lower()}: {needed} do not fit in the capacity {capacity}"
+            for count, needed, capacity in zip(Count, self.values(), capacities.values(), strict=True)
+            if needed > capacity
+        ]
+
+
+_NOT_FINITE, _FACE_PAIRS, _PAIRS = 0, 1, 2
+"""Indices of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
+
+FILTERED_COUNTS = range(_PAIRS + Count.FILTERED, _PAIRS + len(DistanceKind) * len(Count), len(Count))
+"""Indices of the pairs that are filtered, of each kind."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Counts of a detection, or the capacities for them, on the host.
+
+    Attributes:
+        not_finite: Vertices with a position that is not finite; there is no capacity for these.
+        face_pairs: Pairs of faces whose swept boxes overlap, of a broad phase that has a queue for them.
+        vertex_face: Counts of vertex-face pairs.
+        edge_edge: Counts of edge-edge pairs.
+        vertex_edge: Counts of pairs of a point and an edge that no face has.
+        vertex_vertex: Counts of pairs of points.
+    """
+
+    not_finite: int
+    face_pairs: int
+    vertex_face: PairCounts
+    edge_edge: PairCounts
+    vertex_edge: PairCounts = PairCounts()
+    vertex_vertex: PairCounts = PairCounts()
+
+    @property
+    def pairs(self) -> dict[DistanceKind, PairCounts]:
+        """The counts of each kind of pair."""
+        return {kind: getattr(self, kind.label) for kind in DistanceKind}
+
+    def without_filtered(self) -> "Counts":
+        """Returns the counts with no pair that is filtered."""
+        return replace(self, **{kind.label: replace(counts, filtered=0) for kind, counts in self.pairs.items()})
+
+    def values(self) -> list[int]:
+        """Returns all counts in the order of :class:`Counters`."""
+        return [self.not_finite, self.face_pairs, *(v for counts in self.pairs.values() for v in counts.values())]
+
+    def overflows(self, capacities: "Counts") -> list[str]:
+        """Names each buffer that is too small for these counts, with count and capacity."""
+        faces = []
+        if self.face_pairs > capacities.face_pairs:
+            faces = [f"face pairs: {self.face_pairs} do not fit in the capacity {capacities.face_pairs}"]
+        others = capacities.pairs
+        return [*faces, *(line for kind, counts in self.pairs.items() for line in counts.overflows(others[kind], kind))]
+
+
+def add_counts(first: Counts, second: Counts) -> Counts:
+    """Returns the counts of two detections together."""
+
+    def add_pairs(one: PairCounts, other: PairCounts) -> PairCounts:
+        return PairCounts(*(a + b for a, b in zip(one.values(), other.values(), strict=True)))
+
+    pairs = {kind.label: add_pairs(counts, second.pairs[kind]) for kind, counts in first.pairs.items()}
+    return Counts(first.not_finite + second.not_finite, first.face_pairs + second.face_pairs, **pairs)
+
+
+class Counters:
+    """The counts of a detection on its device, which any of its threads may raise.
+
+    Attributes:
+        array: All counts, zero before each detection, Warp array of int64.
+        not_finite: Number of vertices with a position that is not finite, array of one int64.
+        face_pairs: Number of pairs of faces, array of one int64.
+        pairs: Counts of all kinds of pair, array of int64.
+        vertex_face: Counts of vertex-face pairs by :class:`Count`, array of int64.
+        edge_edge: Counts of edge-edge pairs by :class:`Count`, array of int64.
+        vertex_edge: Counts of pairs of a point and an edge by :class:`Count`, array of int64.
+        vertex_vertex: Counts of pairs of points by :class:`Count`, array of int64.
+    """
+
+    def __init__(self, device: wp.Device):
+        """Allocates the counters on a device, all zero."""
+        n = len(Count)
+        self.array = wp.zeros(_PAIRS + n * len(DistanceKind), dtype=wp.int64, device=device)
+        self.not_finite = self.array[_NOT_FINITE:_FACE_PAIRS]
+        self.face_pairs = self.array[_FACE_PAIRS:_PAIRS]
+        self.pairs = self.array[_PAIRS:]
+        self.vertex_face, self.edge_edge, self.vertex_edge, self.vertex_vertex = (
+            self.pairs[n * kind : n * (kind + 1)] for kind in DistanceKind
+        )
+
+    def read(self) -> Counts:
+        """Returns the counts on the host; synchronizes with the device."""
+        not_finite, face_pairs, *pairs = self.array.numpy().tolist()
+        n = len(Count)
+        return Counts(not_finite, face_pairs, *(PairCounts(*pairs[n * kind : n * (kind + 1)]) for kind in DistanceKind))

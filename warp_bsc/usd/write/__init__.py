@@ -1,0 +1,1 @@
+"""Layers with positions of points that a program computed."""
