@@ -12,7 +12,7 @@ from stages import save
 
 import warp_bsc as bsc
 from warp_bsc.replay.usd_overlay import Overlay
-from warp_bsc.usd.points_layer import PointsLayer
+from warp_bsc.usd.write.points_layer import PointsLayer
 
 
 def hits_of(scene, **options):

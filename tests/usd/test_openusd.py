@@ -9,7 +9,7 @@ from pxr import Usd
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
-from warp_bsc.usd.openusd import OLDEST, check_openusd
+from warp_bsc.usd.read.openusd import OLDEST, check_openusd
 
 
 def test_without_openusd_a_scene_says_what_to_install(monkeypatch, capsys):

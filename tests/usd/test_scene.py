@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom
 
+from warp_bsc.usd.read.triangulation import triangulate
 from warp_bsc.usd.scene import Scene
-from warp_bsc.usd.triangulation import triangulate
 
 TRIANGLE = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
 

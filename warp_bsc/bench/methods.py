@@ -4,11 +4,11 @@ All methods read the same arrays, positions by the vertices of a pair's elements
 the two features meet. They differ as follows:
 
 - ``float``, ``conservative``, ``exact``: the detector's own narrow phase,
-  :class:`~warp_bsc.detection.narrow.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the
-  results of the contacts, without sorting. UNSURE is a collision. Pairs that are too wide for the device, which the detector leaves to
-  the host, stay UNSURE. On a GPU the narrow phase compares boxes last, because the detector's broad phase has compared
-  them already. The benchmark's queries are all candidates, also those that this comparison would have excluded, which
-  favors ``cubic``.
+  :class:`~warp_bsc.detection.narrow.narrow_phase.NarrowPhase`, with this method, from the queue of pairs to the results
+  of the contacts, without sorting. UNSURE is a collision. Pairs that are too wide for the device, which the detector
+  leaves to the host, stay UNSURE. On a GPU the narrow phase compares boxes last, because the detector's broad phase has
+  compared them already. The benchmark's queries are all candidates, also those that this comparison would have
+  excluded, which favors ``cubic``.
 - ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close,
   so it finds a time as well; that time is not written.
 - ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5,

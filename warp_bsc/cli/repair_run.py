@@ -17,8 +17,8 @@ from ..repair.shot.report import LEFT_HITS, RepairPage
 from ..repair.shot.stretch import RepairedStretch
 from ..replay.intervals import replay
 from ..replay.results import IntervalResult
-from ..usd.points_layer import PointsLayer
 from ..usd.scene import Scene
+from ..usd.write.points_layer import PointsLayer
 from .device import loading_kernels
 from .error_boundary import describe
 from .interrupts import INTERRUPTS, Interrupted

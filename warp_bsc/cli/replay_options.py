@@ -12,7 +12,7 @@ from typing import Any, Literal
 from .._atomic_file import STDOUT
 from ..replay.workers import checked_address
 from ..usd.frames import FrameRange
-from ..usd.openusd import check_openusd
+from ..usd.read.openusd import check_openusd
 from ..usd.scene import Scene
 from ..usd.selection import PURPOSES, Selection
 from .error_boundary import describe
@@ -144,7 +144,7 @@ def read_scene(path: str, arguments: argparse.Namespace, *, as_json: bool = Fals
     """
     with INTERRUPTS.held():  # an interrupt while USD's modules load is caught there, and breaks them
         check_openusd()
-        importlib.import_module("warp_bsc.usd.find_meshes")
+        importlib.import_module("warp_bsc.usd.read.find_meshes")
     INTERRUPTS.check()
     how = {"strict": arguments.strict, "allow_missing": arguments.allow_missing}
     try:

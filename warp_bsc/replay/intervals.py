@@ -57,9 +57,9 @@ def replay(
             then, only its being inside that mesh is ignored.
         clearance: Distance up to which proximities are found at each time, in the scene's unit of length, at least
             2^-1021; None finds none. A proximity is a vertex and a face, or two edges, that share no vertex and that no
-            edge joins. All of them are found, see
-            :meth:`~warp_bsc.detection.at_rest.proximities.ProximityFinder.find`, but only at the times, not between them. An edge that passes through a face, far from the borders of both, is an
-            intersection and no proximity.
+            edge joins. All of them are found, see :meth:`~warp_bsc.detection.at_rest.proximities.ProximityFinder.find`,
+            but only at the times, not between them. An edge that passes through a face, far from the borders of both,
+            is an intersection and no proximity.
         validate: Number of hits, and of other pairs, of each interval that the exact checker decides again, chosen at
             random; ``"all"`` decides all of them.
         earlier: Results of the first intervals, in order, that an earlier replay has found. They are yielded first,

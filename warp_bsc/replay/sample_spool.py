@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..usd.layer import just_before
-from ..usd.layer_writer import SHAPES
+from ..usd.write.layer import just_before
+from ..usd.write.layer_writer import SHAPES
 from .outputs import without_last_eighth
 
 __all__ = ["Sample", "SampleSpool"]
@@ -43,7 +43,7 @@ class SampleSpool:
 
         Args:
             folder: Its folder.
-            types: Types of attributes, of :data:`~warp_bsc.usd.layer_writer.SHAPES`, by name of a prim and attribute.
+            types: Types of attributes, of :data:`~.write.layer_writer.SHAPES`, by name of a prim and attribute.
 
         Raises:
             OSError: If it cannot be opened.

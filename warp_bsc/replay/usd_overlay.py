@@ -10,10 +10,10 @@ import numpy as np
 
 from .._atomic_file import OutputFile
 from .._version import __version__
-from ..usd.layer import just_before, layer_metadata, unused_path
-from ..usd.layer_writer import LayerContent, LayerGroup, LayerPrim, PrimKind, write_binary_layer, write_text_layer
 from ..usd.scene import Scene
 from ..usd.segment import Segment
+from ..usd.write.layer import just_before, layer_metadata, unused_path
+from ..usd.write.layer_writer import LayerContent, LayerGroup, LayerPrim, PrimKind, write_binary_layer, write_text_layer
 from .limit import not_listed
 from .results import IntervalResult
 from .sample_spool import Key, Sample, SampleSpool

@@ -18,7 +18,7 @@ What moves
 The points, the transforms and the skeleton of a mesh may all have time samples. A scene's times are those of all
 meshes together; at a time that is not a mesh's own sample, USD interpolates. Rotating transforms and skeletons do not
 move points straight from one sample to the next: they are sampled at every whole time code between as well, and splines
-as :func:`~warp_bsc.usd.samples.sample_times` describes. From one time to the next, each vertex moves straight from its
+as :func:`~.read.samples.sample_times` describes. From one time to the next, each vertex moves straight from its
 position at the first time to its position just before the second; a mesh that only its transform moves turns instead,
 if :mod:`~warp_bsc.usd.turns` finds that it does. A mesh that jumps at the second time, from one value clip to the next
 or because a value was held, ends at its position before the jump.
@@ -63,7 +63,6 @@ import numpy as np
 
 from .._arguments import check_instance, checked_flag, checked_integer, checked_strings, given
 from .._one_thread import one_at_a_time
-from .files import SceneFiles
 from .frames import FrameRange
 from .interval import (
     Interval,
@@ -74,7 +73,8 @@ from .interval import (
     message_warning,
 )
 from .jumps import JumpFinder
-from .openusd import check_openusd
+from .read.files import SceneFiles
+from .read.openusd import check_openusd
 from .scene_options import Revealed, SceneOptions
 from .scene_times import find_times
 from .segment import Segment
@@ -83,7 +83,7 @@ from .selection import Selection
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
-    from .meshes import UsdMesh  # which imports pxr
+    from .read.meshes import UsdMesh  # which imports pxr
 
 __all__ = ["Scene"]
 
@@ -179,7 +179,7 @@ class Scene:
         check_openusd()
         stage, path = None, source
         if not isinstance(source, (str, os.PathLike)):
-            from .stage import given_stage, name_of  # noqa: PLC0415 (imports pxr)
+            from .read.stage import given_stage, name_of  # noqa: PLC0415 (imports pxr)
 
             stage = given_stage(source)
             path = name_of(stage)
@@ -210,10 +210,10 @@ class Scene:
         """Opens the file or takes a stage, and finds its meshes, given what reading has revealed in another process."""
         from pxr import UsdGeom  # noqa: PLC0415 (slow)
 
-        from .find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
-        from .stage import check_stage, open_stage  # noqa: PLC0415
+        from .read.find_meshes import find_meshes  # noqa: PLC0415 (imports pxr)
+        from .read.stage import check_stage, open_stage  # noqa: PLC0415
+        from .read.unreadable import LeftOut, UnreadableError, collecting  # noqa: PLC0415
         from .transform_warnings import transform_warnings  # noqa: PLC0415
-        from .unreadable import LeftOut, UnreadableError, collecting  # noqa: PLC0415
 
         self._lock = threading.RLock()
         self._options = options
@@ -315,7 +315,7 @@ class Scene:
         """Returns the call that opens the scene again."""
         revealed = Revealed(tuple(self._parts), self._welds)
         if self._is_given:
-            from .stage import write_for_others  # noqa: PLC0415 (imports pxr)
+            from .read.stage import write_for_others  # noqa: PLC0415 (imports pxr)
 
             self.files.check()
             self._written = self._written or write_for_others(self.stage, self)

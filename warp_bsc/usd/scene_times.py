@@ -8,7 +8,7 @@ from .frames import FrameRange
 from .interval import times_in_words
 
 if TYPE_CHECKING:
-    from .meshes import UsdMesh  # which imports pxr
+    from .read.meshes import UsdMesh  # which imports pxr
 
 __all__ = ["SceneTimes", "find_times"]
 

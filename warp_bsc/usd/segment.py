@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._sorted_keys import distinct, search, search_ranges
-from .position_reader import PositionReader
+from .read.position_reader import PositionReader
 from .scene_mesh import SceneMesh
 from .turns import Turn, find_turns
 from .welding import group_by_position, split_by_position
 
 if TYPE_CHECKING:
-    from .meshes import UsdMesh
+    from .read.meshes import UsdMesh
 
 __all__ = ["Segment"]
 

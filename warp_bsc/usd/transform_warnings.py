@@ -8,9 +8,9 @@ import math
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from .instancers import Instancer
 from .interval import times_in_words
-from .meshes import UsdMesh
+from .read.instancers import Instancer
+from .read.meshes import UsdMesh
 from .turns import Turn, find_turns
 
 __all__ = ["transform_warnings"]

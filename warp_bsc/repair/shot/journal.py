@@ -10,8 +10,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ...replay.earlier import describe_difference
-from ...usd.points_layer import MovedFrame
 from ...usd.scene import Scene
+from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
 from .stretch import RepairedStretch
 

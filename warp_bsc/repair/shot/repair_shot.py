@@ -11,9 +11,9 @@ from ...detection.arcs.rigid_motion import RigidMotion
 from ...detection.mesh import CollisionMesh
 from ...replay.scene_arcs import arcs_of
 from ...usd.interval import Interval
-from ...usd.points_layer import MovedFrame
 from ...usd.scene import Scene
 from ...usd.segment import Segment
+from ...usd.write.points_layer import MovedFrame
 from ..contacts import Contacts
 from ..repair import repair
 from .blend import MARGIN, blend

@@ -12,9 +12,9 @@ import numpy as np
 from ..._atomic_file import OutputFile
 from ...replay.html_page import block, fill_page, inert, shared_part, spread
 from ...replay.page_view import choose_faces
-from ...usd.points_layer import MovedFrame
 from ...usd.scene import Scene
 from ...usd.segment import Segment
+from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
 from .stretch import RepairedStretch
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...usd.points_layer import MovedFrame
+from ...usd.write.points_layer import MovedFrame
 
 __all__ = ["FollowedMesh", "RepairedStretch", "ShotFrame", "StretchRecorder"]
 

@@ -20,7 +20,7 @@ class RigidMeshes:
     """Reads positions of some points of rigid meshes. Transforms of prims above several meshes are computed once."""
 
     def __init__(self, parts: list[tuple[UsdMesh, int, slice, np.ndarray]], dtype: np.dtype):
-        """Makes a reader; arguments are those of :class:`~warp_bsc.usd.position_reader.PositionReader`."""
+        """Makes a reader; arguments are those of :class:`~warp_bsc.usd.read.position_reader.PositionReader`."""
         self._parts = parts
         self._dtype = dtype
         self._points: list[np.ndarray] = []

@@ -3,7 +3,7 @@
 # pyright: reportAttributeAccessIssue=false
 # (OpenUSD's stubs leave out the classes of its modules.)
 
-from .scene import Scene
+from ..scene import Scene
 
 __all__ = ["just_before", "layer_metadata", "unused_path"]
 

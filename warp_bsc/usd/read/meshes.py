@@ -49,8 +49,8 @@ class UsdMesh:
         group: The same value for all instances of a prim that one instancer places; empty without an instancer.
         display_name: Display name in the file, empty if there is none.
         type_name: Type of the prim.
-        is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.shapes.ShapePolygons`.
-        is_strands: Whether it is curves or points, see :class:`~warp_bsc.usd.strands.Strands`.
+        is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.read.shapes.ShapePolygons`.
+        is_strands: Whether it is curves or points, see :class:`~warp_bsc.usd.read.strands.Strands`.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
         states: Its states by the time from which on they hold, the first by minus infinity: None where it is invisible,
             absent or empty, else digests of its topology.

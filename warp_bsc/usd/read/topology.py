@@ -80,7 +80,7 @@ def as_topology(values: Sequence[Any], where: str) -> Topology:
     """Returns the polygons of a mesh; missing attributes are read as empty ones.
 
     Args:
-        values: What :class:`~warp_bsc.usd.shapes.Polygons` read at a time.
+        values: What :class:`~warp_bsc.usd.read.shapes.Polygons` read at a time.
         where: File and prim, for messages.
 
     Raises:

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 
 from pxr import Usd
 
+from ..selection import Selection
 from .instancers import is_ever_shown
 from .mesh_prims import MeshPrimFinder
 from .meshes import UsdMesh
-from .selection import Selection
 from .unreadable import LeftOut, UnreadableError, reading
 
 __all__ = ["find_meshes"]

@@ -92,7 +92,7 @@ class Instancer:
         count: Largest number of instances at any time.
         times: Time codes at which transforms of its instances to the world have a sample.
         break_times: Time codes at which instances may appear or vanish.
-        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
+        may_jump: Whether instances may jump at a time, see :func:`~warp_bsc.usd.read.samples.may_jump`.
     """
 
     count: int = 0

@@ -29,7 +29,7 @@ class MeshPrim:
         path: Its path.
         name: The path, with the number of the instance if a point instancer places it.
         instance: That instance, None if no point instancer places it.
-        binding: Its binding, see :func:`~warp_bsc.usd.skinning.find_bindings`, None if nothing deforms it.
+        binding: Its binding, see :func:`~warp_bsc.usd.read.skinning.find_bindings`, None if nothing deforms it.
         group: The same value for all instances of a prim that one instancer places; empty without an instancer.
     """
 

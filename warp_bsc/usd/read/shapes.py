@@ -36,7 +36,7 @@ class Polygons(Protocol):
 
     @property
     def may_jump(self) -> bool:
-        """Whether points may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`."""
+        """Whether points may jump at a time, see :func:`~warp_bsc.usd.read.samples.may_jump`."""
         ...
 
     def read_points(self, time: Usd.TimeCode) -> Any:

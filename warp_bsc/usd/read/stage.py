@@ -14,8 +14,8 @@ from typing import Any
 
 from pxr import Ar, Sdf, Usd
 
-from .._arguments import given
-from .._warnings import warn_caller
+from ..._arguments import given
+from ..._warnings import warn_caller
 from .unreadable import LeftOut, UnreadableError, collecting, describe_error, in_one_line
 
 __all__ = ["check_stage", "given_stage", "name_of", "open_stage", "write_for_others"]

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._atomic_file import OutputFile
+from ..._atomic_file import OutputFile
+from ..scene import Scene
+from ..segment import Segment
 from .layer import just_before, layer_metadata
 from .layer_writer import new_layer
-from .scene import Scene
-from .segment import Segment
 
 if TYPE_CHECKING:
-    from .meshes import UsdMesh  # which imports pxr
+    from ..read.meshes import UsdMesh  # which imports pxr
 
 __all__ = ["MovedFrame", "PointsLayer"]
 

@@ -42,7 +42,7 @@ class Strands:
 
     @property
     def may_jump(self) -> bool:
-        """Whether value clips hold the points, as of :class:`~warp_bsc.usd.shapes.MeshPolygons`."""
+        """Whether value clips hold the points, as of :class:`~warp_bsc.usd.read.shapes.MeshPolygons`."""
         return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
 
     def read_points(self, time: Usd.TimeCode) -> Any:

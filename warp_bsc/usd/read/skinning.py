@@ -18,7 +18,7 @@ class Skin:
     Attributes:
         skeleton: The prim to whose space the joints transform the points, None if only blend shapes deform the mesh.
         times: Time codes at which the animation has a sample, or a weight is that of an in-between of a blend shape.
-        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.samples.may_jump`.
+        may_jump: Whether it may jump at a time, see :func:`~warp_bsc.usd.read.samples.may_jump`.
     """
 
     def __init__(
