@@ -1,0 +1,1 @@
+"""The contacts of a step and their impulses."""
