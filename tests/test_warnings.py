@@ -31,10 +31,10 @@ def origin(*modules):
 @pytest.mark.parametrize(
     "modules",
     [
-        ["warp_bsc.response.report"],
-        ["warp_bsc.response.report", "warp_bsc.response.stage", "warp_bsc._one_thread"],
-        ["warp_bsc.response.report", "newton.solvers.coupled"],
-        ["warp_bsc.response.report", "warp_bsc.torch", "torch.autograd.function", "warp_bsc.torch"],
+        ["warp_bsc.response.report.report"],
+        ["warp_bsc.response.report.report", "warp_bsc.response.stage", "warp_bsc._one_thread"],
+        ["warp_bsc.response.report.report", "newton.solvers.coupled"],
+        ["warp_bsc.response.report.report", "warp_bsc.torch", "torch.autograd.function", "warp_bsc.torch"],
     ],
 )
 def test_a_warning_names_the_program(modules):

@@ -58,7 +58,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .response.contact_sensor import ContactSensor
     from .response.layer.contact_layer import ContactLayer
     from .response.monitor import CollisionMonitor
-    from .response.report import SolverReport
+    from .response.report.report import SolverReport
     from .response.solver_ccd import SolverCCD
     from .response.state.collision_filter import CollisionFilter
     from .response.state.friction_table import FrictionTable
@@ -94,7 +94,7 @@ _MODULES = {
     "SolverCCD": "response.solver_ccd",
     "SolverImplicit": "implicit.solver_implicit",
     "SolverImplicitAdjoint": "implicit.solver",
-    "SolverReport": "response.report",
+    "SolverReport": "response.report.report",
     "StateRepairResult": "repair.state",
     "UnresolvedContour": "repair.results",
     "distances": "detection.at_rest.proximities",

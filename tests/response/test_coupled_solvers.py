@@ -15,7 +15,7 @@ from newton_scenes import DT, SOLVERS, Rollout, add_patch, bullet
 from newton_versions import needs_attachments
 
 import warp_bsc as bsc
-from warp_bsc.response.integration import coupling_interface
+from warp_bsc.response.drive import coupling as coupling_interface
 
 
 def ball_builder(mass):

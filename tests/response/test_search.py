@@ -14,8 +14,8 @@ from warp_bsc.detection import pipeline
 from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.response.contacts.detect import inspect
 from warp_bsc.response.contacts.proximities import add_proximities
-from warp_bsc.response.schedule import Result
 from warp_bsc.response.state.motion import arrays_of
+from warp_bsc.response.state.status import Result
 from warp_bsc.response.state.structs import NEVER
 from warp_bsc.response.state.workspace import pairs_of
 

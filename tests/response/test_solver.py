@@ -10,8 +10,8 @@ from newton_versions import HAS_OBSERVABLES
 import warp_bsc as bsc
 from warp_bsc._private_names.of_newton import make_style3d
 from warp_bsc.response.contacts.constraints import NEVER_VIOLATED
-from warp_bsc.response.schedule import MAX_ITERATIONS
 from warp_bsc.response.state.structs import ContactKind
+from warp_bsc.response.tuning import MAX_ITERATIONS
 
 SUBSTEPS = {"vbd": 1, "xpbd": 1, "semi_implicit": 16}  # explicit integration is stable in small steps only
 
@@ -93,7 +93,7 @@ def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch
 
     All contacts are projected, as where a world also has contacts of fast elements.
     """
-    monkeypatch.setattr("warp_bsc.response.schedule.MAX_SLOW_ITERATIONS", MAX_ITERATIONS)
+    monkeypatch.setattr("warp_bsc.response.state.status.MAX_SLOW_ITERATIONS", MAX_ITERATIONS)
     monkeypatch.setattr("warp_bsc.response.schedule.SLOW_POSITION_SWEEPS", 16)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)

@@ -8,8 +8,8 @@ import warp as wp
 from newton_scenes import DT, Changed, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.solve.by_world import threads_of_world
 from warp_bsc.response.state import workspace
+from warp_bsc.response.state.cluster import threads_of_world
 
 SPEEDS = 2.0, 60.0, 9.0, 30.0
 

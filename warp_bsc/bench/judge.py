@@ -10,8 +10,8 @@ import warp as wp
 
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..response.report.strain import edges_at_rest
 from ..response.state.mesh import ModelMesh, host_array
-from ..response.strain import edges_at_rest
 from .response_simulation import largest_stretch
 
 __all__ = ["Judge", "Judgement"]

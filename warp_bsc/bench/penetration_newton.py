@@ -7,8 +7,8 @@ import newton
 import numpy as np
 
 from .._private_names.of_newton import make_style3d
+from ..response.report.strain import edges_at_rest
 from ..response.state.mesh import host_array
-from ..response.strain import edges_at_rest
 from .penetration_scenes import PenetrationScene
 from .penetration_states import Trajectory
 from .response_simulation import NotFinite, Simulation, largest_stretch

@@ -13,12 +13,12 @@ from newton.solvers.experimental.coupled import ModelView
 from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
 from ..detection.run.host_function import run_on_host
-from ..response.schedule import Loop
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
 from ..response.state.mesh import host_array
 from ..response.state.motion import arrays_of
+from ..response.state.status import Loop
 from ..response.state.structs import Bodies
 from ..response.step import begin, detect_contacts, resolve_contacts
 from .contact import steps

@@ -8,7 +8,7 @@ from .._arguments import check_finite
 from ..detection.at_rest.body_parts import connect_cells
 from ..detection.mesh import CollisionMesh
 from ..detection.run.launch import launch
-from ..response.inside import Inside, InsideFinder
+from ..response.report.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
 from ..response.state.planes import transformed_plane
 from .contours import connected_components

@@ -9,7 +9,7 @@ import warp as wp
 
 from .._arguments import check_instance, checked_distance, checked_number
 from ..detection.mesh import CollisionMesh
-from ..response.inside import Inside
+from ..response.report.inside import Inside
 from .arguments import checked_layers
 from .free import free, restore_parts
 from .layers import separate_layers
@@ -31,7 +31,7 @@ class StateRepairResult(RepairResult):
     Attributes:
         inside_before: Number of particles inside rigid shapes, soft bodies and the solids of infinite planes in the
             input; one that is inside several counts for each.
-        inside: Those in ``x``, see :class:`warp_bsc.response.inside.Inside`.
+        inside: Those in ``x``, see :class:`warp_bsc.response.report.inside.Inside`.
         inverted_before: Number of tetrahedra whose volume is not positive in the input.
         inverted: Number of those in ``x``. A tetrahedron that has a positive volume keeps one.
         mesh: The mesh of ``UnresolvedContour.elements``: the particles, then the vertices of shapes, then four for each

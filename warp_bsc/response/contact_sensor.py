@@ -9,13 +9,13 @@ import numpy as np
 import warp as wp
 
 from .._arguments import check_instance, checked_integer, checked_number, checked_strings
-from .forces.sums import add_impulse, take_impulse
+from .drive.world_mask import checked_mask
+from .report.forces.sums import add_impulse, take_impulse
 from .stage import CollisionStage
 from .state.mesh import host_array
 from .state.motion import takes_part
 from .state.structs import allocate
 from .state.vectors import to_double, to_single
-from .worlds.world_mask import checked_mask
 
 wp.set_module_options({"enable_backward": False})
 

@@ -17,13 +17,12 @@ from .._arguments import (
     checked_number,
 )
 from .._private_names.of_newton import has_external_rigid_solver
-from .schedule import MAX_ITERATIONS
 from .state.collision_filter import CollisionFilter, checked_filter
 from .state.friction import Friction
 from .state.friction_table import FrictionTable, checked_table
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
-from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
+from .tuning import CONTACTS_PER_PARTICLE, MAX_ITERATIONS, MIN_CONTACTS, SEPARATION
 
 MAX_SUBSTEPS, MAX_CONTACTS = 1024, 2**28
 MAX_FLOAT = float(np.finfo(np.float32).max)

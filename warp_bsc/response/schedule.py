@@ -34,36 +34,16 @@ that were inverted at the start, for contacts of bodies that are left to the inn
 :class:`.state.collision_filter.CollisionFilter`.
 """
 
-from enum import IntEnum
-
 import warp as wp
 
 from ..detection.run.settings import FILTERED_COUNTS
 from ..kernels.pipeline.queues import has_overflowed
+from .state.status import Detection, Loop, Result, SolveStatus, clear_detection
 from .state.structs import Step
+from .tuning import MAX_CUTS
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_ITERATIONS = 40
-"""Iterations of detect and project, after which vertices that still collide are divided."""
-MAX_SLOW_ITERATIONS = 1
-"""The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
-MAX_DIVISIONS = 32
-"""Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
-MAX_PASSES = wp.constant(4)
-"""Passes over dividing planes in each division: layers that fall together by more than they are apart need several."""
-MAX_CUTS = wp.constant(64)
-"""Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
-MAX_TRUNCATIONS = wp.constant(8)
-"""Iterations of detect and truncate of a recorded step, after which vertices that still collide are frozen."""
-MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
-"""Sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one active
-set, after which the device checks whether a constraint is still active."""
-SLOW_POSITION_SWEEPS = 4
-"""Sweeps on positions over constraints that move no body in worlds without fast contacts: division resolves what they
-leave. Velocities need more, as a sweep passes an impulse on by a layer."""
-MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
-"""Sweeps of a step: one ahead of the detection, those of all iterations, and those on velocities."""
 _WIDENING = wp.constant(wp.float64(1.25))
 """Factor by which the separation of new constraints grows with each iteration, so that jams are resolved."""
 _WIDEST = wp.constant(wp.float64(5.0))
@@ -71,132 +51,6 @@ _WIDEST = wp.constant(wp.float64(5.0))
 _FIRST_FILTERED, _FILTERED_KINDS = wp.constant(FILTERED_COUNTS.start), wp.constant(len(FILTERED_COUNTS))
 _FILTERED_STEP = wp.constant(FILTERED_COUNTS.step)
 _LARGEST_COUNT = wp.constant(wp.int64(2**31 - 1))
-
-
-class Loop(IntEnum):
-    """What the conditions of the loop over iterations read: elements of :attr:`SolveStatus.loop`."""
-
-    RECOUNT = 0  # 1 if crossings may have changed since they were counted
-    ACTIVE = 1  # 1 while another iteration is needed
-    UNFINISHED = 2  # 1 if the first detection leaves something to do
-    ITERATION = 3  # detections so far, less one; from max_iterations on, all worlds divide
-    PROJECTING = 4  # 1 if the last detection added constraints
-    NEWLY_FROZEN = 5  # vertices and bodies that this iteration froze
-    MORE_SWEEPS = 6  # 1 while another batch of sweeps is needed
-    SWEEP = 7  # sweeps so far
-    PASS = 8  # passes over dividing planes so far
-    MORE_PASSES = 9  # 1 while another is needed
-    CUTTING = 10  # 1 while tetrahedra invert, and paths are to be cut again
-
-
-class Detection(IntEnum):
-    """Counters of the detection in progress: elements of :attr:`SolveStatus.detection`."""
-
-    HITS = 0  # contacts
-    EXCLUDED = 1  # contacts of elements that crossed or touched at the start
-    OF_BODIES = 2  # contacts between bodies, which are left to the inner solver
-    TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
-    FILTERED = 4  # contacts of shapes that do not collide by Newton's filters, and with planes that are filtered
-
-
-class Result(IntEnum):
-    """Results of a step: elements of :attr:`SolveStatus.results`."""
-
-    CERTIFIED = 0  # 1 if the last detection was complete and found no contact
-    UNDETECTED = 1  # 1 if the last detection was incomplete
-    COUNTED = 2  # 1 once all contacts of the predicted motion are counted
-    FIRST_HITS = 3  # contacts of the predicted motion
-    REMAINING = 4  # contacts that the last detection found
-    EXCLUDED = 5  # contacts that the last detection found and excluded
-    BODY_CONTACTS = 6  # contacts between bodies that the last detection found
-    ITERATIONS = 7  # of detect and project or divide
-    TRUNCATED = 8  # 1 if a path was cut
-    FROZEN = 9  # 1 if a vertex or a body was frozen
-    NOT_FINITE = 10  # particles whose predicted position or velocity was not finite
-    CROSSINGS = 11  # edges that cross faces at the start
-    FILTERED = 12  # pairs of the predicted motion that filters left out
-    INVERTING = 13  # tetrahedra that the motion inverts or may invert, if they are looked at
-    INVERTED = 14  # those that were or may have been inverted at the start
-    NEW_CROSSINGS = 15  # by which crossings of an edge are more than at the start of the step before, in all edges
-
-
-@wp.struct
-class WorldCounts:
-    """Contacts, filtered pairs and tetrahedra by world, shape [worlds]; empty if the report is not asked for worlds."""
-
-    found: wp.array[int]  # by the detection in progress
-    hits: wp.array[int]  # of the predicted motion
-    remaining: wp.array[int]  # that the last detection found
-    left_out: wp.array[int]  # by the detection in progress, see Detection.FILTERED
-    left_out_pairs: wp.array[wp.int64]  # pairs of elements that groups and masks left out of the last detection
-    filtered: wp.array[int]  # pairs of the predicted motion that filters left out, both of these
-    inverting: wp.array[int]  # tetrahedra, see Result.INVERTING
-    inverted: wp.array[int]  # see Result.INVERTED
-
-
-@wp.struct
-class SolveStatus:
-    """How far a step is, and its limits."""
-
-    loop: wp.array[int]  # elements of Loop
-    detection: wp.array[int]  # of Detection
-    results: wp.array[int]  # of Result
-    contact_iteration: wp.array[int]  # of each world, the iteration after which it last had a contact
-    is_fast: wp.array[int]  # of each world, 1 if predicted paths of fast or pushing elements or bodies collide
-    crossings: wp.array[int]  # of each world, edges that cross faces at the start
-    of_worlds: WorldCounts
-    max_iterations: int
-    max_slow_iterations: int
-    max_truncations: int  # or divisions
-    slow_position_sweeps: int
-
-
-def single_elements(values: wp.array) -> list[wp.array]:
-    """Returns views of the single elements of an array, which conditions on the device and the host can read."""
-    return [values[i : i + 1] for i in range(len(values))]
-
-
-def views_of(struct_type: type, values: wp.array):
-    """Returns a struct whose fields, in their order, are views of one element each of an array."""
-    struct = struct_type()
-    for name, element in zip(struct_type.vars, single_elements(values), strict=True):
-        setattr(struct, name, element)
-    return struct
-
-
-def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
-    """Returns a cleared status.
-
-    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
-    """
-    status = SolveStatus()
-    for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
-        setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
-    for name in ("contact_iteration", "is_fast", "crossings"):
-        setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
-    status.max_iterations = max_iterations
-    status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
-    status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
-    status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
-    return status
-
-
-@wp.func
-def _clear_detection(status: SolveStatus):
-    for i in range(status.detection.shape[0]):
-        status.detection[i] = 0
-
-
-@wp.func
-def clear_status(status: SolveStatus):
-    """Clears everything for a step, except for the crossings, of the last step until recounted, and RECOUNT."""
-    _clear_detection(status)
-    for i in range(status.loop.shape[0]):
-        if i != Loop.RECOUNT:
-            status.loop[i] = 0
-    for j in range(status.results.shape[0]):
-        if j != Result.CROSSINGS and j != Result.NEW_CROSSINGS:
-            status.results[j] = 0
 
 
 @wp.func
@@ -328,7 +182,7 @@ def decide(
     overflowed = has_overflowed(counts, capacities)
     if can_search and overflowed and results[Result.UNDETECTED] == 0:
         results[Result.UNDETECTED] = 1
-        _clear_detection(status)
+        clear_detection(status)
         loop[Loop.ITERATION] = wp.max(loop[Loop.ITERATION], status.max_iterations)
         return
     overflowed = overflowed and not can_search
@@ -341,7 +195,7 @@ def decide(
     results[Result.BODY_CONTACTS] = detection[Detection.OF_BODIES]
     if results[Result.COUNTED] == 0:
         results[Result.FILTERED] = _count_filtered(counts, detection[Detection.FILTERED])
-    _clear_detection(status)
+    clear_detection(status)
     loop[Loop.NEWLY_FROZEN] = 0
     if results[Result.COUNTED] == 0:
         results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
@@ -376,18 +230,3 @@ def decide_cut(first: bool, status: SolveStatus):
     loop = status.loop
     loop[Loop.SWEEP] = wp.where(first, 0, loop[Loop.SWEEP] + 1)
     loop[Loop.CUTTING] = wp.where(status.results[Result.INVERTING] > 0 and loop[Loop.SWEEP] < MAX_CUTS, 1, 0)
-
-
-@wp.func
-def begin_sweeps(status: SolveStatus):
-    """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
-    loop = status.loop
-    loop[Loop.SWEEP] = 0
-    loop[Loop.MORE_SWEEPS] = wp.where(loop[Loop.ACTIVE] == 0 or loop[Loop.PROJECTING] == 1, 1, 0)
-    loop[Loop.PROJECTING] = 0
-
-
-@wp.kernel
-def start_sweeps(status: SolveStatus):
-    """Launches :func:`begin_sweeps`."""
-    begin_sweeps(status)

@@ -15,23 +15,25 @@ from .._private_names.of_warp import paused_tape
 from ..detection.run.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
-from .forces.contact_forces import ContactForces
-from .integration.style3d_contacts import Style3DContacts
-from .integration.wrapped_solver import innermost
+from .drive.style3d_springs import Style3DContacts
+from .drive.substeps import Substeps
+from .drive.world_mask import checked_mask
+from .drive.wrapped_solver import innermost
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
-from .schedule import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP, Loop
+from .report.count_steps import count_record
+from .report.forces.contact_forces import ContactForces
+from .report.strain import StrainMeter
 from .stage import CollisionStage, is_recorded
 from .state.collision_filter import CollisionFilter
 from .state.friction_table import FrictionTable
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
+from .state.status import Loop
 from .step import resolve, resolve_inversions
-from .strain import StrainMeter
-from .substeps import Substeps
-from .worlds.world_mask import checked_mask
-from .write_back import count_record, write_back
+from .tuning import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
+from .write_back import write_back
 
 _PASSED_ON = "the inner solver has all contacts that were passed on"
 

@@ -15,20 +15,21 @@ from .._private_names.of_newton import SHAPES_CHANGE
 from .._private_names.of_warp import paused_tape
 from .._warnings import warn_caller
 from .adjoint.between_steps import BetweenSteps
-from .integration.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
-from .integration.coupling_interface import CouplingHooks
-from .integration.wrapped_solver import innermost
-from .report import SolverReport
-from .report_text import unseen_warning
-from .schedule import MAX_ITERATIONS, Loop
+from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
+from .drive.coupling import CouplingHooks
+from .drive.world_mask import WorldMask, checked_mask
+from .drive.wrapped_solver import innermost
+from .report.count_steps import count_outrun, count_step, merge_step, note_crossings
+from .report.count_worlds import WorldCounter
+from .report.report import SolverReport
+from .report.text import unseen_warning
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh, unseen_strands
 from .state.motion import ModelMotion, arrays_of, find_set_bodies
+from .state.status import Loop
 from .state.workspace import Workspace
 from .step import prepare
-from .worlds.count_worlds import WorldCounter
-from .worlds.world_mask import WorldMask, checked_mask
-from .write_back import count_outrun, count_step, merge_step, note_crossings
+from .tuning import MAX_ITERATIONS
 
 
 def is_recorded(tape: wp.Tape | None, state_out: newton.State) -> bool:

@@ -13,10 +13,11 @@ import warp as wp
 
 from .contacts import detect, proximities
 from .contacts.inversions import find_inversions
-from .schedule import Loop, begin_prevention, decide_cut
+from .schedule import begin_prevention, decide_cut
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
 from .state.record import StepRecorder
+from .state.status import Loop
 from .state.workspace import Workspace
 
 

@@ -1,4 +1,4 @@
-"""Numbers that were tuned, all in one place; limits on iterations and sweeps stand in :mod:`.schedule`."""
+"""All numbers that were tuned, and the limits on iterations and sweeps that :mod:`.schedule` explains."""
 
 import warp as wp
 
@@ -135,3 +135,25 @@ CONTACTS_PER_PARTICLE, MIN_CONTACTS = 8, 4096
 """Contacts that a report lists, for each particle, and at least."""
 THREADS = 2048
 """Threads, for each multiprocessor of a GPU, of a launch over the entries of a queue."""
+
+# iterations and sweeps
+MAX_ITERATIONS = 40
+"""Iterations of detect and project, after which vertices that still collide are divided."""
+MAX_SLOW_ITERATIONS = 1
+"""The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
+MAX_DIVISIONS = 32
+"""Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
+MAX_PASSES = wp.constant(4)
+"""Passes over dividing planes in each division: layers that fall together by more than they are apart need several."""
+MAX_CUTS = wp.constant(64)
+"""Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
+MAX_TRUNCATIONS = wp.constant(8)
+"""Iterations of detect and truncate of a recorded step, after which vertices that still collide are frozen."""
+MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
+"""Sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one active
+set, after which the device checks whether a constraint is still active."""
+SLOW_POSITION_SWEEPS = 4
+"""Sweeps on positions over constraints that move no body in worlds without fast contacts: division resolves what they
+leave. Velocities need more, as a sweep passes an impulse on by a layer."""
+MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
+"""Sweeps of a step: one ahead of the detection, those of all iterations, and those on velocities."""

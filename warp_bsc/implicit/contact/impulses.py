@@ -3,9 +3,9 @@
 import warp as wp
 
 from ...kernels.polynomials import EDGE_EDGE
-from ...response.forces.keep import torque_on
-from ...response.forces.publish import publish_contact
-from ...response.forces.structs import ContactRows, ImpulseSums, Sides
+from ...response.report.forces.accumulate import torque_on
+from ...response.report.forces.emit import publish_contact
+from ...response.report.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.state.structs import ContactKind, Step
 from ...response.state.vectors import ZERO, to_double, to_single
 from . import barrier

@@ -13,7 +13,7 @@ from ...detection.pipeline import MIN_CAPACITY
 from ...detection.run.launch import retry_until_fits
 from ...detection.run.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
-from ...response.forces.structs import ContactRows, ImpulseSums, Sides
+from ...response.report.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
 from ...response.state.mesh import ModelMesh, grouped_by_world, host_array
 from ...response.state.motion import StateArrays

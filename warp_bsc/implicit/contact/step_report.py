@@ -3,7 +3,7 @@
 import warp as wp
 
 from ...kernels.pipeline.queues import has_overflowed
-from ...response.report import SolverReport
+from ...response.report.report import SolverReport
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
 from ...response.tuning import MAX_STRAIN

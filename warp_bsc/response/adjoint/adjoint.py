@@ -10,10 +10,10 @@ are integers.
 
 import warp as wp
 
-from ..schedule import SWEEPS_PER_BATCH
 from ..state.record import GROWING, OFFSETS, RecordCounts, check_complete
 from ..state.structs import SUMS, Constraints, add_zeros, allocate
 from ..state.workspace import Workspace
+from ..tuning import SWEEPS_PER_BATCH
 from . import kernels, pose_kernels, restore, structs
 from .arrays import copied, copied_materials, filled, launch_adjoint, materials_with_gradients, with_gradients
 from .structs import Move, Projection, RestoredStep

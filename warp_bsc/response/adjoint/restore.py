@@ -5,13 +5,13 @@ A launch over vertices and bodies has a thread for each vertex, then one for eac
 
 import warp as wp
 
-from ..schedule import Loop, Result
 from ..solve.bodies import change_body_velocity, move_body
 from ..solve.positions import move_vertex
 from ..solve.sweeps import add_delta, count_active
 from ..solve.velocities import change_velocity
 from ..state.fixed_sum import sums_of
 from ..state.record import truncation_at
+from ..state.status import Loop, Result
 from ..state.structs import Motion, can_move
 from .structs import (
     Cursor,

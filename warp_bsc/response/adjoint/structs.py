@@ -4,9 +4,9 @@ import enum
 
 import warp as wp
 
-from ..schedule import SolveStatus
 from ..state.planes import MovingPlanes
 from ..state.record import StepRecord
+from ..state.status import SolveStatus
 from ..state.structs import Step
 
 wp.set_module_options({"enable_backward": False})

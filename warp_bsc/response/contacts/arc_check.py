@@ -9,7 +9,7 @@ import warp as wp
 from ...detection.run.launch import retry_until_fits
 from ...kernels.arcs import Arcs, turns
 from ...kernels.pipeline.queues import has_overflowed
-from ..schedule import Result, SolveStatus
+from ..state.status import Result, SolveStatus
 from ..state.structs import Step
 from ..state.workspace import Workspace
 from . import constraints, rules

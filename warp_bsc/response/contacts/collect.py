@@ -9,9 +9,10 @@ from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import filled_entries, has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
-from ..schedule import Detection, Loop, Result, SolveStatus, count_contact, count_filtered, is_dividing, widened
+from ..schedule import count_contact, count_filtered, is_dividing, widened
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
+from ..state.status import Detection, Loop, Result, SolveStatus
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN

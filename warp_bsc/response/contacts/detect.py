@@ -4,7 +4,8 @@ import warp as wp
 
 from ...detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.run.launch import retry_until_fits
-from ..schedule import Loop, Result, decide, decide_worlds
+from ..schedule import decide, decide_worlds
+from ..state.status import Loop, Result
 from ..state.workspace import Workspace
 from ..write_back import finish_inspection
 from .collect import collect_contacts, collect_penetrations, count_crossings, count_new_crossings, drop_if_full

@@ -5,7 +5,8 @@ import warp as wp
 from ...detection.run.settings import TOLERANCE
 from ...kernels.inversion import inversion_tetrahedron
 from ...kernels.signs import FREE
-from ..schedule import Result, SolveStatus, count_inversion
+from ..schedule import count_inversion
+from ..state.status import Result, SolveStatus
 from ..state.structs import NEVER, ContactKind, Step, Tetrahedra
 from ..state.vectors import ZERO, to_double
 from ..state.workspace import Workspace

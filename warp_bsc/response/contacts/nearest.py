@@ -9,7 +9,7 @@ from ...detection.broad.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.polynomials import VERTEX_FACE
-from ..schedule import SolveStatus
+from ..state.status import SolveStatus
 from ..state.structs import Step
 from ..state.vectors import ZERO, corners_of, to_double
 from ..tuning import BEHIND

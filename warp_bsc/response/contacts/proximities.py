@@ -8,7 +8,8 @@ from ...detection.run.launch import retry_until_fits
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
-from ..schedule import Loop, SolveStatus, is_dividing, is_projecting
+from ..schedule import is_dividing, is_projecting
+from ..state.status import Loop, SolveStatus
 from ..state.structs import ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace

@@ -19,7 +19,8 @@ from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import Impact, impact
-from ..schedule import Detection, SolveStatus, count_contact, count_filtered
+from ..schedule import count_contact, count_filtered
+from ..state.status import Detection, SolveStatus
 from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed

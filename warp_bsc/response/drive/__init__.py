@@ -1,1 +1,1 @@
-"""How the inner solver takes a step: as a whole, in substeps, with springs of contacts, in some worlds, in a coupled solver."""
+"""How the inner solver takes a step: whole, in substeps, with springs, in some worlds, in a coupled solver."""

@@ -35,7 +35,7 @@ from ..adjoint.arrays import filled
 from ..adjoint.pose_kernels import set_centres
 from ..adjoint.structs import StateGradients
 from ..contacts.queue import queues_of
-from ..integration.wrapped_solver import WrappedSolver, innermost
+from ..drive.wrapped_solver import WrappedSolver, innermost
 from ..options import Bodies, StageOptions, friction_of, in_eight_bits, particle_edge_lengths
 from ..state.collision_filter import CollisionFilter
 from ..state.friction_table import FrictionTable

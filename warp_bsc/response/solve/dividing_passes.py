@@ -13,10 +13,11 @@ import warp as wp
 
 from ..contacts.dividing_planes import FAR
 from ..contacts.rules import inverse_mass_of
-from ..schedule import MAX_PASSES, Loop, SolveStatus, is_divided
+from ..schedule import is_divided
+from ..state.status import Loop, SolveStatus
 from ..state.structs import CUT_SHORT, FROZEN, NO_NODE, NOT_PLACED, PLACED, DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, to_double
-from ..tuning import CLOSE_MARGIN, CLOSE_TOGETHER, FAR_APART, MARGIN, SLACK
+from ..tuning import CLOSE_MARGIN, CLOSE_TOGETHER, FAR_APART, MARGIN, MAX_PASSES, SLACK
 from .sides import position_on_sides, position_on_way
 
 wp.set_module_options({"enable_backward": False})

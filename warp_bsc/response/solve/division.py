@@ -12,9 +12,10 @@ from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pa
 from ..contacts.dividing_planes import add_dividing_plane, has_planes
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.queue import PairQueue, queues_of, vertices_of
-from ..schedule import Loop, Result, SolveStatus, divides_proximities, is_divided, is_freezing
+from ..schedule import divides_proximities, is_divided, is_freezing
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
+from ..state.status import Loop, Result, SolveStatus
 from ..state.structs import (
     CUT_SHORT,
     DIVIDED,

@@ -5,25 +5,25 @@ import functools
 import warp as wp
 
 from ..contacts.constraints import gap, min_distance_of, moves_body
-from ..schedule import (
-    MAX_SWEEPS,
-    SWEEPS_PER_BATCH,
-    Loop,
-    SolveStatus,
-    is_dividing,
-    is_projecting,
-    is_reversible,
-    start_sweeps,
-)
+from ..schedule import is_dividing, is_projecting, is_reversible
+from ..state.cluster import BLOCK, wait_for_others
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
+from ..state.status import Loop, SolveStatus, start_sweeps
 from ..state.structs import PROJECTED, ContactKind, Incidence, Pace, Step, constraint_at, constraint_count
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import CLOSE_EDGES, PUSHING_MOMENTUM, TOLERANCE_OF_BODIES, TOLERANCE_OF_CHANGE, TOLERANCE_OF_DISTANCE
+from ..tuning import (
+    CLOSE_EDGES,
+    MAX_SWEEPS,
+    PUSHING_MOMENTUM,
+    SWEEPS_PER_BATCH,
+    TOLERANCE_OF_BODIES,
+    TOLERANCE_OF_CHANGE,
+    TOLERANCE_OF_DISTANCE,
+)
 from . import sweeps
 from .bodies import move_bodies, place_vertices
-from .by_world import BLOCK, wait_for_others
 
 wp.set_module_options({"enable_backward": False})
 

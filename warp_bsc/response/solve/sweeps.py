@@ -9,12 +9,12 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot
 from ..contacts.constraints import TOUCH, gap, moves_body
-from ..schedule import MAX_SWEEPS, Loop, SolveStatus
 from ..state.fixed_sum import add_to_sum
 from ..state.record import StepRecord, end_sweep, is_recording, record_entry
+from ..state.status import Loop, SolveStatus
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
-from ..tuning import COUNTED, CREEP, SLIDING
+from ..tuning import COUNTED, CREEP, MAX_SWEEPS, SLIDING
 from .bodies import activate_bodies, add_body_delta, body_inverse_masses
 
 

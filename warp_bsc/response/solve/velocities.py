@@ -5,13 +5,14 @@ import functools
 import warp as wp
 
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
-from ..schedule import MAX_SWEEPS, SWEEPS_PER_BATCH, Loop, SolveStatus
+from ..state.cluster import BLOCK, wait_for_others
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
+from ..state.status import Loop, SolveStatus
 from ..state.structs import Incidence, Step, constraint_at, constraint_count, has_final_velocity
 from ..state.vectors import ONE, ZERO, relative
 from ..state.workspace import Workspace
-from ..tuning import TOLERANCE_OF_BODIES
+from ..tuning import MAX_SWEEPS, SWEEPS_PER_BATCH, TOLERANCE_OF_BODIES
 from . import sweeps
 from .angular_momentum import (
     add_moments,
@@ -24,7 +25,6 @@ from .angular_momentum import (
     turn_vertices,
 )
 from .bodies import activate_bodies, change_body_velocities, move_to_end, set_vertex_velocities
-from .by_world import BLOCK, wait_for_others
 
 wp.set_module_options({"enable_backward": False})
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 import warp as wp
 
-from ..schedule import Loop, SolveStatus, views_of
+from .status import Loop, SolveStatus, views_of
 from .structs import Constraints, Step, add_zeros
 
 wp.set_module_options({"enable_backward": False})

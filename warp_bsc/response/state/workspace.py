@@ -11,32 +11,24 @@ from ...detection.at_rest.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.run.settings import capacity_for
 from ...kernels.arcs import Arcs
-from ..schedule import (
-    MAX_ITERATIONS,
-    SWEEPS_PER_BATCH,
-    Loop,
-    SolveStatus,
-    WorldCounts,
-    allocate_status,
-    clear_status,
-    single_elements,
-    start_sweeps,
-)
-from ..solve.by_world import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from ..tuning import (
     DIVIDING_PLANES,
     DIVIDING_PLANES_IF_FEW,
     ITERATIONS_RESERVED,
     ITERATIONS_RESERVED_IF_FEW,
+    MAX_ITERATIONS,
     MIN_ENTRIES,
     PAIRS_PER_FACE,
     PAIRS_PER_STATIC_FACE,
+    SWEEPS_PER_BATCH,
     THREADS,
     TOLERANCE,
 )
+from .cluster import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
 from .mesh import ModelMesh, grouped_by_world
 from .motion import ModelMotion, takes_part
 from .record import StepRecord, StepRecorder, record_offsets
+from .status import Loop, SolveStatus, WorldCounts, allocate_status, clear_status, single_elements, start_sweeps
 from .structs import (
     NEVER,
     NO_NODE,
@@ -124,8 +116,8 @@ class Workspace:
     Attributes:
         step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
         dividing: The dividing planes; without arrays if steps may be recorded.
-        loop: Views of single elements of ``status.loop``, by :class:`.schedule.Loop`, for conditions on the device.
-        results: The same of ``status.results``, by :class:`.schedule.Result`.
+        loop: Views of single elements of ``status.loop``, by :class:`.status.Loop`, for conditions on the device.
+        results: The same of ``status.results``, by :class:`.status.Result`.
         recorder: Records the step for its adjoint, or None.
         record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].

@@ -7,8 +7,8 @@ that run together (compute capability 9.0); on a CPU there is one. Worlds withou
 
 import warp as wp
 
-from ..schedule import SolveStatus, begin_sweeps
-from ..state.structs import Step, constraint_count
+from .status import SolveStatus, begin_sweeps
+from .structs import Step, constraint_count
 
 wp.set_module_options({"enable_backward": False})
 

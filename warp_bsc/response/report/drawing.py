@@ -5,7 +5,7 @@ import numpy as np
 import warp as wp
 from newton.viewer import ViewerBase, ViewerViser
 
-from .state.mesh import ModelMesh
+from ..state.mesh import ModelMesh
 
 _NORMAL, _IMPULSE = (0.0, 0.8, 0.2), (1.0, 0.0, 1.0)
 """Colours as Newton draws normals and forces of its own contacts."""

@@ -5,12 +5,12 @@ import functools
 import numpy as np
 from newton.viewer import ViewerBase
 
-from .._arguments import check_instance, checked_number
+from ..._arguments import check_instance, checked_number
+from ..state.mesh import ModelMesh
+from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED
 from .drawing import Drawing
 from .forces.contact_report import ContactReport
-from .report_text import not_finite_warning, table_by_shape, uncertified_warning
-from .state.mesh import ModelMesh
-from .state.structs import FROZEN, NOT_FINITE, TRUNCATED
+from .text import not_finite_warning, table_by_shape, uncertified_warning
 
 _NOT_DRAWN = "report.draw draws contacts only if a stage keeps them: SolverCCD(solver, report_contacts=True)"
 _INCOMPLETE = "report.draw lacks contacts: raise the number that report_contacts= allows"

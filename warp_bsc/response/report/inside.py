@@ -8,11 +8,11 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags, ParticleFlags
 
-from .._arguments import as_numpy
-from ..detection.at_rest.body_parts import connect_cells
-from ..detection.at_rest.containment import ContainmentFinder
-from ..detection.mesh import CollisionMesh
-from .state.mesh import ModelMesh, elements_of, outer_sides
+from ..._arguments import as_numpy
+from ...detection.at_rest.body_parts import connect_cells
+from ...detection.at_rest.containment import ContainmentFinder
+from ...detection.mesh import CollisionMesh
+from ..state.mesh import ModelMesh, elements_of, outer_sides
 
 _ROUNDOFF, _TINY = 2.0**-50, 1e-300  # as in :func:`.state.planes.signed_distance`
 

@@ -12,10 +12,10 @@ import numpy as np
 import warp as wp
 from newton import BodyFlags
 
-from .._private_names.of_warp import paused_tape
-from .state.mesh import host_array
-from .state.motion import ModelMotion, StateArrays, arrays_of, continues, find_misplaced_bodies, takes_part
-from .state.structs import Motion
+from ..._private_names.of_warp import paused_tape
+from ..state.mesh import host_array
+from ..state.motion import ModelMotion, StateArrays, arrays_of, continues, find_misplaced_bodies, takes_part
+from ..state.structs import Motion
 
 wp.set_module_options({"enable_backward": False})
 _FORCES = "particle_f", "body_f"

@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .._warnings import warn_caller
-from ..detection.at_rest.intersections import find_intersections
-from .adjoint.between_steps import AMBIGUOUS_MOVES
+from ..._warnings import warn_caller
+from ...detection.at_rest.intersections import find_intersections
+from ..adjoint.between_steps import AMBIGUOUS_MOVES
+from ..state.motion import SET_STEPS
+from ..state.status import Result, views_of
+from ..state.structs import FROZEN, INVALID, NOT_FINITE, TRUNCATED, UNCERTIFIED
+from ..state.workspace import Workspace
+from ..tuning import MAX_STRAIN
+from .count_steps import StepResults
 from .inside import Inside, InsideFinder
-from .report_text import revoked_warning, set_bodies_warning, shape_name
-from .report_totals import GradientTotals, Penetrated, StepTotals, Totals
-from .report_views import ReportViews
-from .schedule import Result, views_of
-from .state.motion import SET_STEPS
-from .state.structs import FROZEN, INVALID, NOT_FINITE, TRUNCATED, UNCERTIFIED
-from .state.workspace import Workspace
-from .tuning import MAX_STRAIN
-from .worlds.world_report import WorldsOfReport
-from .write_back import StepResults
+from .text import revoked_warning, set_bodies_warning, shape_name
+from .totals import GradientTotals, Penetrated, StepTotals, Totals
+from .views import ReportViews
+from .worlds import WorldsOfReport
 
 _CROSSINGS_WARNING = (
     "edges pass through faces at the start of a step, and their contacts are left to the solver: "

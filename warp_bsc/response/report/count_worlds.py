@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ..schedule import Result, SolveStatus
+from ..state.status import Result, SolveStatus
 from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, Step, allocate
 from ..state.workspace import Workspace
-from ..write_back import StepResults
-from .world_report import Worlds
+from .count_steps import StepResults
+from .worlds import Worlds
 
 wp.set_module_options({"enable_backward": False})
 

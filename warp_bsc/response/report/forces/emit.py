@@ -2,11 +2,11 @@
 
 import warp as wp
 
-from ...kernels.pipeline.queues import take_slot_int
-from ..state.planes import MovingPlanes
-from ..state.structs import ContactKind, Step, can_move, constraint_count
-from ..state.vectors import ZERO, relative, to_double, to_single
-from .keep import body_of_side, responds, time_at_plane, torque_on
+from ....kernels.pipeline.queues import take_slot_int
+from ...state.planes import MovingPlanes
+from ...state.structs import ContactKind, Step, can_move, constraint_count
+from ...state.vectors import ZERO, relative, to_double, to_single
+from .accumulate import body_of_side, responds, time_at_plane, torque_on
 from .structs import ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
 from .sums import add_impulse, body_of_vertex, shape_of, take_impulse
 

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ..state.mesh import host_array, members_of_worlds
-from ..state.motion import StateArrays
-from ..state.structs import allocate
-from ..state.workspace import Workspace
-from . import keep, publish
+from ...state.mesh import host_array, members_of_worlds
+from ...state.motion import StateArrays
+from ...state.structs import allocate
+from ...state.workspace import Workspace
+from . import accumulate, emit
 from .structs import ContactRows, ImpulseSums, PublishedImpulses, Sides, Unpaired
 
 MAX_PAIRS = 2**20
@@ -69,7 +69,7 @@ class ContactForces:
 
     def end(self, end: StateArrays, mask: wp.array[wp.bool] | None) -> None:
         """Takes the centres of mass at the predicted end of a step, of worlds that take part in it."""
-        self._work.launch(keep.write_centres, len(self._centres), [end, self._sides, mask, self._centres])
+        self._work.launch(accumulate.write_centres, len(self._centres), [end, self._sides, mask, self._centres])
 
     def publish(self, substep: int = 0, substeps: int = 1) -> None:
         """Publishes the contacts of the step and all sums; those of a substep beside those of the substeps before."""
@@ -78,12 +78,12 @@ class ContactForces:
             for array in (rows.count, rows.lost, self.published.max_impulse):
                 array.zero_()
         size = max(len(self._unpaired.of_particles), len(self._unpaired.of_bodies))
-        work.launch(keep.keep_unpaired, size, [work.step, self._unpaired])
+        work.launch(accumulate.keep_unpaired, size, [work.step, self._unpaired])
         inputs = [work.motion.planes, self._sides, self._centres, substep, substeps]
-        work.launch_over_constraints(publish.publish_contacts, *inputs, self._unpaired, self._sums, rows)
+        work.launch_over_constraints(emit.publish_contacts, *inputs, self._unpaired, self._sums, rows)
         if self.more is not None:
             self.more(self._sides, self._centres, self._sums, rows)
-        work.launch(publish.publish_sums, self._size, [self._unpaired, first, self._sums], [self.published])
+        work.launch(emit.publish_sums, self._size, [self._unpaired, first, self._sums], [self.published])
 
 
 def _numbers_in(rows, count):

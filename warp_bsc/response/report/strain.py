@@ -4,9 +4,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from .state.structs import Motion
-from .state.workspace import Workspace
-from .tuning import COMPRESSION, SOLID
+from ..state.structs import Motion
+from ..state.workspace import Workspace
+from ..tuning import COMPRESSION, SOLID
 
 wp.set_module_options({"enable_backward": False})
 

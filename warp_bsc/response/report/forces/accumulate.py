@@ -8,12 +8,12 @@ momentum, belong to no pair, and are kept apart.
 
 import warp as wp
 
-from ..state.fixed_sum import sum_of, sums_of
-from ..state.motion import StateArrays, takes_part
-from ..state.planes import MovingPlanes, signed_distance, time_of_entry
-from ..state.poses import in_world
-from ..state.structs import Motion, Step, body_of, can_move, has_final_velocity
-from ..state.vectors import ZERO, to_double, to_single
+from ...state.fixed_sum import sum_of, sums_of
+from ...state.motion import StateArrays, takes_part
+from ...state.planes import MovingPlanes, signed_distance, time_of_entry
+from ...state.poses import in_world
+from ...state.structs import Motion, Step, body_of, can_move, has_final_velocity
+from ...state.vectors import ZERO, to_double, to_single
 from .structs import Sides, Unpaired
 from .sums import body_of_vertex
 

@@ -13,10 +13,10 @@ from newton import BodyFlags, Model, ParticleFlags, ShapeFlags
 
 from ...detection.at_rest.intersections import find_intersections
 from ..contacts.detect import inspect
-from ..report_totals import StepTotals
-from ..schedule import Loop, Result, SolveStatus
+from ..report.totals import StepTotals
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, StateArrays, arrays_of, interrupt_worlds
+from ..state.status import Loop, Result, SolveStatus
 from ..state.structs import add_zeros
 from ..state.workspace import Workspace
 

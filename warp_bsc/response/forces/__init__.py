@@ -1,1 +1,0 @@
-"""Contact forces: what contacts did to momentum in a step, by contact, particle, body, shape and world."""
