@@ -7,7 +7,7 @@ import warp as wp
 from newton_scenes import DT, SOFT, SOLVERS, Changed, add_patch, add_plates, bullet, place_plates
 
 import warp_bsc as bsc
-from warp_bsc.response.report.report.forces import contact_forces
+from warp_bsc.response.report.forces import contact_forces
 from warp_bsc.response.state.mesh import members_of_worlds
 from warp_bsc.response.state.structs import ContactKind
 

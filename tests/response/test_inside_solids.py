@@ -7,7 +7,7 @@ import warp as wp
 from newton_scenes import DT, Changed, Rollout, add_patch, add_plates, place_plates
 
 import warp_bsc as bsc
-from warp_bsc.response.report.report.inside import InsideFinder
+from warp_bsc.response.report.inside import InsideFinder
 from warp_bsc.response.state.mesh import ModelMesh
 
 TURN = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.3, 1.0, 0.1)), 0.7)

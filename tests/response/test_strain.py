@@ -8,7 +8,7 @@ import warp as wp
 from newton_scenes import SOLVERS, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.response.report.report.strain import edges_at_rest
+from warp_bsc.response.report.strain import edges_at_rest
 
 
 def test_lengths_at_rest_are_those_of_the_material(device):
