@@ -10,6 +10,7 @@ from .._arguments import checked_flag
 from .._one_thread import one_at_a_time
 from ..detection.run.host_function import run_on_host
 from .contacts.detect import inspect
+from .drive.inner_steps import WholeSteps
 from .options import default_separation, friction_of
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter, checked_filter
@@ -72,18 +73,15 @@ class CollisionMonitor(CollisionStage):
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
         if report_worlds:
             self._count_worlds()
+        self._inner = WholeSteps(self)
         self._prepare_entry()
 
-    def _finish_step(self, state_in, state_out, contacts, dt, tape):
-        end = arrays_of(state_out)
-        mask = self._mask
-        run_on_host(lambda: self._inspect(end, dt, mask), self.mesh.device)
+    def _resolve(self, step):
+        end = arrays_of(step.state_out)
+        run_on_host(lambda: self._inspect(step, end), self.mesh.device)
 
     @one_at_a_time
-    def _inspect(self, end, dt, mask):
+    def _inspect(self, step, end):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
-        with self._timed():
-            self._motion.set_end(end, dt)
-            with self._masked(mask):
-                inspect(self._work)
-                self._count_step()
+        with self._on_device(step, end):
+            inspect(self._work)

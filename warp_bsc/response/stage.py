@@ -1,4 +1,4 @@
-"""What both stages behind a solver do: step it, keep the motion of the step, and count the step in a report."""
+"""What stages behind a solver do: let it step, resolve the motion that it predicts, and count the step in a report."""
 
 import contextlib
 import functools
@@ -17,6 +17,7 @@ from .._warnings import warn_caller
 from .adjoint.between_steps import BetweenSteps
 from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
 from .drive.coupling import CouplingHooks
+from .drive.inner_steps import InnerSteps, StepCall
 from .drive.world_mask import WorldMask, checked_mask
 from .drive.wrapped_solver import innermost
 from .report.count_steps import count_outrun, count_step, merge_step, note_crossings
@@ -32,12 +33,6 @@ from .step import prepare
 from .tuning import MAX_ITERATIONS
 
 
-def is_recorded(tape: wp.Tape | None, state_out: newton.State) -> bool:
-    """Returns whether a tape, if there is one, records the gradients of a step."""
-    end = state_out.particle_q
-    return tape is not None and end is not None and end.requires_grad
-
-
 class CollisionStage(CouplingHooks):
     """A stage behind another solver: a :class:`.solver_ccd.SolverCCD` or a :class:`.monitor.CollisionMonitor`."""
 
@@ -47,7 +42,7 @@ class CollisionStage(CouplingHooks):
     _has_few_contacts = False  # of a solver that leaves hardly any
     _between_steps: BetweenSteps | None = None  # of a stage whose steps carry gradients
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
-    _mask: wp.array | None = None  # of the step in progress, if worlds take no part in it
+    _inner: InnerSteps  # how the inner solver takes a step
 
     def _allocate(
         self,
@@ -150,43 +145,64 @@ class CollisionStage(CouplingHooks):
             RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
                 recorded no step outside one before, or if the first ``world_mask`` is given in a graph.
         """
+        call = self._checked_call(state_in, state_out, control, contacts, dt, world_mask, options)
+        for step in self._inner.parts(call):  # the step itself, or its substeps
+            with self._entered(step):  # keeps its start, and whatever the inner solver must not change
+                self._inner.take(step)  # the inner solver predicts its end
+                with paused_tape():
+                    self._leave_out(step)  # worlds that take no part
+                    self._resolve(step)  # detects the contacts of the motion, and resolves them
+        if not self.mesh.device.is_capturing:
+            self.report.warn()
+
+    def _checked_call(self, state_in, state_out, control, contacts, dt, world_mask, options):
+        """Returns the arguments of a step, checked, with the tape that records its gradients."""
         checked_number(dt, "dt", 0.0, above=True)
         mask = checked_mask(world_mask, self.model)
         with paused_tape() as tape:
-            self._check_tape(tape, state_in, state_out)
-            if mask is not None and tape is not None and self.model.requires_grad:
-                raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
-            start = state_in if self._coupled is None else self._coupled.start_of(state_in)
+            tape = tape if self.model.requires_grad else None
+            if tape is not None:
+                self._check_tape(state_in, state_out, mask)
+        return StepCall(state_in, state_out, control, contacts, dt, options, mask, tape)
+
+    def _check_tape(self, state_in, state_out, mask):
+        """Raises an error if a tape cannot record the gradients of a step."""
+        if mask is not None:
+            raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
+
+    @contextlib.contextmanager
+    def _entered(self, step):
+        """Keeps where a step starts, and after it where it ended.
+
+        Gradients of the step stay apart from those of what a program moves before it, and after it.
+        """
+        with paused_tape():
+            start = step.state_in if self._coupled is None else self._coupled.start_of(step.state_in)
             self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
             if self._watches_bodies and self._coupled is None:
                 self._find_set_bodies(start)
-            self._mask = mask
-            if mask is not None:
+            if step.mask is not None:
                 self._world_mask.begin(start)
-        with self._watched(tape, state_in, state_out):
-            self._step_inner(state_in, state_out, control, contacts, dt, **options)
-            with paused_tape():
-                if mask is not None:
-                    self._world_mask.restore(mask, state_out)
-                self._finish_step(state_in, state_out, contacts, dt, tape)
+        watched = contextlib.nullcontext()
+        if self._between_steps is not None and step.is_recorded:
+            watched = self._between_steps.watched(step.tape, step.state_in, step.state_out)
+        with watched:
+            yield
         with paused_tape():
             if self._coupled is not None:
-                self._coupled.finish(state_out, self._motion.vertices, self._work.vertices)
+                self._coupled.finish(step.state_out, self._motion.vertices, self._work.vertices)
                 self.report.copy_totals()
-        if not self.mesh.device.is_capturing:
-            self.report.warn()
+
+    def _leave_out(self, step):
+        """Restores the state of worlds that take no part in a step, which the inner solver has stepped."""
+        if step.mask is not None:
+            self._world_mask.restore(step.mask, step.state_out)
 
     def _find_set_bodies(self, start):
         """Counts dynamic bodies whose pose a program writes between steps, which the stage takes to be there."""
         work, report = self._work, self.report
         inputs = [self._motion.vertices, start.body_q, work.vertices.bodies.pose]
         work.launch(find_set_bodies, work.body_count, inputs, [report.set_steps, report.device_totals.set_bodies])
-
-    def _watched(self, tape, state_in, state_out):
-        """Keeps the gradients of a step on a tape apart from those of what a program moves before it, and after it."""
-        if tape is None or self._between_steps is None or not is_recorded(tape, state_out):
-            return contextlib.nullcontext()
-        return self._between_steps.watched(tape, state_in, state_out)
 
     @functools.cached_property
     def _world_mask(self):
@@ -199,24 +215,22 @@ class CollisionStage(CouplingHooks):
             raise RuntimeError("world_mask needs memory: step once with one before capturing")
         return WorldMask(self.solver, self._work, self._motion)
 
-    def _masked(self, mask):
-        """Lets the stage look at the worlds alone that take part, at all if there is no mask."""
-        return contextlib.nullcontext() if mask is None else self._world_mask.applied(mask)
-
-    def _check_tape(self, tape, state_in, state_out):
-        """Raises an error if the step cannot be recorded on a tape."""
-
-    def _step_inner(self, *arguments, **options):
-        """Steps the inner solver."""
-        self.solver.step(*arguments, **options)
-
-    def _finish_step(self, state_in, state_out, contacts, dt, tape):
-        """Detects the collisions of the step after the inner solver, which was passed contacts."""
+    def _resolve(self, step):
+        """Detects the collisions of a step after the inner solver, and resolves them if the stage does that."""
         raise NotImplementedError
 
-    def _count_step(self, substep=0, substeps=1):
+    @contextlib.contextmanager
+    def _on_device(self, step, end):
+        """Prepares the motion to the end that the inner solver predicted, in worlds that take part; counts the step."""
+        with self._timed(step.number):
+            self._motion.set_end(end, step.dt)
+            with contextlib.nullcontext() if step.mask is None else self._world_mask.applied(step.mask):
+                yield
+                self._count_step(step)
+
+    def _count_step(self, step):
         """Adds a substep to the results of its step, which the last one adds to the totals."""
-        work, report, first = self._work, self.report, substep == 0
+        work, report, first = self._work, self.report, step.is_first
         found = report.step_results
         size = max(self.mesh.vertex_count, work.body_count, len(found.results))
         inputs = [work.step, work.status, work.particle_count, self._responds, first]
@@ -224,7 +238,7 @@ class CollisionStage(CouplingHooks):
         work.launch(note_crossings, 1, [work.status])
         if self._counter is not None:
             self._counter.count(first=first)
-        if substep == substeps - 1:
+        if step.is_last:
             if report.thickness is not None:
                 work.launch(count_outrun, 1, [found.results], [report.device_totals])
             work.launch(count_step, 1, [found.results, report.last_strain], [report.device_totals])
@@ -236,7 +250,7 @@ class CollisionStage(CouplingHooks):
         self._work.loop[Loop.RECOUNT].fill_(1)
 
     @contextlib.contextmanager
-    def _timed(self, substep=0):
+    def _timed(self, substep):
         """Measures the time of a step, or a substep, for the report; does nothing while capturing."""
         device = self.mesh.device
         if device.is_capturing:

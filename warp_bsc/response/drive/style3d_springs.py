@@ -13,9 +13,14 @@ The springs are implicit, and add no energy. Multipliers in their place (an augm
 contacts closer, but those of the first iterations threw layers apart.
 """
 
+import functools
+from typing import Any
+
 import newton
 import warp as wp
 
+from ..._private_names.of_newton import with_contacts
+from ..._private_names.of_warp import paused_tape
 from ...detection.run.host_function import run_on_host
 from ..state.motion import ModelMotion, StateArrays, arrays_of
 from ..state.structs import Constraints, Motion
@@ -23,6 +28,7 @@ from ..state.vectors import ZERO, to_double, to_single
 from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts
 from ..tuning import INNER_STIFFNESS, SLOWEST_SLIP
+from .inner_steps import StepCall, WholeSteps
 
 wp.set_module_options({"enable_backward": False})
 
@@ -291,3 +297,21 @@ class Style3DContacts:
 
     def frame_end(self, *_arguments) -> None:
         """Does nothing."""
+
+
+class SpringSteps(WholeSteps):
+    """Lets Style3D step with the constraints of the stage in place of its own contacts."""
+
+    pushes_before: str | None = "SolverStyle3D pushes in its iterations"
+
+    def __init__(self, stage: Any, work: Workspace):
+        """Allocates buffers; ``work`` is free between steps of the stage."""
+        super().__init__(stage)
+        self._contacts, self._device = Style3DContacts(work), work.device
+
+    def take(self, call: StepCall) -> None:
+        """Finds the contacts of particles that fly on, and steps Style3D with them."""
+        with paused_tape():
+            run_on_host(functools.partial(self._contacts.find, call.state_in, call.dt), self._device)
+        with with_contacts(self._stage.solver, self._contacts):
+            super().take(call)

@@ -5,17 +5,21 @@ and so are its forces on particles and bodies. What a program moves, particles a
 equal share of its way in each. A tape records what each of them does; the state between two is a new one then.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from dataclasses import replace
 
 import newton
 import numpy as np
 import warp as wp
 from newton import BodyFlags
+from newton.solvers import SolverBase, SolverStyle3D
 
+from ..._private_names.of_newton import has_external_rigid_solver
 from ..._private_names.of_warp import paused_tape
 from ..state.mesh import host_array
 from ..state.motion import ModelMotion, StateArrays, arrays_of, continues, find_misplaced_bodies, takes_part
 from ..state.structs import Motion
+from .inner_steps import InnerSteps, StepCall
 
 wp.set_module_options({"enable_backward": False})
 _FORCES = "particle_f", "body_f"
@@ -114,21 +118,25 @@ def _remember_poses(
 
 
 class Substeps:
-    """Takes steps in a number of smaller ones.
+    """Divides steps into a number of smaller ones.
 
     Attributes:
         number: The number, at least 2.
     """
 
-    def __init__(self, motion: ModelMotion, number: int, *, leaves_bodies: bool):
+    def __init__(self, steps: InnerSteps, motion: ModelMotion, number: int, *, integrator: SolverBase):
         """Allocates the states between steps that no tape records.
 
         Args:
+            steps: How the inner solver takes each of the smaller steps.
             motion: The motion of the steps.
             number: The number of smaller steps.
-            leaves_bodies: Whether the inner solver moves no body: a program writes where they are at the end of a step.
+            integrator: The solver that integrates. If it moves no body, a program writes where they are at the end of a
+                step.
         """
-        self.number, self._motion, self._model = number, motion, motion.mesh.model
+        self.number, self._steps, self._motion, self._model = number, steps, motion, motion.mesh.model
+        self._leaves_bodies_on_tape = has_external_rigid_solver(integrator)
+        leaves_bodies = self._leaves_bodies_on_tape or isinstance(integrator, SolverStyle3D)
         model, device = self._model, self._model.device
         self._states = [model.state(requires_grad=False) for _ in range(2)]
         self._forces = {n: wp.clone(array, requires_grad=False) for n, array in _forces_of(self._states[0]).items()}
@@ -147,38 +155,45 @@ class Substeps:
         self._way.is_moved = wp.array(moved, dtype=bool, device=device)
         self._way.ends_in_out = leaves_bodies
 
-    def take(
-        self,
-        step: Callable[..., None],
-        state_in: newton.State,
-        state_out: newton.State,
-        dt: float,
-        *,
-        mask: wp.array[wp.bool] | None,
-        on_tape: bool,
-    ) -> None:
-        """Takes the steps, ``step(state_in, state_out, dt, i)`` each, with its number ``i``.
+    @property
+    def pushes_before(self) -> str | None:
+        """What pushes before the stage in each of the steps."""
+        return self._steps.pushes_before
 
-        Worlds that the ``mask`` leaves out take no part.
+    def take(self, call: StepCall) -> None:
+        """Steps the inner solver, see :class:`.inner_steps.InnerSteps`."""
+        self._steps.take(call)
+
+    def parts(self, call: StepCall) -> Iterator[StepCall]:
+        """Yields the smaller steps.
+
+        Raises:
+            NotImplementedError: If a tape records them, and another solver moves bodies.
         """
-        forces = self._copy_forces(state_in, on_tape)
-        start = state_in
+        on_tape = call.tape is not None
+        if on_tape and self._model.body_count and self._leaves_bodies_on_tape:
+            raise NotImplementedError(
+                "on a tape, a step with substeps has no gradients with respect to bodies that another solver moves"
+            )
+        forces = self._copy_forces(call.state_in, on_tape)
+        start = call.state_in
         if not on_tape:
             start = self._states[1]
-            self._begin(state_in, state_out, start, mask)
+            self._begin(call.state_in, call.state_out, start, call.mask)
         for i in range(self.number):
-            end = state_out
+            end = call.state_out
             if i < self.number - 1:
                 end = self._new_state() if on_tape else self._states[i % 2]
             if not on_tape:
                 self._launch(_go_on, [self._way, i, self.number], [arrays_of(start), arrays_of(end)])
-            step(start, end, dt / self.number, i)
-            if end is not state_out:
+            dt = call.dt / self.number
+            yield replace(call, state_in=start, state_out=end, dt=dt, number=i, count=self.number)
+            if end is not call.state_out:
                 for name, array in forces.items():  # the inner solver adds its own to those of the start
                     wp.copy(getattr(end, name), array)
             start = end
         if not on_tape:
-            inputs = [self._model.body_world, mask, arrays_of(state_out)]
+            inputs = [self._model.body_world, call.mask, arrays_of(call.state_out)]
             self._launch(_remember_poses, inputs, [self._last_body_q])
 
     def _begin(self, state_in, state_out, start, mask):

@@ -1,0 +1,81 @@
+"""How the inner solver takes the steps of a stage."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import newton
+import warp as wp
+
+
+@dataclass(frozen=True)
+class StepCall:
+    """A call of a stage's ``step``, or of one of its substeps.
+
+    Attributes:
+        state_in, state_out, control, contacts, dt: As of :meth:`.stage.CollisionStage.step`.
+        options: More for the inner solver.
+        mask: Which worlds take part, None for all.
+        tape: That which records the gradients of the step; None if none does.
+        number, count: The number of the substep, from 0, and how many there are.
+    """
+
+    state_in: newton.State
+    state_out: newton.State
+    control: newton.Control | None
+    contacts: newton.Contacts | None
+    dt: float
+    options: dict[str, Any] = field(default_factory=dict)
+    mask: wp.array[wp.bool] | None = None
+    tape: wp.Tape | None = None
+    number: int = 0
+    count: int = 1
+
+    @property
+    def is_recorded(self) -> bool:
+        """Whether a tape records the gradients of the step."""
+        end = self.state_out.particle_q
+        return self.tape is not None and end is not None and end.requires_grad
+
+    @property
+    def is_first(self) -> bool:
+        """Whether the results of the step begin with this one."""
+        return self.number == 0
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the step ends with this one."""
+        return self.number == self.count - 1
+
+
+class InnerSteps(Protocol):
+    """Divides a step into those that a stage resolves, and lets the inner solver take each."""
+
+    pushes_before: str | None
+    """What pushes contacts apart before the stage does, so that its impulses are not all; None for nothing."""
+
+    def parts(self, call: StepCall) -> Iterator[StepCall]:
+        """Yields the steps to take, one after the other; the stage resolves each before it asks for the next."""
+        ...
+
+    def take(self, call: StepCall) -> None:
+        """Steps the inner solver, which predicts the end of the step."""
+        ...
+
+
+class WholeSteps:
+    """Steps the inner solver once, with what it was called with."""
+
+    pushes_before: str | None = None
+
+    def __init__(self, stage: Any):
+        """Steps the ``solver`` of a stage, whichever it is at the time."""
+        self._stage = stage
+
+    def parts(self, call: StepCall) -> Iterator[StepCall]:
+        """Yields the call itself."""
+        yield call
+
+    def take(self, call: StepCall) -> None:
+        """Steps the inner solver."""
+        self._stage.solver.step(call.state_in, call.state_out, call.control, call.contacts, call.dt, **call.options)
