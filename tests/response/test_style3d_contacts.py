@@ -8,7 +8,8 @@ from newton.solvers import SolverStyle3D
 from newton_scenes import Rollout
 
 import warp_bsc as bsc
-from warp_bsc.response.stage import CollisionStage
+from warp_bsc.response.drive.inner_steps import WholeSteps
+from warp_bsc.response.drive.style3d_springs import SpringSteps
 
 RATE = 60.0
 
@@ -60,7 +61,7 @@ def roll(model, steps, **options):
 def test_a_drape_stretches_hardly(sheets, device, monkeypatch):
     model = drape(device, sheets=sheets)
     rollout, stretch = roll(model, 60)
-    monkeypatch.setattr(bsc.SolverCCD, "_step_inner", CollisionStage._step_inner)  # which does not see them
+    monkeypatch.setattr(SpringSteps, "take", WholeSteps.take)  # which does not see them
     _, without = roll(model, 60)
     assert stretch < 0.12 and without > 2.0 * stretch
     assert rollout.positions[:, 2].max() > 0.15  # it lies on the sphere
@@ -79,7 +80,7 @@ def test_equal_runs_are_equal_bit_for_bit(device):
             states.reverse()
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
     work = solver._work
-    solver._inner_rows.find(states[0], 1.0 / RATE)
+    solver._inner._contacts.find(states[0], 1.0 / RATE)
     of_second = work.constraints.vertices.numpy()[: work.constraints.count.numpy()[0]] >= model.particle_count // 2
     of_cloth = work.constraints.vertices.numpy()[: len(of_second)] < model.particle_count
     pairs = (of_second & of_cloth).any(axis=1) & (~of_second).any(axis=1)

@@ -20,7 +20,7 @@ from .._private_names.of_newton import (
 from .._private_names.of_warp import paused_tape
 from ..detection.run.host_function import run_on_host
 from ..response.adjoint.between_steps import BetweenSteps
-from ..response.drive.wrapped_solver import WrappedSolver
+from ..response.wrapped_solver import WrappedSolver
 from . import kernels, matrix_kernels
 from .attachments import check_attachments
 from .bodies import BodyPoses, Poses

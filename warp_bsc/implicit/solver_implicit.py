@@ -1,6 +1,5 @@
 """The solver with contact inside: inertia, elasticity, contact and friction in one solve of each step."""
 
-import functools
 from typing import Literal
 
 import newton
@@ -12,7 +11,6 @@ from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
-from ..detection.run.host_function import run_on_host
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
@@ -225,22 +223,16 @@ class SolverImplicit(SolverCCD):
         """Raises a TypeError, as a stage does."""
         raise TypeError("a SolverImplicit cannot be copied: make a new one of the same model")
 
-    def _check_tape(self, tape, state_in, state_out):
-        if tape is not None and self.model.requires_grad:
-            raise NotImplementedError("a step of SolverImplicit on a tape carries no gradients yet: step outside it")
+    def _check_tape(self, state_in, state_out, mask):
+        raise NotImplementedError("a step of SolverImplicit on a tape carries no gradients yet: step outside it")
 
-    def _finish_step(self, state_in, state_out, contacts, dt, tape):
-        end = arrays_of(state_out)
-        solve = functools.partial(self._solve, end, dt)
-        run_on_host(functools.partial(self._resolve, end, dt, solve, self._mask), self.mesh.device)
-
-    def _solve(self, end, dt):
+    def _solve(self, step, end, recorder):
         work = self._work
         begin(work)
-        self._newton.solve(end, dt)
+        self._newton.solve(end, step.dt)
         detect_contacts(work)
         wp.capture_if(work.loop[Loop.UNFINISHED], self._retreat, end=end)
-        resolve_contacts(work, dt)
+        resolve_contacts(work, step.dt)
 
     def _retreat(self, end):
         self._newton.retreat(end, self._detect)

@@ -3,28 +3,24 @@
 import functools
 from typing import Literal
 
-import newton
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
-from .._arguments import checked_number
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver, with_contacts
-from .._private_names.of_warp import paused_tape
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver
 from ..detection.run.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
-from .drive.style3d_springs import Style3DContacts
+from .drive.inner_steps import InnerSteps, WholeSteps
+from .drive.style3d_springs import SpringSteps
 from .drive.substeps import Substeps
-from .drive.world_mask import checked_mask
-from .drive.wrapped_solver import innermost
 from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .report.count_steps import count_record
 from .report.forces.contact_forces import ContactForces
 from .report.strain import StrainMeter
-from .stage import CollisionStage, is_recorded
+from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter
 from .state.friction_table import FrictionTable
 from .state.mesh import ModelMesh
@@ -33,6 +29,7 @@ from .state.record import StepRecorder
 from .state.status import Loop
 from .step import resolve, resolve_inversions
 from .tuning import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
+from .wrapped_solver import innermost
 from .write_back import write_back
 
 _PASSED_ON = "the inner solver has all contacts that were passed on"
@@ -237,66 +234,31 @@ class SolverCCD(CollisionStage):
         self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
-        # in place of its own; a contact layer pushes itself, and a recorded step has the contacts of Style3D
-        sees_contacts = isinstance(solver, SolverStyle3D) and not self.model.requires_grad
-        self._inner_rows = Style3DContacts(self._work) if sees_contacts else None
-        self._substeps: Substeps | None = None
-        self._part = 0, 1  # number of the substep in progress, and of substeps in a step
-        if self.substeps > 1:
-            leaves_bodies = has_external_rigid_solver(integrator) or isinstance(integrator, SolverStyle3D)
-            self._substeps = Substeps(motion, self.substeps, leaves_bodies=leaves_bodies)
+        self._inner = self._choose_steps(integrator)
         self._forces: ContactForces | None = None
         if options.report_contacts:
             self._forces = ContactForces(self._work, options.report_contacts)
             self.report.keep_contacts(self._forces.rows, self._forces.published, self._forces.shapes_of_worlds)
-        self._pushes_before: str | None = None  # in all steps
-        if self._inner_rows is not None:
-            self._pushes_before = "SolverStyle3D pushes in its iterations"
-        elif isinstance(self.solver, ContactLayer):
-            self._pushes_before = "the contact layer pushes before the stage"
-        elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
-            self._pushes_before = "SolverVBD has self-contact"
-        self.report.impulses_elsewhere = self._pushes_before
+        self.report.impulses_elsewhere = self._inner.pushes_before
         if options.report_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
         self._prepare_entry()
 
-    @one_at_a_time
-    def step(
-        self,
-        state_in: newton.State,
-        state_out: newton.State,
-        control: newton.Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        **options,
-    ) -> None:
-        """Steps the inner solver, and resolves the collisions of its motion, see :meth:`.stage.CollisionStage.step`.
+    def _choose_steps(self, integrator):
+        """Returns how the inner solver takes steps; with gradients Style3D has its own contacts."""
+        steps: InnerSteps = WholeSteps(self)
+        if isinstance(self.solver, SolverStyle3D) and not self.model.requires_grad:
+            steps = SpringSteps(self, self._work)
+        elif isinstance(self.solver, ContactLayer):
+            steps.pushes_before = "the contact layer pushes before the stage"
+        elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
+            steps.pushes_before = "SolverVBD has self-contact"
+        if self.substeps == 1:
+            return steps
+        return Substeps(steps, self._motion, self.substeps, integrator=integrator)
 
-        On a tape, minimum distances raise NotImplementedError only if there are particles without faces and springs.
-        """
-        if self._substeps is None:
-            super().step(state_in, state_out, control, contacts, dt, **options)
-            return
-        checked_number(dt, "dt", 0.0, above=True)
-        with paused_tape() as tape:
-            self._check_tape(tape, state_in, state_out)
-
-        def step(start, end, small_dt, i):
-            self._part = i, self.substeps
-            super(SolverCCD, self).step(start, end, control, contacts, small_dt, **options)
-
-        on_tape = tape is not None and self.model.requires_grad
-        if on_tape and self.model.body_count and has_external_rigid_solver(innermost(self.solver)):
-            raise NotImplementedError(
-                "on a tape, a step with substeps has no gradients with respect to bodies that another solver moves"
-            )
-        mask = checked_mask(options.get("world_mask"), self.model)
-        self._substeps.take(step, state_in, state_out, dt, mask=mask, on_tape=on_tape)
-
-    def _check_tape(self, tape, state_in, state_out):
-        if tape is None or not self.model.requires_grad:
-            return
+    def _check_tape(self, state_in, state_out, mask):
+        super()._check_tape(state_in, state_out, mask)
         if state_in is state_out:
             raise ValueError("on a tape, state_out must not be state_in")
         if self._work.detector.points:
@@ -313,37 +275,25 @@ class SolverCCD(CollisionStage):
         Raises:
             NotImplementedError: If a step has substeps: proxies would not follow them.
         """
-        if self._substeps is not None:
+        if self.substeps > 1:
             raise NotImplementedError(
                 f"substeps={self.substeps} of SolverCCD in a coupled solver: give them to its SolverCoupled.Entry"
             )
         super().coupling_notify_iteration_restarts(enabled)
-        self._inner_rows = None  # which would push proxies without a feedback
+        self._inner = WholeSteps(self)  # springs would push proxies without a feedback
 
-    def _step_inner(self, *arguments, **options):
-        if self._inner_rows is None:
-            super()._step_inner(*arguments, **options)
-            return
-        state_in, dt = arguments[0], arguments[-1]
-        with paused_tape():
-            run_on_host(functools.partial(self._inner_rows.find, state_in, dt), self.mesh.device)
-        with with_contacts(self.solver, self._inner_rows):
-            super()._step_inner(*arguments, **options)
-
-    def _finish_step(self, state_in, state_out, contacts, dt, tape):
-        device, end = self.mesh.device, arrays_of(state_out)
-        mask, part = self._mask, self._part
-        has_some = contacts is not None and contacts.soft_contact_max > 0
-        self.report.impulses_elsewhere = self._pushes_before or (_PASSED_ON if has_some else None)
-        if is_recorded(tape, state_out):
-            self._record(arrays_of(state_in), end, dt, tape)
+    def _resolve(self, step):
+        has_some = step.contacts is not None and step.contacts.soft_contact_max > 0
+        self.report.impulses_elsewhere = self._inner.pushes_before or (_PASSED_ON if has_some else None)
+        end = arrays_of(step.state_out)
+        if step.is_recorded:
+            self._record(step, end)
         else:
-            solve = functools.partial(resolve, self._work, dt)
-            run_on_host(lambda: self._resolve(end, dt, solve, mask, part), device)
+            run_on_host(lambda: self._resolve_motion(step, end), self.mesh.device)
 
-    def _record(self, start, end, dt, tape):
-        """Resolves the motion to a state, and changes it; a tape records the adjoint."""
-        device, model, friction = self.mesh.device, self.model, self._motion.friction
+    def _record(self, step, end):
+        """Resolves the motion of a step, and changes its end; the tape records the adjoint."""
+        device, model, friction, start = self.mesh.device, self.model, self._motion.friction, arrays_of(step.state_in)
         arrays = [start.particle_q, end.particle_q, end.particle_qd]
         if model.body_count:
             arrays += [start.body_q, end.body_q, end.body_qd]
@@ -351,14 +301,13 @@ class SolverCCD(CollisionStage):
         read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
         read = [array for array in read if array is not None and len(array) and array.requires_grad]
         recorded: RecordedStep | None = None
-        part = self._part
 
         def forward():
             nonlocal recorded
-            self._resolve(end, dt, functools.partial(resolve, self._work, dt, self._recorder), part=part)
+            self._resolve_motion(step, end, self._recorder)
             recorded = None
             if device.is_capturing or self._work.has_changed():
-                recorded = RecordedStep(self._work, dt)
+                recorded = RecordedStep(self._work, step.dt)
                 self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
         def backward():
@@ -367,43 +316,41 @@ class SolverCCD(CollisionStage):
                     StepAdjoint(recorded).backward(*(array.grad for array in arrays))
 
         run_on_host(forward, device)
-        tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
+        step.tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
 
     @one_at_a_time
-    def _resolve(self, end, dt, solve, mask=None, part=(0, 1)):
-        """Solves the motion from the start of the step to its end, as it was predicted, and changes the end.
+    def _resolve_motion(self, step, end, recorder=None):
+        """Resolves the motion from the start of a step to its end, as it was predicted, and changes the end."""
+        if self._reads_friction:
+            self._motion.friction.read()
+        if self._forces is not None:
+            self._forces.end(end, step.mask)
+        with self._on_device(step, end):
+            self._solve(step, end, recorder)
+            if step.is_first:
+                self.report.last_strain.zero_()
+            self._measure_strain()
+            resolve_inversions(self._work, step.dt)
+            check_arcs(self._work)
+            self._write_end(step, end)
 
-        A ``part`` is the number of a substep, from 0, and how many there are.
-        """
-        with self._timed(part[0]):
-            if self._reads_friction:
-                self._motion.friction.read()
-            self._motion.set_end(end, dt)
-            if self._forces is not None:
-                self._forces.end(end, mask)
-            with self._masked(mask):
-                solve()
-                if part[0] == 0:
-                    self.report.last_strain.zero_()
-                self._measure_strain()
-                resolve_inversions(self._work, dt)
-                check_arcs(self._work)
-                self._write_end(end, part)
+    def _solve(self, step, end, recorder):
+        """Makes the motion free of its contacts, see :func:`.step.resolve`."""
+        resolve(self._work, step.dt, recorder)
 
     def _measure_strain(self):
         """Measures the strain by contacts of a whole step, for the report."""
         measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
         wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
 
-    def _write_end(self, end, part):
-        """Writes the resolved motion to the arrays of a state, and counts the step, or this part of it."""
+    def _write_end(self, step, end):
+        """Writes the resolved motion to the arrays of a state, and publishes the contacts."""
         size = max(self.mesh.vertex_count, self.model.body_count)
         poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
         outputs = [end, poses, self._work.status]
         self._work.launch(write_back, size, [self._work.vertices], outputs)
         if self._forces is not None:
-            self._forces.publish(*part)
-        self._count_step(*part)
+            self._forces.publish(step.number, step.count)
 
     def _follow_shapes(self):
         self._motion.friction.read_shapes(self.model)

@@ -19,7 +19,6 @@ from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, un
 from .drive.coupling import CouplingHooks
 from .drive.inner_steps import InnerSteps, StepCall
 from .drive.world_mask import WorldMask, checked_mask
-from .drive.wrapped_solver import innermost
 from .report.count_steps import count_outrun, count_step, merge_step, note_crossings
 from .report.count_worlds import WorldCounter
 from .report.report import SolverReport
@@ -31,6 +30,7 @@ from .state.status import Loop
 from .state.workspace import Workspace
 from .step import prepare
 from .tuning import MAX_ITERATIONS
+from .wrapped_solver import innermost
 
 
 class CollisionStage(CouplingHooks):
@@ -140,8 +140,8 @@ class CollisionStage(CouplingHooks):
             TypeError: If ``dt`` is no number, or ``world_mask`` no array of bool.
             ValueError: If ``dt`` is not finite or not more than 0, if ``world_mask`` has another shape or device, or if
                 a tape records gradients of the response, and ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients of a response that keeps a distance, or in a part of the
-                worlds.
+            NotImplementedError: If a tape records gradients where particles without faces keep a distance, or in a
+                part of the worlds.
             RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
                 recorded no step outside one before, or if the first ``world_mask`` is given in a graph.
         """
@@ -159,8 +159,8 @@ class CollisionStage(CouplingHooks):
         """Returns the arguments of a step, checked, with the tape that records its gradients."""
         checked_number(dt, "dt", 0.0, above=True)
         mask = checked_mask(world_mask, self.model)
-        with paused_tape() as tape:
-            tape = tape if self.model.requires_grad else None
+        with paused_tape() as active:
+            tape = active if self.model.requires_grad else None
             if tape is not None:
                 self._check_tape(state_in, state_out, mask)
         return StepCall(state_in, state_out, control, contacts, dt, options, mask, tape)

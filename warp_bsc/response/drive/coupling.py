@@ -13,7 +13,7 @@ from ..state.motion import ModelMotion, arrays_of, continues
 from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
-from .wrapped_solver import WrappedSolver
+from ..wrapped_solver import WrappedSolver
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,7 +8,6 @@ equal share of its way in each. A tape records what each of them does; the state
 from collections.abc import Iterator
 from dataclasses import replace
 
-import newton
 import numpy as np
 import warp as wp
 from newton import BodyFlags

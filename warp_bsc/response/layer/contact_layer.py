@@ -35,7 +35,6 @@ from ..adjoint.arrays import filled
 from ..adjoint.pose_kernels import set_centres
 from ..adjoint.structs import StateGradients
 from ..contacts.queue import queues_of
-from ..drive.wrapped_solver import WrappedSolver, innermost
 from ..options import Bodies, StageOptions, friction_of, in_eight_bits, particle_edge_lengths
 from ..state.collision_filter import CollisionFilter
 from ..state.friction_table import FrictionTable
@@ -43,6 +42,7 @@ from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, arrays_of
 from ..state.structs import add_zeros
 from ..tuning import LAYER_THICKNESS, PAIRS_PER_FACE, START_DEPTH
+from ..wrapped_solver import WrappedSolver, innermost
 from . import kernels
 from .adjoint import RecordedPushes, go_back, record_pushes
 from .pushes import Layer

@@ -5,9 +5,9 @@ import functools
 from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import CouplingInterface
 
-from ..._arguments import check_instance
-from ..._one_thread import Occupied
-from ..._private_names.versions import warn_if_untested
+from .._arguments import check_instance
+from .._one_thread import Occupied
+from .._private_names.versions import warn_if_untested
 
 
 class WrappedSolver(SolverBase, CouplingInterface):
