@@ -73,7 +73,7 @@ def press():
 def photograph(solver, state, camera, impulse_scale=None):
     """Returns a picture of a state with what the report draws, uint8, shape [height, width, 3]."""
     print(solver.report)
-    print(solver.report.table())
+    print(solver.report.forces.table())
     viewer = ViewerGL(*SIZE, headless=True)
     viewer.set_model(solver.model)
     position, pitch, yaw = camera

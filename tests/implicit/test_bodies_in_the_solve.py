@@ -247,7 +247,7 @@ def test_a_proxy_whose_joint_the_entry_sees_is_carried_by_what_it_rests_on(mode,
         states[0].clear_forces()
         coupled.step(*states, model.control(), None, DT)
         states.reverse()
-        forces.append(stage.report.body_impulse.numpy()[0, :3] / DT)
+        forces.append(stage.report.forces.body_impulse.numpy()[0, :3] / DT)
     np.testing.assert_allclose(np.mean(forces[-10:], axis=0), (0.0, 0.0, 0.4 * 9.81), atol=4e-3)
     assert np.abs(states[0].joint_qd.numpy()).max() < 1e-3 and abs(states[0].joint_q.numpy()[0]) < 1e-3
     assert stage.report.totals.revoked_steps == stage.report.totals.uncertified_steps == 0

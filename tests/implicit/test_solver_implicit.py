@@ -53,7 +53,7 @@ def forces(solver, state, end, steps):
     found = []
     for _ in range(steps):
         solver.step(state, end, None, None, DT)
-        found.append(solver.report.shape_impulse.numpy()[0] / DT)
+        found.append(solver.report.forces.shape_impulse.numpy()[0] / DT)
         state, end = end, state
     return np.array(found)
 
@@ -70,13 +70,13 @@ def test_a_scale_under_a_cloth_shows_its_weight(on_plane, device):
     assert np.allclose(force, (0.0, 0.0, -weight), atol=1e-3 * weight)
     report = solver.report
     assert report.certified and report.converged and report.arrived and report.hits == 0
-    assert report.contacts.complete and report.impulses_complete
-    listed = report.contacts.numpy()
+    assert report.forces.contacts.complete and report.forces.complete
+    listed = report.forces.contacts.numpy()
     assert np.isin(listed["kind"], [2] if on_plane else [0, 1]).all() and (listed["shapes"] == (-1, 0)).all()
     assert listed["normal_impulse"].sum() / DT == pytest.approx(weight, rel=1e-3)
     assert np.allclose(listed["velocity"], (0.0, 0.0, -GRAVITY * DT), atol=1e-3)
-    assert np.allclose(report.particle_impulse.numpy().sum(axis=0) / DT, (0.0, 0.0, weight), atol=1e-3 * weight)
-    assert not report.unpaired_particle_impulse.numpy().any()
+    assert np.allclose(report.forces.particle_impulse.numpy().sum(axis=0) / DT, (0.0, 0.0, weight), atol=1e-3 * weight)
+    assert not report.forces.unpaired_particle_impulse.numpy().any()
 
 
 def test_friction_on_a_ramp_is_mu_times_the_normal_force(device):
@@ -98,7 +98,7 @@ def test_torques_on_a_moved_body_are_those_of_its_contacts(device):
     model = builder.finalize(device=device)
     solver = bsc.SolverImplicit(model, report_contacts=True)
     step(solver, model.state(), model.state(), 12)
-    wrench, weight = solver.report.body_impulse.numpy()[body] / DT, weight_of(model)
+    wrench, weight = solver.report.forces.body_impulse.numpy()[body] / DT, weight_of(model)
     # the arm of the weight is 0.3 m to the left
     assert np.allclose(wrench, (0.0, 0.0, -weight, 0.0, -0.3 * weight, 0.0), atol=2e-3 * weight)
 
@@ -304,7 +304,7 @@ def test_a_step_in_a_graph_is_the_step_without(device):
             else:
                 launch()
             report = solver.report
-            found += [positions(state), report.particle_impulse.numpy(), report.newton_steps, report.last_change]
+            found += [positions(state), report.forces.particle_impulse.numpy(), report.newton_steps, report.last_change]
         ends.append(found)
         assert (report.totals.steps, report.totals.uncertified_steps) == (4, 0)
     assert max(ends[0][2::4]) > 1

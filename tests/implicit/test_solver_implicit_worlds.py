@@ -68,7 +68,7 @@ class Run:
 
     def keep(self, worlds=None):
         arrays = [getattr(self.states[0], name).numpy() for name in ARRAYS]
-        arrays.append(self.solver.report.particle_impulse.numpy())
+        arrays.append(self.solver.report.forces.particle_impulse.numpy())
         results = self.solver.report.worlds.numpy()
         for world in range(self.count) if worlds is None else worlds:
             found = [x.reshape(self.count, -1, 3)[world].copy() for x in arrays]
@@ -129,7 +129,7 @@ def test_each_world_is_as_alone(together):
             names = "newton_steps", "last_change", "converged", "arrived", "certified", "hits", "strain"
             for name in names:
                 assert results[name].tolist() == [getattr(report, name)], name
-            most = max(most, len(report.contacts.numpy()["kind"]))
+            most = max(most, len(report.forces.contacts.numpy()["kind"]))
         assert same(alone.ends[0], together.ends[seed]), seed
     assert most > 10
     steps = np.array([[end[-5] for end in ends] for ends in together.ends])

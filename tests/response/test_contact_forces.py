@@ -34,7 +34,7 @@ def step_forces(model, solver, dt, steps):
     for _ in range(steps):
         state.clear_forces()
         solver.step(state, end, control, None, dt)
-        forces.append(solver.report.shape_impulse.numpy()[0] / dt)
+        forces.append(solver.report.forces.shape_impulse.numpy()[0] / dt)
         state, end = end, state
     return np.array(forces)
 
@@ -58,8 +58,10 @@ def test_a_scale_under_a_cloth_shows_its_weight(inner, substeps, rate, device):
     weight = GRAVITY * float(model.particle_mass.numpy().sum())
     assert np.allclose(forces[-rate // 10 :].mean(axis=0), (0.0, 0.0, -weight), atol=0.01 * weight)
     report = solver.report
-    assert report.contacts.complete and report.impulses_complete
-    assert np.allclose(report.particle_impulse.numpy().sum(axis=0) * rate, -forces[-1], rtol=1e-5, atol=1e-5 * weight)
+    assert report.forces.contacts.complete and report.forces.complete
+    assert np.allclose(
+        report.forces.particle_impulse.numpy().sum(axis=0) * rate, -forces[-1], rtol=1e-5, atol=1e-5 * weight
+    )
 
 
 def test_friction_on_a_ramp_is_mu_times_the_normal_force(device):
@@ -92,7 +94,7 @@ def test_pads_feel_the_weight_of_what_they_grip_and_its_velocity_is_its_motion(d
     for _ in range(80):
         solver.step(state, end, None, None, dt)
         state, end = end, state
-        force = solver.report.shape_impulse.numpy()[:, 2].sum() / dt
+        force = solver.report.forces.shape_impulse.numpy()[:, 2].sum() / dt
         means = [x.numpy()[:, 2].astype(float) @ mass / mass.sum() for x in (state.particle_q, state.particle_qd)]
         rows.append((force, *means))
     force, centre, velocity = np.array(rows[40:]).T
@@ -116,11 +118,11 @@ def test_the_impulse_of_a_bounce_is_the_change_of_momentum(device):
     solver.step(state, end, model.control(), None, DT)
     after = float(end.body_qd.numpy()[0, 2])
     assert after > 0.9
-    impulse = solver.report.body_impulse.numpy()[0]
+    impulse = solver.report.forces.body_impulse.numpy()[0]
     assert impulse[2] == pytest.approx(mass * (after + 2.0 + GRAVITY * DT), rel=1e-4)
     assert np.allclose(impulse[[0, 1, 3, 4, 5]], 0.0, atol=1e-4 * impulse[2])
-    assert solver.report.shape_impulse.numpy()[0, 2] == pytest.approx(-impulse[2], rel=1e-6)
-    (kind,) = set(solver.report.contacts.numpy()["kind"])
+    assert solver.report.forces.shape_impulse.numpy()[0, 2] == pytest.approx(-impulse[2], rel=1e-6)
+    (kind,) = set(solver.report.forces.contacts.numpy()["kind"])
     assert kind == ContactKind.PLANE
 
 
@@ -140,14 +142,14 @@ def check_momentum(model, solver, steps, place=None):
         speed = 1.0 + np.abs(before).max()
         solver.step(state, end, control, None, DT)
         report = solver.report
-        impulse, unpaired = report.particle_impulse.numpy(), report.unpaired_particle_impulse.numpy()
+        impulse, unpaired = report.forces.particle_impulse.numpy(), report.forces.unpaired_particle_impulse.numpy()
         change = mass * (end.particle_qd.numpy().astype(float) - before)
         rounding = 3e-6 * mass.max() * speed
         assert np.allclose(impulse[free], change[free], rtol=0.0, atol=rounding)
-        of_pairs, of_shapes = sum_up(model, report.contacts.numpy())
+        of_pairs, of_shapes = sum_up(model, report.forces.contacts.numpy())
         assert np.allclose(of_pairs + unpaired, impulse, rtol=0.0, atol=rounding)
-        assert np.allclose(of_shapes, report.shape_impulse.numpy(), rtol=0.0, atol=10.0 * rounding)
-        total = of_pairs.astype(float).sum(axis=0) + report.shape_impulse.numpy().astype(float).sum(axis=0)
+        assert np.allclose(of_shapes, report.forces.shape_impulse.numpy(), rtol=0.0, atol=10.0 * rounding)
+        total = of_pairs.astype(float).sum(axis=0) + report.forces.shape_impulse.numpy().astype(float).sum(axis=0)
         assert np.allclose(total, 0.0, atol=10.0 * rounding)
         if body_before is not None:
             check_bodies(model, report, end.body_qd.numpy().astype(float) - body_before, body_before)
@@ -178,7 +180,7 @@ def sum_up(model, found):
 def check_bodies(model, report, change, speed):
     """Checks the impulses on free bodies with isotropic inertia against the changes of their velocities."""
     free = (model.body_inv_mass.numpy() > 0.0) & (model.body_flags.numpy() & newton.BodyFlags.KINEMATIC == 0)
-    impulse = report.body_impulse.numpy()[free]
+    impulse = report.forces.body_impulse.numpy()[free]
     linear = model.body_mass.numpy()[:, None] * change[:, :3]
     # velocities are rounded, of which the change is a difference
     rounding = 1e-6 * model.body_mass.numpy().max() * (1.0 + np.abs(speed).max())
@@ -242,21 +244,25 @@ def test_matrices_of_pairs_add_up(device):
     for _ in range(20):
         solver.step(state, end, model.control(), None, DT)
         state, end = end, state
-    matrix, shapes = report.shape_pair_impulse.numpy(), report.shapes_of_worlds
+    matrix, shapes = report.forces.shape_pair_impulse.numpy(), report.forces.shapes_of_worlds
     assert shapes.tolist() == [[0, 1], [0, 2]] and matrix.shape == (2, 3, 3, 3)
     assert (
         np.array_equal(matrix, -matrix.transpose(0, 2, 1, 3))
         and (matrix[:, 1, 2, 2] <= 0.0).all()
         and matrix[:, 1, 2, 2].min() < 0.0
     )
-    found, scale = report.contacts.numpy(), np.abs(matrix).max()
+    found, scale = report.forces.contacts.numpy(), np.abs(matrix).max()
     for world in range(2):
         ours = found["world"] == world
         _, of_shapes = sum_up(model, {name: values[ours] for name, values in found.items()})
         assert np.allclose(of_shapes[shapes[world]], matrix[world, :2].sum(axis=1), atol=1e-5 * scale)
-        assert np.allclose(matrix[world, 1].sum(axis=0), report.shape_impulse.numpy()[world + 1], atol=1e-5 * scale)
-        assert np.allclose(report.body_impulse.numpy()[world, :3], matrix[world, 1].sum(axis=0), atol=1e-5 * scale)
-    assert np.allclose(matrix[:, 0].sum(axis=(0, 1)), report.shape_impulse.numpy()[0], atol=1e-5 * scale)
+        assert np.allclose(
+            matrix[world, 1].sum(axis=0), report.forces.shape_impulse.numpy()[world + 1], atol=1e-5 * scale
+        )
+        assert np.allclose(
+            report.forces.body_impulse.numpy()[world, :3], matrix[world, 1].sum(axis=0), atol=1e-5 * scale
+        )
+    assert np.allclose(matrix[:, 0].sum(axis=(0, 1)), report.forces.shape_impulse.numpy()[0], atol=1e-5 * scale)
     assert set(found["kind"]) >= {ContactKind.VERTEX_FACE, ContactKind.PLANE}
 
 
@@ -266,7 +272,7 @@ def test_matrices_that_are_too_large_are_an_error(device, monkeypatch):
     solver = bsc.SolverCCD(Changed(model), report_contacts=True)
     solver.step(model.state(), model.state(), model.control(), None, DT)
     with pytest.raises(RuntimeError, match="1 entries: sum up contacts"):
-        solver.report.shape_pair_impulse  # noqa: B018
+        solver.report.forces.shape_pair_impulse  # noqa: B018
 
 
 def test_what_pushes_before_the_stage_is_named(device):
@@ -302,11 +308,11 @@ def test_contacts_beyond_the_capacity_are_counted_and_summed_up(device):
     )
     for solver in (few, all_listed):
         solver.step(state, model.state(), control, None, DT)
-    assert not few.report.contacts.complete and all_listed.report.contacts.complete
-    assert few.report.contacts.count.numpy()[0] == all_listed.report.contacts.count.numpy()[0] > 5
-    assert len(few.report.contacts.numpy()["toi"]) == few.report.contacts.capacity == 5
-    assert few.report.impulses_complete
-    assert np.array_equal(few.report.particle_impulse.numpy(), all_listed.report.particle_impulse.numpy())
+    assert not few.report.forces.contacts.complete and all_listed.report.forces.contacts.complete
+    assert few.report.forces.contacts.count.numpy()[0] == all_listed.report.forces.contacts.count.numpy()[0] > 5
+    assert len(few.report.forces.contacts.numpy()["toi"]) == few.report.forces.contacts.capacity == 5
+    assert few.report.forces.complete
+    assert np.array_equal(few.report.forces.particle_impulse.numpy(), all_listed.report.forces.particle_impulse.numpy())
 
 
 @pytest.mark.parametrize("mass, complete", [(1e-3, True), (1e8, False)])
@@ -316,8 +322,8 @@ def test_impulses_that_are_too_large_for_a_sum_are_flagged(mass, complete, devic
     model.particle_inv_mass.fill_(1.0 / mass)
     solver = bsc.SolverCCD(SOLVERS["semi_implicit"](model), report_contacts=True)
     step_forces(model, solver, 1.0 / 100.0, 3)
-    assert len(solver.report.contacts.numpy()["toi"])
-    assert solver.report.impulses_complete == solver.report.contacts.complete == complete
+    assert len(solver.report.forces.contacts.numpy()["toi"])
+    assert solver.report.forces.complete == solver.report.forces.contacts.complete == complete
 
 
 def test_a_stage_that_is_not_asked_has_no_contacts(device):
@@ -332,10 +338,8 @@ def test_a_stage_that_is_not_asked_has_no_contacts(device):
             state, end = end, state
         ends.append(np.concatenate([state.particle_q.numpy(), state.particle_qd.numpy()]))
         if not asked:
-            names = "contacts", "particle_impulse", "body_impulse", "shape_impulse", "shape_pair_impulse"
-            for name in (*names, "shapes_of_worlds", "impulses_complete", "unpaired_particle_impulse"):
-                with pytest.raises(RuntimeError, match="report_contacts=True"):
-                    getattr(solver.report, name)
+            with pytest.raises(RuntimeError, match="report_contacts=True"):
+                _ = solver.report.forces
     assert np.array_equal(*ends)
 
 

@@ -90,7 +90,7 @@ def test_what_rests_shows_its_weight_by_world_and_filter(rested):
     parts = data.net_normal_forces_w.numpy() + data.net_friction_forces_w.numpy()
     np.testing.assert_allclose(parts, data.net_forces_w.numpy(), atol=1e-6)
     np.testing.assert_allclose(
-        data.net_forces_w.numpy()[:, 0], rested.solver.report.body_impulse.numpy()[1::2, :3] / DT, atol=1e-3
+        data.net_forces_w.numpy()[:, 0], rested.solver.report.forces.body_impulse.numpy()[1::2, :3] / DT, atol=1e-3
     )
 
 
@@ -143,7 +143,7 @@ def test_too_many_contacts_are_flagged(device):
     for _ in range(3):
         solver.step(state, state, None, None, DT)
         sensor.update(DT)
-        flags.append((bool(sensor.data.complete.numpy()[0]), solver.report.contacts.complete))
+        flags.append((bool(sensor.data.complete.numpy()[0]), solver.report.forces.contacts.complete))
     assert flags[-1] == (False, False) and all(one == other for one, other in flags)
 
 

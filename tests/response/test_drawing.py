@@ -51,7 +51,7 @@ def test_contacts_are_drawn_where_they_are(device):
     solver, state = shot(device, report_contacts=True)
     report, viewer = solver.report, Recorder(solver.model)
     report.draw(viewer)
-    contacts = report.contacts.numpy()
+    contacts = report.forces.contacts.numpy()
     assert len(contacts["point"]) > 10
     for name, expected in (
         ("normals", contacts["normal"]),
@@ -144,7 +144,7 @@ def test_a_stage_that_keeps_no_contacts_says_so_where_it_is_drawn(device):
     with pytest.warns(UserWarning, match="report_contacts=True"):
         solver.report.draw(Recorder(solver.model))
     with pytest.raises(RuntimeError, match="report_contacts=True"):
-        solver.report.table()
+        solver.report.forces.table()
     monitor = bsc.CollisionMonitor(Changed(solver.model))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -163,14 +163,14 @@ def test_table_by_shape(device):
     solver = bsc.SolverCCD(SOLVERS["xpbd"](model), report_contacts=True)
     state, end = model.state(), model.state()
     solver.step(state, end, None, None, 1e-6)
-    assert solver.report.table().splitlines()[1] == "no contact had an impulse"
+    assert solver.report.forces.table().splitlines()[1] == "no contact had an impulse"
     for _ in range(12):
         solver.step(state, end, None, None, DT)
         state, end = end, state
-    contacts, table = solver.report.contacts.numpy(), solver.report.table(DT)
+    contacts, table = solver.report.forces.contacts.numpy(), solver.report.forces.table(DT)
     lines = table.splitlines()
     assert max(map(len, lines)) <= 80 and len(lines) == 4
-    assert "[N]" in lines[0] and "[N s]" in solver.report.table()
+    assert "[N]" in lines[0] and "[N s]" in solver.report.forces.table()
     rows = {line[:36].strip(): line[36:].split() for line in lines[1:]}
     assert rows.keys() == {"particles", "scale", "..." + long[-33:]}
     count, normal, tangential = rows["particles"]
@@ -188,7 +188,7 @@ def test_usd_has_what_is_drawn(device, tmp_path):
     path = tmp_path / "contacts.usda"
     viewer = ViewerUSD(str(path), fps=60, num_frames=2)
     viewer.set_model(solver.model)
-    count = len(solver.report.contacts.numpy()["point"])
+    count = len(solver.report.forces.contacts.numpy()["point"])
     for frame in range(2):
         viewer.begin_frame(frame / 60)
         viewer.log_state(state)

@@ -158,7 +158,7 @@ def test_cut_vertices_have_the_velocity_of_their_path(device):
     assert 5 < np.count_nonzero(moved) < count
     np.testing.assert_allclose(rollout.velocities[moved], velocities[moved], rtol=1e-5, atol=1e-4)
     momentum = model.particle_mass.numpy()[:, None] * rollout.velocities
-    np.testing.assert_allclose(solver.report.particle_impulse.numpy(), momentum, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(solver.report.forces.particle_impulse.numpy(), momentum, rtol=1e-5, atol=1e-7)
 
 
 def test_where_cuts_do_not_suffice_vertices_are_frozen(device):

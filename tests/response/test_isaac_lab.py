@@ -123,7 +123,7 @@ def test_the_manager_steps_and_resets_worlds(stand_ins, task, kind, device, monk
     start = state.particle_q.numpy().copy()
     for _ in range(3):
         manager._step_solver(state, end, model.control(), None, DT)
-        contacts += len(solver.report.contacts.numpy()["kind"])
+        contacts += len(solver.report.forces.contacts.numpy()["kind"])
         state, end = end, state
     assert contacts > 10 and solver.report.certified
     moved = state.particle_q.numpy().copy()

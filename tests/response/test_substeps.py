@@ -50,8 +50,14 @@ def read(report):
         name: getattr(report, name) for name in ("certified", "strain", "crossings", "not_finite", *NUMBERS, *LISTS)
     }
     said |= {f"worlds.{name}": values.copy() for name, values in report.worlds.numpy().items()}
-    said |= {name: getattr(report, name).numpy().copy() for name in ("particle_impulse", "unpaired_particle_impulse")}
-    return said | {"contacts": report.contacts.numpy(), "bits": report._find_vertices(0xFFFF), "cut": report.truncated}
+    said |= {
+        name: getattr(report.forces, name).numpy().copy() for name in ("particle_impulse", "unpaired_particle_impulse")
+    }
+    return said | {
+        "contacts": report.forces.contacts.numpy(),
+        "bits": report.find_vertices(0xFFFF),
+        "cut": report.truncated,
+    }
 
 
 def check(whole, said):

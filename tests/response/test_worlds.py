@@ -81,7 +81,7 @@ class Worlds:
         self.clock += taken
         after, report = self._read(end), self.solver.report
         results = {name: values.copy() for name, values in report.worlds.numpy().items()}
-        impulses = [getattr(report, f"{kind}_impulse").numpy().copy() for kind in ("particle", "body", "shape")]
+        impulses = [getattr(report.forces, f"{kind}_impulse").numpy().copy() for kind in ("particle", "body", "shape")]
         for world in range(self.count):
             if taken[world]:
                 found = [*after[world], *(x.reshape(self.count, -1, x.shape[-1])[world] for x in impulses)]
@@ -130,7 +130,7 @@ def test_each_world_is_stepped_as_if_it_were_alone(inner, substeps, device):
                 "crossings",
             ):
                 assert results[name].tolist() == [getattr(report, name)], name
-            listed = report.contacts.numpy()["normal_impulse"]
+            listed = report.forces.contacts.numpy()["normal_impulse"]
             assert results["max_impulse"][0] == max(listed, default=0.0)
             hits += report.hits
         assert same(alone.ends[0], together.ends[seed]), seed
@@ -440,11 +440,11 @@ def test_a_graph_reads_the_mask_of_each_replay(device):
             assert np.array_equal(*(getattr(ends[0], name).numpy() for ends in states)), name
         reports = [solver.report for solver in solvers]
         for kind in ("particle", "body", "shape"):
-            assert np.array_equal(*(getattr(report, f"{kind}_impulse").numpy() for report in reports))
+            assert np.array_equal(*(getattr(report.forces, f"{kind}_impulse").numpy() for report in reports))
         for one, other in zip(*(report.worlds.numpy().values() for report in reports), strict=True):
             assert np.array_equal(one, other)
         filtered += reports[1].worlds.filtered.numpy()
-        for one, other in zip(*(report.contacts.numpy().values() for report in reports), strict=True):
+        for one, other in zip(*(report.forces.contacts.numpy().values() for report in reports), strict=True):
             assert np.array_equal(one, other)
         if replay == 2:
             for i in range(2):

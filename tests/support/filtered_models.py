@@ -115,7 +115,7 @@ def judge(seed, stage=bsc.SolverCCD, **options):
         alone = np.setdiff1d(moved, np.concatenate([*touched, at_plane]))
         if len(alone):
             result.failures.append(f"seed {seed}, step {step}: nothing is near particles {alone} that moved")
-        rows = report.contacts.numpy()
+        rows = report.forces.contacts.numpy()
         of_pairs = rows["vertices"][rows["vertices"][:, 1] >= 0]
         split = np.where(rows["kind"][rows["vertices"][:, 1] >= 0] == 1, 2, 1)
         for n in (1, 2):

@@ -248,7 +248,7 @@ class SolverImplicit(SolverCCD):
         """Raises NotImplementedError: the contacts of the solve are no contacts of Newton's pipeline."""
         raise NotImplementedError(
             "SolverImplicit does not use Newton's contacts, and has no forces of them: pass report_contacts=True, and "
-            "read report.contacts and the impulses beside it"
+            "read report.forces.contacts and the impulses beside it"
         )
 
     def notify_model_changed(self, flags: int) -> None:

@@ -214,7 +214,7 @@ class ContactSensor:
         sensors, filters = checked_strings(sensors, "sensors"), checked_strings(filters, "filters")
         checked_integer(history_length, "history_length", 1)
         self._threshold = checked_number(force_threshold, "force_threshold", 0.0)
-        self._model, self._device, self._contacts = solver.model, solver.model.device, solver.report.contacts
+        self._model, self._device, self._contacts = solver.model, solver.model.device, solver.report.forces.contacts
         worlds = max(1, self._model.world_count)
         columns = np.full((self._model.shape_count + 1, 2), -1, dtype=np.int32)
         self.labels: list[str] = []

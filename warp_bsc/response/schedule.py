@@ -14,14 +14,15 @@ Where a contact has no dividing plane, its paths are truncated instead.
 When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
 more. It ends: vertices that stood apart at the start and stand still do not collide.
 
-When is a vertex frozen, that is, left at its start? If it still collides in the last row; if its prediction is not
-finite; with all others, if the last detection was incomplete. A detection is incomplete if a queue was too small, and
-queues cannot grow in a CUDA graph. :mod:`.contacts.search` then finds contacts without queues, and all worlds go to the
-third row. Recorded steps cannot be searched, and freeze at once.
+When is a vertex frozen, that is, left at its start? If it still collides in the last row, and with all others if the
+last detection was incomplete. One whose prediction is not finite is left at its start as well, and counted apart. A
+detection is incomplete if a queue was too small, and queues cannot grow in a CUDA graph. :mod:`.contacts.search` then
+finds contacts without queues, and all worlds go to the third row. Recorded steps cannot be searched, and freeze at
+once.
 
-What makes a step uncertified? Contacts that are left, a last detection that was incomplete, or start positions that are
-not finite, see :func:`decide`; and predictions that are not finite, whatever stands in their place. Where inversions
-are prevented, tetrahedra that still invert as well.
+What makes a step uncertified? Contacts that remain, a last detection that was incomplete, or start positions that are
+not finite, see :func:`decide`; predictions that are not finite; contacts on arcs; tetrahedra that still invert where
+that is prevented; and an end that a coupled solver has not shown yet: :mod:`.state.certificate` has it all.
 
 Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration divides
 what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the
@@ -36,8 +37,9 @@ that were inverted at the start, for contacts of bodies that are left to the inn
 
 import warp as wp
 
-from ..detection.run.settings import FILTERED_COUNTS
+from ..detection.run.settings import FILTERED_COUNTS, Counter
 from ..kernels.pipeline.queues import has_overflowed
+from .state.certificate import certify
 from .state.status import Detection, Loop, Result, SolveStatus, clear_detection
 from .state.structs import Step
 from .tuning import MAX_CUTS
@@ -200,8 +202,8 @@ def decide(
     if results[Result.COUNTED] == 0:
         results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
         results[Result.COUNTED] = 1
-    certified = hits == 0 and inverting == 0 and not overflowed and counts[0] == wp.int64(0)
-    results[Result.CERTIFIED] = wp.where(certified, 1, 0)
+    are_finite = counts[Counter.NOT_FINITE] == wp.int64(0)
+    certify(results, hits == 0 and inverting == 0 and are_finite and not overflowed)
     results[Result.UNDETECTED] = wp.where(overflowed, 1, 0)
     loop[Loop.ACTIVE] = wp.where(finished or overflowed or stuck, 0, 1)
     loop[Loop.ITERATION] = loop[Loop.ITERATION] + loop[Loop.ACTIVE]

@@ -19,6 +19,7 @@ from .layer.contact_layer import ContactLayer
 from .options import StageOptions, default_separation, friction_of
 from .report.count_steps import count_record
 from .report.forces.contact_forces import ContactForces
+from .report.forces.contact_report import ContactReport
 from .report.strain import StrainMeter
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter
@@ -238,7 +239,9 @@ class SolverCCD(CollisionStage):
         self._forces: ContactForces | None = None
         if options.report_contacts:
             self._forces = ContactForces(self._work, options.report_contacts)
-            self.report.keep_contacts(self._forces.rows, self._forces.published, self._forces.shapes_of_worlds)
+            forces = self._forces
+            listed = forces.rows, forces.published, forces.shapes_of_worlds
+            self.report.keep_forces(ContactReport(self.model, *listed))
         self.report.impulses_elsewhere = self._inner.pushes_before
         if options.report_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)

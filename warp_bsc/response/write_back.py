@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .state.certificate import revoke
 from .state.motion import StateArrays
 from .state.status import Result, SolveStatus
 from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, Vertices
@@ -25,7 +26,7 @@ def _count_if_not_finite(outcome: int, is_particle: bool, status: SolveStatus):
     What stands in its place is no result of the inner solver.
     """
     if outcome & NOT_FINITE != 0:
-        status.results[Result.CERTIFIED] = 0
+        revoke(status.results)
         if is_particle:
             wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
 

@@ -185,10 +185,15 @@ class PairCounts:
         ]
 
 
-_NOT_FINITE, _FACE_PAIRS, _PAIRS = 0, 1, 2
-"""Indices of the counts in one array: vertices, pairs of faces, and from the third on those of each kind of pair."""
+class Counter(enum.IntEnum):
+    """Indices of the counts of a detection in one array."""
 
-FILTERED_COUNTS = range(_PAIRS + Count.FILTERED, _PAIRS + len(DistanceKind) * len(Count), len(Count))
+    NOT_FINITE = 0  # vertices with a position that is not finite
+    FACE_PAIRS = 1
+    PAIRS = 2  # the first of those of each kind of pair, by :class:`Count`
+
+
+FILTERED_COUNTS = range(Counter.PAIRS + Count.FILTERED, Counter.PAIRS + len(DistanceKind) * len(Count), len(Count))
 """Indices of the pairs that are filtered, of each kind."""
 
 
@@ -261,10 +266,10 @@ class Counters:
     def __init__(self, device: wp.Device):
         """Allocates the counters on a device, all zero."""
         n = len(Count)
-        self.array = wp.zeros(_PAIRS + n * len(DistanceKind), dtype=wp.int64, device=device)
-        self.not_finite = self.array[_NOT_FINITE:_FACE_PAIRS]
-        self.face_pairs = self.array[_FACE_PAIRS:_PAIRS]
-        self.pairs = self.array[_PAIRS:]
+        self.array = wp.zeros(Counter.PAIRS + n * len(DistanceKind), dtype=wp.int64, device=device)
+        self.not_finite = self.array[Counter.NOT_FINITE : Counter.FACE_PAIRS]
+        self.face_pairs = self.array[Counter.FACE_PAIRS : Counter.PAIRS]
+        self.pairs = self.array[Counter.PAIRS :]
         self.vertex_face, self.edge_edge, self.vertex_edge, self.vertex_vertex = (
             self.pairs[n * kind : n * (kind + 1)] for kind in DistanceKind
         )

@@ -6,7 +6,6 @@ from ...kernels.pipeline.queues import has_overflowed
 from ...response.report.report import SolverReport
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
-from ...response.tuning import MAX_STRAIN
 from .system import Progress, is_near_end
 
 wp.set_module_options({"enable_backward": False})
@@ -66,6 +65,9 @@ class ImplicitStepReport(SolverReport):
     has :attr:`newton_steps`, :attr:`last_change`, :attr:`converged` and :attr:`arrived` by world as well.
     """
 
+    strain_cause = ""
+    shorter_steps = strain_advice = "take shorter steps, or raise max_iterations if report.converged is false"
+
     def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps of a workspace."""
         super().__init__(work, responds=responds)
@@ -110,13 +112,6 @@ class ImplicitStepReport(SolverReport):
     def unconverged_steps(self) -> int:
         """Steps so far that were not :attr:`converged`."""
         return self._read(self.unconverged)
-
-    def _strain_warning(self):
-        return f"a step strained an edge by more than {float(MAX_STRAIN):.0%}: {self._shorter_steps}"
-
-    @property
-    def _shorter_steps(self):
-        return "take shorter steps, or raise max_iterations if report.converged is false"
 
     def __str__(self) -> str:
         """Returns the line of the stage, and how many steps did not converge."""

@@ -9,6 +9,7 @@ import warp as wp
 from ...detection.run.launch import retry_until_fits
 from ...kernels.arcs import Arcs, turns
 from ...kernels.pipeline.queues import has_overflowed
+from ..state.certificate import revoke
 from ..state.status import Result, SolveStatus
 from ..state.structs import Step
 from ..state.workspace import Workspace
@@ -40,7 +41,7 @@ def _count(step: Step, contacts: PairQueue, i: int, arcs: Arcs, status: SolveSta
     found = rules.classify_contact(step, contacts.kind, contacts.pairs[i], corners, owner, bound, may_cross)
     if found == ContactClass.OURS:
         wp.atomic_add(status.results, int(Result.REMAINING), 1)
-        status.results[Result.CERTIFIED] = 0
+        revoke(status.results)
         if status.of_worlds.remaining:
             wp.atomic_add(status.of_worlds.remaining, world, 1)
         mark_changed(step.vertices, corners)
@@ -61,7 +62,7 @@ def _count_contacts(
 ):
     """Counts the contacts of two kinds on arcs; if a queue overflowed, some may be missing, and nothing is certain."""
     if wp.tid() == 0 and has_overflowed(counts, capacities):
-        status.results[Result.CERTIFIED] = 0
+        revoke(status.results)
     for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
         number = int(0)
         while number < 2:  # one body for both, which is large

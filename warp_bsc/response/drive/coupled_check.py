@@ -14,6 +14,7 @@ from newton import BodyFlags, Model, ParticleFlags, ShapeFlags
 from ...detection.at_rest.intersections import find_intersections
 from ..contacts.detect import inspect
 from ..report.totals import StepTotals
+from ..state.certificate import certify, is_certified, revoke
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, StateArrays, arrays_of, interrupt_worlds
 from ..state.status import Loop, Result, SolveStatus
@@ -63,7 +64,7 @@ def _await(results: wp.array[int], worlds: wp.array[wp.bool], step: _Step, total
         worlds[i] = False
     if i == 0:
         step.certified[0] = results[Result.CERTIFIED]
-        results[Result.CERTIFIED] = 0
+        revoke(results)
         totals.unseen_steps[0] += wp.int64(1 - step.awaits[0])
         step.awaits[0] = 1
 
@@ -132,7 +133,7 @@ def _conclude(
         worlds[i] = step.certified_worlds[i] and free and seen.results[Result.UNDETECTED] == 0
     if i == 0:
         is_lost = step.lost[step.lost.shape[0] - 1] == 1
-        is_free = seen.results[Result.CERTIFIED] == 1
+        is_free = is_certified(seen.results)
         is_free = is_free and seen.results[Result.CROSSINGS] <= results[Result.CROSSINGS]
         is_free = is_free and seen.results[Result.EXCLUDED] <= results[Result.EXCLUDED]
         if not is_free or not is_lost:
@@ -143,7 +144,7 @@ def _conclude(
             if results[Result.NEW_CROSSINGS] == 0:  # a step that has some is counted
                 totals.penetrated_steps[0] += wp.int64(step.certified[0])
         elif not is_lost:
-            results[Result.CERTIFIED] = step.certified[0]
+            certify(results, step.certified[0] == 1)
         step.awaits[0] = 0
 
 

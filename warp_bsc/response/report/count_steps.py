@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ..state.certificate import is_certified
 from ..state.record import RecordCounts
 from ..state.status import Loop, Result, SolveStatus
 from ..state.structs import INVALID, UNCERTIFIED, Step
@@ -53,7 +54,7 @@ def merge_step(step: Step, status: SolveStatus, particle_count: int, responds: b
         out.results[i] = wp.where(first, found, _merged(i, out.results[i], found))
     if i < out.of_vertices.shape[0]:
         outcome = step.vertices.outcome[i] + int(0)
-        if status.results[Result.CERTIFIED] == 0:
+        if not is_certified(status.results):
             outcome = outcome | _marks(step, status, i, i < particle_count, responds)
         out.of_vertices[i] = outcome | wp.where(first, 0, out.of_vertices[i])
     if i < out.of_bodies.shape[0]:
@@ -65,7 +66,7 @@ def note_crossings(status: SolveStatus):
     """Says whether the next step, or substep, has to count crossings at its start."""
     results = status.results
     # a certified motion of elements that did not cross makes no crossings
-    unchanged = results[Result.CERTIFIED] == 1 and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
+    unchanged = is_certified(results) and results[Result.CROSSINGS] == 0 and results[Result.EXCLUDED] == 0
     status.loop[Loop.RECOUNT] = wp.where(unchanged, 0, 1)
 
 

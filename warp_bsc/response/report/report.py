@@ -2,43 +2,35 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import warp as wp
+from newton.viewer import ViewerBase
 
-from ..._warnings import warn_caller
+from ..._arguments import check_instance, checked_number
 from ...detection.at_rest.intersections import find_intersections
-from ..adjoint.between_steps import AMBIGUOUS_MOVES
-from ..state.motion import SET_STEPS
 from ..state.status import Result, views_of
 from ..state.structs import FROZEN, INVALID, NOT_FINITE, TRUNCATED, UNCERTIFIED
 from ..state.workspace import Workspace
-from ..tuning import MAX_STRAIN
 from .count_steps import StepResults
+from .drawing import Drawing
+from .forces.contact_report import ContactReport
 from .inside import Inside, InsideFinder
-from .text import revoked_warning, set_bodies_warning, shape_name
+from .step_warnings import StepWarnings
+from .text import line_of
 from .totals import GradientTotals, Penetrated, StepTotals, Totals
-from .views import ReportViews
-from .worlds import WorldsOfReport
+from .worlds import Worlds
 
-_CROSSINGS_WARNING = (
-    "edges pass through faces at the start of a step, and their contacts are left to the solver: "
-    "warp_bsc.repair_state(model, state) moves them apart before the first step"
-)
-_INVERSIONS_WARNING = (
-    "a step inverted tetrahedra, report.inversions counts those of the last one: take shorter steps, or pass "
-    "inversions='prevented'"
-)
-_NOT_FOLLOWED = (
-    "has changed in what the stage does not follow at run time, such as type, source, body, margin or flags of "
-    "collision: it collides as it was, at its new pose; put a new stage behind the solver"
-)
+_NOT_DRAWN = "report.draw draws contacts only if a stage keeps them: SolverCCD(solver, report_contacts=True)"
+_INCOMPLETE = "report.draw lacks contacts: raise the number that report_contacts= allows"
+_NO_CONTACTS = "a stage keeps contacts only if it is asked to: SolverCCD(solver, report_contacts=True)"
+_NO_WORLDS = "a stage counts worlds only if it is asked to: pass report_worlds=True"
 _NOT_WATCHED = "a stage counts inversions only if it is asked to: pass inversions='reported' or 'prevented'"
-_LAYER_WARNING = "contacts passed the contact layer in one step: results jump there, gradients miss it"
 
 
-class SolverReport(ReportViews, WorldsOfReport):
+class SolverReport:
     """Results of the steps of a :class:`.solver_ccd.SolverCCD`; reading one synchronizes with the device.
 
     Of steps that are not certified, are not finite, strain, cross or invert something it warns once each.
@@ -53,11 +45,19 @@ class SolverReport(ReportViews, WorldsOfReport):
 
     Attributes:
         step_results: What the last step did, on the device, which the other attributes read.
+        impulses_elsewhere: What resolves contacts before the stage in the last step, so that its impulses on them are
+            small; None if nothing is known to.
     """
+
+    impulses_elsewhere: str | None = None
+    strain_cause: str = ", as its solver does not see the contacts, or its iterations are too few for the step"
+    shorter_steps: str = "take shorter steps, or raise substeps"
+    strain_advice: str = f"give it more iterations, {shorter_steps}, or step cloth and soft bodies by SolverImplicit"
 
     def __init__(self, work: Workspace, *, responds: bool = True):
         """Reports on the steps in which a response resolves a motion, or only inspects it."""
-        self._motion, self._work, self._responds = work.motion, work, responds
+        self._motion, self._work, self.responds = work.motion, work, responds
+        self.model, self.shape_of_vertices = work.mesh.model, work.mesh.shape_vertices.shape
         self.step_results = StepResults()
         self.step_results.results = wp.zeros(len(Result), dtype=int, device=work.device)
         self.step_results.of_vertices = wp.zeros_like(work.vertices.outcome)
@@ -67,7 +67,9 @@ class SolverReport(ReportViews, WorldsOfReport):
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
         self.device_totals = views_of(StepTotals, self.total_values)
         self._host_totals = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device="cpu", pinned=work.device.is_cuda)
-        self._said: set[str] = set()  # the warnings that have been given
+        self._warnings = StepWarnings(self)
+        self._forces: ContactReport | None = None
+        self._worlds: Worlds | None = None
         self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.thickness: wp.array[wp.float64] | None = None  # of that layer [m]
         self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
@@ -79,7 +81,7 @@ class SolverReport(ReportViews, WorldsOfReport):
 
     def count_lost(self) -> int:
         """Returns the steps on a tape so far that the buffers of a graph were too small for; warns of nothing."""
-        totals = dict(zip(StepTotals.vars, self.total_values.numpy().tolist(), strict=True))
+        totals = self._totals_by_name()
         return totals["undetected_steps"] + totals["lost_gradients"]
 
     def warn(self) -> None:
@@ -90,41 +92,44 @@ class SolverReport(ReportViews, WorldsOfReport):
         Known is what the host knows already; the device is only waited for to warn. A step on a GPU may end before the
         host knows of it: then the next one warns, or the first number that is read, which waits for the device.
         """
-        known = dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True))
-        if known["not_finite_steps"] and self._responds:
-            self._warn_once("not_finite", self._not_finite_warning)
-        if known["revoked_steps"]:
-            self._warn_once("revoked", self._revoked_warning)
-        named = known["not_finite_steps"] + known["revoked_steps"]
-        if (known["uncertified_steps"] > named or known["remaining"]) and self._responds:
-            self._warn_once("uncertified", self._uncertified_warning)
-        if known["strained_steps"]:
-            self._warn_once("strain", self._strain_warning)
-        if known["crossing_steps"] and self._responds:
-            self._warn_once("crossings", lambda: _CROSSINGS_WARNING)
-        if known["inverting_steps"] and not self._prevents_inversions:
-            self._warn_once("inversions", lambda: _INVERSIONS_WARNING)
-        if known["outrun_steps"] and self._mesh.model.requires_grad:
-            self._warn_once("layer", lambda: f"{_LAYER_WARNING}; {self._shorter_steps}")
-        if known["shape_not_followed"]:
-            shape = shape_name(self._mesh.model, known["shape_not_followed"] - 1)
-            self._warn_once("shapes", lambda: f"{shape} {_NOT_FOLLOWED}")
-        if known["set_bodies"]:
-            self._warn_once("set_bodies", self._set_bodies_warning)
-        if known["ambiguous_moves"]:
-            self._warn_once("moves", lambda: f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)")
+        self._warnings.warn(dict(zip(StepTotals.vars, self._host_totals.numpy(), strict=True)))
 
     def leave_state_to_other_stage(self) -> None:
         """Makes the report warn of no step that is not certified in the state of the program alone.
 
         A stage around the coupled solver says so of what it makes of that state.
         """
-        self._said.add("revoked")
+        self._warnings.leave_out("revoked")
 
-    def _warn_once(self, subject, message):
-        if subject not in self._said:
-            self._said.add(subject)
-            warn_caller(message())
+    def keep_forces(self, forces: ContactReport) -> None:
+        """Makes the report have contacts and impulses."""
+        self._forces = forces
+
+    def keep_worlds(self, worlds: Worlds) -> None:
+        """Makes the report have results by world."""
+        self._worlds = worlds
+
+    @property
+    def forces(self) -> ContactReport:
+        """The contacts of the last step and their impulses, on the device.
+
+        Raises:
+            RuntimeError: If the stage was not asked to keep contacts.
+        """
+        if self._forces is None:
+            raise RuntimeError(_NO_CONTACTS)
+        return self._forces
+
+    @property
+    def worlds(self) -> Worlds:
+        """Results of the last step by world, on the device.
+
+        Raises:
+            RuntimeError: If the stage was not asked for them.
+        """
+        if self._worlds is None:
+            raise RuntimeError(_NO_WORLDS)
+        return self._worlds
 
     def _read(self, values):
         """Returns the largest number of an array, and warns: the totals were copied before, on the same stream."""
@@ -135,23 +140,6 @@ class SolverReport(ReportViews, WorldsOfReport):
     def _read_result(self, result):
         """Returns one of the results of the last step, and warns."""
         return self._read(self.step_results.results[result : result + 1])
-
-    def _set_bodies_warning(self):
-        labels, bodies = self._mesh.model.body_label, np.flatnonzero(self.set_steps.numpy() == SET_STEPS)
-        return set_bodies_warning([f"body {body} ({labels[body]!r})" for body in bodies])
-
-    def _revoked_warning(self):
-        passed = self.coupled.find_passed()
-        return revoked_warning(self._mesh.model, passed if len(passed) else self.coupled.bodies)
-
-    def _strain_warning(self):
-        cause = "its solver does not see the contacts, or its iterations are too few for the step"
-        advice = f"give it more iterations, {self._shorter_steps}, or step cloth and soft bodies by SolverImplicit"
-        return f"a step strained an edge by more than {float(MAX_STRAIN):.0%}, as {cause}: {advice}"
-
-    @property
-    def _shorter_steps(self):
-        return "take shorter steps, or raise substeps"
 
     @property
     def certified(self) -> bool:
@@ -258,7 +246,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         They stood where they were at its start, and the step is not certified. Without a response they are left as the
         inner solver made them.
         """
-        count = int(np.count_nonzero(self._find_vertices(NOT_FINITE)[: self._mesh.model.particle_count]))
+        count = int(np.count_nonzero(self.find_vertices(NOT_FINITE)[: self._mesh.model.particle_count]))
         self.warn()
         return count
 
@@ -271,7 +259,7 @@ class SolverReport(ReportViews, WorldsOfReport):
         true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
         nothing but the position of a body is not finite. Gathered on the host, on each access.
         """
-        listed = self._find_uncertified()[: self._mesh.model.particle_count]
+        listed = self.find_uncertified()[: self._mesh.model.particle_count]
         return np.flatnonzero(listed).astype(np.int32)
 
     @property
@@ -286,12 +274,12 @@ class SolverReport(ReportViews, WorldsOfReport):
         if self.certified or not model.body_count:
             return np.empty(0, dtype=np.int32)
         first = model.particle_count
-        bodies = np.unique(self._mesh.shape_vertices.body[self._find_vertices(UNCERTIFIED)[first:]])
+        bodies = np.unique(self._mesh.shape_vertices.body[self.find_vertices(UNCERTIFIED)[first:]])
         if self.coupled is not None:
             bodies = np.union1d(bodies, self.coupled.find_bodies())
         return bodies[bodies >= 0].astype(np.int32)
 
-    def _find_uncertified(self):
+    def find_uncertified(self) -> np.ndarray:
         """Returns which vertices of the mesh the certificate of the last step lacks, bool, shape [vertex_count]."""
         outcome = self.step_results.of_vertices.numpy()
         listed, invalid = ((outcome & int(bit)) != 0 for bit in (UNCERTIFIED, INVALID))
@@ -400,14 +388,20 @@ class SolverReport(ReportViews, WorldsOfReport):
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        return Totals(*self._read_totals()[:-5])
+        totals = self._read_totals()
+        return Totals(**{field.name: totals[field.name] for field in fields(Totals)})
 
     @property
     def gradients(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
-        layerless = 0 if self.layerless_steps is None else self._read(self.layerless_steps)
-        grazing, lost_steps, outrun, ambiguous = self._read_totals()[-4:]
-        return GradientTotals(grazing, lost_steps, layerless, outrun, ambiguous)
+        totals = self._read_totals()
+        return GradientTotals(
+            grazing=totals["grazing"],
+            lost_steps=totals["lost_gradients"],
+            layerless_steps=0 if self.layerless_steps is None else self._read(self.layerless_steps),
+            outrun_steps=totals["outrun_steps"],
+            ambiguous_moves=totals["ambiguous_moves"],
+        )
 
     @property
     def layer_thickness(self) -> float | None:
@@ -415,61 +409,67 @@ class SolverReport(ReportViews, WorldsOfReport):
         return None if self.thickness is None else float(self.thickness.numpy()[0])
 
     def _read_totals(self):
-        values = self.total_values.numpy().tolist()
+        totals = self._totals_by_name()
         self.warn()
-        return values
+        return totals
+
+    def _totals_by_name(self):
+        return dict(zip(StepTotals.vars, self.total_values.numpy().tolist(), strict=True))
+
+    def draw(self, viewer: ViewerBase, *, impulse_scale: float | None = None) -> None:
+        """Draws the last step in a frame of a viewer: call it between ``begin_frame`` and ``end_frame``.
+
+        It draws normals of contacts as green lines, their impulses on the first of both elements as magenta arrows,
+        truncated vertices in orange, frozen ones in blue, and those that the certificate lacks in red. Minimum
+        distances are transparent shells around all surfaces, which touch where two are as near as they may come. All is
+        where the step ended, under ``/ccd``, and without the offsets of worlds and layers of a viewer, as Newton draws
+        cloth. Synchronizes with the device.
+
+        Args:
+            viewer: Any viewer of Newton.
+            impulse_scale: Length of an arrow by its impulse [m/(N s)]; None for one by which nine of ten arrows are at
+                most two median edges long, in the steps that were drawn so far.
+
+        Raises:
+            TypeError: If an argument has another type.
+            ValueError: If ``impulse_scale`` is not more than 0.
+        """
+        check_instance(viewer, "viewer", ViewerBase, "a viewer of Newton")
+        if impulse_scale is not None:
+            impulse_scale = checked_number(impulse_scale, "impulse_scale", 0.0, above=True)
+        contacts = None
+        if self._forces is not None:
+            contacts = self.forces.contacts.numpy()
+            if not self.forces.contacts.complete:
+                self._warnings.once("undrawn", lambda: _INCOMPLETE)
+        elif self.responds:
+            self._warnings.once("undrawn", lambda: _NOT_DRAWN)
+        vertices = {"truncated": self.find_vertices(TRUNCATED), "frozen": self.find_vertices(FROZEN)}
+        vertices["uncertified"] = self.find_uncertified()
+        self._drawing.draw(viewer, self._work.vertices.x1.numpy(), contacts, vertices, impulse_scale)
+
+    @functools.cached_property
+    def _drawing(self):
+        return Drawing(self._mesh)
 
     def __str__(self) -> str:
         """Returns the steps so far in one line, what crosses at the start of the last, and is inside solids at its end.
 
         Searches for what is inside, on the host.
         """
-        totals, gradients, inside = self.totals, self.gradients, len(np.unique(self.inside.particles))
-        line = (
-            f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
-            f"vertices, {totals.uncertified_steps} not certified"
-        )
-        if totals.revoked_steps:
-            line += f" ({totals.revoked_steps} only in the state of the program)"
-        if totals.unseen_steps:
-            line += f", {totals.unseen_steps} whose end in the state of the program was not seen"
-        if totals.strained_steps:
-            line += f", {totals.strained_steps} that strained an edge by more than {float(MAX_STRAIN):.0%}"
-        if totals.inverting_steps:
-            line += f", {totals.inverting_steps} that inverted tetrahedra"
-        if self.crossings:
-            line += f", {self.crossings} crossings at the start of the step"
-            line += " (warp_bsc.repair_state removes those of a first step)"
-        if inside:
-            line += f", {inside} particles inside solids"
-        if totals.remaining or totals.excluded:
-            line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
-        if self.filtered:
-            line += f"; {self.filtered} filtered pairs in the last step, which are not certified"
-        if totals.not_finite_steps:
-            line += f", {totals.not_finite_steps} steps with positions that are not finite"
-        if gradients.grazing or gradients.lost_steps:
-            line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
-        if self.layer_thickness is not None:
-            line += f"; contact layer of {1e3 * self.layer_thickness:.3g} mm"
-        if gradients.outrun_steps:
-            line += f", which contacts passed in {gradients.outrun_steps} steps"
-        if gradients.layerless_steps:
-            line += f"; {gradients.layerless_steps} steps without their contact layer"
-        return line
+        return line_of(self)
 
     @property
     def _mesh(self):
         return self._work.mesh
 
     @property
-    def _prevents_inversions(self):
+    def prevents_inversions(self) -> bool:
+        """Whether the stage keeps tetrahedra from inverting, so that its certificate covers that."""
         return self._work.ends is not None
 
-    def _find_positions(self):
-        return self._work.vertices.x1.numpy()
-
-    def _find_vertices(self, bit):
+    def find_vertices(self, bit) -> np.ndarray:
+        """Returns which vertices have a bit of the outcome, themselves or their body, bool, shape [vertex_count]."""
         results, mesh = self.step_results, self._mesh
         found = (results.of_vertices.numpy() & int(bit)) != 0
         if len(results.of_bodies):

@@ -1,7 +1,11 @@
 """What a report says in words: a table of impulses by shape, and which particles and shapes a certificate lacks."""
 
+from typing import Any
+
 import newton
 import numpy as np
+
+from ..tuning import MAX_STRAIN
 
 _LABEL = 36  # characters
 _MOST_ROWS = 40
@@ -124,3 +128,40 @@ def uncertified_warning(
         "To look closer: report.uncertified_vertices and report.uncertified_bodies list all of that step, and "
         "report.draw(viewer) shows them in red"
     )
+
+
+def line_of(report: Any) -> str:
+    """Returns what a :class:`.report.SolverReport` says of the steps so far, in one line."""
+    totals, gradients, inside = report.totals, report.gradients, len(np.unique(report.inside.particles))
+    line = (
+        f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
+        f"vertices, {totals.uncertified_steps} not certified"
+    )
+    if totals.revoked_steps:
+        line += f" ({totals.revoked_steps} only in the state of the program)"
+    if totals.unseen_steps:
+        line += f", {totals.unseen_steps} whose end in the state of the program was not seen"
+    if totals.strained_steps:
+        line += f", {totals.strained_steps} that strained an edge by more than {float(MAX_STRAIN):.0%}"
+    if totals.inverting_steps:
+        line += f", {totals.inverting_steps} that inverted tetrahedra"
+    if report.crossings:
+        line += f", {report.crossings} crossings at the start of the step"
+        line += " (warp_bsc.repair_state removes those of a first step)"
+    if inside:
+        line += f", {inside} particles inside solids"
+    if totals.remaining or totals.excluded:
+        line += f"; contacts: {totals.remaining} remained, {totals.excluded} excluded"
+    if report.filtered:
+        line += f"; {report.filtered} filtered pairs in the last step, which are not certified"
+    if totals.not_finite_steps:
+        line += f", {totals.not_finite_steps} steps with positions that are not finite"
+    if gradients.grazing or gradients.lost_steps:
+        line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
+    if report.layer_thickness is not None:
+        line += f"; contact layer of {1e3 * report.layer_thickness:.3g} mm"
+    if gradients.outrun_steps:
+        line += f", which contacts passed in {gradients.outrun_steps} steps"
+    if gradients.layerless_steps:
+        line += f"; {gradients.layerless_steps} steps without their contact layer"
+    return line

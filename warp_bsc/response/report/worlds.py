@@ -1,4 +1,4 @@
-"""The part of a report that says what a step did in each world, as arrays on the device."""
+"""The part of a report that says what a step did in each world, as arrays on the device: ``report.worlds``."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-_NOT_ASKED = "a stage counts worlds only if it is asked to: pass report_worlds=True"
 _NO_IMPULSES = "a stage keeps impulses only if it is asked to: SolverCCD(solver, report_contacts=True)"
 
 
@@ -72,24 +71,3 @@ class Worlds:
         """Returns all results but :attr:`inside` on the host. Synchronizes with the device."""
         arrays = {name: array for name, array in vars(self).items() if isinstance(array, wp.array)}
         return {name.lstrip("_"): array.numpy() for name, array in arrays.items()}
-
-
-class WorldsOfReport:
-    """Results of the last step by world, if ``report_worlds`` of the stage asks for them."""
-
-    _worlds: Worlds | None = None
-
-    def keep_worlds(self, worlds: Worlds) -> None:
-        """Makes the report have results by world."""
-        self._worlds = worlds
-
-    @property
-    def worlds(self) -> Worlds:
-        """Results of the last step by world, on the device.
-
-        Raises:
-            RuntimeError: If the stage was not asked for them.
-        """
-        if self._worlds is None:
-            raise RuntimeError(_NOT_ASKED)
-        return self._worlds

@@ -1,13 +1,15 @@
-"""The part of a report that says what contacts did to momentum, as arrays on the device."""
+"""The part of a report that says what contacts did to momentum, as arrays on the device: ``report.forces``."""
 
 from dataclasses import dataclass
 
+import newton
 import numpy as np
 import warp as wp
 
+from ...._arguments import checked_number
+from ..text import table_by_shape
 from .structs import ContactRows, PublishedImpulses
 
-_NOT_ASKED = "a stage keeps contacts only if it is asked to: SolverCCD(solver, report_contacts=True)"
 _COLUMNS = "kind", "vertices", "weights", "shapes", "bodies", "world", "toi", "point", "normal", "velocity"
 _COLUMNS += "normal_impulse", "tangential_impulse"
 
@@ -66,7 +68,7 @@ class Contacts:
         """Whether all contacts of the last step are listed. Synchronizes with the device.
 
         If there are more than fit, sums have the others too. If an impulse or a sum is too large to be held, sums lack
-        it; :attr:`ContactReport.impulses_complete` is false then.
+        it; :attr:`ContactReport.complete` is false then.
         """
         return int(self.count.numpy()[0]) <= self.capacity and int(self._lost.numpy()[0]) == 0
 
@@ -89,33 +91,31 @@ class ContactReport:
     the inner solver itself pushes, such as the penalties of VBD, is no part of them: it is in the observables of that
     solver, if it has some.
 
-    :attr:`impulses_elsewhere` says where that solver takes over contacts that the stage resolves behind others.
+    :attr:`.report.SolverReport.impulses_elsewhere` says where that solver takes over contacts that the stage resolves
+    behind others.
 
     Sums reach 130,000 N s, of impulses of up to 65,000 N s each, in units of 1.5e-14 N s, and are the same in any order
-    of threads; :attr:`impulses_complete` is false where that is not enough.
-
-    Attributes:
-        impulses_elsewhere: What resolves contacts before the stage in the last step, so that its impulses on them are
-            small; None if nothing is known to.
+    of threads; :attr:`complete` is false where that is not enough.
     """
 
-    impulses_elsewhere: str | None = None
-    _rows: "ContactRows | None" = None
-    _published: "PublishedImpulses | None" = None
-    _shapes_of_worlds: np.ndarray
+    def __init__(
+        self, model: newton.Model, rows: ContactRows, published: PublishedImpulses, shapes_of_worlds: np.ndarray
+    ):
+        """Takes the arrays that each step writes.
 
-    def keep_contacts(self, rows: ContactRows, published: PublishedImpulses, shapes_of_worlds: np.ndarray) -> None:
-        """Makes the report have contacts and impulses, from the arrays that each step writes."""
-        self._rows, self._published, self._shapes_of_worlds = rows, published, shapes_of_worlds
+        Args:
+            model: The model.
+            rows: The contacts.
+            published: The sums.
+            shapes_of_worlds: The shapes of each world, those in all worlds first, then -1, int32, shape
+                [world_count, n].
+        """
+        self._model, self._rows, self._sums, self.shapes_of_worlds = model, rows, published, shapes_of_worlds
 
     @property
     def contacts(self) -> Contacts:
-        """The contacts of the last step that had an impulse.
-
-        Raises:
-            RuntimeError: If the stage was not asked to keep contacts, here and in all that follow.
-        """
-        return Contacts(*(getattr(self._listed, name) for name in ["count", *_COLUMNS, "lost"]))
+        """The contacts of the last step that had an impulse."""
+        return Contacts(*(getattr(self._rows, name) for name in ["count", *_COLUMNS, "lost"]))
 
     @property
     def particle_impulse(self) -> wp.array[wp.vec3]:
@@ -165,31 +165,29 @@ class ContactReport:
         Raises:
             RuntimeError: If there are more than 2^20 entries: sum up :attr:`contacts` instead.
         """
-        pairs, (worlds, local) = self._sums.pair, self._shapes_of_worlds.shape
+        pairs, (worlds, local) = self._sums.pair, self.shapes_of_worlds.shape
         if not len(pairs):
             entries = worlds * (local + 1) ** 2
             raise RuntimeError(f"shape_pair_impulse would have {entries} entries: sum up contacts by shapes instead")
         return pairs.reshape((worlds, local + 1, local + 1))
 
     @property
-    def shapes_of_worlds(self) -> np.ndarray:
-        """The shapes of each world, those in all worlds first, then -1, int32, shape [world_count, n]."""
-        assert self._sums is not None
-        return self._shapes_of_worlds
-
-    @property
-    def impulses_complete(self) -> bool:
+    def complete(self) -> bool:
         """Whether sums have the impulses of all contacts of the last step, see :attr:`Contacts.complete`."""
-        return int(self._listed.lost.numpy()[0]) == 0
+        return int(self._rows.lost.numpy()[0]) == 0
 
-    @property
-    def _listed(self):
-        if self._rows is None:
-            raise RuntimeError(_NOT_ASKED)
-        return self._rows
+    def table(self, dt: float | None = None) -> str:
+        """Returns a table of the contacts of the last step by shape: their number, normal and tangential impulses.
 
-    @property
-    def _sums(self):
-        if self._published is None:
-            raise RuntimeError(_NOT_ASKED)
-        return self._published
+        Tangential impulses are added up without their directions. Lines have at most 80 characters; shapes without
+        contacts are left out, and only the 40 with the largest normal impulses are in it.
+
+        Args:
+            dt: Length of the step [s], for mean forces in place of impulses.
+
+        Raises:
+            ValueError: If ``dt`` is not more than 0.
+        """
+        dt = None if dt is None else checked_number(dt, "dt", 0.0, above=True)
+        contacts = self.contacts
+        return table_by_shape(self._model, contacts.numpy(), dt, complete=contacts.complete)
