@@ -93,8 +93,8 @@ def test_proximities_save_a_pile_an_iteration_for_each_layer(device, monkeypatch
 
     All contacts are projected, as where a world also has contacts of fast elements.
     """
-    monkeypatch.setattr("warp_bsc.response.state.status.MAX_SLOW_ITERATIONS", MAX_ITERATIONS)
-    monkeypatch.setattr("warp_bsc.response.state.status.SLOW_POSITION_SWEEPS", 16)
+    monkeypatch.setattr("warp_bsc.response.state.workspace.MAX_SLOW_ITERATIONS", MAX_ITERATIONS)
+    monkeypatch.setattr("warp_bsc.response.state.workspace.SLOW_POSITION_SWEEPS", 16)
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1), wp.quat_identity()), hx=0.2, hy=0.2, hz=0.1)
     for layer in range(6):

@@ -121,6 +121,7 @@ class Substeps:
 
     Attributes:
         number: The number, at least 2.
+        pushes_before: As of the ``steps`` that it divides into.
     """
 
     def __init__(self, steps: InnerSteps, motion: ModelMotion, number: int, *, integrator: SolverBase):
@@ -134,6 +135,7 @@ class Substeps:
                 step.
         """
         self.number, self._steps, self._motion, self._model = number, steps, motion, motion.mesh.model
+        self.pushes_before = steps.pushes_before
         self._leaves_bodies_on_tape = has_external_rigid_solver(integrator)
         leaves_bodies = self._leaves_bodies_on_tape or isinstance(integrator, SolverStyle3D)
         model, device = self._model, self._model.device
@@ -153,11 +155,6 @@ class Substeps:
             moved = kinematic | (host_array(model.body_inv_mass) == 0.0) | leaves_bodies
         self._way.is_moved = wp.array(moved, dtype=bool, device=device)
         self._way.ends_in_out = leaves_bodies
-
-    @property
-    def pushes_before(self) -> str | None:
-        """What pushes before the stage in each of the steps."""
-        return self._steps.pushes_before
 
     def take(self, call: StepCall) -> None:
         """Steps the inner solver, see :class:`.inner_steps.InnerSteps`."""

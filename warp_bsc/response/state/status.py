@@ -4,15 +4,6 @@ from enum import IntEnum
 
 import warp as wp
 
-from ..tuning import (
-    MAX_DIVISIONS,
-    MAX_ITERATIONS,
-    MAX_SLOW_ITERATIONS,
-    MAX_SWEEPS,
-    MAX_TRUNCATIONS,
-    SLOW_POSITION_SWEEPS,
-)
-
 wp.set_module_options({"enable_backward": False})
 
 
@@ -105,23 +96,6 @@ def views_of(struct_type: type, values: wp.array):
     for name, element in zip(struct_type.vars, single_elements(values), strict=True):
         setattr(struct, name, element)
     return struct
-
-
-def allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
-    """Returns a cleared status.
-
-    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
-    """
-    status = SolveStatus()
-    for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
-        setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
-    for name in ("contact_iteration", "is_fast", "crossings"):
-        setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
-    status.max_iterations = max_iterations
-    status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
-    status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
-    status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
-    return status
 
 
 @wp.func

@@ -16,19 +16,25 @@ from ..tuning import (
     DIVIDING_PLANES_IF_FEW,
     ITERATIONS_RESERVED,
     ITERATIONS_RESERVED_IF_FEW,
+    MAX_DIVISIONS,
     MAX_ITERATIONS,
+    MAX_SLOW_ITERATIONS,
+    MAX_SWEEPS,
+    MAX_TRUNCATIONS,
     MIN_ENTRIES,
     PAIRS_PER_FACE,
     PAIRS_PER_STATIC_FACE,
+    SLOW_POSITION_SWEEPS,
     SWEEPS_PER_BATCH,
     THREADS,
     TOLERANCE,
 )
 from .cluster import BLOCK, begin_worlds, count_constraints, list_constraints, threads_of_world
+from .launches import Launches
 from .mesh import ModelMesh, grouped_by_world
 from .motion import ModelMotion, takes_part
 from .record import StepRecord, StepRecorder, record_offsets
-from .status import Loop, SolveStatus, WorldCounts, allocate_status, clear_status, single_elements, start_sweeps
+from .status import Detection, Loop, Result, SolveStatus, WorldCounts, clear_status, single_elements, start_sweeps
 from .structs import (
     NEVER,
     NO_NODE,
@@ -110,7 +116,24 @@ def pairs_of(mesh: ModelMesh, can_move: np.ndarray) -> int:
     return PAIRS_PER_FACE * moving + PAIRS_PER_STATIC_FACE * (count - moving)
 
 
-class Workspace:
+def _allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
+    """Returns a cleared status.
+
+    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
+    """
+    status = SolveStatus()
+    for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
+        setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
+    for name in ("contact_iteration", "is_fast", "crossings"):
+        setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
+    status.max_iterations = max_iterations
+    status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
+    status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
+    status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
+    return status
+
+
+class Workspace(Launches):
     """The buffers that a step works on, reused from step to step, on the device of the mesh.
 
     Attributes:
@@ -208,7 +231,7 @@ class Workspace:
             sizes |= dict.fromkeys(("first", "lacks", "placed", "wanted", "reached"), vertices)
             self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
         limits = {"max_iterations": max_iterations, "recorded": differentiable}
-        self.status = allocate_status(self.worlds, device, **limits)
+        self.status = _allocate_status(self.worlds, device, **limits)
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
         self.recorder: StepRecorder | None = None
         self.record = StepRecord()
@@ -366,36 +389,6 @@ class Workspace:
         """Reserves a truncation for each particle and body, if the step is recorded; does nothing in a CUDA graph."""
         if self.recorder is not None:
             self.recorder.reserve("truncations", self.particle_count + self.body_count)
-
-    def launch(self, kernel: wp.Kernel, size: int, inputs: Sequence, outputs: Sequence = ()) -> None:
-        """Launches a kernel on the device."""
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
-
-    def launch_over_entries(self, kernel: wp.Kernel, inputs: Sequence) -> None:
-        """Launches a kernel that takes all entries of a queue, of which the device knows the number.
-
-        Its last input is the number of its threads: each takes every so many-th entry, so that capacity that is not
-        used costs nothing. On the CPU it is one thread, because Warp's additions are not atomic there.
-        """
-        wp.launch(kernel, self._threads, inputs=[*inputs, self._threads], device=self.device)
-
-    def launch_over_constraints(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel that takes all constraints, with the step as its first input, as in all that follow."""
-        self.launch_over_entries(kernel, [self.step, *inputs])
-
-    def launch_over_particles(self, kernel: wp.Kernel, *inputs, at_least_once: bool = False) -> None:
-        """Launches a kernel over the particles; ``at_least_once`` even if there are none."""
-        self.launch(kernel, max(self.particle_count, int(at_least_once)), [self.step, *inputs])
-
-    def launch_over_bodies(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the bodies, if they can be moved."""
-        if self.body_count:
-            self.launch(kernel, self.body_count, [self.step, *inputs])
-
-    def launch_over_shape_vertices(self, kernel: wp.Kernel, *inputs) -> None:
-        """Launches a kernel over the vertices of shapes, if bodies can be moved."""
-        if self.body_count:
-            self.launch(kernel, self.mesh.vertex_count - self.particle_count, [self.step, *inputs])
 
     def sweep_by_world(self, kernel: Callable[[int], wp.Kernel], inputs: Sequence) -> None:
         """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.solve.by_world`.
