@@ -11,6 +11,7 @@ minimum distances, a contact is a pair that comes nearer than it may.
 
 import warp as wp
 
+from .._profiling import phase
 from .contacts import detect, proximities
 from .contacts.inversions import find_inversions
 from .schedule import begin_prevention, decide_cut
@@ -42,6 +43,7 @@ def find_contacts(work: Workspace, recorder: StepRecorder | None = None) -> None
     detect_contacts(work)
 
 
+@phase("detect contacts")
 def detect_contacts(work: Workspace) -> None:
     """Adds constraints for the contacts of the motion that :func:`begin` has initialized."""
     if work.max_penetrations:
@@ -74,6 +76,7 @@ def _iterate(work, dt):
     detect.detect(work, only_changed=True)
 
 
+@phase("inversions")
 def resolve_inversions(work: Workspace, dt: float) -> None:
     """Counts the tetrahedra that the resolved motion inverts, and cuts paths until there is none, if that is asked for.
 
@@ -111,6 +114,7 @@ def _cut_paths(work):
     work.launch(decide_cut, 1, [False, work.status])
 
 
+@phase("add proximities")
 def add_proximities(work: Workspace) -> None:
     """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
     wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
@@ -124,6 +128,7 @@ def prepare(work: Workspace) -> None:
     work.vertices.outcome.zero_()
 
 
+@phase("begin")
 def begin(work: Workspace, recorder: StepRecorder | None = None) -> None:
     """Initializes vertices and bodies by their prediction, and counts what crosses at the start, which is excluded."""
     work.begin(recorder)

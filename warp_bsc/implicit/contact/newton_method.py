@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from ..._profiling import phase
 from ...detection.pipeline import MIN_CAPACITY
 from ...detection.run.launch import retry_until_fits
 from ...detection.run.settings import capacity_for
@@ -293,6 +294,7 @@ class NewtonMethod:
         self._begin(end, dt)
         self._find_end(end)
 
+    @phase("retreat")
     def retreat(self, end: StateArrays, detect: Callable[[], None]) -> None:
         """Ends the step earlier in worlds in which the workspace found contacts, where ``detect`` finds none then."""
         self._go_back(end, detect, begins=True)
@@ -331,6 +333,7 @@ class NewtonMethod:
     def _least_speed(self):
         return self._metre * _LEAST_SPEED * min(1.0, 60.0 * self._dt)
 
+    @phase("begin solve")
     def _begin(self, end, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
@@ -386,6 +389,7 @@ class NewtonMethod:
         self._any_leaves.zero_()
         self._find_candidates()
 
+    @phase("find candidates")
     def _find_candidates(self):
         """Finds the pairs that may come near each other within the boxes."""
         work, detector = self._work, self._work.detector
@@ -485,6 +489,7 @@ class NewtonMethod:
         self._flow.phase.fill_(int(Phase.PUBLISH))
         self._advance(of_all=True)
 
+    @phase("linear solve")
     def _solve(self):
         work, team = self._work, self._team
         if team.blocks > 1:
@@ -506,6 +511,7 @@ class NewtonMethod:
         )
         self._advance()
 
+    @phase("Newton step")
     def _advance(self, resumes=False, of_all=False):
         work = self._work
         self._problem.grows = int(self._may_grow and not work.device.is_capturing)

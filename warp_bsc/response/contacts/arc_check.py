@@ -6,6 +6,7 @@ step loses its certificate.
 
 import warp as wp
 
+from ..._profiling import phase
 from ...detection.run.launch import retry_until_fits
 from ...kernels.arcs import Arcs, turns
 from ...kernels.pipeline.queues import has_overflowed
@@ -70,6 +71,7 @@ def _count_contacts(
             number += 1
 
 
+@phase("check arcs")
 def check_arcs(work: Workspace) -> None:
     """Takes the certificate from a resolved motion whose arcs collide, if it was resolved by its chords."""
     if work.turns is None or work.on_arcs:

@@ -7,6 +7,8 @@ from typing import Any, Protocol
 import newton
 import warp as wp
 
+from ..._profiling import phase
+
 
 @dataclass(frozen=True)
 class StepCall:
@@ -76,6 +78,7 @@ class WholeSteps:
         """Yields the call itself."""
         yield call
 
+    @phase("inner solver")
     def take(self, call: StepCall) -> None:
         """Steps the inner solver."""
         self._stage.solver.step(call.state_in, call.state_out, call.control, call.contacts, call.dt, **call.options)

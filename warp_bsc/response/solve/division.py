@@ -7,6 +7,7 @@ start. Paths of vertices are also cut before a tetrahedron of theirs inverts, wh
 
 import warp as wp
 
+from ..._profiling import phase
 from ..contacts import first_contact
 from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
 from ..contacts.dividing_planes import add_dividing_plane, has_planes
@@ -340,6 +341,7 @@ def freeze_undetected(step: Step, dividing: DividingPlanes, particles: int, bodi
             _freeze_body(step, i)
 
 
+@phase("divide")
 def divide(work: Workspace, dt: float) -> None:
     """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
     work.reserve_truncations()

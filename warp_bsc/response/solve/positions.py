@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from ..._profiling import phase
 from ..contacts.constraints import gap, min_distance_of, moves_body
 from ..schedule import is_dividing, is_projecting, is_reversible
 from ..state.cluster import BLOCK, wait_for_others
@@ -178,6 +179,7 @@ def _sweep(cluster: int) -> wp.Kernel:
     return sweep_positions
 
 
+@phase("project positions")
 def project(work: Workspace) -> None:
     """Moves vertices and bodies apart at the end of the step, until their constraints are met."""
     if work.sweeping_threads:

@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from ..._profiling import phase
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
 from ..state.cluster import BLOCK, wait_for_others
 from ..state.fixed_sum import with_delta
@@ -189,6 +190,7 @@ def _sweep(cluster: int) -> wp.Kernel:
     return sweep_velocities
 
 
+@phase("project velocities")
 def project(work: Workspace, dt: float) -> None:
     """Solves friction and restitution of all contacts that moved a vertex in a step of length ``dt`` [s].
 
