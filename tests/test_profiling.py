@@ -33,7 +33,9 @@ print(*dict.fromkeys(names), sep="\\n")
 def test_a_profile_reads_as_the_phases_of_a_step():
     def run(value):
         environment = os.environ | {"WARP_BSC_PROFILE": value}
-        done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
+        )
         return [line.removeprefix("warp_bsc: ") for line in done.stdout.splitlines() if line.startswith("warp_bsc: ")]
 
     phases = run("1")

@@ -1,8 +1,6 @@
 """Steps on a tape that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
-import copy
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import newton
 import warp as wp
@@ -10,19 +8,9 @@ from newton.solvers import SolverBase
 
 from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
+from .drive.snapshot import Snapshot
 from .layer.contact_layer import ContactLayer
 from .stage import CollisionStage
-
-
-def _clone(x: Any) -> Any:
-    """Returns a copy of an array, or of a state or a namespace of one; the model of a state may be any."""
-    if isinstance(x, wp.array):
-        return wp.clone(x, requires_grad=False)
-    copied = copy.copy(x)
-    for name, value in vars(x).items():
-        if isinstance(value, (wp.array, newton.Model.AttributeNamespace)):
-            setattr(copied, name, _clone(value))
-    return copied
 
 
 class CapturedSteps:
@@ -81,7 +69,7 @@ class CapturedSteps:
             restored.append(self._report.total_values)
         if self._layer is not None:
             restored.append(self._layer.skipped)
-        self._saved = [(x, _clone(x)) for x in restored]
+        self._before = Snapshot(restored)
         self._graph = None
         self.retaken = 0
 
@@ -106,16 +94,14 @@ class CapturedSteps:
 
     def _launch(self):
         """Launches the graph; if its buffers were too small, restores the state and returns False."""
-        for x, saved in self._saved:
-            saved.assign(x)
+        self._before.save()
         lost = self._count_lost()
         wp.capture_launch(self._graph)
         if self._count_lost() == lost:
             if self._report is not None:
                 self._report.warn()
             return True
-        for x, saved in self._saved:
-            x.assign(saved)
+        self._before.restore()
         if self._report is not None:
             self._report.copy_totals()
             wp.synchronize_device(self._device)  # so that the next step does not warn of one that was taken back

@@ -14,6 +14,7 @@ from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
 from ..wrapped_solver import WrappedSolver
+from .snapshot import Snapshot
 
 wp.set_module_options({"enable_backward": False})
 
@@ -185,8 +186,7 @@ class _Coupled:
         self._last, self._first, self._start = model.state(), model.state(), model.state()
         self._continues = False
         self.has_stepped = False  # since the last reset
-        starts = motion.starts() if restarts else []
-        self._starts = [(start, wp.clone(start)) for start in starts]
+        self._starts = Snapshot(motion.starts() if restarts else [])
         self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
 
@@ -209,12 +209,10 @@ class _Coupled:
         if dt <= 0.0:  # ``reset`` interrupts the motion
             return
         if iteration_restart:
-            for start, kept in self._starts:
-                wp.copy(start, kept)
+            self._starts.restore()
         elif not self._continues:
             _copy_positions(self._first, self._last)
-            for start, kept in self._starts:
-                wp.copy(kept, start)
+            self._starts.save()
         self._continues = True
         self.body_impulses.zero_()  # those of an earlier pass
         self.particle_impulses.zero_()
