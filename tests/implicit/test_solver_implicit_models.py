@@ -141,7 +141,7 @@ def test_a_friction_table_decides_what_slides(friction, slides, on_plane, device
     table = np.array([[-1.0, friction], [friction, -1.0]], dtype=np.float32)
     of_pairs = bsc.FrictionTable(table, particle_material=0, shape_material=1)
     steps = 20
-    _, state = run(model, steps, friction_table=of_pairs, max_iterations=40)
+    _, state = run(model, steps, friction=of_pairs, max_iterations=40)
     speed = state.particle_qd.numpy()[:, 0].mean()
     if slides:
         expected = steps * DT * GRAVITY * (np.sin(angle) - friction * np.cos(angle))

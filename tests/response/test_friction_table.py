@@ -61,8 +61,7 @@ def test_each_pair_slides_by_its_friction_and_a_graph_reads_the_table_again(devi
     materials = {"particle_material": material, "shape_material": [2, 3, 5, 6]}
     solver = bsc.SolverCCD(
         free(model),
-        friction=0.2,
-        friction_table=bsc.FrictionTable(table, **materials),
+        friction=bsc.FrictionTable(table, particle_mu=0.2, **materials),
         bodies="separated",
     )
     states, control = [model.state(), model.state()], model.control()
@@ -119,10 +118,10 @@ def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
             "on a GPU Style3D adds up forces in any order, which the first contact magnifies as much as friction"
         )
     ends = []
-    for mu, table in ((0.25, None), (0.0, bsc.FrictionTable([[0.25]])), (0.0, None)):
+    for mu, friction in ((0.25, 0.25), (0.0, bsc.FrictionTable([[0.25]], particle_mu=0.0)), (0.0, 0.0)):
         model = drape(device, cells=6) if inner == "style3d" else falling(device, mu)
         model.shape_material_mu.fill_(mu)
-        options = {"friction": mu, "friction_table": table}
+        options = {"friction": friction}
         if inner == "style3d":
             solver = newton.solvers.SolverStyle3D(model)
             solver.collision = None  # its own contacts, which need those of Newton
@@ -154,7 +153,7 @@ def test_gradients_reach_the_table(contact_layer, device):
         friction, table = wp.array([mu], **numbers), wp.array([[0.25]], **numbers)
         options = {"friction": friction, "contact_layer": contact_layer}
         if mu == 0.0:
-            options["friction_table"] = bsc.FrictionTable(table)
+            options["friction"] = bsc.FrictionTable(table, particle_mu=friction)
         solver, states = bsc.SolverCCD(semi_implicit(model), **options), [model.state() for _ in range(5)]
         with wp.Tape() as tape:
             for start, end in itertools.pairwise(states):

@@ -361,7 +361,7 @@ def test_gradient_in_a_cuda_graph(device):
     if not wp.get_device(device).is_cuda:
         pytest.skip("a CUDA graph needs a GPU")
     table = wp.array([[0.3]], dtype=float, device=device, requires_grad=True)
-    scene = Throw(device, friction_table=bsc.FrictionTable(table))
+    scene = Throw(device, friction=bsc.FrictionTable(table))
     scene.velocity.assign(THROW[None])
     tape = scene.backward()
     eager = scene.velocity.grad.numpy()[0].copy(), table.grad.numpy()[0, 0].copy()
@@ -380,7 +380,7 @@ def test_gradient_in_a_cuda_graph(device):
 def test_an_incomplete_record_gives_nan(device):
     """As in a CUDA graph whose buffers are too small."""
     table = wp.array([[0.3]], dtype=float, device=device, requires_grad=True)
-    scene = Throw(device, friction_table=bsc.FrictionTable(table), steps=1)
+    scene = Throw(device, friction=bsc.FrictionTable(table), steps=1)
     scene.velocity.assign(np.float32([[0.0, 0.0, -9.0]]))
     scene.backward()
     table.grad.zero_()

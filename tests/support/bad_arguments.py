@@ -482,10 +482,10 @@ def calls_of_solvers() -> dict[str, Call]:
         "too few": bsc.CollisionFilter(particle_mask=np.ones(count - 1, dtype=int)),
         "shapes": bsc.CollisionFilter(shape_group=[1]),
     }
-    tables = without(OBJECTS, "None") | {
+    tables = {
         "list": [[0.1]],
-        "too few": bsc.FrictionTable([[0.1]], particle_material=np.zeros(count - 1, dtype=int)),
-        "shapes": bsc.FrictionTable([[0.1]], shape_material=[0]),
+        "table of fewer": bsc.FrictionTable([[0.1]], particle_material=np.zeros(count - 1, dtype=int)),
+        "table of other shapes": bsc.FrictionTable([[0.1]], shape_material=[0]),
     }
     coefficients = without(bad_arrays(np.zeros((2, 2))), "integers", "half precision") | {
         "not square": np.zeros((2, 1)),
@@ -511,7 +511,12 @@ def calls_of_solvers() -> dict[str, Call]:
         "FrictionTable": Call(
             bsc.FrictionTable,
             {"coefficients": [[0.1]]},
-            {"coefficients": coefficients} | dict.fromkeys(["particle_material", "shape_material"], materials),
+            {
+                "coefficients": coefficients,
+                "particle_material": materials,
+                "shape_material": materials,
+                "particle_mu": without(NUMBERS, "None") | {"negative": -1.0, "doubles": coefficient["doubles"]},
+            },
             raises=bsc.FrictionTable,
         ),
         "SolverCCD": Call(
@@ -520,8 +525,7 @@ def calls_of_solvers() -> dict[str, Call]:
             {
                 "solver": solvers,
                 "separation": without(POSITIVE, "None"),
-                "friction": coefficient | {"huge": 1e39},
-                "friction_table": tables,
+                "friction": coefficient | {"huge": 1e39} | tables,
                 "restitution": coefficient | {"above 1": 1.5},
                 "substeps": NOT_COUNT | {"zero": 0, "many": 1025},
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
@@ -554,8 +558,7 @@ def calls_of_solvers() -> dict[str, Call]:
             {
                 "solver": solvers,
                 "thickness": without(POSITIVE, "None"),
-                "friction": coefficient | {"huge": 1e39},
-                "friction_table": tables,
+                "friction": coefficient | {"huge": 1e39} | tables,
                 "restitution": coefficient | {"above 1": 1.5},
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
@@ -569,8 +572,7 @@ def calls_of_solvers() -> dict[str, Call]:
             {"model": inner.model},
             {
                 "model": OBJECTS,
-                "friction": coefficient | {"huge": 1e39},
-                "friction_table": tables,
+                "friction": coefficient | {"huge": 1e39} | tables,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
                 "collision_filter": filters,

@@ -133,8 +133,7 @@ class SolverImplicit(SolverCCD):
         self,
         model: newton.Model,
         *,
-        friction: float | wp.array[float] | None = None,
-        friction_table: FrictionTable | None = None,
+        friction: float | wp.array[float] | FrictionTable | None = None,
         bodies: Literal["solved", "left"] = "solved",
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
@@ -150,7 +149,6 @@ class SolverImplicit(SolverCCD):
             model: A model with particles or free bodies.
             friction: Coefficient of particles, as of :class:`warp_bsc.SolverCCD`, like all that follow but for
                 ``max_iterations``. Below a speed of 0.5 mm/s it is proportional to the speed.
-            friction_table: Coefficients by pair of materials.
             bodies: Whether the solver moves free dynamic bodies, or leaves all of them where a program, or another
                 solver, puts them.
             min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it. Without this and
@@ -202,7 +200,6 @@ class SolverImplicit(SolverCCD):
             contact_layer=False,
             restitution=0.0,
             friction=friction,
-            friction_table=friction_table,
             min_distance=min_distance,
             particle_radius=particle_radius,
             collision_filter=collision_filter,

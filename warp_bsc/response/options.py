@@ -61,7 +61,6 @@ class StageOptions:
         *,
         separation=None,
         friction=None,
-        friction_table=None,
         restitution=None,
         substeps=1,
         bodies="pushed",
@@ -78,11 +77,12 @@ class StageOptions:
         if separation is not None:
             separation = checked_distance(separation, "separation", zero=False)
             checked_number(separation, "separation", 0.0, MAX_FLOAT)
+        table, friction = checked_table(friction, model)
         substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)
         return cls(
             separation=separation,
             friction=checked_friction(friction, model),
-            friction_table=checked_table(friction_table, model),
+            friction_table=table,
             reads_friction=model.requires_grad or isinstance(friction, wp.array),
             restitution=checked_restitution(restitution, model),
             substeps=substeps,

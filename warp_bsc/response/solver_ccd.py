@@ -107,8 +107,7 @@ class SolverCCD(CollisionStage):
         solver: SolverBase,
         *,
         separation: float | None = None,
-        friction: float | wp.array[float] | None = None,
-        friction_table: FrictionTable | None = None,
+        friction: float | wp.array[float] | FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
         substeps: int = 1,
         bodies: Literal["pushed", "separated", "left"] = "pushed",
@@ -129,9 +128,8 @@ class SolverCCD(CollisionStage):
             friction: Coefficient of particles, at least 0; default: the model's ``particle_mu``. Shapes have that of
                 their material, contacts the geometric mean. May be an array of float32, of length 1 or of one for each
                 particle, which each step reads again, and which may require gradients; so are then the coefficients of
-                shapes, as with ``requires_grad``. Negative values count as 0.
-            friction_table: Coefficients by pair of materials, where they are another than the geometric mean, see
-                :class:`.state.friction_table.FrictionTable`. None for none.
+                shapes, as with ``requires_grad``. Negative values count as 0. A
+                :class:`.state.friction_table.FrictionTable` has coefficients by pair of materials.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             substeps: Number of smaller steps of equal length in a step, 1 to 1024, each a step of the inner solver with
@@ -188,7 +186,6 @@ class SolverCCD(CollisionStage):
             self.model,
             separation=separation,
             friction=friction,
-            friction_table=friction_table,
             restitution=restitution,
             substeps=substeps,
             bodies=bodies,
@@ -214,7 +211,7 @@ class SolverCCD(CollisionStage):
         inner = solver.solver if isinstance(solver, ContactLayer) else solver
         integrator = innermost(solver)
         moves = options.moves_bodies(mesh, integrator)
-        coefficients = friction_of(mesh, self.friction, table=friction_table)
+        coefficients = friction_of(mesh, self.friction, table=options.friction_table)
         moving = {"moves_bodies": moves, "responds_to_bodies": separates, "watches_turns": True}
         motion = ModelMotion(mesh, coefficients, **moving)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
@@ -222,8 +219,7 @@ class SolverCCD(CollisionStage):
         if options.contact_layer and self.model.requires_grad and inner is solver:
             self.solver = ContactLayer(
                 solver,
-                friction=self.friction,
-                friction_table=friction_table,
+                friction=friction if options.friction_table is not None else self.friction,
                 restitution=self.restitution,
                 min_distance=min_distance,
                 particle_radius=particle_radius,

@@ -85,8 +85,7 @@ class ContactLayer(WrappedSolver):
         solver: SolverBase,
         *,
         thickness: float | None = None,
-        friction: float | wp.array[float] | None = None,
-        friction_table: FrictionTable | None = None,
+        friction: float | wp.array[float] | FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
@@ -102,9 +101,8 @@ class ContactLayer(WrappedSolver):
                 the next push each other as well. Default: a quarter of the median edge length, or 0.45 of the shortest
                 less the minimum distance where the first step shows that motion is too fast for that, see
                 :mod:`.layer.thickness`.
-            friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``.
-            friction_table: Coefficients by pair of materials, as for :class:`.solver_ccd.SolverCCD`. A stage around the
-                layer has its own: give it the same.
+            friction: As for :class:`.solver_ccd.SolverCCD`, like ``restitution`` and ``particle_radius``. A stage
+                around the layer has its own: give it the same.
             restitution: Share of the approaching velocity that comes back, in [0, 1].
             min_distance: Distance of pairs at the bottom of the layer [m], or ``"model"``; None or 0: they touch.
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all.
@@ -122,7 +120,6 @@ class ContactLayer(WrappedSolver):
         options = StageOptions.of(
             self.model,
             friction=friction,
-            friction_table=friction_table,
             restitution=restitution,
             min_distance=min_distance,
             particle_radius=particle_radius,
@@ -137,7 +134,7 @@ class ContactLayer(WrappedSolver):
         if thickness is not None:
             thin = thick = checked_distance(thickness, "thickness", zero=False)
         moves_bodies = options.moves_bodies(mesh, innermost(solver))
-        coefficients = friction_of(mesh, self.friction, table=friction_table)
+        coefficients = friction_of(mesh, self.friction, table=options.friction_table)
         self._motion = ModelMotion(mesh, coefficients, moves_bodies=moves_bodies)
         layer, device = Layer(), mesh.device
         n, body_count = mesh.vertex_count, self.model.body_count if moves_bodies else 0

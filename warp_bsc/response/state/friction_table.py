@@ -7,7 +7,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..._arguments import as_numpy, check_instance, checked_integers
+from ..._arguments import as_numpy, checked_integers, checked_number
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class FrictionTable:
     Cloth that slides on the first shape and sticks to the second, and for which everything else is as without a table::
 
         table = [[-1.0, 0.1, 0.9], [0.1, -1.0, -1.0], [0.9, -1.0, -1.0]]
-        SolverCCD(solver, friction_table=FrictionTable(table, particle_material=0, shape_material=[1, 2]))
+        SolverCCD(solver, friction=FrictionTable(table, particle_material=0, shape_material=[1, 2]))
 
     Attributes:
         coefficients: Coefficients, shape [n, n], symmetric. A Warp array of float32 on the device of the model is read
@@ -31,6 +31,8 @@ class FrictionTable:
         particle_material: Material of each particle, integers in [0, n), shape [particle_count], or one for all. A
             stage reads the materials once, when it is made.
         shape_material: Material of each shape, shape [shape_count], or one for all.
+        particle_mu: Coefficients of particles, for pairs that have none of their own, as ``friction`` of
+            :class:`.solver_ccd.SolverCCD` without a table.
 
     Raises:
         TypeError: If coefficients are no numbers, or materials no integers.
@@ -40,6 +42,7 @@ class FrictionTable:
     coefficients: wp.array | np.ndarray | list[list[float]]
     particle_material: int | np.ndarray | wp.array = 0
     shape_material: int | np.ndarray | wp.array = 0
+    particle_mu: float | wp.array | None = None
 
     def __post_init__(self):
         values = self.coefficients
@@ -65,6 +68,12 @@ class FrictionTable:
             if materials.ndim > 1:
                 raise ValueError(f"{name} must be one integer or an array of one dimension, not {materials.shape}")
             checked_integers(materials, name, materials.size, len(values))
+        mu = self.particle_mu
+        if isinstance(mu, wp.array):
+            if mu.dtype is not wp.float32:
+                raise TypeError(f"particle_mu must be a number, or an array of float32, not of {mu.dtype.__name__}")
+        elif mu is not None:
+            checked_number(mu, "particle_mu", 0.0)
 
     def on_device(self, model: newton.Model) -> wp.array:
         """Returns the coefficients on the device of a model, float32, shape [n, n]: those that a program may change."""
@@ -76,19 +85,18 @@ class FrictionTable:
         """Returns the materials of the particles and shapes of a model, int32, with errors as of the class."""
         counts, most = {"particle": model.particle_count, "shape": model.shape_count}, len(self.coefficients)
         of_particles, of_shapes = (
-            checked_integers(getattr(self, f"{what}_material"), f"friction_table.{what}_material", n, most)
+            checked_integers(getattr(self, f"{what}_material"), f"friction.{what}_material", n, most)
             for what, n in counts.items()
         )
         return of_particles, of_shapes
 
 
-def checked_table(friction_table: Any, model: newton.Model) -> FrictionTable | None:
-    """Returns the argument ``friction_table``, a :class:`FrictionTable` that fits a model, or None."""
-    if friction_table is None:
-        return None
-    check_instance(friction_table, "friction_table", FrictionTable, "a FrictionTable")
-    friction_table.materials(model)
-    values = friction_table.coefficients
+def checked_table(friction: Any, model: newton.Model) -> tuple[FrictionTable | None, Any]:
+    """Returns the table of the argument ``friction``, or None, and the coefficient of particles, not checked yet."""
+    if not isinstance(friction, FrictionTable):
+        return None, friction
+    friction.materials(model)
+    values = friction.coefficients
     if isinstance(values, wp.array) and values.device != model.device:
-        raise ValueError(f"friction_table.coefficients must be on device {model.device}, not {values.device}")
-    return friction_table
+        raise ValueError(f"friction.coefficients must be on device {model.device}, not {values.device}")
+    return friction, friction.particle_mu
