@@ -1,6 +1,6 @@
 """Whether two moving features come within a minimum distance d, certified by subdivision of the step.
 
-The proofs of :mod:`.clearance` show that they do not, each over a whole part of the step. At one time, two points of
+The proofs of :mod:`.separation_proof` show that they do not, each over a whole part of the step. At one time, two points of
 the features whose distance is certainly at most d are a HIT.
 
 Two searches look for parts that are free. Most queries end in the first one.
@@ -25,11 +25,11 @@ With a roundoff of 0 the bounds are zero, and the status is the one that floatin
 
 import warp as wp
 
-from .clearance import POINT_ERROR, direction_clears, norm_bound, plane_clears, polygon_clears, sum_of_size
 from .closest import between, closest_coordinates, contact_at, unit_scale
 from .culling import DIRECTION_ERROR, centroid_direction
 from .distance import nearest_pair
 from .polynomials import VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity
+from .separation_proof import POINT_ERROR, direction_clears, norm_bound, plane_clears, polygon_clears, sum_of_size
 from .signs import FREE, HIT, UNDERFLOW, UNSURE
 from .time_of_impact import Impact, clamped_tolerance, mix_vector, power_of_two, restrict_motion
 

@@ -2,8 +2,7 @@
 
 Their chords must stay farther apart than the bounds of the deviations of both elements together, see
 :mod:`warp_bsc.kernels.arcs`. That is shown for the whole step by the plane of the pair or the direction through the
-centroids, the first two proofs of :mod:`warp_bsc.kernels.clearance`; or by directions between the closest points at a
-few times, each for the times around its own, as in the advancement of :mod:`warp_bsc.kernels.min_distance`. Bounds are
+centroids, the first two proofs of :mod:`.separation_proof`; or by directions between the closest points at a few times, each for the times around its own, as in the advancement of :mod:`warp_bsc.kernels.min_distance`. Bounds are
 theirs. Pairs that :mod:`.simd_query` cannot use are left.
 """
 
@@ -11,9 +10,9 @@ import functools
 
 import warp as wp
 
-from ..clearance import INFLATED, NORMAL_ERROR, PLANE_ERROR
 from ..min_distance import AWAY, SHORTEST, SMALLEST
 from ..pairs import ABOVE_SUM
+from ..separation_proof import INFLATED, NORMAL_ERROR, PLANE_ERROR
 from ..signs import ROUNDOFF
 from .simd import native_for_pairs
 from .simd_query import QUERY, QUERY_CONSTANTS

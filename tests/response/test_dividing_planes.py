@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch, add_plates, bullet, place_plates
 
 import warp_bsc as bsc
-from warp_bsc.response.contacts.dividing_planes import add_plane, add_solid, has_planes
 from warp_bsc.response.contacts.first_contact import packed_contact
-from warp_bsc.response.solve.sides import position_on_sides
+from warp_bsc.response.contacts.planes_between import add_plane, add_solid, has_planes
+from warp_bsc.response.solve.vertex_projection import position_on_sides
 from warp_bsc.response.state.structs import DIVIDED, NEVER, NO_NODE, DividingPlanes, Motion, allocate
 
 

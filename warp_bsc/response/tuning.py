@@ -85,7 +85,7 @@ PLANE_MARGIN = wp.constant(wp.float64(0.1))
 """Distance from a plane, as a share of the separation, that a vertex gets if projection has not kept it out."""
 PLANE_APPROACH = wp.constant(wp.float64(0.25))
 """Most of that, beyond rounding, as a share of how far the vertex would be if it stood still: see
-:mod:`.contacts.dividing_planes`."""
+:mod:`.contacts.planes_between`."""
 PLANE_DEPTH = wp.constant(wp.float64(0.05))
 """Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
 

@@ -18,8 +18,8 @@ from ..state.vectors import ONE, ZERO, relative
 from ..tuning import PLANE_APPROACH, PLANE_DEPTH, PLANE_MARGIN
 from . import constraints, rules
 from .constraints import TOUCH
-from .dividing_planes import add_dividing_plane, add_solid
 from .first_contact import update_first_contact
+from .planes_between import add_dividing_plane, add_solid
 from .queue import PairQueue, has_pair, pair_count, vertices_of
 from .rules import ContactClass
 

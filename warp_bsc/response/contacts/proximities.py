@@ -15,8 +15,8 @@ from ..state.vectors import ZERO, corners_of
 from ..state.workspace import Workspace
 from ..tuning import REACH, RESTING_PATH
 from . import constraints
-from .closest import closest_vector
-from .nearest import NearestArguments, clip_paths, find_nearest_in_hierarchy, find_nearest_in_queue, is_behind
+from .closest_points import closest_vector
+from .occluders import NearestArguments, clip_paths, find_nearest_in_hierarchy, find_nearest_in_queue, is_behind
 from .queue import PairQueue, has_pair, pair_count, queues_of, vertices_of
 from .rules import ContactClass, are_occluded, are_on_body, are_parallel, crossed_at_start, owner_of
 

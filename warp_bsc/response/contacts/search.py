@@ -25,9 +25,9 @@ from ..state.structs import ContactKind, DividingPlanes, Step
 from ..state.vectors import ZERO
 from .collect import mark_changed
 from .constraints import distances_at_start
-from .dividing_planes import add_dividing_plane
 from .face_pairs import pair_of_bit
 from .first_contact import update_first_contact
+from .planes_between import add_dividing_plane
 from .rules import ContactClass, classify_contact, owner_of
 
 _TOLERANCE = wp.constant(wp.float64(TOLERANCE))

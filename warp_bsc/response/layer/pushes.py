@@ -7,7 +7,7 @@ from ...detection.narrow.rings import are_within_rings
 from ...kernels.closest import closest_weights
 from ...kernels.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE
-from ..contacts.closest import closest_vector
+from ..contacts.closest_points import closest_vector
 from ..contacts.constraints import friction_on_plane
 from ..contacts.rules import ContactClass, owner_of
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance

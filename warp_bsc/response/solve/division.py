@@ -10,8 +10,8 @@ import warp as wp
 from ..._profiling import phase
 from ..contacts import first_contact
 from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
-from ..contacts.dividing_planes import add_dividing_plane, has_planes
 from ..contacts.first_contact import TIME_UNITS
+from ..contacts.planes_between import add_dividing_plane, has_planes
 from ..contacts.queue import PairQueue, queues_of, vertices_of
 from ..schedule import divides_proximities, is_divided, is_freezing
 from ..state.poses import pose_between, velocity_between
@@ -36,8 +36,8 @@ from ..state.vectors import ONE, to_double, to_single
 from ..state.workspace import Workspace
 from ..tuning import CUT, SHARE_OF_PATH
 from .bodies import FREEZES, WHOLE_PATH, place_vertices
-from .dividing_passes import begin_passes, move_to_sides, place_planes, want
-from .sides import share_of_path
+from .plane_placement import begin_passes, move_to_sides, place_planes, want
+from .vertex_projection import share_of_path
 
 wp.set_module_options({"enable_backward": False})
 

@@ -248,7 +248,7 @@ class DividingPlanes:
 
     The planes of two elements have four vertices, so that there are four nodes for each. A node is the number
     ``8 plane + 2 corner + side``, side 1 of a vertex below, as this is what its vertex asks for: less to read where all
-    is scattered in memory. These planes move, see :mod:`.solve.dividing_passes`.
+    is scattered in memory. These planes move, see :mod:`.solve.plane_placement`.
     """
 
     count: wp.array[int]  # of planes, whether they fit or not

@@ -147,7 +147,7 @@ class Workspace(Launches):
         crossings_of_edges: Faces that each edge crosses at the start of the step.
         last_crossings: The same of the step before; very many in a first step, whose start is as a program made it.
         nearest: How far each vertex is from the nearest face in each of six directions [m], see
-            :mod:`.contacts.nearest`; None if steps may be recorded.
+            :mod:`.contacts.occluders`; None if steps may be recorded.
         clipped: Where paths end that are clipped there.
         differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
             as whether a constraint is active would otherwise depend on tiny changes, and results jump.

@@ -1,4 +1,4 @@
-"""Projects a vertex onto its sides of dividing planes, which :mod:`.dividing_passes` places.
+"""Projects a vertex onto its sides of dividing planes, which :mod:`.plane_placement` places.
 
 References:
     D. Goldfarb and A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic Programs,
@@ -7,7 +7,7 @@ References:
 
 import warp as wp
 
-from ..contacts.dividing_planes import FAR
+from ..contacts.planes_between import FAR
 from ..state.structs import NO_NODE, DividingPlanes
 from ..state.vectors import ONE, ZERO, to_double, to_single
 from ..tuning import MAX_PLANE_STEPS, WEDGE

@@ -5,20 +5,20 @@ at all times of a linear motion: where along it the plane lies at the end is fre
 that it wants, and one that it has reached, at first its start. A pass places each plane between what its two elements
 have reached, as near as it may be to where they would meet, and then moves each vertex to the position above its planes
 that is nearest to what it wants. What it had reached is above them, so that a solution exists for all pairs at once,
-and each vertex finds it by itself, see :mod:`.sides`. Layers that fall together, even by more than they are apart,
+and each vertex finds it by itself, see :mod:`.vertex_projection`. Layers that fall together, even by more than they are apart,
 follow each other in a few passes. Elements that slide along a plane go on sliding.
 """
 
 import warp as wp
 
-from ..contacts.dividing_planes import FAR
+from ..contacts.planes_between import FAR
 from ..contacts.rules import inverse_mass_of
 from ..schedule import is_divided
 from ..state.status import Loop, SolveStatus
 from ..state.structs import CUT_SHORT, FROZEN, NO_NODE, NOT_PLACED, PLACED, DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, to_double
 from ..tuning import CLOSE_MARGIN, CLOSE_TOGETHER, FAR_APART, MARGIN, MAX_PASSES, SLACK
-from .sides import position_on_sides, position_on_way
+from .vertex_projection import position_on_sides, position_on_way
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,7 +6,7 @@ from ...kernels.pairs import firsts_of
 from ...kernels.pipeline.queues import take_slot_int
 from ..state.structs import DividingPlanes, Motion, Step
 from ..state.vectors import HALF, ZERO, to_double
-from .closest import closest_direction
+from .closest_points import closest_direction
 from .rules import inverse_mass_of
 
 FAR = wp.constant(wp.float64(1.0e300))
@@ -102,7 +102,7 @@ def add_dividing_plane(
 ) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
-    It lies across the shortest vector between them at the start; :mod:`.solve.dividing_passes` places it. Elements that
+    It lies across the shortest vector between them at the start; :mod:`.solve.plane_placement` places it. Elements that
     touch at the start have none, nor do those without a contact that planes cannot bring together. Of the distance that
     the elements must keep, ``min_distance`` [m], half is on either side.
 
