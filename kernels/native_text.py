@@ -1,4 +1,4 @@
-"""The C++ of native functions, from headers beside the modules that use it.
+"""The C++ of native functions, from headers in the folder ``native`` beside the modules that use it.
 
 A header holds statements of a function: all of its body, or the definitions at its beginning that several functions
 share. Its text becomes a part of the snippet, so that Warp compiles a module anew where a header has changed.
@@ -10,9 +10,9 @@ from pathlib import Path
 __all__ = ["definitions", "header"]
 
 
-def header(path: str) -> str:
-    """Returns the text of a header, by its path in this package."""
-    return (Path(__file__).parent / path).read_text(encoding="utf-8")
+def header(module: str, name: str) -> str:
+    """Returns the text of a header, by the file of a module beside it and its name."""
+    return (Path(module).parent / "native" / name).read_text(encoding="utf-8")
 
 
 def definitions(types: Mapping[str, str], **constants: bool | int | float) -> str:

@@ -18,9 +18,9 @@ ROOT = Path(__file__).parents[1]
 LIMITS = Path(__file__).with_name("form.toml")
 
 
-def sources(root, *folders):
-    """The Python files of folders, in order."""
-    return [path for folder in folders for path in sorted((root / folder).rglob("*.py"))]
+def sources(root, *folders, ending="py"):
+    """The files of folders with an ending, in order."""
+    return [path for folder in folders for path in sorted((root / folder).rglob(f"*.{ending}"))]
 
 
 def lines_of(paths):
@@ -108,7 +108,7 @@ def measure(root, limits):
     return {
         "total": {
             "lines": sum(lengths.values()),
-            "lines_of_headers": lines_of((root / "kernels").rglob("*.h")),
+            "lines_of_headers": lines_of(sources(root, "kernels", "warp_bsc", ending="h")),
             "private_accesses_of_tests": private_accesses(root).total(),
         },
         "packages": {package: house(root, package) for package in packages},

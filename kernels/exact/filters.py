@@ -24,7 +24,7 @@ UNKNOWN = wp.constant(9)
 def _on_cpu(unknown: int, limbs: int, text: str) -> str:
     """Returns the text of a native function that computes with numbers on a CPU, and returns "unknown" on a GPU."""
     defined = definitions({"Integer": limbs_type(limbs)}, unknown=unknown)
-    numbers = header("exact/native/numbers.h")
+    numbers = header(__file__, "numbers.h")
     return f"{defined}#if defined(__CUDA_ARCH__)\nreturn unknown;\n#else\n{numbers}{text}#endif\n"
 
 
@@ -57,7 +57,7 @@ _SIGN_AT_TIME = """
 for _limbs in LIMBS[1:]:
     _Integer = integer(_limbs)
 
-    @wp.func_native(snippet=_on_cpu(UNKNOWN, _limbs, header("exact/native/signs_at_roots.h")))
+    @wp.func_native(snippet=_on_cpu(UNKNOWN, _limbs, header(__file__, "signs_at_roots.h")))
     def near_signs_at_roots(
         p0: _Integer,
         p1: _Integer,

@@ -54,7 +54,7 @@ _FROM_POINTS = f"""{SCALED}
 """
 
 
-@wp.func_native(snippet=definitions({}, largest_bits=BITS[1]) + header("exact/native/narrow_polygon.h"))
+@wp.func_native(snippet=definitions({}, largest_bits=BITS[1]) + header(__file__, "narrow_polygon.h"))
 def make_narrow_polygon(
     edges: bool,
     # points at the start

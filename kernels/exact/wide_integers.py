@@ -27,7 +27,7 @@ def limbs_type(limbs: int) -> str:
 
 # p = x y for signed x, y: each taken as unsigned, then corrected, because a number below zero stands for itself plus
 # 2^(64 limbs), which has added the other factor that much higher
-_MULTIPLY = header("exact/native/multiply.h")
+_MULTIPLY = header(__file__, "multiply.h")
 
 _PRODUCT = f"""{_MULTIPLY}
     wp::uint64 p[sizeof(ret_type) / 8];
@@ -123,7 +123,7 @@ _SHIFT = """
 """
 
 
-SCALED = header("exact/native/scaled.h")
+SCALED = header(__file__, "scaled.h")
 """For native functions: arrays of limbs of finite numbers divided by a power of two that divides them, and of
 differences, modulo 2 to the width."""
 

@@ -19,5 +19,5 @@ def native_for_pairs(dtype: type, vertex_face: bool, *headers: str, **constants:
         constants: Numbers that they use, by name.
     """
     scalar = {"Scalar": "float" if dtype is wp.vec3 else "double"}
-    texts = [header(f"pipeline/native/{name}") for name in ("simd.h", *headers)]
+    texts = [header(__file__, name) for name in ("simd.h", *headers)]
     return definitions(scalar, vertex_face=vertex_face, **constants) + "".join(texts)

@@ -21,7 +21,7 @@ import warp as wp
 from ..native_text import definitions, header
 
 
-@wp.func_native(snippet=header("pipeline/native/pair_packet.h"))
+@wp.func_native(snippet=header(__file__, "pair_packet.h"))
 def pair_packet(
     packet: int,
     # tree of the packet
@@ -80,7 +80,7 @@ def fit_packet_of(dtype: type) -> wp.Function:
     """
     scalar = definitions({"Scalar": "float" if dtype is wp.vec3 else "double"})
 
-    @wp.func_native(scalar + header("pipeline/native/fit_packet.h"))
+    @wp.func_native(scalar + header(__file__, "fit_packet.h"))
     def fit_packet(
         packet: int,
         count: int,

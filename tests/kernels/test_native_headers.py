@@ -17,8 +17,9 @@ from warp_bsc.kernels.pipeline.batch_culling import cull_batch_of
 from warp_bsc.kernels.pipeline.batch_impacts import impact_batch_of
 from warp_bsc.kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
 
-KERNELS = Path(native_text.__file__).parent
-HEADERS = sorted(path.relative_to(KERNELS).as_posix() for path in KERNELS.rglob("*.h"))
+ROOT = Path(__file__).parents[2]
+HEADERS = {path.relative_to(ROOT).as_posix(): path.read_text() for path in sorted((ROOT / "kernels").rglob("*.h"))}
+OTHERS = [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "warp_bsc").rglob("*.h"))]  # need our structs
 OF_PAIRS = (cull_batch_of, cull_arc_batch_of, classify_batch_of, impact_batch_of)
 WARNINGS = """
 #pragma clang diagnostic error "-Wall"
@@ -41,8 +42,8 @@ def compile_functions(functions, path):
     source = codegen.cpu_module_header.format(block_dim=1) + WARNINGS
     for number, function in enumerate(functions):
         snippet = function.native_snippet
-        for name in HEADERS:
-            snippet = snippet.replace(native_text.header(name), f'#line 1 "{name}"\n{native_text.header(name)}')
+        for name, text in HEADERS.items():
+            snippet = snippet.replace(text, f'#line 1 "{name}"\n{text}')
         function.build(None)
         text = codegen.codegen_snippet(function.adj, f"native_{number}", snippet, None, None, forward_only=True)
         source += text.replace("static", "", 1)  # used by nobody here
@@ -52,25 +53,25 @@ def compile_functions(functions, path):
 
 def test_each_header_is_compiled_without_a_warning(tmp_path):
     functions = native_functions()
-    unused = [name for name in HEADERS if not any(native_text.header(name) in f.native_snippet for f in functions)]
+    unused = [name for name, text in HEADERS.items() if not any(text in each.native_snippet for each in functions)]
     assert HEADERS and not unused
     compile_functions(functions, tmp_path / "functions.cpp")
 
 
 def test_a_warning_of_the_compiler_is_an_error(tmp_path, capfd):
-    @wp.func_native(native_text.header("pipeline/native/fit_packet.h") + "if (count = 1) return;")
+    @wp.func_native(HEADERS["kernels/pipeline/native/fit_packet.h"] + "if (count = 1) return;")
     def doubtful(packet: int, count: int): ...
 
     with pytest.raises(Exception, match="build failed"):
         compile_functions([doubtful], tmp_path / "doubtful.cpp")
-    assert "pipeline/native/fit_packet.h:" in capfd.readouterr().err
+    assert "kernels/pipeline/native/fit_packet.h:" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("path", HEADERS)
+@pytest.mark.parametrize("path", [*HEADERS, *OTHERS])
 def test_headers_are_formatted(path):
     clang_format = pytest.importorskip("clang_format")
-    command = [clang_format.get_executable("clang-format"), "--dry-run", "--Werror", KERNELS / path]
-    run = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    command = [clang_format.get_executable("clang-format"), "--dry-run", "--Werror", path]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert run.returncode == 0, run.stderr
 
 
