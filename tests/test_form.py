@@ -71,8 +71,10 @@ def house(root, package):
 
 
 def functions_of(root):
-    """Each function of the sources: its name with its file, the number of its parameters, and whether it is a kernel
-    without a comment of its own line between them."""
+    """For each function its file and name, how many parameters it has, and whether it is a kernel without groups.
+
+    A comment on a line of its own, between the parameters, begins a group.
+    """
     for path in sources(root, "kernels", "warp_bsc"):
         text = path.read_text(encoding="utf-8")
         for node in ast.walk(ast.parse(text)):
@@ -103,7 +105,7 @@ def measure(root, limits):
     """All numbers of a tree, in the tables of ``form.toml``."""
     files = sources(root, "kernels", "warp_bsc")
     packages = ["kernels", *(path.parent.name for path in sorted((root / "warp_bsc").glob("*/__init__.py")))]
-    largest, functions = limits["largest"], list(functions_of(root))
+    largest, functions = limits["largest"], sorted(functions_of(root))
     lengths = {path.relative_to(root).as_posix(): lines_of([path]) for path in files}
     return {
         "total": {
