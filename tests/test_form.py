@@ -148,6 +148,8 @@ def test_no_number_is_more_than_its_limit(table):
     found = exceeded({table: measured[table]}, limits)
     if any("private" in line for line in found):
         found += [f"  {name}: {count}" for name, count in private_accesses(ROOT).most_common()]
+    for package in sorted({line.split()[1] for line in found if " circles: " in line}):
+        found += [f"  {package}: {', '.join(sorted(circle))}" for circle in circles(rooms_of(ROOT, package))]
     assert not found, "\n".join([*found, "shorten or simplify it; only a person raises a number of tests/form.toml"])
 
 
