@@ -157,10 +157,10 @@ LIBRARIES = {
 
 
 @functools.cache
-def imports():
+def imports(root=ROOT):
     """Every import of our sources: file, package, names of the imported module (ours begin with "warp_bsc")."""
     found = []
-    for folder in (ROOT / "warp_bsc", ROOT / "kernels"):
+    for folder in (root / "warp_bsc", root / "kernels"):
         for path in sorted(folder.rglob("*.py")):
             relative = path.relative_to(folder)
             inside = ["warp_bsc", *(["kernels"] if folder.name == "kernels" else []), *relative.with_suffix("").parts]
@@ -174,7 +174,7 @@ def imports():
                     modules = [[*base, alias.name] for alias in node.names]
                 else:
                     continue
-                found += [(str(path.relative_to(ROOT)), package, module) for module in modules]
+                found += [(path.relative_to(root).as_posix(), package, module) for module in modules]
     return found
 
 

@@ -75,12 +75,15 @@ def test_the_wheel_has_the_data_that_it_names():
     found = set()
     for package, patterns in options["package-data"].items():
         assert package in options["packages"]
-        folder = ROOT / options["package-dir"].get(package, package.replace(".", "/"))
+        folder = ROOT / options["package-dir"].get(
+            package, package.replace("warp_bsc.kernels", "kernels").replace(".", "/")
+        )
         for pattern in patterns:
             files = [path for path in folder.glob(pattern) if path.is_file()]
             assert files or any(folder.glob(pattern + "/*")), (package, pattern)
             found.update(files)
-    package = {path for path in (ROOT / "warp_bsc").rglob("*.*") if path.suffix not in (".py", ".pyc")}
+    folders = (ROOT / "warp_bsc", ROOT / "kernels")
+    package = {path for folder in folders for path in folder.rglob("*.*") if path.suffix not in (".py", ".pyc")}
     measurements = {path for path in package if path.parent.name == "measurements"}  # for the tables of the guides
     demo = ROOT / "assets" / "cloth_twist.usd"
     assert found - {demo} == {path for path in package - measurements if path.is_file()} and demo in found
@@ -90,4 +93,4 @@ def test_the_wheel_has_the_data_that_it_names():
 def test_the_sdist_has_what_tests_and_the_site_need():
     lines = (ROOT / "MANIFEST.in").read_text().split("\n")
     assert {f"graft {name}" for name in ("assets", "conda", "docs", "examples", "tests")} <= set(lines)
-    assert "include AGENTS.md CHANGELOG.md CITATION.cff" in lines
+    assert "include .clang-format AGENTS.md CHANGELOG.md CITATION.cff" in lines

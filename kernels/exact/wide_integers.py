@@ -9,6 +9,8 @@ result twice as wide, or as wide as the wider factors.
 
 import warp as wp
 
+from ..native_text import definitions, header
+
 LIMBS = (1, 2, 4, 8, 16, 32, 64)
 """Available widths, in limbs, each twice the one before."""
 
@@ -18,97 +20,14 @@ def integer(limbs: int) -> type:
     return wp.types.vector(length=limbs, dtype=wp.uint64)
 
 
+def limbs_type(limbs: int) -> str:
+    """Returns the name in C++ of the type of integers of ``limbs`` 64-bit limbs."""
+    return f"wp::vec_t<{limbs}, wp::uint64>"
+
+
 # p = x y for signed x, y: each taken as unsigned, then corrected, because a number below zero stands for itself plus
 # 2^(64 limbs), which has added the other factor that much higher
-_MULTIPLY = """
-    const auto multiply = [](const auto& x, const auto& y, wp::uint64* p) {
-        constexpr int A = sizeof(x) / 8, B = sizeof(y) / 8, R = sizeof(ret_type) / 8;
-        for (int i = 0; i < R; ++i)
-            p[i] = 0;
-#if !defined(__CUDA_ARCH__)
-        if constexpr (A * B >= 64) {
-            // only the limbs that are not zero, of absolute values: most numbers are much narrower than their type
-            struct Limbs { wp::uint64 of[A > B ? A : B]; int low, high; };
-            const auto magnitude = [](const auto& a, Limbs& to) -> wp::uint64 {
-                constexpr int N = sizeof(a) / 8;
-                const wp::uint64 mask = 0 - (a[N - 1] >> 63);
-                wp::uint64 carry = mask & 1;
-                to.low = N, to.high = 0;
-                for (int i = 0; i < N; ++i) {
-                    to.of[i] = (a[i] ^ mask) + carry;
-                    carry &= to.of[i] == 0;
-                    if (to.of[i] != 0) {
-                        to.low = to.low < i ? to.low : i;
-                        to.high = i + 1;
-                    }
-                }
-                return mask;
-            };
-            Limbs a, b;
-            const wp::uint64 negative = magnitude(x, a) ^ magnitude(y, b);
-            if (a.high == 0 || b.high == 0)
-                return;
-            for (int i = a.low; i < a.high; ++i) {
-                unsigned __int128 sum = 0;
-                int j = b.low;
-                for (; j < b.high && i + j < R; ++j) {
-                    sum = (unsigned __int128)a.of[i] * b.of[j] + p[i + j] + (wp::uint64)(sum >> 64);
-                    p[i + j] = (wp::uint64)sum;
-                }
-                if (i + j < R)
-                    p[i + j] = (wp::uint64)(sum >> 64);
-            }
-            if (negative) {
-                wp::uint64 carry = 1;
-                for (int i = 0; i < R; ++i) {
-                    p[i] = ~p[i] + carry;
-                    carry &= p[i] == 0;
-                }
-            }
-            return;
-        }
-#endif
-        // small ones without loops: an index that varies would put them into local memory on a GPU
-        constexpr bool small = A * B <= 64;
-#pragma unroll(small ? A : 1)
-        for (int i = 0; i < A; ++i) {
-            wp::uint64 carry = 0;
-#pragma unroll(small ? B : 1)
-            for (int j = 0; j < B; ++j) {
-                if (i + j >= R)
-                    break;
-#if defined(__CUDA_ARCH__)
-                wp::uint64 low = x[i] * y[j];
-                wp::uint64 high = __umul64hi(x[i], y[j]);
-                low += carry;
-                high += low < carry;
-                low += p[i + j];
-                high += low < p[i + j];
-                p[i + j] = low;
-                carry = high;
-#else
-                const unsigned __int128 sum = (unsigned __int128)x[i] * y[j] + p[i + j] + carry;
-                p[i + j] = (wp::uint64)sum;
-                carry = (wp::uint64)(sum >> 64);
-#endif
-            }
-            if (i + B < R)
-                p[i + B] = carry;
-        }
-        const wp::uint64 x_mask = 0 - (x[A - 1] >> 63), y_mask = 0 - (y[B - 1] >> 63);
-        wp::uint64 x_borrow = 0, y_borrow = 0;
-        for (int i = A; i < R && i < A + B; ++i) {
-            const wp::uint64 s = y[i - A] & x_mask, old = p[i];
-            p[i] = old - s - x_borrow;
-            x_borrow = (old < s) | ((old == s) & x_borrow);
-        }
-        for (int i = B; i < R && i < A + B; ++i) {
-            const wp::uint64 s = x[i - B] & y_mask, old = p[i];
-            p[i] = old - s - y_borrow;
-            y_borrow = (old < s) | ((old == s) & y_borrow);
-        }
-    };
-"""
+_MULTIPLY = header(__file__, "multiply.h")
 
 _PRODUCT = f"""{_MULTIPLY}
     wp::uint64 p[sizeof(ret_type) / 8];
@@ -204,50 +123,7 @@ _SHIFT = """
 """
 
 
-SCALED = """
-    const auto scaled = [](wp::float64 value, int exponent, auto& x) {
-        constexpr int L = sizeof(x) / 8;
-        union { wp::float64 value; wp::uint64 bits; } word;
-        word.value = value;
-        const int field = (int)((word.bits >> 52) & 2047);
-        wp::uint64 mantissa = word.bits & ((1ull << 52) - 1);
-        if (field > 0)
-            mantissa |= 1ull << 52;
-#if !defined(__CUDA_ARCH__)
-        if constexpr (L == 1) {
-            if (field > 0 && exponent > -1023 && exponent < 1023 && field - 1023 - exponent < 62) {
-                word.bits = (wp::uint64)(1023 - exponent) << 52;
-                x[0] = (wp::uint64)(long long)(value * word.value);
-                return;
-            }
-        }
-#endif
-        int shift = (field > 0 ? field : 1) - 1075 - exponent;
-        if (shift < 0) {
-            mantissa = shift > -64 ? mantissa >> -shift : 0;
-            shift = 0;
-        }
-        const wp::uint64 mask = 0 - (word.bits >> 63);
-        wp::uint64 carry = word.bits >> 63;
-        for (int i = 0; i < L; ++i) {
-            const int from = 64 * i - shift;  // bit of the mantissa that is the lowest of this limb
-            wp::uint64 limb = 0;
-            if (from > -64 && from <= 0)
-                limb = mantissa << -from;
-            else if (from > 0 && from < 64)
-                limb = mantissa >> from;
-            x[i] = (limb ^ mask) + carry;
-            carry &= x[i] == 0;
-        }
-    };
-    const auto difference = [](const auto& x, const auto& y, auto& d) {
-        wp::uint64 borrow = 0;
-        for (int i = 0; i < (int)(sizeof(x) / 8); ++i) {
-            d[i] = x[i] - y[i] - borrow;
-            borrow = (x[i] < y[i]) | ((x[i] == y[i]) & borrow);
-        }
-    };
-"""
+SCALED = header(__file__, "scaled.h")
 """For native functions: arrays of limbs of finite numbers divided by a power of two that divides them, and of
 differences, modulo 2 to the width."""
 
@@ -260,7 +136,7 @@ _SCALED_LIKE = f"""{SCALED}
 
 def _returning(snippet: str, limbs: int) -> str:
     """Returns a snippet preceded by the definition of its return type."""
-    return f"    using ret_type = wp::vec_t<{limbs}, wp::uint64>;{snippet}"
+    return definitions({"ret_type": limbs_type(limbs)}) + snippet
 
 
 for _limbs in LIMBS:

@@ -6,117 +6,18 @@ width of the instructions is that of the processor.
 
 import warp as wp
 
-_TYPES = """
-    typedef Scalar Scalars __attribute__((ext_vector_type(8)));
-    typedef Scalar Loaded __attribute__((ext_vector_type(4), aligned(sizeof(Scalar))));
-    typedef double Doubles __attribute__((ext_vector_type(8)));
-    typedef decltype(Doubles() < Doubles()) Longs;
-    typedef bool Bools __attribute__((ext_vector_type(8)));
-    struct Vectors { Doubles x, y, z; };
-
-    auto bits = [](auto mask) -> int {
-        return __builtin_bit_cast(unsigned char, __builtin_convertvector(mask, Bools));
-    };
-    auto least = [](Doubles a, Doubles b) { return __builtin_elementwise_min(a, b); };
-    auto most = [](Doubles a, Doubles b) { return __builtin_elementwise_max(a, b); };
-    auto absolute = [](Doubles a) { return __builtin_elementwise_abs(a); };
-    auto larger = [=](Doubles a, Doubles b) { return most(absolute(a), absolute(b)); };
-    auto sizes = [=](Vectors a, Vectors b) { return Vectors{larger(a.x, b.x), larger(a.y, b.y), larger(a.z, b.z)}; };
-    auto plus = [](Vectors a, Vectors b) { return Vectors{a.x + b.x, a.y + b.y, a.z + b.z}; };
-    auto minus = [](Vectors a, Vectors b) { return Vectors{a.x - b.x, a.y - b.y, a.z - b.z}; };
-    auto times = [](Doubles a, Vectors b) { return Vectors{a * b.x, a * b.y, a * b.z}; };
-    auto dot = [](Vectors a, Vectors b) { return a.x * b.x + a.y * b.y + a.z * b.z; };
-    auto cross = [](Vectors a, Vectors b) {
-        return Vectors{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-    };
-"""
-
-_POINTS = """
-    auto corners_of = [&](int slot, int* corner) {
-        const int* pair = (const int*)pairs.data + 2 * (size_t)slot;
-        if (vertex_face) {
-            const int* face = elements.data + 3 * (size_t)pair[1];
-            corner[0] = pair[0], corner[1] = face[0], corner[2] = face[1], corner[3] = face[2];
-        } else {
-            const int* edge = elements.data + 2 * (size_t)pair[0];
-            const int* other = elements.data + 2 * (size_t)pair[1];
-            corner[0] = edge[0], corner[1] = edge[1], corner[2] = other[0], corner[3] = other[1];
-        }
-    };
-
-    // positions may be a view, with any stride; x y z are read with a fourth number where there is one
-    auto position = [](const auto& x, int corner) {
-        return (const Scalar*)((const char*)x.data + x.strides[0] * (wp::int64)corner);
-    };
-    const bool forward = x0.strides[0] >= 3 * (int)sizeof(Scalar) && x1.strides[0] >= 3 * (int)sizeof(Scalar);
-    const int last = forward ? (x0.shape[0] < x1.shape[0] ? x0.shape[0] : x1.shape[0]) - 1 : -1;
-    auto both = [](const Scalar* a, const Scalar* b, bool has_fourth) -> Scalars {
-        if (has_fourth)
-            return __builtin_shufflevector(*(const Loaded*)a, *(const Loaded*)b, 0, 1, 2, 3, 4, 5, 6, 7);
-        return Scalars{a[0], a[1], a[2], 0, b[0], b[1], b[2], 0};
-    };
-
-    // reads the points of the pairs in eight slots, transposed to the coordinates of all eight
-    auto read_points = [&](const int* slots, Scalars* points) {
-        int corners[4][8], largest = 0;
-        for (int lane = 0; lane < 8; ++lane) {
-            int corner[4];
-            corners_of(slots[lane], corner);
-            for (int i = 0; i < 4; ++i) {
-                corners[i][lane] = corner[i];
-                largest = corner[i] > largest ? corner[i] : largest;
-            }
-        }
-        const bool has_fourth = largest < last;
-        auto read = [&](const auto& x, const int* corner, Scalars* to) {
-            auto row = [&](int lane) {
-                return both(position(x, corner[lane]), position(x, corner[lane + 4]), has_fourth);
-            };
-            const Scalars a = row(0), b = row(1), c = row(2), d = row(3);
-            const Scalars xz = __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14);
-            const Scalars more_xz = __builtin_shufflevector(c, d, 0, 8, 2, 10, 4, 12, 6, 14);
-            const Scalars y = __builtin_shufflevector(a, b, 1, 9, 3, 11, 5, 13, 7, 15);
-            const Scalars more_y = __builtin_shufflevector(c, d, 1, 9, 3, 11, 5, 13, 7, 15);
-            to[0] = __builtin_shufflevector(xz, more_xz, 0, 1, 8, 9, 4, 5, 12, 13);
-            to[1] = __builtin_shufflevector(y, more_y, 0, 1, 8, 9, 4, 5, 12, 13);
-            to[2] = __builtin_shufflevector(xz, more_xz, 2, 3, 10, 11, 6, 7, 14, 15);
-        };
-        for (int i = 0; i < 4; ++i) {
-            read(x0, corners[i], points + 3 * i);
-            read(x1, corners[i], points + 12 + 3 * i);
-        }
-    };
-
-    // the differences u, v, w of eight pairs at both ends
-    struct Relative { Vectors u0, v0, w0, u1, v1, w1; };
-    auto relative = [&](const Scalars* points) -> Relative {
-        auto point = [&](int i) {
-            return Vectors{
-                __builtin_convertvector(points[3 * i], Doubles),
-                __builtin_convertvector(points[3 * i + 1], Doubles),
-                __builtin_convertvector(points[3 * i + 2], Doubles)};
-        };
-        if (vertex_face)
-            return {minus(point(2), point(1)), minus(point(3), point(1)), minus(point(0), point(1)),
-                    minus(point(6), point(5)), minus(point(7), point(5)), minus(point(4), point(5))};
-        return {minus(point(1), point(0)), minus(point(3), point(2)), minus(point(2), point(0)),
-                minus(point(5), point(4)), minus(point(7), point(6)), minus(point(6), point(4))};
-    };
-"""
+from ..native_text import definitions, header
 
 
-def native_for_pairs(dtype: type, vertex_face: bool, snippet: str, **constants: float) -> str:
+def native_for_pairs(dtype: type, vertex_face: bool, *headers: str, **constants: float) -> str:
     """Returns the text of a native function of pairs of elements, with arguments x0, x1, elements and pairs.
 
     Args:
         dtype: Type of a position, vec3 or vec3d.
         vertex_face: Whether pairs are (vertex, face); otherwise (edge, edge).
-        snippet: The function after the definitions of this module.
-        constants: Numbers that it uses, by name.
+        headers: Headers of this folder's ``native`` that make the function, after ``simd.h``.
+        constants: Numbers that they use, by name.
     """
-    header = [
-        f"typedef {'float' if dtype is wp.vec3 else 'double'} Scalar;",
-        f"constexpr bool vertex_face = {'true' if vertex_face else 'false'};",
-        *(f"constexpr auto {name} = {value!r};" for name, value in constants.items()),
-    ]
-    return "".join(f"    {line}\n" for line in header) + _TYPES + _POINTS + snippet
+    scalar = {"Scalar": "float" if dtype is wp.vec3 else "double"}
+    texts = [header(__file__, name) for name in ("simd.h", *headers)]
+    return definitions(scalar, vertex_face=vertex_face, **constants) + "".join(texts)

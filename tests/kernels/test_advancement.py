@@ -6,6 +6,7 @@ import distances
 import numpy as np
 import pytest
 import warp as wp
+from outputs import filled_with_nan
 from sheets import crumpled
 
 import warp_bsc as bsc
@@ -83,7 +84,7 @@ def test_cleared_times_are_certified(kind, device):
     x, g = wp.array(points, dtype=wp.vec3d), wp.array(direction, dtype=wp.vec3d)
     advanced = {}
     for name, distance in (("near", near), ("half", 0.5 * reached)):
-        end = wp.empty(n, dtype=wp.float64)
+        end = filled_with_nan(n, wp.float64)
         inputs = [wp.array(a, dtype=wp.float64) for a in (start, distance)]
         wp.launch(clear, n, inputs=[kind, x, g, *inputs], outputs=[end])
         found = end.numpy()

@@ -4,6 +4,7 @@ from math import comb
 
 import numpy as np
 import warp as wp
+from outputs import filled_with_nan
 
 from warp_bsc.checker.polynomials import differentiate, trim
 from warp_bsc.checker.roots import doubles_around, inner_part, isolated_roots, sign_at_root
@@ -54,7 +55,7 @@ def ask(f, q):
     """Asks the device about cubics and quadratics in z, integer arrays of shapes (n, 4) and (n, 3)."""
     n = len(f)
     outputs = [wp.zeros(n, dtype=int), wp.zeros(n, dtype=int), wp.zeros(n, dtype=wp.vec2i)]
-    outputs += [wp.zeros(n, dtype=wp.vec3i), wp.zeros((n, 3), dtype=wp.float64)]
+    outputs += [wp.zeros(n, dtype=wp.vec3i), filled_with_nan((n, 3), wp.float64)]
     inputs = [wp.array(to_limbs(x), dtype=number) for x in (f, q)]
     wp.launch(answer, n, inputs=inputs, outputs=outputs)
     return [output.numpy() for output in outputs]

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from outputs import filled_with_nan
 
 from warp_bsc.kernels import bernstein
 
@@ -68,7 +69,7 @@ def run(q, k, weights, interval):
         "factor": (n, wp.vec2d),
         "remainder": (n, wp.vec2d),
     }
-    outputs = {name: wp.zeros(shape, dtype=dtype) for name, (shape, dtype) in shapes.items()}
+    outputs = {name: filled_with_nan(shape, dtype) for name, (shape, dtype) in shapes.items()}
     wp.launch(run_all, n, inputs=inputs, outputs=list(outputs.values()))
     return SimpleNamespace(
         q=exact(q),

@@ -12,6 +12,7 @@ import pytest
 import warp as wp
 from compilation import QUICK
 from generators import GENERATORS, mostly_hits, uniform
+from outputs import filled_with_nan
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -85,7 +86,7 @@ def ask(kind, points, direction=None):
         answers.status = status.numpy()
         return answers
     direction = np.ones((n, 3)) if direction is None else direction
-    separated, axis = wp.zeros((n, 2), dtype=wp.bool), wp.zeros(n, dtype=wp.vec3d)
+    separated, axis = wp.zeros((n, 2), dtype=wp.bool), filled_with_nan(n, wp.vec3d)
     inputs = [kind == "edge_edge", wp.array(points, dtype=wp.vec3d), wp.array(direction, dtype=wp.vec3d)]
     wp.launch(ask_double, n, inputs=inputs, outputs=[boxes, separated, status, axis])
     return SimpleNamespace(boxes=boxes.numpy(), separated=separated.numpy(), status=status.numpy(), axis=axis.numpy())

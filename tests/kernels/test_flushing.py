@@ -7,6 +7,7 @@ from exact_queries import decide_exactly
 from flushing import subnormals_flushed
 from generators import GENERATORS
 from impacts import impact_kernel
+from outputs import filled_with_nan
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -41,7 +42,8 @@ def test_answers_are_true(kind, dtype):
     truth = ~np.isnan(interval[:, 0])
     latest = interval[:, 1] + 2.0**-1022
     status, _, _, toi, *_ = outputs = [
-        wp.zeros(n, dtype=t, device="cpu") for t in (int, int, int, wp.float64, wp.vec3d, wp.vec3d)
+        *(wp.zeros(n, dtype=int, device="cpu") for _ in range(3)),
+        *(filled_with_nan(n, t, "cpu") for t in (wp.float64, wp.vec3d, wp.vec3d)),
     ]
     point = wp.vec3 if dtype is np.float32 else wp.vec3d
     inputs = [kind == "edge_edge", 2.0**-20, wp.array(points, dtype=point, device="cpu")]

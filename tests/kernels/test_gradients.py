@@ -19,6 +19,7 @@ from generators import GENERATORS, mostly_hits
 from hypothesis import given
 from hypothesis import strategies as st
 from impacts import impact_kernel
+from outputs import filled_with_nan
 from sheets import crumpled
 
 import warp_bsc as bsc
@@ -37,7 +38,7 @@ def impacts(kind, points, tolerance=TOLERANCE):
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
     x = wp.array(points, dtype=dtype, requires_grad=True)
     flags = [wp.zeros(n, dtype=int) for _ in range(3)]
-    outputs = [wp.zeros(n, dtype=t, requires_grad=True) for t in (wp.float64, wp.vec3d, wp.vec3d)]
+    outputs = [filled_with_nan(n, t, requires_grad=True) for t in (wp.float64, wp.vec3d, wp.vec3d)]
     with wp.Tape() as tape:
         inputs = [kind == "edge_edge", tolerance, x]
         wp.launch(impact_kernel(dtype), n, inputs=inputs, outputs=[*flags, *outputs])
@@ -208,7 +209,7 @@ def test_gradients_pass_the_check_of_warp(kind, device):
     points = points[np.flatnonzero((distance > 0.3) & (found.status == HIT))[:4]]
     x = wp.array(points, dtype=wp.vec3d, requires_grad=True)
     flags = [wp.zeros(4, dtype=int) for _ in range(3)]
-    outputs = [wp.zeros(4, dtype=t, requires_grad=True) for t in (wp.float64, wp.vec3d, wp.vec3d)]
+    outputs = [filled_with_nan(4, t, requires_grad=True) for t in (wp.float64, wp.vec3d, wp.vec3d)]
     inputs = [kind == "edge_edge", 2.0**-38, x]
     options = {"eps": 1e-4, "atol": 1e-6, "rtol": 1e-5, "show_summary": False}
     assert wp.autograd.gradcheck(impact_kernel(wp.vec3d), 4, inputs, [*flags, *outputs], **options)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS, integer_lattice, uniform
+from outputs import filled_with_nan
 
 from warp_bsc.kernels import polynomials, signs
 from warp_bsc.kernels.motion import edge_edge_motion, vertex_face_motion
@@ -93,7 +94,7 @@ def run(kind, points):
         "q": ((n, 3, 4), wp.vec3d),  # axis, test, coefficient
         "q_bounds": ((n, 3), wp.vec4d),
     }
-    outputs = {name: wp.zeros(shape, dtype=dtype) for name, (shape, dtype) in shapes.items()}
+    outputs = {name: filled_with_nan(shape, dtype) for name, (shape, dtype) in shapes.items()}
     inputs = [kind == "edge_edge", single, wp.array(points.astype(np.float64), dtype=wp.vec3d)]
     wp.launch(compute, n, inputs=inputs, outputs=list(outputs.values()))
     return SimpleNamespace(**{name: array.numpy() for name, array in outputs.items()})

@@ -8,6 +8,7 @@ import pytest
 import warp as wp
 from generators import GENERATORS, grazing, mostly_hits, one_ulp_apart, touching, uniform
 from impacts import impact_kernel
+from outputs import filled_with_nan
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -38,9 +39,9 @@ def impacts(kind, points, tolerance=2.0**-20):
     outputs = {
         "status": wp.zeros(n, dtype=int),
         "within_tolerance": wp.zeros(n, dtype=int),
-        "toi": wp.zeros(n, dtype=wp.float64),
-        "coordinates": wp.zeros(n, dtype=wp.vec3d),
-        "normal": wp.zeros(n, dtype=wp.vec3d),
+        "toi": filled_with_nan(n, wp.float64),
+        "coordinates": filled_with_nan(n, wp.vec3d),
+        "normal": filled_with_nan(n, wp.vec3d),
     }
     inputs = [kind == "edge_edge", tolerance, wp.array(points.astype(np.float64), dtype=wp.vec3d)]
     status, within_tolerance, *contacts = outputs.values()
@@ -400,7 +401,7 @@ def test_coordinates_are_those_of_the_closest_points(kind):
     rng = np.random.default_rng(5)
     n = 3000
     uvw = vectors(rng, n)
-    found, gap = wp.zeros(n, dtype=wp.vec2d), wp.zeros(n, dtype=wp.vec3d)
+    found, gap = filled_with_nan(n, wp.vec2d), filled_with_nan(n, wp.vec3d)
     wp.launch(find_closest, n, inputs=[KINDS.index(kind), wp.array(uvw, dtype=wp.vec3d)], outputs=[found, gap])
     found, gap = found.numpy(), gap.numpy()
     size = np.abs(uvw).max(axis=(1, 2))

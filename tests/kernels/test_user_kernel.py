@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 from generators import GENERATORS
+from outputs import filled_with_nan
 
 from warp_bsc import query_edge_edge, query_vertex_face
 from warp_bsc.kernels import HIT, UNSURE, ccd_edge_edge, ccd_vertex_face, impact_vertex_face
@@ -31,7 +32,7 @@ def ask_edge_edge(p: wp.array2d[wp.vec3d], status: wp.array[int]):
 def test_single_precision_answers_are_those_of_the_query(name, device):
     points = GENERATORS[name](np.random.default_rng(11), 300, "vertex_face", np.float32)
     status = wp.zeros(len(points), dtype=int)
-    toi = wp.zeros(len(points), dtype=wp.float64)
+    toi = filled_with_nan(len(points), wp.float64)
     wp.launch(ask_vertex_face, len(points), inputs=[wp.array(points, dtype=wp.vec3), status, toi])
     expected = query_vertex_face(points, method="conservative")
     # the user's module may fuse multiply and add: certified answers agree, and little else is left open
@@ -53,7 +54,7 @@ def test_times_of_impact_in_a_user_kernel_have_gradients(device):
     triangle = [[-1.0, -1.0, 0.0], [2.0, -1.0, 0.0], [-1.0, 2.0, 0.0]]
     points = np.array([[[0.0, 0.0, 1.0], *triangle, [0.0, 0.0, -1.0], *triangle]], dtype=np.float32)
     p = wp.array(points, dtype=wp.vec3, requires_grad=True)
-    status, toi = wp.zeros(1, dtype=int), wp.zeros(1, dtype=wp.float64, requires_grad=True)
+    status, toi = wp.zeros(1, dtype=int), filled_with_nan(1, wp.float64, requires_grad=True)
     with wp.Tape() as tape:
         wp.launch(ask_vertex_face, 1, inputs=[p], outputs=[status, toi])
     tape.backward(toi)

@@ -1,0 +1,280 @@
+// The body of classify_batch; after simd_query.h.
+
+auto evaluate_cubic = [](Cubic k, Doubles a, Doubles b) {
+    return ((k.k0 * b + 3.0 * k.k1 * a) * b + 3.0 * k.k2 * a * a) * b + k.k3 * a * a * a;
+};
+auto evaluate_quadratic = [](Vectors q, Doubles a, Doubles b) { return (q.x * b + 2.0 * q.y * a) * b + q.z * a * a; };
+
+// a cubic with one extremum at most, the signs of its ends, and the lanes in which it has one or two roots
+struct Curve {
+    Cubic k;
+    Doubles bound, size;
+    Vectors d;
+    Signs start;
+    int one, two;
+};
+
+struct Ends {
+    Signs first, last;
+};
+auto linear_signs = [&](Doubles l0, Doubles l1, Doubles line_bound, const Curve& y) -> Ends {
+    const Signs s0 = sign(l0, line_bound), s1 = sign(l1, line_bound);
+    const int equal = ~((s0.positive ^ s1.positive) | (s0.negative ^ s1.negative));
+    auto from_lanes = [](int lanes) -> Longs {
+        return -__builtin_convertvector(__builtin_bit_cast(Bools, (unsigned char)lanes), Longs);
+    };
+    const Doubles a = where(from_lanes(known(s0)), absolute(l0), 4.0 * line_bound);
+    const Doubles b = where(from_lanes(known(s1)), absolute(l1), 4.0 * line_bound);
+    const int vague = ~(known(s0) & known(s1)) & bits(most(a, b) < 8.0 * line_bound);
+    const Doubles sum = a + b, square = sum * sum;
+    const Doubles y_bound = square * (2.0 * y.bound * sum + crossing_error * y.size * line_bound) + underflow * y.bound;
+    const Signs side = product(sign(evaluate_cubic(y.k, a, b), y_bound), y.start);
+    const Doubles slope_bound =
+        sum * (2.0 * difference_of_cubic * y.bound * sum + slope_crossing_error * y.size * line_bound) +
+        underflow * y.bound;
+    const Signs before = product(sign(evaluate_quadratic(y.d, a, b), slope_bound), y.start);
+    // with two roots, a root of the line outside of them is before or after both
+    const int after_line = (y.one & side.positive) | (y.two & side.positive & before.negative);
+    const int before_line = (y.one & side.negative) | (y.two & side.positive & before.positive);
+    const int amid = y.two & side.negative;
+    auto at = [&](int of_start, int of_end) {
+        const int lanes = ~vague;
+        const Signs found = {((of_start & s0.positive) | (of_end & s1.positive)) & lanes,
+                             ((of_start & s0.negative) | (of_end & s1.negative)) & lanes};
+        return chosen(equal, s0, found);
+    };
+    return {at(before_line | amid, after_line), at(before_line, after_line | amid)};
+};
+
+auto quadratic_signs = [&](Vectors q, Doubles q_bound, const Curve& y, int lanes) -> Ends {
+    const Signs constant = quadratic_sign(q, q_bound);
+    Ends result = {constant, constant};
+    lanes &= ~known(constant);
+    if (!lanes)
+        return result;
+    const Doubles leading = (q.z - q.y) - (q.y - q.x);
+    const Doubles chord_bound = q_bound + 0.25 * (absolute(leading) + 6.0 * q_bound);
+    const Ends chord = linear_signs(q.x, q.z, chord_bound, y);
+    result = {chosen(lanes, chord.first, constant), chosen(lanes, chord.last, constant)};
+    lanes &= ~(known(chord.first) & known(chord.last));
+    if (!lanes)
+        return result;
+    // division of the cubic by the quadratic
+    const Doubles d0 = q.y - q.x, d1 = q.z - q.y;
+    const Doubles e0 = (y.k.k2 - y.k.k1) - (y.k.k1 - y.k.k0), e1 = (y.k.k3 - y.k.k2) - (y.k.k2 - y.k.k1);
+    const Doubles leading_q = d1 - d0, leading_k = e1 - e0, square = leading_q * leading_q;
+    const Doubles l0 = 3.0 * e0 * leading_q - 2.0 * d0 * leading_k;
+    const Doubles l1 = 3.0 * e1 * leading_q - 2.0 * d1 * leading_k;
+    const Doubles r0 = square * y.k.k0 - l0 * q.x, r1 = square * y.k.k3 - l1 * q.z;
+    const Doubles q_size = largest_of(q);
+    const Doubles unit = y.size * q_bound + q_size * y.bound;
+    const Ends factor = linear_signs(l0, l1, factor_error * unit + underflow * y.bound, y);
+    const Ends rest = linear_signs(r0, r1, division_error * q_size * unit + underflow * y.bound, y);
+    return {chosen(known(result.first), result.first, negated(product(factor.first, rest.first))),
+            chosen(known(result.last), result.last, negated(product(factor.last, rest.last)))};
+};
+
+// the lanes in which a cubic certainly has no extremum, one, or may have two
+struct Shape {
+    int monotone, extremum, two_extrema;
+};
+auto curve_class = [&](const Curve& y) -> Shape {
+    const Doubles bound = difference_of_cubic * y.bound;
+    const Signs s0 = sign(y.d.x, bound), s1 = sign(y.d.y, bound), s2 = sign(y.d.z, bound);
+    const Signs outer = product(s0, s2), inner = product(s0, s1);
+    const Doubles discriminant = y.d.y * y.d.y - y.d.x * y.d.z;
+    const int rootless = bits(discriminant < -y.bound * (discriminant_error * largest_of(y.d) + underflow));
+    const int monotone = outer.positive & (inner.positive | rootless);
+    return {monotone, outer.negative, outer.positive & ~monotone & inner.negative};
+};
+auto curve_of = [&](Cubic k, Doubles bound) -> Curve {
+    const Doubles size = most(most(absolute(k.k0), absolute(k.k1)), most(absolute(k.k2), absolute(k.k3)));
+    return {k, bound, size, {k.k1 - k.k0, k.k2 - k.k1, k.k3 - k.k2}, sign(k.k0, bound), 0, 0};
+};
+
+struct Status {
+    int free, hit;
+};  // unsure in the other lanes
+auto classify_piece = [&](Curve y, const InsideTests& tests, int extremum, int lanes) -> Status {
+    const Signs end = sign(y.k.k3, y.bound);
+    const Signs ends = product(y.start, end);
+    y.one = ends.negative & lanes;
+    y.two = 0;
+    int none = ends.positive & ~extremum;
+    int turning = ends.positive & extremum & lanes;
+    if (turning) {
+        const Doubles d0 = y.d.x, d1 = y.d.y, d2 = y.d.z;
+        const int away = product(sign(d0, difference_of_cubic * y.bound), y.start).positive;
+        none |= turning & away;
+        turning &= ~away;
+        const Doubles a = absolute(d0), b = absolute(d2), sum = a + b;
+        const Doubles leading = (d2 - d1) - (d1 - d0);
+        const Doubles spread = absolute(leading) + turning_error * y.bound;
+        const Doubles value = evaluate_cubic(y.k, a, b);
+        const Doubles rounding = 2.0 * y.bound * sum * sum * sum + underflow * y.bound;
+        const Doubles deviation = 7.0 * (0.25 * spread) * (0.25 * spread) * sum * sum;
+        y.two = turning & product(sign(value, rounding), y.start).negative;
+        turning &= ~y.two;
+        const int beside = turning & product(sign(value, rounding + deviation), y.start).positive;
+        none |= beside;
+        turning &= ~beside;
+        if (turning) {
+            const Doubles t0 = leading * y.k.k0 - (d1 - d0) * d0, t1 = leading * y.k.k3 - (d2 - d1) * d2;
+            const Doubles t_bound = y.bound * (turning_error * y.size + underflow);
+            const Signs s0 = sign(t0, t_bound), s1 = sign(t1, t_bound);
+            const Doubles ta = absolute(t0), tb = absolute(t1);
+            const Doubles side_bound =
+                (ta + tb) * (6.0 * y.bound * (ta + tb) + slope_crossing_error * y.size * t_bound) + underflow * y.bound;
+            const Signs side = sign(evaluate_quadratic(y.d, ta, tb), side_bound);
+            const int as_slope = product(side, sign(d0, y.bound)).positive;
+            const int split = product(s0, s1).negative;
+            const int same = product(s0, s1).positive;
+            const int decided = same | (split & known(side));
+            Signs at = chosen(split & as_slope, s1, s0);
+            at = product({at.positive & decided, at.negative & decided}, sign(leading, turning_error * y.bound));
+            at = product(at, y.start);
+            none |= turning & at.positive;
+            y.two |= turning & at.negative;
+        }
+    }
+    const int rooted = y.one | y.two;
+    Status status = {none, 0};
+    if (!rooted)
+        return status;
+    Signs first[4], last[4];
+    for (int i = 0; i < 4; ++i) {
+        const Ends found = quadratic_signs(tests.q[i], tests.bounds[i], y, rooted);
+        first[i] = found.first, last[i] = found.last;
+    }
+    const Verdict at_first = verdict(first), at_last = verdict(last);
+    status.free |= at_first.free & at_last.free & rooted;
+    status.hit = (at_first.hit | at_last.hit) & rooted;
+    return status;
+};
+
+// the status in some lanes, from the inside tests of their axis
+auto classify_with = [&](Cubic k, Doubles bound, const InsideTests& tests, int lanes) -> Status {
+    const Verdict constant = constant_verdict(tests);
+    Curve curve = curve_of(k, bound);
+    const Signs ends = product(curve.start, sign(k.k3, bound));
+    Status status = {constant.free, constant.hit & ends.negative & ~constant.free};
+    lanes &= ~(status.free | status.hit) & known(ends);
+    if (!lanes)
+        return status;
+    Shape shape = curve_class(curve);
+    // a cubic with two extrema is split at its inflection
+    const int split = lanes & shape.two_extrema;
+    Doubles a, b, sum, square;
+    if (split) {
+        const Doubles e0 = absolute((k.k2 - k.k1) - (k.k1 - k.k0));
+        const Doubles e1 = absolute((k.k3 - k.k2) - (k.k2 - k.k1));
+        const Doubles scale = inverse_power_of_two(most(e0, e1));
+        a = scale * e0, b = scale * e1, sum = a + b, square = sum * sum;
+    }
+    lanes &= shape.monotone | shape.extremum;
+    Status split_status = {split, 0};
+    InsideTests part_tests = tests;
+    for (int part = lanes ? 0 : 1; part < (split ? 3 : 1); ++part) {
+        Status found = {0, 0};
+        if (part > 0) {
+            const Doubles k01 = b * k.k0 + a * k.k1, k12 = b * k.k1 + a * k.k2, k23 = b * k.k2 + a * k.k3;
+            const Doubles k012 = b * k01 + a * k12, k123 = b * k12 + a * k23, middle = b * k012 + a * k123;
+            const Cubic part_k = part == 1 ? Cubic{square * sum * k.k0, square * k01, sum * k012, middle}
+                                           : Cubic{middle, sum * k123, square * k23, square * sum * k.k3};
+            for (int i = 0; i < 4; ++i) {
+                const Vectors q = tests.q[i];
+                const Doubles q01 = b * q.x + a * q.y, q12 = b * q.y + a * q.z, q012 = b * q01 + a * q12;
+                part_tests.q[i] =
+                    part == 1 ? Vectors{square * q.x, sum * q01, q012} : Vectors{q012, sum * q12, square * q.z};
+                part_tests.bounds[i] = split_error * square * tests.bounds[i];
+            }
+            curve = curve_of(part_k, split_error * square * sum * bound);
+            shape = curve_class(curve);
+            found.free = known(cubic_sign(part_k, curve.bound)) | constant_verdict(part_tests).free;
+            lanes = split & ~found.free & known(curve.start) & known(sign(part_k.k3, curve.bound)) &
+                    (shape.monotone | shape.extremum);
+        }
+        if (lanes) {
+            const Status piece = classify_piece(curve, part_tests, shape.extremum, lanes);
+            found.free |= piece.free & lanes;
+            found.hit |= piece.hit & lanes;
+        }
+        Status& into = part == 0 ? status : split_status;
+        into.free = part == 0 ? status.free | found.free : split_status.free & found.free;
+        into.hit |= part == 0 ? found.hit : found.hit & split;
+    }
+    return {status.free | split_status.free, status.hit | split_status.hit};
+};
+
+// with a roundoff of zero: the lanes that touch at the start or at the end
+auto touching = [&](Cubic k, const InsideTests& tests) -> int {
+    auto weakly_inside = [&](Doubles a, Doubles b, Doubles c, Doubles d) {
+        const Doubles low = least(least(a, b), least(c, d)), high = most(most(a, b), most(c, d));
+        return ((low >= 0.0) & (high > 0.0)) | ((high <= 0.0) & (low < 0.0));
+    };
+    const Vectors* q = tests.q;
+    return bits(((k.k0 == 0.0) & weakly_inside(q[0].x, q[1].x, q[2].x, q[3].x)) |
+                ((k.k3 == 0.0) & weakly_inside(q[0].z, q[1].z, q[2].z, q[3].z)));
+};
+auto without_zeros = [&](Cubic k) -> Cubic {
+    const Doubles tiny = tiny_share * curve_of(k, Doubles(0.0)).size;
+    const Doubles start = where(k.k1 != 0.0, k.k1, where(k.k2 != 0.0, k.k2, k.k3));
+    const Doubles end = where(k.k2 != 0.0, k.k2, where(k.k1 != 0.0, k.k1, k.k0));
+    return {where(k.k0 == 0.0, where(start < 0.0, -tiny, tiny), k.k0), k.k1, k.k2,
+            where(k.k3 == 0.0, where(end < 0.0, -tiny, tiny), k.k3)};
+};
+
+unsigned long long statuses = 0;
+for (int group = 0; group < count; group += 8) {
+    const int filled = count - group < 8 ? count - group : 8;
+    int slots[8];
+    for (int lane = 0; lane < 8; ++lane)
+        slots[lane] = first + group + (lane < filled ? lane : 0);
+    Scalars points[24];
+    read_points(slots, points);
+    const int all = (1 << filled) - 1;
+    int usable = all;
+    const Motion motion = scaled_motion(points, usable);
+    const Coplanarity y = coplanarity(motion);
+    int free = known(cubic_sign(y.k, y.bound)), hit = 0, left = usable & ~free;
+    if (left) {
+        const InsideTests tests = inside_tests(motion, y, largest_axis(plus(plus(plus(y.n0, y.nh), y.nh), y.n1)));
+        Cubic k = y.k;
+        int lanes = left;
+        for (int attempt = 0; attempt < 2 && lanes; ++attempt) {
+            const Status found = classify_with(k, y.bound, tests, lanes);
+            free |= found.free & lanes;
+            hit |= found.hit & ~found.free & lanes;
+            left &= ~(free | hit);
+            if (roundoff > 0.0)
+                break;
+            // signs that floating point computes: zeros at the ends need no subdivision
+            lanes = left & bits((k.k0 == 0.0) | (k.k3 == 0.0));
+            if (!lanes)
+                break;
+            hit |= touching(k, tests) & lanes;
+            k = without_zeros(k);
+            free |= known(cubic_sign(k, Doubles(0.0))) & lanes & ~hit;
+            left &= ~(free | hit);
+            lanes = left & lanes;
+        }
+        if (left && !(roundoff > 0.0)) {
+            const Vectors u = plus(motion.u0, motion.u1), v = plus(motion.v0, motion.v1);
+            const Vectors w = plus(motion.w0, motion.w1);
+            const int apart = direction_separates(motion, between(closest_coordinates(u, v, w), u, v, w));
+            free |= left & apart;
+            hit |= left & ~apart;
+        }
+    }
+    free &= usable;
+    hit &= usable;
+    const int unsure = usable & ~(free | hit), open = all & ~usable;
+    auto spread = [](unsigned x) {
+        x = (x | (x << 4)) & 0x0f0fu;
+        x = (x | (x << 2)) & 0x3333u;
+        return (x | (x << 1)) & 0x5555u;
+    };
+    const unsigned long long packet = spread(hit | open) | (spread(unsure | open) << 1);
+    statuses |= packet << (2 * group);
+}
+return statuses;
