@@ -1,7 +1,7 @@
 """Whether two moving features come within a minimum distance d, certified by subdivision of the step.
 
-The proofs of :mod:`.separation_proof` show that they do not, each over a whole part of the step. At one time, two points of
-the features whose distance is certainly at most d are a HIT.
+The proofs of :mod:`.separation_proof` show that they do not, each over a whole part of the step. At one time, two
+points of the features whose distance is certainly at most d are a HIT.
 
 Two searches look for parts that are free. Most queries end in the first one.
 

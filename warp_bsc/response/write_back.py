@@ -2,10 +2,10 @@
 
 import warp as wp
 
-from .state.certificate import revoke
+from .state.certificate import revoke_if_not_finite
 from .state.motion import StateArrays
 from .state.status import Result, SolveStatus
-from .state.structs import FROZEN, NOT_FINITE, TRUNCATED, Vertices
+from .state.structs import FROZEN, TRUNCATED, Vertices
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,18 +17,6 @@ def _write_cuts(outcome: int, status: SolveStatus):
         status.results[Result.TRUNCATED] = 1
     if outcome & FROZEN != 0:
         status.results[Result.FROZEN] = 1
-
-
-@wp.func
-def _count_if_not_finite(outcome: int, is_particle: bool, status: SolveStatus):
-    """Counts a particle without a finite prediction. A step with one, or with such a vertex of a shape, is uncertified.
-
-    What stands in its place is no result of the inner solver.
-    """
-    if outcome & NOT_FINITE != 0:
-        revoke(status.results)
-        if is_particle:
-            wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
 
 
 @wp.kernel
@@ -48,23 +36,10 @@ def write_back(vertices: Vertices, end: StateArrays, body_q_prev: wp.array[wp.tr
     if i >= vertices.outcome.shape[0]:
         return
     outcome = vertices.outcome[i]
-    _count_if_not_finite(outcome, i < end.particle_q.shape[0], status)
+    revoke_if_not_finite(outcome, i < end.particle_q.shape[0], status)
     if i >= end.particle_q.shape[0]:  # a vertex of a shape, which moves with its body, wherever that is
         return
     if outcome != 0:
         end.particle_q[i] = vertices.x1[i]
         end.particle_qd[i] = vertices.velocity[i]
     _write_cuts(outcome, status)
-
-
-@wp.kernel
-def finish_inspection(outcome: wp.array[int], particle_count: int, status: SolveStatus):
-    """Makes the status of an inspection that of a step in which nothing was changed.
-
-    The inspection took vertices without a finite end to stand. Their motion as it is stored is not certified.
-    """
-    vertex = wp.tid()
-    if vertex == 0:
-        status.results[Result.FIRST_HITS] = status.results[Result.REMAINING]
-        status.results[Result.ITERATIONS] = 0
-    _count_if_not_finite(outcome[vertex], vertex < particle_count, status)

@@ -5,13 +5,28 @@ import warp as wp
 from ...detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.run.launch import retry_until_fits
 from ..schedule import decide, decide_worlds
-from ..state.status import Loop, Result
+from ..state.certificate import revoke_if_not_finite
+from ..state.status import Loop, Result, SolveStatus
 from ..state.workspace import Workspace
-from ..write_back import finish_inspection
 from .collect import collect_contacts, collect_penetrations, count_crossings, count_new_crossings, drop_if_full
 from .impacts import count_grazing
 from .queue import queues_of
 from .search import find_contacts_without_queues
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def _finish_inspection(outcome: wp.array[int], particle_count: int, status: SolveStatus):
+    """Makes the status of an inspection that of a step in which nothing was changed.
+
+    The inspection took vertices without a finite end to stand. Their motion as it is stored is not certified.
+    """
+    vertex = wp.tid()
+    if vertex == 0:
+        status.results[Result.FIRST_HITS] = status.results[Result.REMAINING]
+        status.results[Result.ITERATIONS] = 0
+    revoke_if_not_finite(outcome[vertex], vertex < particle_count, status)
 
 
 def inspect(work: Workspace) -> None:
@@ -23,7 +38,7 @@ def inspect(work: Workspace) -> None:
     detect_crossings(work)
     detect(work)
     inputs = [work.vertices.outcome, work.particle_count]
-    work.launch(finish_inspection, len(work.vertices.outcome), inputs, [work.status])
+    work.launch(_finish_inspection, len(work.vertices.outcome), inputs, [work.status])
 
 
 def detect_crossings(work: Workspace) -> None:

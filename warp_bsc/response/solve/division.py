@@ -217,12 +217,16 @@ def _freeze_vertex(step: Step, dividing: DividingPlanes, vertex: int):
 
 @wp.kernel
 def truncate_vertices(
+    # in and out
     step: Step,
+    # in
     vertex_face: PairQueue,
     edge_edge: PairQueue,
+    # in and out
     dividing: DividingPlanes,
     status: SolveStatus,
     record: StepRecord,
+    # in
     dt: wp.float64,
 ):
     """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.

@@ -138,7 +138,9 @@ def _sweep(cluster: int) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
     def sweep_positions(
+        # in and out
         step: Step,
+        # in
         particles: Incidence,
         status: SolveStatus,
         tolerance: wp.float64,

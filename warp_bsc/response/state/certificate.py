@@ -8,7 +8,8 @@ of the program.
 
 import warp as wp
 
-from .status import Result
+from .status import Result, SolveStatus
+from .structs import NOT_FINITE
 
 
 @wp.func
@@ -27,3 +28,15 @@ def is_certified(results: wp.array[int]) -> bool:
 def revoke(results: wp.array[int]):
     """Takes the certificate from a step, in its results."""
     results[Result.CERTIFIED] = 0
+
+
+@wp.func
+def revoke_if_not_finite(outcome: int, is_particle: bool, status: SolveStatus):
+    """Counts a particle without a finite prediction. A step with one, or with such a vertex of a shape, is uncertified.
+
+    What stands in its place is no result of the inner solver.
+    """
+    if outcome & NOT_FINITE != 0:
+        revoke(status.results)
+        if is_particle:
+            wp.atomic_add(status.results, int(Result.NOT_FINITE), 1)
