@@ -127,7 +127,7 @@ class DiffsimExample(ExampleBase):
         """Checks that the stage certified all steps, and that all have gradients."""
         if self.ccd:
             report = self.solver.report
-            assert report.totals.uncertified_steps + report.gradients.lost_steps == 0, report
+            assert report.totals.uncertified_steps + report.gradient_counts.lost_steps == 0, report
 
 
 class MarkExample(DiffsimExample):

@@ -168,5 +168,5 @@ def test_the_example_trains_a_policy(device):
         history, steered, free, report = torch_policy.train(2)
     assert len(history) == 2 and history[1] != history[0]
     assert np.isfinite(steered).all() and (steered != free).all() and free.min() > 0.05
-    assert report.totals.uncertified_steps == report.gradients.outrun_steps == 0
+    assert report.totals.uncertified_steps == report.gradient_counts.layer_passed_steps == 0
     assert report.layer_thickness > 0.0

@@ -146,7 +146,7 @@ def draw_step(path):
     axis.plot(*start.T, ".-", color="grey", label="start of the step")
     axis.plot(*predicted.T, ".-", color=_POLYGON, label="predicted by VBD")
     axis.plot(*result.T, ".-", color=_CURVE, label="moved by the stage")
-    text = f"{report.hits} contacts, {report.iterations} iterations, certified: {report.certified}"
+    text = f"{report.predicted_contacts} contacts, {report.iterations} iterations, certified: {report.certified}"
     axis.set(aspect="equal", xlim=(-0.32, 0.32), ylim=(0.07, 0.22), xlabel="x [m]", ylabel="z [m]", title=text)
     axis.legend(loc="lower center", ncols=3)
     figure.savefig(path, dpi=110)

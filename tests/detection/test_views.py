@@ -141,7 +141,7 @@ def test_the_stage_takes_states_that_are_views(view, device):
         hits = 0
         for _ in range(6):
             solver.step(*states, model.control(), None, 1.0 / 600.0)
-            hits += solver.report.hits
+            hits += solver.report.predicted_contacts
             assert solver.report.certified
             states.reverse()
         assert hits > 0

@@ -348,7 +348,7 @@ def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypat
     example.run_frame._graph = "a graph"
     example.step()
     assert example.run_frame.retaken == 1
-    assert example.solver.report.gradients.lost_steps == 0
+    assert example.solver.report.gradient_counts.lost_steps == 0
     np.testing.assert_allclose(example.throws.numpy(), expected.throws.numpy(), rtol=1e-4)
 
 

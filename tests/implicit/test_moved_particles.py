@@ -211,7 +211,7 @@ def test_two_states_that_take_turns_have_no_array_for_each_gradient(device):
     seed = wp.array(scene.weights, dtype=wp.vec3, device=device)
     tape.backward(grads={states[STEPS % 2].particle_q: seed})
     assert np.isnan(states[0].particle_q.grad.numpy()[scene.held]).all()
-    assert scene.solver.report.gradients.ambiguous_moves == len(scene.held)
+    assert scene.solver.report.gradient_counts.ambiguous_moves == len(scene.held)
 
 
 def test_in_a_graph_as_without(device):

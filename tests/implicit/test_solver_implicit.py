@@ -69,7 +69,7 @@ def test_a_scale_under_a_cloth_shows_its_weight(on_plane, device):
     force, weight = forces(solver, model.state(), model.state(), 12)[-1], weight_of(model)
     assert np.allclose(force, (0.0, 0.0, -weight), atol=1e-3 * weight)
     report = solver.report
-    assert report.certified and report.converged and report.arrived and report.hits == 0
+    assert report.certified and report.converged and report.arrived and report.predicted_contacts == 0
     assert report.forces.contacts.complete and report.forces.complete
     listed = report.forces.contacts.numpy()
     assert np.isin(listed["kind"], [2] if on_plane else [0, 1]).all() and (listed["shapes"] == (-1, 0)).all()
@@ -205,7 +205,7 @@ def test_sheets_that_hit_each_other_where_single_vertices_are_cut_have_their_bar
     states, hits = [solver.model.state(), solver.model.state()], 0
     for k in range(20):
         solver.step(states[k % 2], states[1 - k % 2], None, None, DT)
-        hits += solver.report.hits
+        hits += solver.report.predicted_contacts
     assert hits == 0
     assert solver.report.converged
     assert solver.report.unconverged_steps <= 4

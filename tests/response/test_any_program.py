@@ -29,7 +29,7 @@ def check_rest(rollout, dt, steps):
     touched = 0
     for _ in range(steps):
         rollout.step(dt)
-        touched += rollout.solver.report.hits > 0
+        touched += rollout.solver.report.predicted_contacts > 0
     report = rollout.solver.report
     assert (report.totals.truncated_steps, report.totals.frozen_steps, report.totals.uncertified_steps) == (0, 0, 0)
     assert rollout.collisions == 0 and touched > 0.1 * steps
@@ -101,10 +101,10 @@ def test_a_wanted_position_that_is_not_finite(value, what, device):
     for _ in range(3):
         start = rollout.positions
         rollout.step()
-        assert not rollout.solver.report.certified and not rollout.solver.report.undetected
+        assert not rollout.solver.report.certified and not rollout.solver.report.detection_incomplete
         assert rollout.solver.report.not_finite == 1 and rollout.solver.report.remaining == 0
         assert rollout.solver.report.uncertified_vertices.tolist() == [lost]
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.positions[lost].tobytes() == start[lost].tobytes()
         assert (rollout.velocities[lost] == 0.0).all()
         assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
@@ -139,7 +139,7 @@ def test_a_start_position_that_is_not_finite(value, device):
         rollout.solver.step(start, end, None, None, DT)
         rollout.states = end, start
         report = rollout.solver.report
-        assert not report.certified and not report.undetected and report.totals.uncertified_steps == step + 1
+        assert not report.certified and not report.detection_incomplete and report.totals.uncertified_steps == step + 1
         assert not np.isfinite(rollout.positions[broken]).any()
         assert np.isfinite(rollout.positions[others]).all() and np.isfinite(rollout.velocities[others]).all()
         for x1, collides in ((wanted, True), (rollout.positions, False)):
@@ -176,7 +176,7 @@ def test_any_positions_that_are_not_finite(shot, share, seed):
         assert shot.solver.report.not_finite == len(lost)
         assert np.isfinite(shot.positions).all() and np.isfinite(shot.velocities).all()
         still = (shot.positions[lost] == start[lost]).all(axis=1)
-        assert still.all() or shot.solver.report.hits  # another may push it
+        assert still.all() or shot.solver.report.predicted_contacts  # another may push it
     assert shot.collisions == 0 and shot.solver.report.totals.frozen_steps == standing
 
 
@@ -205,7 +205,7 @@ def test_plates_that_leave_no_room(gaps, iterations, device):
         report = rollout.solver.report
         certified.append(report.certified)
         uncertified += not report.certified
-        assert report.totals.uncertified_steps == uncertified and not report.undetected
+        assert report.totals.uncertified_steps == uncertified and not report.detection_incomplete
         assert report.certified == (report.remaining == 0)
         assert rollout.collisions - collisions <= report.remaining
         assert np.isfinite(rollout.positions).all() and np.isfinite(rollout.velocities).all()
@@ -227,7 +227,7 @@ def test_shapes_may_pass_through_each_other(device):
         gap = next_gap
         rollout.step()
         report = rollout.solver.report
-        assert (report.certified, report.hits, report.remaining) == (True, 0, 0)
+        assert (report.certified, report.predicted_contacts, report.remaining) == (True, 0, 0)
         assert rollout.solver.report.crossings == 0
     np.testing.assert_array_equal(rollout.positions, np.float32(cloth))
 
@@ -282,7 +282,7 @@ def test_worlds_do_not_notice_each_other(trouble, device):
             rollout.solver.step(start, end, None, None, DT)
             rollout.states = end, start
             bits.append(np.delete(np.concatenate([rollout.positions, rollout.velocities], axis=1), middle, axis=0))
-            hits += rollout.solver.report.hits
+            hits += rollout.solver.report.predicted_contacts
             outcome = rollout.solver._work.vertices.outcome.numpy()
             assert not (np.delete(outcome, middle) & ~int(PROJECTED)).any()
             troubled |= {

@@ -200,7 +200,7 @@ def test_gradient_of_a_step_is_that_of_central_differences(case, device):
     scene = Step(device, shape, **options)
     end = scene.end(scene.values)
     report, moved = scene.solver.report, {name: end[name] - scene.values[name] for name in end}
-    assert (report.hits == 0) == ("layer" in case) and report.certified
+    assert (report.predicted_contacts == 0) == ("layer" in case) and report.certified
     assert (report.truncated > 0) == ("truncation" in case) and (report.totals.frozen_steps > 0) == (case == "frozen")
     assert (np.abs(moved["particle_q"]).max() > 1e-3) == (shape != "on the ground")
     assert (np.abs(moved["body_q"]).max() > 1e-3) == (shape in ("wedge", "on the ground"))
@@ -344,7 +344,7 @@ class Push:
         for start, end in itertools.pairwise(self.states):
             start.clear_forces()
             self.solver.step(start, end, model.control(), None, DT / 6.0)
-            self.contacts.append(self.solver.report.hits)
+            self.contacts.append(self.solver.report.predicted_contacts)
         self.value.zero_()
         last = self.states[-1]
         along = np.array([1.0, 0.6, 0.8]), np.array([0.3, -0.5, 0.7])

@@ -157,7 +157,7 @@ def test_steps_after_a_change_are_those_of_a_stage_of_the_changed_model(graph, d
         expected.step()
         assert states[0].particle_q.numpy().tobytes() == expected.positions.tobytes()
         assert states[0].particle_qd.numpy().tobytes() == expected.velocities.tobytes()
-    assert expected.collisions == 0 and expected.solver.report.hits > 0
+    assert expected.collisions == 0 and expected.solver.report.predicted_contacts > 0
     assert not expected.find_crossings(expected.vertices(states[0]))
     totals = stage.report.totals
     assert (totals.steps, totals.uncertified_steps, totals.crossing_steps) == (10, 0, 0)
@@ -178,7 +178,7 @@ def test_a_change_is_a_jump_that_nothing_sweeps(device):
     with pytest.warns(UserWarning, match="edges pass through faces"):
         rollout.step()
         report = stage.report
-        assert (report.certified, report.hits) == (True, 0)
+        assert (report.certified, report.predicted_contacts) == (True, 0)
     np.testing.assert_array_equal(rollout.positions, before)
     rollout.mesh = ModelMesh(model)
     assert report.crossings == len(rollout.find_crossings(rollout.vertices(rollout.states[0]))) > 10
@@ -205,7 +205,7 @@ def test_a_body_that_moves_while_its_shape_changes_is_swept_with_the_new_shape(d
         with pytest.warns(UserWarning, match="strained"):
             rollout.step()
             assert report.strain > 0.2
-        assert report.certified and report.hits > 10 and report.crossings == 0
+        assert report.certified and report.predicted_contacts > 10 and report.crossings == 0
         ends.append(rollout.positions)
     np.testing.assert_array_equal(*ends)
     assert np.linalg.norm(ends[0] - (0.0, 0.0, -0.1), axis=1).min() > 0.0495
@@ -219,7 +219,7 @@ def test_the_monitor_follows(device):
     expected = Rollout(model, None)
     stage.step(*states, None, None, DT)
     found = expected.find_collisions(expected.vertices(states[0]), expected.vertices(states[1]))
-    assert stage.report.hits == len(found) > 0
+    assert stage.report.predicted_contacts == len(found) > 0
     assert all(vertex >= 81 and vertex not in range(162, 162 + 418) for pair in found for vertex in pair)
 
 

@@ -158,7 +158,7 @@ def test_central_differences_agree_with_each_other_and_with_the_tape(target, vel
     differences = central_differences(device, target, velocity)
     scene = Throws(device, target, 1, requires_grad=True)
     derivatives = np.concatenate([differences, scene.gradients(velocity)[None]])
-    assert scene.solver.report.gradients.lost_steps == 0
+    assert scene.solver.report.gradient_counts.lost_steps == 0
     sizes = np.abs(derivatives).min(axis=0)
     spread = derivatives.max(axis=0) - derivatives.min(axis=0)
     assert (spread <= 0.03 * sizes.max()).all()
@@ -199,7 +199,7 @@ def test_a_bounce_returns_the_restitution_whenever_it_begins(floor, tolerance, r
     rollout = Rollout(model, solver)
     for _ in range(16):
         rollout.step(DT)
-        assert solver.report.certified and solver.report.hits == 0
+        assert solver.report.certified and solver.report.predicted_contacts == 0
     upward = rollout.states[0].particle_qd.numpy().reshape(count, -1, 3)[..., 2].mean(axis=1)
     np.testing.assert_allclose(upward / speed, restitution, atol=tolerance)
 
@@ -221,7 +221,7 @@ def test_pushes_conserve_momentum(friction, device):
     start = rollout.states[0].particle_qd.numpy().copy()
     for _ in range(30):
         rollout.step(DT)
-        assert solver.report.certified and solver.report.hits == 0
+        assert solver.report.certified and solver.report.predicted_contacts == 0
     assert np.abs(rollout.states[0].particle_qd.numpy() - start).max() > 0.3
     before, after = ((mass * velocities).sum(axis=0) for velocities in (start, rollout.states[0].particle_qd.numpy()))
     np.testing.assert_allclose(after, before, atol=1e-7 * mass.sum())
@@ -314,7 +314,7 @@ def test_gradient_of_a_step_is_that_of_central_differences(restitution, device):
 
     pushed = np.abs(end(first)[0] - first[1]).max(axis=1)
     assert (pushed > 1e-3).all()
-    assert solver.report.hits == 0
+    assert solver.report.predicted_contacts == 0
     random = np.random.default_rng(1)
     for _ in range(3):
         cotangents = [random.normal(size=(6, 3)), dt * random.normal(size=(6, 3))]
@@ -356,7 +356,7 @@ def test_a_layer_without_room_for_its_pairs_pushes_nothing(device):
             rollout.step(DT)
         assert solver.report.totals.uncertified_steps == 0
         ends.append(rollout.states[0].particle_q.numpy())
-    assert 1 <= solver.solver.skipped_steps == solver.report.gradients.layerless_steps <= 12
+    assert 1 <= solver.solver.skipped_steps == solver.report.gradient_counts.layer_overflows <= 12
     assert "steps without their contact layer" in str(solver.report)
     np.testing.assert_array_equal(*ends)
 
@@ -383,7 +383,7 @@ def test_gradients_in_a_graph_are_those_without(device):
                 tape = differentiate()
             tape.zero()
             wp.capture_launch(capture.graph)
-        assert scene.solver.report.gradients.lost_steps + scene.solver.solver.skipped_steps == 0
+        assert scene.solver.report.gradient_counts.lost_steps + scene.solver.solver.skipped_steps == 0
         gradients.append(scene.velocity.grad.numpy())
     np.testing.assert_allclose(gradients[1], gradients[0], rtol=1e-5)
 

@@ -157,7 +157,7 @@ def test_a_monitor_around_the_coupled_solver_counts_what_passes(device):
     rollout, uncertified = Rollout(model, bsc.CollisionMonitor(solver)), 0
     for _ in range(40):
         rollout.step()
-        assert rollout.solver.report.hits == len(rollout.new_collisions)
+        assert rollout.solver.report.predicted_contacts == len(rollout.new_collisions)
         uncertified += bool(rollout.new_collisions)
     assert rollout.solver.report.totals.uncertified_steps == uncertified > 0
 
@@ -403,7 +403,7 @@ def test_proxies_start_where_a_program_sets_them_first(resets, device):
     start.clear_forces()
     solver.step(start, end, None, None, DT)
     solver.sync_entry_states(end)
-    assert stage.report.certified and stage.report.hits == 0
+    assert stage.report.certified and stage.report.predicted_contacts == 0
     # the sheet is at rest but for the rounding of its elastic forces; the ball would carry it by its radius
     np.testing.assert_allclose(end.particle_q.numpy(), model.particle_q.numpy(), rtol=0.0, atol=1e-8)
 

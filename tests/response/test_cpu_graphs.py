@@ -195,7 +195,9 @@ def test_a_step_in_a_graph_is_the_step_without(inner):
                 wp.capture_launch(capture.graph)
             else:
                 step()
-            reports.append([solver.report.hits, solver.report.iterations, solver.report.totals.truncated_steps])
+            reports.append(
+                [solver.report.predicted_contacts, solver.report.iterations, solver.report.totals.truncated_steps]
+            )
         assert (solver.report.totals.steps, solver.report.totals.uncertified_steps) == (8, 0)
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy(), reports])
     assert np.max(reports, axis=0)[1] > 1
@@ -250,7 +252,7 @@ def test_a_replay_without_room_is_taken_back():
             steps()
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
         retaken.append((steps.retaken, int(replays.numpy()[0])))
-        totals, lost = solver.report.totals, solver.report.gradients.lost_steps
+        totals, lost = solver.report.totals, solver.report.gradient_counts.lost_steps
         assert (totals.steps, totals.undetected_steps, totals.uncertified_steps, lost) == (7, 0, 0, 0)
     assert retaken == [(2, 6), (0, 0)]  # the first run is outside the graph
     for actual, expected in zip(*ends, strict=True):
@@ -283,7 +285,7 @@ def test_gradients_in_a_graph_are_those_without():
             wp.capture_launch(capture.graph)
         else:
             rollout()
-        assert solver.report.totals.truncated_steps + solver.report.hits > 0
+        assert solver.report.totals.truncated_steps + solver.report.predicted_contacts > 0
         gradients.append([states[0].particle_q.grad.numpy(), states[0].particle_qd.grad.numpy()])
     assert all(np.isfinite(gradient).all() and np.abs(gradient).max() > 0.0 for gradient in gradients[1])
     for actual, expected in zip(*gradients, strict=True):

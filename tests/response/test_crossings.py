@@ -138,7 +138,7 @@ def test_crossings_elsewhere_do_not_let_a_bullet_pass(device):
         rollout.step()
         assert rollout.solver.report.certified
         assert rollout.solver.report.crossings > 0
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
     assert rollout.collisions == 0 and hits > 100
     assert rollout.velocities[-49:, 2].mean() > -20.0
 
@@ -234,7 +234,7 @@ def test_cloth_on_a_roller_without_common_vertices(device):
         c, s = np.cos(0.02 * (k + 1)), np.sin(0.02 * (k + 1))
         turned = np.float32(np.stack([c * x + s * z, y, c * z - s * x], axis=1))
         rollout.step()
-        touched += rollout.solver.report.hits
+        touched += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
         assert rollout.positions[cloth:].tobytes() == turned.tobytes()
     assert rollout.collisions == 0 and touched > 0

@@ -45,7 +45,7 @@ def test_a_bullet(speed, iterations, device):
     for _ in range(12 if speed < 50.0 else 8):
         start = rollout.positions
         rollout.step()
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
         assert rollout.solver.report.iterations <= iterations + 33
         missed, path = (np.linalg.norm(x.astype(float) - wanted[0], axis=1) for x in (rollout.positions, start))
@@ -73,7 +73,7 @@ def test_a_tilted_bullet(iterations, device):
         if hits == 0 and iterations == 0:
             slid, wanted_slide = ((x - start)[-81:, 0].mean() for x in (rollout.positions, *wanted))
             assert slid > 0.8 * wanted_slide > 0.0
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
     assert rollout.collisions == 0 and hits > 50
     assert rollout.solver.report.totals.frozen_steps == 0
@@ -112,7 +112,7 @@ def test_plates_that_close_on_cloth(iterations, device):
     for step in range(8):
         gap = max(0.004, 0.026 - 0.004 * step)
         rollout.step()
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
         assert np.abs(rollout.positions[:, 2]).max() < 0.5 * gap
     assert rollout.collisions == 0 and hits > 50
@@ -133,7 +133,7 @@ def test_a_pile_takes_few_rounds(device):
         rounds.append(rollout.solver.report.iterations)
     report = rollout.solver.report
     assert report.totals.uncertified_steps == report.totals.truncated_steps == 0
-    assert rollout.collisions == 0 and report.hits > 50
+    assert rollout.collisions == 0 and report.predicted_contacts > 50
     assert max(rounds) <= 4 and np.median(rounds[3:]) <= 2, rounds
 
 
@@ -161,7 +161,7 @@ def test_layers_that_move_together_are_not_stopped(turns, device):
     start, hits = rollout.positions[:count], 0
     for _ in range(10):
         rollout.step(dt)
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
     assert rollout.collisions == 0 and hits > 0
     path = rollout.positions[:count] - start
     assert abs((path * wanted).sum() / (wanted**2).sum() - 1.0) < 1e-3
@@ -389,7 +389,9 @@ def test_edges_on_edges_push_nothing_aside(device):
     rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
     start = rollout.positions
     rollout.step()
-    assert rollout.solver.report.certified and rollout.solver.report.hits > 1000 and rollout.collisions == 0
+    assert (
+        rollout.solver.report.certified and rollout.solver.report.predicted_contacts > 1000 and rollout.collisions == 0
+    )
     aside = np.linalg.norm((rollout.positions - start)[:, :2], axis=1)
     assert aside.max() < 1.2e-5  # with planes across all pairs of edges twice as far
 
@@ -409,7 +411,7 @@ def test_what_ends_exactly_in_contact_is_divided(z, start, device):
     solver = bsc.SolverCCD(Changed(model, lambda state: state.particle_q.assign(ends)), max_iterations=0)
     state, end = model.state(), model.state()
     solver.step(state, end, None, None, DT)
-    assert solver.report.certified and solver.report.hits and not solver.report.frozen
+    assert solver.report.certified and solver.report.predicted_contacts and not solver.report.frozen
     assert end.particle_q.numpy()[:9, 2].min() > z
 
 

@@ -42,7 +42,7 @@ def shot(device, **options):
     for _ in range(3):
         solver.step(state, end, model.control(), None, DT)
         state, end = end, state
-        if solver.report.hits:
+        if solver.report.predicted_contacts:
             break
     return solver, state
 

@@ -84,7 +84,7 @@ def test_random_steps_are_counted_and_made_free_of_inversions(size, held, device
         for _ in range(2):
             rollout.step()
             report = solver.report
-            assert (rollout.inverting, rollout.inverted) == (0, 0) == (report.inversions, report.inverted)
+            assert (rollout.inverting, rollout.inverted) == (0, 0) == (report.inverting, report.inverted_at_start)
             assert report.certified
             cut += report.truncated
             moved = (rollout.start != rollout.vertices(rollout.states[0])).any(axis=1)
@@ -95,7 +95,7 @@ def test_random_steps_are_counted_and_made_free_of_inversions(size, held, device
         rollout, counts = Inverting(model, solver), []
         for _ in range(3):
             rollout.step()
-            counts.append((solver.report.inversions, solver.report.inverted))
+            counts.append((solver.report.inverting, solver.report.inverted_at_start))
             assert counts[-1] == (rollout.inverting, rollout.inverted)
     assert counts[0][0] > 5 and counts[-1][1] > 5
     assert solver.report.totals.inverting_steps == sum(count > 0 for count, _ in counts)
@@ -138,8 +138,8 @@ def test_a_block_that_is_thrown_or_pressed_inverts_nowhere(scene, substeps, devi
             report = solver.report
             seen[inversions] += rollout.inverting
             if substeps == 1:  # whose way is straight
-                assert (report.inversions, report.inverted) == (rollout.inverting, rollout.inverted)
-            assert report.certified and (inversions == "reported" or report.inversions == 0)
+                assert (report.inverting, report.inverted_at_start) == (rollout.inverting, rollout.inverted)
+            assert report.certified and (inversions == "reported" or report.inverting == 0)
         assert substeps > 1 or rollout.collisions == 0  # as above
     assert seen["prevented"] == 0
     if scene is wall:
@@ -168,7 +168,7 @@ def test_where_cuts_do_not_suffice_vertices_are_frozen(device):
     rollout = Inverting(model, solver)
     rollout.step()
     report = solver.report
-    assert (rollout.inverting, rollout.collisions, report.inversions) == (0, 0, 0)
+    assert (rollout.inverting, rollout.collisions, report.inverting) == (0, 0, 0)
     assert report.certified and report.frozen > 20
     stands = (rollout.positions == rollout.start[: model.particle_count]).all(axis=1)
     assert np.count_nonzero(stands) == report.frozen and not rollout.velocities[stands].any()
@@ -176,7 +176,7 @@ def test_where_cuts_do_not_suffice_vertices_are_frozen(device):
 
 def test_what_is_not_asked_for_changes_nothing(device):
     model, ends = shaken_model(device), []
-    for inversions in ("left", "reported"):
+    for inversions in ("allowed", "reported"):
         solver = bsc.SolverCCD(Changed(model, shaken(1, 0.02)), inversions=inversions)
         rollout = Rollout(model, solver)
         for _ in range(2):
@@ -184,7 +184,7 @@ def test_what_is_not_asked_for_changes_nothing(device):
         ends.append([rollout.positions.tobytes(), rollout.velocities.tobytes()])
     assert ends[0] == ends[1]
     solver = bsc.SolverCCD(Changed(model))
-    for name in ("inversions", "inverted"):
+    for name in ("inverting", "inverted_at_start"):
         with pytest.raises(RuntimeError, match="inversions='reported'"):
             getattr(solver.report, name)
 
@@ -192,7 +192,7 @@ def test_what_is_not_asked_for_changes_nothing(device):
 def test_a_step_that_inverts_nothing_is_the_same_bit_by_bit(device):
     """Looking for inversions changes nothing, and the cut begins only where there is one."""
     ends = []
-    for inversions in ("left", "prevented"):
+    for inversions in ("allowed", "prevented"):
         model = wall(device)
         solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=5), inversions=inversions)
         rollout = Inverting(model, solver)
@@ -201,7 +201,7 @@ def test_a_step_that_inverts_nothing_is_the_same_bit_by_bit(device):
         for _ in range(16):
             rollout.step()
             assert rollout.inverting == 0
-            contacts += solver.report.hits
+            contacts += solver.report.predicted_contacts
         ends.append([rollout.positions.tobytes(), rollout.velocities.tobytes()])
     assert contacts > 0 and ends[0] == ends[1]
 
@@ -217,7 +217,7 @@ def test_what_is_inverted_at_the_start_is_left(device):
     for _ in range(3):
         rollout.step()
         assert rollout.inverting == 0 and rollout.inverted >= 2
-        assert (solver.report.inversions, solver.report.inverted) == (0, rollout.inverted)
+        assert (solver.report.inverting, solver.report.inverted_at_start) == (0, rollout.inverted)
     assert solver.report.totals.uncertified_steps == 0
 
 
@@ -236,7 +236,7 @@ def test_held_particles_that_invert_are_not_certified(device):
     tets, before = model.tet_indices.numpy().reshape(-1, 4), model.particle_q.numpy()  # the program moves in the step
     points = np.concatenate([before[tets], rollout.positions[tets]], axis=1)
     moves = (tets >= 9).any(axis=1)
-    assert report.inversions == np.count_nonzero(checker.tetrahedron(points)[moves]) > 0
+    assert report.inverting == np.count_nonzero(checker.tetrahedron(points)[moves]) > 0
     assert set(range(9)) <= set(report.uncertified_vertices.tolist()) <= set(range(27))
     assert report.frozen >= 9
 
@@ -263,7 +263,7 @@ def test_worlds_are_alone_and_may_take_no_part(device):
             start, end = end, start
             ends.append(start.particle_q.numpy().reshape(len(of_worlds), -1, 3).copy())
             report = solver.report.worlds.numpy()
-            assert report["certified"].all() and not report["inversions"].any() and not report["inverted"].any()
+            assert report["certified"].all() and not report["inverting"].any() and not report["inverted_at_start"].any()
             assert report["truncated"].sum() == solver.report.truncated
             assert mask is None or not report["truncated"][~np.array(mask)].any()
         return ends
@@ -290,10 +290,10 @@ def test_worlds_report_their_inversions(device):
     solver = bsc.SolverCCD(Changed(model, change), inversions="reported", report_worlds=True)
     rollout = Inverting(model, solver)
     rollout.step()
-    assert solver.report.worlds.inversions.numpy().tolist() == [0, rollout.inverting]
+    assert solver.report.worlds.inverting.numpy().tolist() == [0, rollout.inverting]
     assert rollout.inverting >= 2
     rollout.step()
-    assert solver.report.worlds.inverted.numpy().tolist() == [0, rollout.inverted]
+    assert solver.report.worlds.inverted_at_start.numpy().tolist() == [0, rollout.inverted]
     assert solver.report.worlds.certified.numpy().all()
 
 
@@ -321,7 +321,7 @@ def test_steps_in_a_graph_are_those_without():
         counts = []
         for _ in range(4):
             run()
-            counts.append((solver.report.truncated, solver.report.inversions))
+            counts.append((solver.report.truncated, solver.report.inverting))
         ends.append([states[0].particle_q.numpy().tobytes(), states[0].particle_qd.numpy().tobytes(), counts])
     assert ends[0] == ends[1]
     assert any(truncated for truncated, _ in counts) and not any(inversions for _, inversions in counts)
@@ -335,7 +335,7 @@ def test_a_step_on_a_tape_counts_but_does_not_prevent(device):
     solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), inversions="reported")
     with wp.Tape():
         solver.step(start, end, None, None, 1e-4)
-    assert (solver.report.inversions, solver.report.inverted) == (0, 0)
+    assert (solver.report.inverting, solver.report.inverted_at_start) == (0, 0)
     solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), inversions="prevented")
     with wp.Tape(), pytest.raises(NotImplementedError, match="inversions"):
         solver.step(start, end, None, None, 1e-4)

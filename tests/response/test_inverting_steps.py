@@ -17,5 +17,5 @@ def test_a_row_for_each_mode(monkeypatch, capsys):
     inverting = {line.split()[1]: [int(x) for x in line.split()[5:7]] for line in lines}
     assert all(float(line.split()[3]) > 0.0 and line.split()[2] == "2" for line in lines)
     assert inverting["plain"][1] > 0 and inverting["prevented"] == [0, 0]
-    assert inverting["reported"] == inverting["left"] and inverting["left"][1] > 100
+    assert inverting["reported"] == inverting["allowed"] and inverting["allowed"][1] > 100
     assert f"{inverting['reported'][0]} that inverted tetrahedra" in lines[2]

@@ -43,7 +43,7 @@ def test_a_bullet(speed, iterations, device):
     hits = 0
     for _ in range(8 if speed < 50.0 else 4):
         rollout.step()
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
     assert hits > 20 and rollout.near == rollout.approaches == rollout.collisions == 0
     assert rollout.solver.report.totals.frozen_steps == 0
@@ -60,7 +60,7 @@ def test_ropes_and_points(device):
     hits = 0
     for _ in range(12):
         rollout.step()
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
     assert hits > 40 and rollout.near == rollout.approaches == 0
 
@@ -115,8 +115,8 @@ def test_without_queues(device, monkeypatch):
     hits = 0
     for _ in range(8):
         rollout.step()
-        hits += rollout.solver.report.hits
-        assert rollout.solver.report.certified and not rollout.solver.report.undetected
+        hits += rollout.solver.report.predicted_contacts
+        assert rollout.solver.report.certified and not rollout.solver.report.detection_incomplete
     assert hits > 20 and rollout.near == rollout.approaches == 0
 
 
@@ -131,7 +131,7 @@ def test_worlds(device):
         for _ in range(6):
             rollout.step()
             assert rollout.solver.report.certified
-        assert rollout.solver.report.hits > 0
+        assert rollout.solver.report.predicted_contacts > 0
         ends.append(rollout.positions)
     np.testing.assert_array_equal(ends[1], np.concatenate([ends[0]] * 2))
 
@@ -206,7 +206,7 @@ def test_plates_bodies_and_coupled_steps(options, device):
     for step in range(6):
         gap = max(0.022, 0.04 - 0.004 * step)
         rollout.step()
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
         assert rollout.solver.report.certified
     assert hits > 20 and rollout.approaches == 0
 
@@ -269,7 +269,7 @@ def test_a_monitor_counts_approaches(device):
     for distance in (None, 0.012):
         rollout = Rollout(model, bsc.CollisionMonitor(SOLVERS["vbd"](model), min_distance=distance))
         rollout.step()
-        hits.append(rollout.solver.report.hits)
+        hits.append(rollout.solver.report.predicted_contacts)
         assert rollout.solver.report.certified == (hits[-1] == 0)
     assert hits[1] > hits[0]
 

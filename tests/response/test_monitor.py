@@ -83,13 +83,17 @@ def test_the_monitor_reports_what_exact_detection_finds_and_changes_nothing(scen
         rollout.step()
         assert bits(*rollout.states[::-1]) == wanted
         contacts, unsure = exact_contacts(rollout, x0, rollout.positions)
-        assert 0 <= report.hits + report.excluded - len(contacts) <= unsure
+        assert 0 <= report.predicted_contacts + report.excluded - len(contacts) <= unsure
         equal += unsure == 0 < len(contacts)
-        assert report.remaining == report.hits
-        assert report.certified == (report.hits == 0) == (len(report.uncertified_vertices) == 0)
+        assert report.remaining == report.predicted_contacts
+        assert report.certified == (report.predicted_contacts == 0) == (len(report.uncertified_vertices) == 0)
         assert report.crossings == len(rollout.detector.find_intersections(x0))
         assert (report.iterations, report.truncated, report.frozen, report.not_finite) == (0, 0, 0, 0)
-        hits, excluded, crossings = hits + report.hits, excluded + report.excluded, crossings + report.crossings
+        hits, excluded, crossings = (
+            hits + report.predicted_contacts,
+            excluded + report.excluded,
+            crossings + report.crossings,
+        )
         uncertified += not report.certified
     assert hits > 100
     assert (excluded > 0) == (crossings > 0) == (scene is blade)  # the other is through within one step
@@ -125,7 +129,13 @@ def test_the_monitor_reports_the_same_from_a_graph(device):
             else:
                 step()
             report = solver.report
-            counts = report.hits, report.remaining, report.excluded, report.crossings, report.totals.uncertified_steps
+            counts = (
+                report.predicted_contacts,
+                report.remaining,
+                report.excluded,
+                report.crossings,
+                report.totals.uncertified_steps,
+            )
             rows[-1].append((*counts, report.uncertified_vertices.tolist(), states[0].particle_q.numpy().tobytes()))
         assert report.totals.steps == 6
     assert rows[0] == rows[1]
@@ -147,9 +157,12 @@ def test_the_monitor_needs_no_friction(device):
     rollout = Rollout(model, bsc.CollisionMonitor(newton.solvers.SolverXPBD(model, iterations=0)))
     rollout.step()
     report = rollout.solver.report
-    assert (report.hits, report.excluded) == (model.particle_count, 0)  # all vertices enter the plane
+    assert (report.predicted_contacts, report.excluded) == (model.particle_count, 0)  # all vertices enter the plane
     rollout.step()
-    assert (report.hits, report.excluded) == (0, model.particle_count)  # and are left to the solver from then on
+    assert (report.predicted_contacts, report.excluded) == (
+        0,
+        model.particle_count,
+    )  # and are left to the solver from then on
     assert report.certified and report.totals.uncertified_steps == 1
 
 
@@ -166,7 +179,7 @@ def test_gradients_of_the_inner_solver_pass_the_monitor_unchanged(device):
             for start, end in itertools.pairwise(states):
                 start.clear_forces()
                 solver.step(start, end, control, None, DT / 4)
-                hits += solver.report.hits if monitored else 0
+                hits += solver.report.predicted_contacts if monitored else 0
         tape.backward(grads={states[-1].particle_q: wp.ones_like(states[-1].particle_q)})
         gradients.append([states[0].particle_q.grad.numpy(), states[0].particle_qd.grad.numpy()])
     assert hits > 0
@@ -207,7 +220,12 @@ def test_the_monitor_does_not_certify_positions_that_are_not_finite(device):
     solver.step(start, end, model.control(), None, DT)
     report = solver.report
     totals = report.totals
-    assert (report.not_finite, totals.not_finite_steps, report.hits, totals.uncertified_steps) == (1, 1, 0, 1)
+    assert (report.not_finite, totals.not_finite_steps, report.predicted_contacts, totals.uncertified_steps) == (
+        1,
+        1,
+        0,
+        1,
+    )
     assert np.isnan(end.particle_q.numpy()[last]).all()
     np.testing.assert_array_equal(report.uncertified_vertices, particles_of_elements_with(model, last))
 
@@ -221,7 +239,7 @@ def test_particles_without_a_position_at_the_start_are_named(make, device):
     solver = make(newton.solvers.SolverXPBD(model, iterations=0))
     solver.step(start, end, model.control(), None, DT)
     report = solver.report
-    assert not report.certified and report.hits == 0
+    assert not report.certified and report.predicted_contacts == 0
     np.testing.assert_array_equal(report.uncertified_vertices, particles_of_elements_with(model, first))
 
 
@@ -282,6 +300,6 @@ def test_crossings_at_the_start_are_counted_from_the_first_step(make, device):
     for steps in (1, 2):
         rollout.step()
         assert (report.crossings, report.totals.steps) == (expected, steps)
-        assert (report.hits, report.excluded) == (0, 0)  # nothing moves
+        assert (report.predicted_contacts, report.excluded) == (0, 0)  # nothing moves
         assert report.certified and len(report.uncertified_vertices) == 0
     assert f"0 not certified, {expected} crossings at the start of the step" in str(report)

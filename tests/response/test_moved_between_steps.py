@@ -55,7 +55,7 @@ def test_a_ball_set_between_steps_is_one_that_moves_in_them(device):
         assert between.positions.tobytes() == within.positions.tobytes()
         assert between.velocities.tobytes() == within.velocities.tobytes()
         assert ball_in_sheet(between) == between.solver.report.crossings == 0
-        hits += between.solver.report.hits
+        hits += between.solver.report.predicted_contacts
     assert hits > 20 and between.positions[:, 2].min() < POSES[-1][2]
 
 
@@ -110,7 +110,7 @@ def test_the_first_step_begins_where_the_model_puts_things(device_loop, device):
         animate(rollout, POSES[-1])
         rollout.step()
     report = rollout.solver.report
-    assert report.certified and report.hits > 20 and report.truncated == 0
+    assert report.certified and report.predicted_contacts > 20 and report.truncated == 0
     assert ball_in_sheet(rollout) == rollout.solver.report.crossings == 0
     assert rollout.positions[:, 2].min() < POSES[-1][2] - 0.05  # below the ball
 
@@ -141,7 +141,7 @@ def test_joints_may_place_bodies_before_the_first_step(placed, turned, passes, d
     model.joint_q.fill_(turned)
     newton.eval_fk(model, model.joint_q, model.joint_qd, rollout.states[0])
     rollout.step()
-    assert (rollout.solver.report.hits > 0) == passes and rollout.solver.report.certified
+    assert (rollout.solver.report.predicted_contacts > 0) == passes and rollout.solver.report.certified
 
 
 def test_the_monitor_counts_what_a_ball_passes_between_steps(device):
@@ -151,7 +151,7 @@ def test_the_monitor_counts_what_a_ball_passes_between_steps(device):
     for x in POSES:
         animate(rollout, x)
         rollout.step()
-        hits += rollout.solver.report.hits
+        hits += rollout.solver.report.predicted_contacts
     assert hits > 20 and (rollout.positions[:, 2] == 0.0).all()
 
 
@@ -203,7 +203,7 @@ def test_what_is_set_to_another_state_begins_there(how, device):
         rollout.solver.reset(rollout.states[0])
     animate(rollout, POSES[-1])
     rollout.step()
-    assert rollout.solver.report.certified and rollout.solver.report.hits == 0
+    assert rollout.solver.report.certified and rollout.solver.report.predicted_contacts == 0
     assert rollout.positions.tobytes() == expected.tobytes()
 
 

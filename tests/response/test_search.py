@@ -63,8 +63,8 @@ def test_a_bullet(speed, device, monkeypatch):
         hits = 0
         for _ in range(12 if speed < 50.0 else 8):
             rollout.step()
-            hits += rollout.solver.report.hits
-            assert rollout.solver.report.certified and not rollout.solver.report.undetected
+            hits += rollout.solver.report.predicted_contacts
+            assert rollout.solver.report.certified and not rollout.solver.report.detection_incomplete
         assert rollout.collisions == 0 and hits > 50
         assert rollout.solver.report.totals.frozen_steps == 0
         ends.append(rollout.positions.tobytes() + rollout.velocities.tobytes())
@@ -174,8 +174,8 @@ def test_a_graph_captured_before_anything_touches(device, monkeypatch):
         before = rollout.vertices(start)
         wp.capture_launch(capture.graph)
         assert not rollout.find_collisions(before, rollout.vertices(end))
-        assert rollout.solver.report.certified and not rollout.solver.report.undetected
-        hits += rollout.solver.report.hits
+        assert rollout.solver.report.certified and not rollout.solver.report.detection_incomplete
+        hits += rollout.solver.report.predicted_contacts
         wp.copy(start.particle_q, end.particle_q)
         wp.copy(start.particle_qd, end.particle_qd)
     assert hits > 100

@@ -82,7 +82,7 @@ class Throw:
             start.clear_forces()
             self.solver.step(start, end, self.control, None, DT)
             if not model.device.is_capturing:
-                self.hits += self.solver.report.hits
+                self.hits += self.solver.report.predicted_contacts
         self.centre.zero_()
         inputs, outputs = [states[-1].particle_q, self.thrown, wp.vec3(*OBLIQUE)], [self.centre]
         wp.launch(add_to_centre, self.thrown, inputs=inputs, outputs=outputs, device=model.device)
@@ -300,8 +300,8 @@ def test_grazing_contacts_are_flagged_and_gradients_finite(device):
     states[1].particle_q.assign(positions)
     with wp.Tape() as tape:
         solver.step(*states, None, None, 0.01)
-    assert solver.report.hits > 0
-    assert solver.report.gradients.grazing > 0
+    assert solver.report.predicted_contacts > 0
+    assert solver.report.gradient_counts.grazing > 0
     assert "grazing" in str(solver.report)
     states[1].particle_q.grad.fill_(1.0)
     states[1].particle_qd.grad.fill_(1.0)
@@ -374,7 +374,7 @@ def test_gradient_in_a_cuda_graph(device):
         wp.capture_launch(capture.graph)
         np.testing.assert_allclose(scene.velocity.grad.numpy()[0], eager[0], rtol=1e-4)
         np.testing.assert_allclose(table.grad.numpy()[0, 0], eager[1], rtol=1e-4)
-    assert scene.solver.report.gradients.lost_steps == 0
+    assert scene.solver.report.gradient_counts.lost_steps == 0
 
 
 def test_an_incomplete_record_gives_nan(device):

@@ -40,7 +40,7 @@ class Pair:
         return whole, said
 
 
-NUMBERS = "hits", "remaining", "excluded", "filtered", "iterations", "body_contacts"
+NUMBERS = "predicted_contacts", "remaining", "excluded", "filtered", "iterations", "body_contacts"
 LISTS = "uncertified_vertices", "uncertified_bodies"
 
 
@@ -66,7 +66,7 @@ def check(whole, said):
     assert whole["worlds.certified"].tolist() == np.all([part["worlds.certified"] for part in said], axis=0).tolist()
     for name in NUMBERS:
         assert whole[name] == sum(part[name] for part in said), name
-    for name in ("hits", "remaining", "filtered"):
+    for name in ("predicted_contacts", "remaining", "filtered"):
         expected = np.sum([part[f"worlds.{name}"] for part in said], axis=0)
         assert whole[f"worlds.{name}"].tolist() == expected.tolist(), name
     for name in ("strain", "crossings", "worlds.strain", "worlds.crossings", "worlds.max_impulse"):
@@ -91,7 +91,7 @@ def test_a_step_is_that_many_smaller_ones_and_its_report_is_of_all(inner, device
     for _ in range(4):
         whole, said = pair.step()
         check(whole, said)
-        hits += whole["hits"] > max(part["hits"] for part in said)
+        hits += whole["predicted_contacts"] > max(part["predicted_contacts"] for part in said)
     assert hits and pair.together.report.totals.steps == 4
 
 

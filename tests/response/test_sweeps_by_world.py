@@ -36,9 +36,13 @@ def run(speeds, device, options):
                 array.assign(np.where(back, getattr(model, name).numpy(), array.numpy()))
             solver.reset(states[0], wp.array([speed == SPEEDS[0] for speed in speeds] + [False], device=device))
         results = solver.report.worlds.numpy()
-        hits += results["hits"]
+        hits += results["predicted_contacts"]
         arrays = [getattr(states[0], name).numpy().reshape(len(speeds), -1) for name in ("particle_q", "particle_qd")]
-        ends.append(np.concatenate([*arrays, *(results[name].reshape(-1, 1) for name in ("hits", "strain"))], axis=1))
+        ends.append(
+            np.concatenate(
+                [*arrays, *(results[name].reshape(-1, 1) for name in ("predicted_contacts", "strain"))], axis=1
+            )
+        )
     return np.stack(ends, axis=1), hits
 
 

@@ -82,10 +82,10 @@ def test_a_blade_meets_what_its_chords_miss(make, options, device):
     for state, x in zip((start, after), ends, strict=True):
         solver.mesh.positions(start.particle_q, state.body_q, x)
     assert bsc.CollisionDetector(solver.mesh).detect(*ends).earliest_toi == 2.0  # the chords
-    assert report.hits > 20
+    assert report.predicted_contacts > 20
     moved = np.abs(end.particle_q.numpy() - start.particle_q.numpy()).max()
     if make is bsc.CollisionMonitor:
-        assert not report.certified and report.remaining == report.hits and moved == 0.0
+        assert not report.certified and report.remaining == report.predicted_contacts and moved == 0.0
         assert len(report.uncertified_vertices) > 0 and report.uncertified_bodies.tolist() == [0]
     else:
         assert report.certified and moved > 0.05
@@ -129,7 +129,7 @@ def test_the_search_of_a_gpu_finds_them_too(tiny, options, device, monkeypatch):
     options = {"inner": Changed(model, turned(1.0)), "tiny": tiny, **options}
     monitor = hierarchy_stage(model, monkeypatch, make=bsc.CollisionMonitor, **options)
     report = step_once(monitor, model)[0]
-    assert report.remaining == plain.remaining > 0 and not report.certified and not report.undetected
+    assert report.remaining == plain.remaining > 0 and not report.certified and not report.detection_incomplete
     solver = hierarchy_stage(model, monkeypatch, **options)
     report, start, end = step_once(solver, model)
     ends = [wp.empty(solver.mesh.vertex_count, dtype=wp.vec3, device=device) for _ in range(2)]
@@ -163,7 +163,7 @@ def test_a_propeller_throws_a_cloth(device):
         solver.mesh.positions(states[1].particle_q, states[1].body_q, ends[1])
         assert solver.report.certified and solver.report.crossings == 0
         assert crossings_on_arcs(solver.mesh, *ends, angle if number else 0.0) == 0
-        hits += solver.report.hits
+        hits += solver.report.predicted_contacts
         states.reverse()
     assert hits > 200
     assert np.linalg.norm(states[0].particle_qd.numpy(), axis=1).max() > 2.0
@@ -197,7 +197,7 @@ def test_random_bars_push_a_cloth_off_their_arcs(options, device):
             continue
         report, _start, end = step_once(solver, model)
         assert report.certified, seed
-        with_contacts += report.hits > 0
+        with_contacts += report.predicted_contacts > 0
         start_x, end_x = x.copy(), x.copy()
         end_x[:count] = end.particle_q.numpy()
         place, quaternion = end.body_q.numpy()[0, :3], end.body_q.numpy()[0, 3:]
@@ -217,7 +217,7 @@ def test_a_dynamic_blade_is_stopped(device):
     model.particle_mass.zero_()
     solver = bsc.SolverCCD(Changed(model, turned(0.5 * np.pi)))
     report, _start, end = step_once(solver, model)
-    assert report.hits > 0 and report.certified
+    assert report.predicted_contacts > 0 and report.certified
     np.testing.assert_array_equal(end.particle_q.numpy(), model.particle_q.numpy())
     place, turn = end.body_q.numpy()[0, :3], Rotation.from_quat(end.body_q.numpy()[0, 3:]).as_rotvec()
     count, finder = model.particle_count, bsc.CollisionDetector(solver.mesh)
@@ -260,8 +260,8 @@ def test_bodies_that_do_not_turn_give_the_same_bits(device, monkeypatch):
                     Changed(model, lambda state: set_pose(state, (0, 1.2, 0), about_z(0.0))), **options
                 )
                 report, _start, end = step_once(solver, model)
-                assert report.hits > 0
-                ends.append([end.particle_q.numpy().tobytes(), end.body_q.numpy().tobytes(), report.hits])
+                assert report.predicted_contacts > 0
+                ends.append([end.particle_q.numpy().tobytes(), end.body_q.numpy().tobytes(), report.predicted_contacts])
     assert ends[:4] == ends[4:]
 
 
@@ -270,7 +270,7 @@ def test_a_hinge_is_where_it_turns(device):
     for at, hits in ((0.95, True), (1.05, False)):
         model = blade_and_strip(device, at=at)
         report, *_ = step_once(bsc.CollisionMonitor(Changed(model, turned(np.pi / 2))), model)
-        assert (report.hits > 0) == hits, at
+        assert (report.predicted_contacts > 0) == hits, at
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.001])
@@ -293,7 +293,7 @@ def test_a_disc_that_spins_on_a_sheet_is_at_rest_as_by_its_chords(distance, devi
         for number in range(6):
             solver.solver.change = turned(0.2 * (number + 1), place)
             solver.step(*states, None, None, DT)
-            assert solver.report.certified and solver.report.hits == 0
+            assert solver.report.certified and solver.report.predicted_contacts == 0
             states.reverse()
             if not distance:
                 np.testing.assert_array_equal(states[0].body_q.numpy()[0, :3], np.float32(place))

@@ -121,7 +121,7 @@ def test_each_world_is_stepped_as_if_it_were_alone(inner, substeps, device):
             report, results = alone.solver.report, alone.solver.report.worlds.numpy()
             for name in (
                 "certified",
-                "hits",
+                "predicted_contacts",
                 "remaining",
                 "filtered",
                 "truncated",
@@ -132,7 +132,7 @@ def test_each_world_is_stepped_as_if_it_were_alone(inner, substeps, device):
                 assert results[name].tolist() == [getattr(report, name)], name
             listed = report.forces.contacts.numpy()["normal_impulse"]
             assert results["max_impulse"][0] == max(listed, default=0.0)
-            hits += report.hits
+            hits += report.predicted_contacts
         assert same(alone.ends[0], together.ends[seed]), seed
     assert hits > 50
 
@@ -190,9 +190,9 @@ def test_nothing_is_found_in_a_world_that_takes_no_part(stage, device):
         for _ in range(2):
             solver.step(state, end, model.control(), None, DT, world_mask=masked)
             results = solver.report.worlds.numpy()
-            hits += solver.report.hits
+            hits += solver.report.predicted_contacts
             if masked is not None:
-                assert results["hits"].tolist() == [0, solver.report.hits, 0]
+                assert results["predicted_contacts"].tolist() == [0, solver.report.predicted_contacts, 0]
                 assert results["certified"][[0, 2]].all()
             state, end = end, state
         assert hits > 0
@@ -333,7 +333,7 @@ def test_frozen_and_truncated_vertices_are_counted_by_world(device):
         state.body_q.assign(body_q)
         solver.step(state, end, model.control(), None, DT)
         results, report = solver.report.worlds.numpy(), solver.report
-        for name in ("hits", "remaining", "truncated", "frozen"):
+        for name in ("predicted_contacts", "remaining", "truncated", "frozen"):
             assert results[name].tolist() == [0, getattr(report, name)]
         assert results["certified"].tolist() == [True, report.certified] and results["max_impulse"][0] == 0.0
         cut += min(report.truncated, report.frozen)
@@ -484,7 +484,7 @@ def test_a_world_moves_alike_beside_some_that_are_turned_or_tangled(others, devi
         for _ in range(16):
             solver.step(state, end, model.control(), None, DT)
             state, end = end, state
-            hits += solver.report.hits
+            hits += solver.report.predicted_contacts
         assert hits > 20
         ends.append(state.particle_q.numpy()[:169])
     np.testing.assert_array_equal(*ends)

@@ -124,7 +124,7 @@ def judge(seed, stage=bsc.SolverCCD, **options):
                 result.failures.append(f"seed {seed}, step {step}: a filtered pair has an impulse")
         if not meets_plane[rows["vertices"][rows["vertices"][:, 1] < 0, 0]].all():
             result.failures.append(f"seed {seed}, step {step}: a filtered plane has an impulse")
-        result.hits, result.filtered = result.hits + report.hits, result.filtered + report.filtered
+        result.hits, result.filtered = result.hits + report.predicted_contacts, result.filtered + report.filtered
         result.moved += len(moved)
         state, end = end, state
     return result

@@ -79,7 +79,7 @@ def compare(scene, iterations, polish, steps, device):
     yield "residual", float(rollout.adjoint.report.largest_residuals.max())
     if wrap is not None:
         report = rollout.solver.report
-        if report.totals.uncertified_steps or report.gradients.outrun_steps:
+        if report.totals.uncertified_steps or report.gradient_counts.layer_passed_steps:
             raise RuntimeError(f"a step is not certified, or contacts passed the layer: {report}")
     free = (model.particle_inv_mass.numpy() > 0.0)[:, None]
     directions = [axis * free for axis in np.eye(3)] + [rng.normal(size=free.shape) * free for _ in range(3)]

@@ -25,7 +25,7 @@ from warp_bsc.bench.response_scenes import SCENES, build_scene
 from warp_bsc.bench.response_simulation import Simulation
 from warp_bsc.response.state.mesh import ModelMesh
 
-MODES = "plain", "left", "reported", "prevented"
+MODES = "plain", "allowed", "reported", "prevented"
 EXAMPLES = {"softbody_hanging": "softbody", "softbody_dropping_to_cloth": "multiphysics"}
 BLOCK = {"density": 100.0, "k_mu": 1e4, "k_lambda": 1e4, "k_damp": 1e-3, "particle_radius": 0.002}
 

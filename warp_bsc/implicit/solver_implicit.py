@@ -134,11 +134,11 @@ class SolverImplicit(SolverCCD):
         model: newton.Model,
         *,
         friction: float | wp.array[float] | FrictionTable | None = None,
-        bodies: Literal["solved", "left"] = "solved",
+        bodies: Literal["solved", "ignored"] = "solved",
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
-        inversions: Literal["left", "reported", "prevented"] = "left",
+        inversions: Literal["allowed", "reported", "prevented"] = "allowed",
         max_iterations: int = MAX_STEPS,
         report_contacts: bool | int = False,
         report_worlds: bool = False,
@@ -157,7 +157,7 @@ class SolverImplicit(SolverCCD):
                 with ``requires_grad``, they take no part, and a warning says so.
             particle_radius: Radius of each particle [m], or one for all.
             collision_filter: Groups and masks of particles and shapes.
-            inversions: What happens to tetrahedra that invert: ``"left"``, ``"reported"`` or ``"prevented"``.
+            inversions: What happens to tetrahedra that invert: ``"allowed"``, ``"reported"`` or ``"prevented"``.
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
                 hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
                 whether they sufficed. While something that a program moves is on its way, a step takes up to 16.
@@ -176,27 +176,27 @@ class SolverImplicit(SolverCCD):
         check_instance(model, "model", (newton.Model, ModelView), "a newton.Model")
         if not model.particle_count and not model.body_count:
             raise ValueError("model: it has neither particles nor bodies")
-        moves = checked_choice(bodies, "bodies", ("solved", "left")) == "solved"
+        moves = checked_choice(bodies, "bodies", ("solved", "ignored")) == "solved"
         jointed = _find_jointed_body(model) if moves else None
         if jointed is not None:
             raise ValueError(
                 f"a joint holds body {jointed} ({model.body_label[jointed]!r}), and SolverImplicit solves for free "
                 "bodies only: in a coupled solver (newton.solvers.experimental.coupled), give the body and the joint "
-                "to another entry, and this one a proxy of it; or pass bodies='left' if something else writes poses"
+                "to another entry, and this one a proxy of it; or pass bodies='ignored' if something else writes poses"
             )
         attached = attachment_arrays(model) if moves else None
         if attached is not None:
             if _dynamic_bodies(model)[host_array(attached.body)].any():
                 raise NotImplementedError(
                     "model: it attaches particles to a body that SolverImplicit would move; make the body kinematic, "
-                    "or pass bodies='left' if something else writes its pose"
+                    "or pass bodies='ignored' if something else writes its pose"
                 )
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
         if model.particle_count and min_distance is None and particle_radius is None and not model.requires_grad:
             particle_radius = _radii_of_strands(model)
         super().__init__(
             _Inertia(model, moves_bodies=moves),
-            bodies="separated" if moves and _dynamic_bodies(model).any() else "left",
+            bodies="separated" if moves and _dynamic_bodies(model).any() else "ignored",
             contact_layer=False,
             restitution=0.0,
             friction=friction,

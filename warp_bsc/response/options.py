@@ -26,8 +26,8 @@ from .tuning import CONTACTS_PER_PARTICLE, MAX_ITERATIONS, MIN_CONTACTS, SEPARAT
 
 MAX_SUBSTEPS, MAX_CONTACTS = 1024, 2**28
 MAX_FLOAT = float(np.finfo(np.float32).max)
-Bodies = Literal["pushed", "separated", "left"]
-Inversions = Literal["left", "reported", "prevented"]
+Bodies = Literal["pushed", "separated", "ignored"]
+Inversions = Literal["allowed", "reported", "prevented"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class StageOptions:
         min_distance=None,
         particle_radius=None,
         collision_filter=None,
-        inversions="left",
+        inversions="allowed",
         contact_layer=True,
         max_iterations=MAX_ITERATIONS,
         report_contacts: bool | int = False,
@@ -99,7 +99,7 @@ class StageOptions:
     def moves_bodies(self, mesh: ModelMesh, solver: SolverBase) -> bool:
         """Returns whether the response can move bodies behind a solver."""
         model = mesh.model
-        if self.bodies == "left" or not model.body_count:
+        if self.bodies == "ignored" or not model.body_count:
             return False
         if self.bodies == "pushed":
             integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)

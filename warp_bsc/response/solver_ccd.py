@@ -110,11 +110,11 @@ class SolverCCD(CollisionStage):
         friction: float | wp.array[float] | FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
         substeps: int = 1,
-        bodies: Literal["pushed", "separated", "left"] = "pushed",
+        bodies: Literal["pushed", "separated", "ignored"] = "pushed",
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
-        inversions: Literal["left", "reported", "prevented"] = "left",
+        inversions: Literal["allowed", "reported", "prevented"] = "allowed",
         contact_layer: bool = True,
         max_iterations: int = MAX_ITERATIONS,
         report_contacts: bool | int = False,
@@ -140,10 +140,10 @@ class SolverCCD(CollisionStage):
                 coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the
                 inner solver; ``report.body_contacts`` counts those that its motion passes. ``"separated"``: bodies are
                 also kept apart from each other and from static shapes, as their flags, groups and filters of collision
-                say, and certified; the inner solver must read ``body_q`` and ``body_qd`` of the state. ``"left"``: no
-                body is pushed. The stage pushes no body into an infinite plane that it collides with, nor deeper than
-                it was or is predicted to be; with ``"separated"``, no motion takes it there. Kinematic bodies, bodies
-                without mass, static shapes and infinite planes are never pushed. If all bodies are kinematic at
+                say, and certified; the inner solver must read ``body_q`` and ``body_qd`` of the state. ``"ignored"``:
+                no body is pushed. The stage pushes no body into an infinite plane that it collides with, nor deeper
+                than it was or is predicted to be; with ``"separated"``, no motion takes it there. Kinematic bodies,
+                bodies without mass, static shapes and infinite planes are never pushed. If all bodies are kinematic at
                 construction, they stay so.
             min_distance: Distance that pairs keep [m], vertices from faces and edges from edges, and particles from
                 infinite planes: a pair that started farther apart stays so, and one that started closer comes no
@@ -161,10 +161,10 @@ class SolverCCD(CollisionStage):
                 :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
                 particles by their flags are left out in any case, pairs of shapes as ``bodies`` says.
             inversions: What happens to tetrahedra whose volume becomes, or may become, 0 or negative at a time of the
-                step. ``"left"``: nothing. ``"reported"``: ``report.inversions`` counts those of the step as it is
+                step. ``"allowed"``: nothing. ``"reported"``: ``report.inverting`` counts those of the step as it is
                 stored. ``"prevented"``: the paths of their vertices are cut as well, as they are for collisions, and a
                 step with one that is left is not certified. Tetrahedra that were inverted at the start are left, and
-                counted apart (``report.inverted``).
+                counted apart (``report.inverted_at_start``).
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
@@ -227,7 +227,7 @@ class SolverCCD(CollisionStage):
                 bodies=options.bodies,
             )
         if isinstance(self.solver, ContactLayer):
-            self.report.layerless_steps, self.report.thickness = self.solver.skipped, self.solver.thickness_values
+            self.report.layer_overflows, self.report.thickness = self.solver.skipped, self.solver.thickness_values
         self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
@@ -266,7 +266,9 @@ class SolverCCD(CollisionStage):
                 "omit min_distance and particle_radius"
             )
         if self._work.ends is not None:
-            raise NotImplementedError("inversions='prevented' has no gradients: on a tape, pass 'reported' or 'left'")
+            raise NotImplementedError(
+                "inversions='prevented' has no gradients: on a tape, pass 'reported' or 'allowed'"
+            )
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Prepares for a coupled simulation, see :class:`.integration.coupling_interface.CouplingHooks`.

@@ -19,7 +19,7 @@ from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, un
 from .drive.coupling import CouplingHooks
 from .drive.inner_steps import InnerSteps, StepCall
 from .drive.world_mask import WorldMask, checked_mask
-from .report.count_steps import count_outrun, count_step, merge_step, note_crossings
+from .report.count_steps import count_layer_passed, count_step, merge_step, note_crossings
 from .report.count_worlds import WorldCounter
 from .report.report import SolverReport
 from .report.text import unseen_warning
@@ -240,7 +240,7 @@ class CollisionStage(CouplingHooks):
             self._counter.count(first=first)
         if step.is_last:
             if report.thickness is not None:
-                work.launch(count_outrun, 1, [found.results], [report.device_totals])
+                work.launch(count_layer_passed, 1, [found.results], [report.device_totals])
             work.launch(count_step, 1, [found.results, report.last_strain], [report.device_totals])
         wp.copy(work.last_crossings, work.crossings_of_edges)
         report.copy_totals()

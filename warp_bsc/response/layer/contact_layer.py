@@ -65,7 +65,7 @@ class ContactLayer(WrappedSolver):
         Only contacts within one step are seen: what a program moves between steps is passed on to the stage. Contacts
         between bodies, and of bodies with infinite planes, are left to the inner solver and the stage; they make
         results jump. So does what moves farther in a step than the layer is thick: behind the layer,
-        ``report.gradients.outrun_steps`` of the stage counts such steps.
+        ``report.gradient_counts.layer_passed_steps`` of the stage counts such steps.
 
     References:
         R. Tonge, F. Benevolenski and A. Voroshilov, Mass Splitting for Jitter-Free Parallel Rigid Body Simulation, ACM

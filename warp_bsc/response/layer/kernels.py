@@ -92,7 +92,7 @@ def finish_shares(
     capacities: wp.array[wp.int64],
     # in and out
     sums: wp.array[wp.int64],
-    layerless_steps: wp.array[wp.int64],
+    layer_overflows: wp.array[wp.int64],
 ):
     """Adds the shares of contacts with planes, and writes the sums; zeros if pairs are missing: then nothing pushes."""
     vertex = wp.tid()  # or a body, whose contacts with planes are left to the inner solver
@@ -107,7 +107,7 @@ def finish_shares(
     if has_overflowed(counts, capacities):
         share = ZERO
         if vertex == 0:
-            layerless_steps[0] += wp.int64(1)
+            layer_overflows[0] += wp.int64(1)
     layer.shares[vertex] = share
 
 

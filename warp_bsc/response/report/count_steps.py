@@ -101,6 +101,6 @@ def count_record(counts: RecordCounts, totals: StepTotals):
 
 
 @wp.kernel
-def count_outrun(results: wp.array[int], totals: StepTotals):
+def count_layer_passed(results: wp.array[int], totals: StepTotals):
     """Counts a step in which a contact layer left contacts to the stage."""
-    totals.outrun_steps[0] += wp.int64(wp.min(results[Result.FIRST_HITS], 1))
+    totals.layer_passed_steps[0] += wp.int64(wp.min(results[Result.FIRST_HITS], 1))

@@ -22,12 +22,12 @@ class _Arrays:
     truncated: wp.array[int]
     frozen: wp.array[int]
     not_finite: wp.array[int]
-    hits: wp.array[int]
+    predicted_contacts: wp.array[int]
     remaining: wp.array[int]
     filtered: wp.array[int]
     crossings: wp.array[int]
-    inversions: wp.array[int]  # empty if they are not looked at, and what follows
-    inverted: wp.array[int]
+    inverting: wp.array[int]  # empty if they are not looked at, and what follows
+    inverted_at_start: wp.array[int]
 
 
 @wp.kernel
@@ -40,24 +40,24 @@ def _begin(status: SolveStatus, prevents_inversions: bool, first: bool, out: _Ar
     found = status.of_worlds
     if first:
         out.certified[world] = True
-        out.hits[world] = 0
+        out.predicted_contacts[world] = 0
         out.remaining[world] = 0
         out.filtered[world] = 0
         out.crossings[world] = 0
     if status.results[Result.UNDETECTED] != 0 or found.remaining[world] > 0:
         out.certified[world] = False
-    out.hits[world] += found.hits[world]
+    out.predicted_contacts[world] += found.hits[world]
     out.remaining[world] += found.remaining[world]
     out.filtered[world] += found.filtered[world]
     out.crossings[world] = wp.max(out.crossings[world], status.crossings[world])
-    if out.inversions:
+    if out.inverting:
         if first:
-            out.inversions[world] = 0
-            out.inverted[world] = 0
+            out.inverting[world] = 0
+            out.inverted_at_start[world] = 0
         if prevents_inversions and found.inverting[world] > 0:
             out.certified[world] = False
-        out.inversions[world] += found.inverting[world]
-        out.inverted[world] = wp.max(out.inverted[world], found.inverted[world])
+        out.inverting[world] += found.inverting[world]
+        out.inverted_at_start[world] = wp.max(out.inverted_at_start[world], found.inverted[world])
     out.truncated[world] = 0
     out.frozen[world] = 0
     out.not_finite[world] = 0
@@ -126,7 +126,7 @@ class WorldCounter:
         self._work, self._results = work, results
         work.count_worlds()
         inverting = 0 if work.tetrahedra is None else work.worlds
-        sizes = {"inversions": inverting, "inverted": inverting}
+        sizes = {"inverting": inverting, "inverted_at_start": inverting}
         self._out = allocate(_Arrays, work.worlds, work.device, **sizes)
         arrays = {name: getattr(self._out, name) for name in _Arrays.vars if inverting or name not in sizes}
         self.worlds = Worlds(**arrays, strain=strain, _find_inside=find_inside, _max_impulse=max_impulse)

@@ -35,13 +35,14 @@ class SolverReport:
 
     Of steps that are not certified, are not finite, strain, cross or invert something it warns once each.
 
-    :attr:`totals` and :attr:`gradients` are sums over all steps so far; all others are of the last step. In a step with
-    substeps, numbers are sums over these, but for :attr:`crossings` and :attr:`inverted`, the most at the start of one.
-    It is certified if all of them are; a vertex counts as truncated, frozen, not finite or uncertified if it is in any.
+    :attr:`totals` and :attr:`gradient_counts` are sums over all steps so far; all others are of the last step. In a
+    step with substeps, numbers are sums over these, but for :attr:`crossings` and :attr:`inverted_at_start`, the most
+    at the start of one. It is certified if all of them are; a vertex counts as truncated, frozen, not finite or
+    uncertified if it is in any.
 
     Without a response (:class:`.monitor.CollisionMonitor`) the motion that the inner solver predicted is the motion
-    that is stored: :attr:`remaining` equals :attr:`hits`, a step is certified if both are 0, and nothing is truncated
-    or frozen.
+    that is stored: :attr:`remaining` equals :attr:`predicted_contacts`, a step is certified if both are 0, and nothing
+    is truncated or frozen.
 
     Attributes:
         step_results: What the last step did, on the device, which the other attributes read.
@@ -70,7 +71,7 @@ class SolverReport:
         self._warnings = StepWarnings(self)
         self._forces: ContactReport | None = None
         self._worlds: Worlds | None = None
-        self.layerless_steps: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
+        self.layer_overflows: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
         self.thickness: wp.array[wp.float64] | None = None  # of that layer [m]
         self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
         self.spans: list[tuple] = []  # start and end of each substep of the last step, in seconds, or events on a GPU
@@ -149,14 +150,14 @@ class SolverReport:
 
         Contacts that :attr:`excluded` counts, pairs that filters leave out (:attr:`filtered`), and contacts of which no
         vertex can be moved, are not part of this. A step with a position or velocity that is not finite, at the start
-        or as it is predicted, is not certified. With ``inversions="prevented"``, :attr:`inversions` is 0 in a certified
+        or as it is predicted, is not certified. With ``inversions="prevented"``, :attr:`inverting` is 0 in a certified
         step. :attr:`uncertified_vertices` lists the particles concerned. Behind a coupled
         solver, a step is not certified until its end in the state of the program is seen, see :class:`.CouplingHooks`.
         """
         return bool(self._read_result(Result.CERTIFIED))
 
     @property
-    def hits(self) -> int:
+    def predicted_contacts(self) -> int:
         """Contacts of the motion that the inner solver predicted in the last step, without those excluded."""
         return self._read_result(Result.FIRST_HITS)
 
@@ -211,7 +212,7 @@ class SolverReport:
         return crossings if self.coupled is None else max(crossings, self.coupled.crossings)
 
     @property
-    def inversions(self) -> int:
+    def inverting(self) -> int:
         """Tetrahedra that the motion of the last step as it is stored inverts, or may invert.
 
         Counted are those whose volume certainly was positive at the start, and is not certainly positive in the whole
@@ -223,7 +224,7 @@ class SolverReport:
         return self._read_inversions(Result.INVERTING)
 
     @property
-    def inverted(self) -> int:
+    def inverted_at_start(self) -> int:
         """Tetrahedra whose volume at the start of the last step was 0 or negative, or not certainly positive.
 
         No cut of a path changes that, and they are left to the inner solver. Those of which no vertex can be moved are
@@ -255,9 +256,10 @@ class SolverReport:
         """Particles that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
 
         They are the particles of contacts that remain, of tetrahedra that invert where that is prevented, of elements
-        with a start position that is not finite, and those that :attr:`not_finite` counts. If :attr:`undetected` is
-        true, they are all particles. Vertices of rigid shapes are not listed, so that the array is also empty if
-        nothing but the position of a body is not finite. Gathered on the host, on each access.
+        with a start position that is not finite, and those that :attr:`not_finite` counts. If
+        :attr:`detection_incomplete` is true, they are all particles. Vertices of rigid shapes are not listed, so that
+        the array is also empty if nothing but the position of a body is not finite. Gathered on the host, on each
+        access.
         """
         listed = self.find_uncertified()[: self._mesh.model.particle_count]
         return np.flatnonzero(listed).astype(np.int32)
@@ -289,7 +291,7 @@ class SolverReport:
         return listed
 
     @property
-    def undetected(self) -> bool:
+    def detection_incomplete(self) -> bool:
         """Whether the last step froze all vertices because its detection was incomplete.
 
         This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
@@ -392,14 +394,14 @@ class SolverReport:
         return Totals(**{field.name: totals[field.name] for field in fields(Totals)})
 
     @property
-    def gradients(self) -> GradientTotals:
+    def gradient_counts(self) -> GradientTotals:
         """Totals over all steps on a tape so far, as of this access."""
         totals = self._read_totals()
         return GradientTotals(
             grazing=totals["grazing"],
             lost_steps=totals["lost_gradients"],
-            layerless_steps=0 if self.layerless_steps is None else self._read(self.layerless_steps),
-            outrun_steps=totals["outrun_steps"],
+            layer_overflows=0 if self.layer_overflows is None else self._read(self.layer_overflows),
+            layer_passed_steps=totals["layer_passed_steps"],
             ambiguous_moves=totals["ambiguous_moves"],
         )
 

@@ -17,7 +17,7 @@ _CROSSINGS = (
     "warp_bsc.repair_state(model, state) moves them apart before the first step"
 )
 _INVERSIONS = (
-    "a step inverted tetrahedra, report.inversions counts those of the last one: take shorter steps, or pass "
+    "a step inverted tetrahedra, report.inverting counts those of the last one: take shorter steps, or pass "
     "inversions='prevented'"
 )
 _NOT_FOLLOWED = (
@@ -25,7 +25,7 @@ _NOT_FOLLOWED = (
     "collision: it collides as it was, at its new pose; put a new stage behind the solver"
 )
 _LAYER = "contacts passed the contact layer in one step: results jump there, gradients miss it"
-_MOVES = f"{AMBIGUOUS_MOVES} (see report.gradients.ambiguous_moves)"
+_MOVES = f"{AMBIGUOUS_MOVES} (see report.gradient_counts.ambiguous_moves)"
 
 
 class StepWarnings:
@@ -62,7 +62,7 @@ class StepWarnings:
             self.once("crossings", lambda: _CROSSINGS)
         if known["inverting_steps"] and not report.prevents_inversions:
             self.once("inversions", lambda: _INVERSIONS)
-        if known["outrun_steps"] and model.requires_grad:
+        if known["layer_passed_steps"] and model.requires_grad:
             self.once("layer", lambda: f"{_LAYER}; {report.shorter_steps}")
         if known["shape_not_followed"]:
             shape = shape_name(model, known["shape_not_followed"] - 1)

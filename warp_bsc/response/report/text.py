@@ -132,7 +132,7 @@ def uncertified_warning(
 
 def line_of(report: Any) -> str:
     """Returns what a :class:`.report.SolverReport` says of the steps so far, in one line."""
-    totals, gradients, inside = report.totals, report.gradients, len(np.unique(report.inside.particles))
+    totals, gradients, inside = report.totals, report.gradient_counts, len(np.unique(report.inside.particles))
     line = (
         f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
         f"vertices, {totals.uncertified_steps} not certified"
@@ -160,8 +160,8 @@ def line_of(report: Any) -> str:
         line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
     if report.layer_thickness is not None:
         line += f"; contact layer of {1e3 * report.layer_thickness:.3g} mm"
-    if gradients.outrun_steps:
-        line += f", which contacts passed in {gradients.outrun_steps} steps"
-    if gradients.layerless_steps:
-        line += f"; {gradients.layerless_steps} steps without their contact layer"
+    if gradients.layer_passed_steps:
+        line += f", which contacts passed in {gradients.layer_passed_steps} steps"
+    if gradients.layer_overflows:
+        line += f"; {gradients.layer_overflows} steps without their contact layer"
     return line

@@ -27,7 +27,7 @@ class StepTotals:
     shape_not_followed: wp.array[wp.int64]  # the last shape with a change that the stage does not follow, from 1
     grazing: wp.array[wp.int64]
     lost_gradients: wp.array[wp.int64]
-    outrun_steps: wp.array[wp.int64]
+    layer_passed_steps: wp.array[wp.int64]
     ambiguous_moves: wp.array[wp.int64]
 
 
@@ -39,7 +39,7 @@ class Totals:
         steps: Steps. One that is taken in substeps is one step, of which its substeps count together.
         uncertified_steps: Steps that were not certified.
         undetected_steps: Steps that froze all vertices because their detection was incomplete, see
-            :attr:`.report.SolverReport.undetected`.
+            :attr:`.report.SolverReport.detection_incomplete`.
         truncated_steps: Steps in which a path was truncated.
         frozen_steps: Steps in which a vertex or a body was frozen.
         not_finite_steps: Steps with positions or velocities of particles that were not finite.
@@ -47,7 +47,7 @@ class Totals:
         excluded: Sum of :attr:`.report.SolverReport.excluded`; a pair counts in each step in which it has a contact.
         strained_steps: Steps in which :attr:`.report.SolverReport.strain` was more than 0.2.
         crossing_steps: Steps at whose start :attr:`.report.SolverReport.crossings` was more than 0.
-        inverting_steps: Steps in which :attr:`.report.SolverReport.inversions` was more than 0; 0 if the stage was not
+        inverting_steps: Steps in which :attr:`.report.SolverReport.inverting` was more than 0; 0 if the stage was not
             asked to count them.
         penetrated_steps: Steps of which ``passed`` or ``crossed`` of :attr:`.report.SolverReport.penetrated` was more
             than 0, and those in ``revoked_steps``.
@@ -108,16 +108,16 @@ class GradientTotals:
             no plane, are unbounded; finite ones replace them, see :mod:`warp_bsc.kernels.gradients`.
         lost_steps: Steps in a CUDA graph whose record did not fit in its buffers. Gradients through such a step are
             NaN, see :class:`.captured_steps.CapturedSteps`.
-        layerless_steps: Steps whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
+        layer_overflows: Steps whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
             Contacts then act where they hit, and results are not continuous.
-        outrun_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or are
-            between bodies. Results are not continuous there.
+        layer_passed_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or
+            are between bodies. Results are not continuous there.
         ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps on a tape, and
             that are NaN, as it cannot be known what they are of, see :mod:`.adjoint.between_steps`.
     """
 
     grazing: int
     lost_steps: int
-    layerless_steps: int
-    outrun_steps: int
+    layer_overflows: int
+    layer_passed_steps: int
     ambiguous_moves: int

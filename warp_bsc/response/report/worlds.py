@@ -18,7 +18,7 @@ class Worlds:
 
     Attributes:
         certified: Whether the motion is certified, bool.
-        hits: Contacts of the predicted motion, int.
+        predicted_contacts: Contacts of the predicted motion, int.
         remaining: Contacts of the motion as it is stored, int.
         filtered: Pairs that filters left out, int. Shapes that are in all worlds have their elements in each of them.
         truncated: Vertices and bodies whose paths were truncated, int.
@@ -26,15 +26,16 @@ class Worlds:
         not_finite: Particles whose predicted position or velocity was not finite, int.
         crossings: Edges that cross faces at the start, int.
         strain: Largest strain by contacts, float.
-        inversions: Tetrahedra that the motion inverts, int; None if the stage was not asked to count them.
-        inverted: Tetrahedra that were inverted at the start, int; None if the stage was not asked to count them.
+        inverting: Tetrahedra that the motion inverts, int; None if the stage was not asked to count them.
+        inverted_at_start: Tetrahedra that were inverted at the start, int; None if the stage was not asked to count
+            them.
         newton_steps, last_change, converged, arrived: As of
             :class:`warp_bsc.implicit.contact.step_report.ImplicitStepReport`, int, float and bool; None if another
             solver steps.
     """
 
     certified: wp.array[wp.bool]
-    hits: wp.array[int]
+    predicted_contacts: wp.array[int]
     remaining: wp.array[int]
     filtered: wp.array[int]
     truncated: wp.array[int]
@@ -43,8 +44,8 @@ class Worlds:
     crossings: wp.array[int]
     strain: wp.array[float]
     _find_inside: Callable[[], np.ndarray]
-    inversions: wp.array[int] | None = None
-    inverted: wp.array[int] | None = None
+    inverting: wp.array[int] | None = None
+    inverted_at_start: wp.array[int] | None = None
     newton_steps: wp.array[int] | None = None
     last_change: wp.array[float] | None = None
     converged: wp.array[wp.bool] | None = None

@@ -257,9 +257,9 @@ class Workspace(Launches):
         self.detector.count_filtered_by_world(self.status.of_worlds.left_out_pairs)
         return self.status.of_worlds
 
-    def watch_inversions(self, inversions: Literal["left", "reported", "prevented"]) -> None:
+    def watch_inversions(self, inversions: Literal["allowed", "reported", "prevented"]) -> None:
         """Allocates what it takes to count the tetrahedra that a step inverts, or also to prevent that."""
-        if inversions == "left":
+        if inversions == "allowed":
             return
         self.tetrahedra = tetrahedra = Tetrahedra()
         tetrahedra.corners = self.mesh.device_tets
