@@ -25,7 +25,7 @@ KINDS = 17
 VARYING_ON_GPU = 5, 12, 13, 16
 """Kinds of scenes in which ``SolverSemiImplicit`` adds up the forces on a particle in any order."""
 COUNTS = "steps", "uncertified_steps", "truncated_steps", "frozen_steps", "total_remaining", "total_excluded"
-COUNTS += "hits", "remaining", "excluded", "crossings", "body_contacts", "truncated", "frozen"
+COUNTS += "predicted_contacts", "remaining", "excluded", "crossings", "body_contacts", "truncated", "frozen"
 
 
 class Given(newton.solvers.SolverBase):
