@@ -157,8 +157,7 @@ def order(roots: int, value: int, slope: int, bend: int) -> wp.vec3i:
 
     Args:
         roots: Number of positive roots, which are the last ones, with multiplicity. If it is one, ``slope`` and
-        ``bend``
-            have no effect.
+            ``bend`` have no effect.
         value: Sign of the cubic at the point, times its sign at infinity.
         slope: Sign of its derivative there, times the same.
         bend: Sign of its second derivative there, times the same.

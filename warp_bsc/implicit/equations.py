@@ -1,8 +1,8 @@
 """The equations that a step of VBD solves, and their derivatives.
 
-The end x1 of a step balances all forces on each particle: inertia m / dt^2 (x0 + dt v0 + dt^2 (g + f / m) - x1), and
-those of elements. Of a gradient g with respect to x1, the implicit function theorem makes gradients with respect to
-all that the forces depend on: with A = -d forces / d x1 and A^T l = g, they are those of the forces, given l.
+At the end x1 of a step the forces on each particle balance: inertia m / dt^2 (x0 + dt v0 + dt^2 (g + f / m) - x1), and
+the forces of elements. Let A = -d forces / d x1. By the implicit function theorem, a gradient g with respect to x1
+becomes the gradient of l . forces with respect to everything that the forces depend on, where A^T l = g.
 """
 
 from typing import NamedTuple

@@ -126,10 +126,10 @@ class SolverCCD(CollisionStage):
             solver: Any Newton solver that moves particles.
             separation: Distance that contacts are moved apart [m]; default: 0.005 of the median edge length.
             friction: Coefficient of particles, at least 0; default: the model's ``particle_mu``. Shapes have that of
-                their material, contacts the geometric mean. May be an array of float32, of length 1 or of one for each
-                particle, which each step reads again, and which may require gradients; so are then the coefficients of
-                shapes, as with ``requires_grad``. Negative values count as 0. A
-                :class:`.state.friction_table.FrictionTable` has coefficients by pair of materials.
+                their material, contacts the geometric mean. May be an array of float32, of length 1 or
+                [particle_count]: each step reads it, and the coefficients of shapes, again; it may require gradients.
+                Negative values count as 0. A :class:`.state.friction_table.FrictionTable` has coefficients by pair of
+                materials.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             substeps: Number of smaller steps of equal length in a step, 1 to 1024, each a step of the inner solver with

@@ -99,8 +99,9 @@ def query_vertex_face(
     Raises:
         TypeError: If an argument has another type.
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or the method is unknown. With ``out``: if the points are not
-            as it has rows, elsewhere or not contiguous, ``toi`` is not as in it, or there is a minimum distance.
+            tolerance is out of range, or the method is unknown. With ``out``: if it has another
+            number of rows or another device than the points, the points are not contiguous, ``toi`` is not as in it, or
+            there is a minimum distance.
         RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
     """
     if out is not None:
@@ -159,8 +160,9 @@ def query_edge_edge(
     Raises:
         TypeError: If an argument has another type.
         ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or the method is unknown. With ``out``: if the points are not
-            as it has rows, elsewhere or not contiguous, ``toi`` is not as in it, or there is a minimum distance.
+            tolerance is out of range, or the method is unknown. With ``out``: if it has another
+            number of rows or another device than the points, the points are not contiguous, ``toi`` is not as in it, or
+            there is a minimum distance.
         RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
     """
     if out is not None:

@@ -102,9 +102,9 @@ def add_dividing_plane(
 ) -> bool:
     """Adds a plane between two elements to the lists of those of their four vertices that can be moved.
 
-    It lies across the shortest vector between them at the start; :mod:`.solve.plane_placement` places it. Elements that
-    touch at the start have none, nor do those without a contact that planes cannot bring together. Of the distance that
-    the elements must keep, ``min_distance`` [m], half is on either side.
+    It lies across the shortest vector between them at the start; :mod:`.solve.plane_placement` places it. No plane
+    is added between elements that touch at the start, nor between elements that have no contact and that no plane could
+    bring together. Half of the distance that the elements must keep, ``min_distance`` [m], is on either side.
 
     Returns:
         Whether it added a plane.

@@ -53,7 +53,7 @@ def _restore_last_poses(
 
 @wp.struct
 class _Held:
-    """What a step would change of worlds that take no part in it, kept until its end; and their masks."""
+    """Data of the worlds that take no part in a step, kept until its end, and masses that are 0 in these worlds."""
 
     last: wp.array[wp.vec3]  # where vertices ended the last step
     planes: wp.array[wp.vec4d]

@@ -33,10 +33,9 @@ wp.set_module_options({"enable_backward": False})
 def _is_active(step: Step, status: SolveStatus, sweep: int, tolerance: wp.float64, i: int) -> bool:
     """Returns whether a constraint is active for positions: it is violated, or may pull something back.
 
-    Constraints met within the tolerance cost nothing, and move nothing. Nor do proximities that planes divide
-    afterwards, but for those at rest, which friction holds in place: projection knows nothing of elasticity, and in a
-    stack it stretches layers, which then spring back. Edges at rest near each other are left to planes too, unless they
-    are too near: a stack has four times as many as of vertices and faces, which hold it as well.
+    Skipped are constraints that are met within the tolerance; proximities that a later division will separate, because
+    projection ignores elasticity and would stretch a stack, except at rest, where friction must hold them; and edges at
+    rest that are not too near each other, because vertex-face proximities, a fourth as many, already hold the stack.
     """
     motion, constraints = step.motion, step.constraints
     corners = constraints.vertices[i]
