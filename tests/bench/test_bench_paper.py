@@ -13,7 +13,7 @@ from warp_bsc.bench import paper as bench_paper
 from warp_bsc.bench.ipc_toolkit import time_queries
 from warp_bsc.bench.methods import METHODS, STAGES
 from warp_bsc.bench.paper import Effort, benchmark_scene, find_places
-from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
+from warp_bsc.bench.detector_scenes import load_intervals, load_scene, paper_scenes
 from warp_bsc.bench.worst_case import find_worst
 from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
@@ -154,7 +154,7 @@ def test_worst_query_is_one_of_those_asked():
 
 
 def test_scenes_come_with_a_checkout(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr("warp_bsc.bench.scenes.__file__", str(tmp_path / "warp_bsc" / "bench" / "scenes.py"))
+    monkeypatch.setattr("warp_bsc.bench.detector_scenes.__file__", str(tmp_path / "warp_bsc" / "bench" / "scenes.py"))
     with pytest.raises(FileNotFoundError, match="come with a checkout"):
         paper_scenes()
     for arguments in ([], ["--quick"], ["funnel"]):

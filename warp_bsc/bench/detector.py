@@ -13,7 +13,7 @@ from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..detection.run.settings import Method
 from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
-from .scenes import BenchmarkScene
+from .detector_scenes import BenchmarkScene
 from .timing import replay_graph
 
 __all__ = ["DetectorBenchmark", "benchmark_detector"]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..detection.run.settings import PairKind
-from .scenes import BenchmarkScene
+from .detector_scenes import BenchmarkScene
 from .timing import count_threads
 
 __all__ = [

@@ -23,7 +23,7 @@ from ..kernels.signs import UNSURE
 from .detector import benchmark_detector
 from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
-from .scenes import BenchmarkScene
+from .detector_scenes import BenchmarkScene
 from .timing import count_threads
 from .worst_case import WorstQuery, adversarial_queries, find_worst
 

@@ -16,7 +16,7 @@ from ..bench.figure import draw_paper_benchmarks
 from ..bench.methods import METHODS, STAGES
 from ..bench.paper import Effort, Place, SceneBenchmark, Timing, benchmark_scene, find_adversarial_worst, find_places
 from ..bench.provenance import shorten_path, with_record
-from ..bench.scenes import PAPER_SCENES, BenchmarkScene, is_scene_name, load_intervals, paper_scenes
+from ..bench.detector_scenes import PAPER_SCENES, BenchmarkScene, is_scene_name, load_intervals, paper_scenes
 from ..bench.timing import limited_threads
 from ..bench.worst_case import WorstQuery
 from .bench import JSON_FILE, Benchmark, check_json, open_json, show_progress, stage_columns
