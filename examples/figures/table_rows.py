@@ -5,8 +5,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from warp_bsc.bench.penetration import SIMULATORS
-from warp_bsc.bench.repair import FILE, KNOWN_MESH
+from warp_bsc.bench.measure.penetration import SIMULATORS
+from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH
 
 Found = dict[str, Any]
 """A measurement: what a command wrote with --json."""

@@ -11,8 +11,14 @@ import newton.utils
 import pytest
 import warp as wp
 
-from warp_bsc.bench import newton_examples, newton_process
-from warp_bsc.bench.newton_examples import WARM_UP, NewtonExample, describe_needs, find_examples, measure_example
+from warp_bsc.bench.measure import newton_examples, newton_process
+from warp_bsc.bench.measure.newton_examples import (
+    WARM_UP,
+    NewtonExample,
+    describe_needs,
+    find_examples,
+    measure_example,
+)
 
 # A triangle stands above a pinned sheet and moves down by 1 cm a frame, its tip from 5.5 cm: after the sixth frame two
 # of its edges cross a face of the sheet. Nothing else crosses, and nothing but the stage stops it.

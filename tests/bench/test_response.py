@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.bench import response_scenes
 from warp_bsc.bench.crossings import CrossingCounter
 from warp_bsc.bench.elastic_energy import ElasticEnergy
-from warp_bsc.bench.response import (
+from warp_bsc.bench.measure.response import (
     CONFIGURATIONS,
     CONVERGED,
     REFERENCE,
@@ -20,8 +19,9 @@ from warp_bsc.bench.response import (
     ResponseMeasurement,
     measure_response,
 )
-from warp_bsc.bench.response_scenes import NotRunnable, build_scene
-from warp_bsc.bench.response_simulation import Samples, Simulation, energy_gained, largest_stretch, total_energy
+from warp_bsc.bench.scenes import contact as response_scenes
+from warp_bsc.bench.scenes.contact import NotRunnable, build_scene
+from warp_bsc.bench.scenes.simulation import Samples, Simulation, energy_gained, largest_stretch, total_energy
 from warp_bsc.implicit.elastic import Elastic
 
 
@@ -235,7 +235,7 @@ def test_a_program_moves_bodies_and_particles(device):
 
 def test_newton_steps_are_limited_unless_the_run_is_the_converged_one(device, monkeypatch):
     """After as many steps as are compared, here fewer, while cubes meet."""
-    monkeypatch.setattr("warp_bsc.bench.response.EARLY_STEPS", 14)
+    monkeypatch.setattr("warp_bsc.bench.measure.response.EARLY_STEPS", 14)
     limited, converged = (measure("pile", name, device=device, seconds=14 / 60) for name in ("implicit", CONVERGED))
     assert limited.steps == converged.steps == 14
     assert limited.crossings == limited.collisions == limited.uncertified_steps == 0

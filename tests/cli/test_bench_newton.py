@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from warp_bsc.bench.newton_examples import ExampleMeasurement, ExampleRun, StageTotals
+from warp_bsc.bench.measure.newton_examples import ExampleMeasurement, ExampleRun, StageTotals
 from warp_bsc.cli import bench_newton
 from warp_bsc.cli.main import main
 

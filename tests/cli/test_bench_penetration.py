@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from warp_bsc.bench.penetration import SCENES, SIMULATORS, PenetrationMeasurement, PenetrationRun
+from warp_bsc.bench.measure.penetration import SCENES, SIMULATORS, PenetrationMeasurement, PenetrationRun
 from warp_bsc.cli import bench_penetration
 from warp_bsc.cli.main import main
 

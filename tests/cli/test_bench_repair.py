@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from warp_bsc.bench.repair import RepairAttempt, RepairRun
-from warp_bsc.bench.repair_scenes import KINDS, KNOWN
+from warp_bsc.bench.measure.repair import RepairAttempt, RepairRun
+from warp_bsc.bench.scenes.repair import KINDS, KNOWN
 from warp_bsc.cli import bench_repair
 from warp_bsc.cli.main import main
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from warp_bsc.bench.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
+from warp_bsc.bench.measure.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
 from warp_bsc.cli import bench_response
 from warp_bsc.cli.main import main
 

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 from warp_bsc.response.state import motion
 
 DT = 1.0 / 240.0

@@ -32,7 +32,7 @@ from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 from warp_bsc.kernels.exact.polygon import BITS
 
 KINDS = ("vertex_face", "edge_edge")

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 
 LENGTHS = 3.0, 1.0, 0.3
 """Lengths of central differences, in units of each array."""

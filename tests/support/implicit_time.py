@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 
 DT, ITERATIONS = 1.0 / 60.0, 20
 

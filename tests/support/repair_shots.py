@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 from warp_bsc.cli.main import main as run_command
 from warp_bsc.usd.scene import Scene
 

@@ -23,7 +23,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 
 SAMPLING_SECONDS = 0.05
 

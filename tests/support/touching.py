@@ -18,7 +18,7 @@ from sheets import grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 from warp_bsc.bench.timing import limited_threads
 from warp_bsc.detection.run.launch import cores
 

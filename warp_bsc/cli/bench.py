@@ -12,7 +12,7 @@ import warp as wp
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from .._atomic_file import STDOUT, OutputFile
-from ..bench.provenance import with_record
+from ..bench.record import with_record
 from .device import loading_kernels
 from .exit_status import explain_statuses
 from .interrupts import INTERRUPTS

@@ -9,9 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from ..bench.detector import DetectorBenchmark, benchmark_detector
-from ..bench.provenance import shorten_path
-from ..bench.detector_scenes import BenchmarkScene, default_scenes, is_scene_name, load_scene
+from ..bench.measure.detector import DetectorBenchmark, benchmark_detector
+from ..bench.record import shorten_path
+from ..bench.scenes.detector import BenchmarkScene, default_scenes, is_scene_name, load_scene
 from ..bench.timing import count_threads, limited_threads
 from .bench import JSON_FILE, Benchmark, check_json, measure_each, name_place, report_runs, stage_columns
 from .device import find_device, load_detector, loading_kernels

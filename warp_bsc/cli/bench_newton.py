@@ -6,7 +6,7 @@ import itertools
 from dataclasses import asdict
 from typing import Any
 
-from ..bench.newton_examples import (
+from ..bench.measure.newton_examples import (
     MODES,
     WARM_UP,
     ExampleMeasurement,

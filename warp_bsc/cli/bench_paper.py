@@ -11,14 +11,22 @@ from typing import Any
 import warp as wp
 
 from .._atomic_file import STDOUT, OutputFile
-from ..bench import ipc_toolkit
 from ..bench.figure import draw_paper_benchmarks
-from ..bench.methods import METHODS, STAGES
-from ..bench.paper import Effort, Place, SceneBenchmark, Timing, benchmark_scene, find_adversarial_worst, find_places
-from ..bench.provenance import shorten_path, with_record
-from ..bench.detector_scenes import PAPER_SCENES, BenchmarkScene, is_scene_name, load_intervals, paper_scenes
+from ..bench.measure.methods import METHODS, STAGES
+from ..bench.measure.paper import (
+    Effort,
+    Place,
+    SceneBenchmark,
+    Timing,
+    benchmark_scene,
+    find_adversarial_worst,
+    find_places,
+)
+from ..bench.measure.worst_case import WorstQuery
+from ..bench.peers import ipc_toolkit
+from ..bench.record import shorten_path, with_record
+from ..bench.scenes.detector import PAPER_SCENES, BenchmarkScene, is_scene_name, load_intervals, paper_scenes
 from ..bench.timing import limited_threads
-from ..bench.worst_case import WorstQuery
 from .bench import JSON_FILE, Benchmark, check_json, open_json, show_progress, stage_columns
 from .device import find_device
 from .options import THREADS, flag, several

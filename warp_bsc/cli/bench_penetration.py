@@ -6,7 +6,7 @@ import itertools
 from dataclasses import asdict
 from typing import Any
 
-from ..bench.penetration import (
+from ..bench.measure.penetration import (
     SCENES,
     SIMULATORS,
     WARM_UP,

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ..bench.queries import MODES, SEED, QueryBenchmark, benchmark_copy, benchmark_queries, check_query_count
-from ..bench.query_files import METHODS, GivenQueries, benchmark_given_queries
+from ..bench.measure.given_queries import METHODS, GivenQueries, benchmark_given_queries
+from ..bench.measure.queries import MODES, SEED, QueryBenchmark, benchmark_copy, benchmark_queries, check_query_count
 from ..bench.timing import count_threads, limited_threads
 from ..detection.run.launch import cores
 from ..detection.run.settings import PairKind

@@ -6,9 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from ..bench import ipc_toolkit
-from ..bench.mesh_files import is_mesh_name
-from ..bench.repair import (
+from ..bench.measure.repair import (
     CROSSING_RANGES,
     FILE,
     HINTS,
@@ -19,7 +17,9 @@ from ..bench.repair import (
     measure_repair,
     summarize,
 )
-from ..bench.repair_scenes import KINDS, KNOWN, TangledMesh, damaged, load_tangled
+from ..bench.peers import ipc_toolkit
+from ..bench.scenes.mesh_files import is_mesh_name
+from ..bench.scenes.repair import KINDS, KNOWN, TangledMesh, damaged, load_tangled
 from .bench import JSON_FILE, Benchmark, check_json, measure_each, report_runs
 from .device import find_device
 from .options import DEVICE, names_of, natural, number, several

@@ -7,7 +7,7 @@ import itertools
 from dataclasses import asdict
 from typing import Any
 
-from ..bench.response import (
+from ..bench.measure.response import (
     CONFIGURATIONS,
     CONVERGED,
     EARLY_STEPS,

@@ -36,8 +36,8 @@ from typing import Any
 
 import warp as wp
 
-from ...kernels.culling import edge_edge_boxes_apart, vertex_face_boxes_apart
-from ...kernels.signs import FREE, HIT
+from ....kernels.culling import edge_edge_boxes_apart, vertex_face_boxes_apart
+from ....kernels.signs import FREE, HIT
 
 __all__ = ["COPLANAR", "DISTANCE", "cubic_solver_edge_edge", "cubic_solver_vertex_face"]
 

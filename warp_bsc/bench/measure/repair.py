@@ -8,11 +8,11 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
-from ..detection.mesh import CollisionMesh
-from ..repair.repair import repair
-from ..repair.results import RepairResult
-from . import ipc_toolkit
-from .repair_scenes import TangledMesh
+from ...detection.mesh import CollisionMesh
+from ...repair.repair import repair
+from ...repair.results import RepairResult
+from ..peers import ipc_toolkit
+from ..scenes.repair import TangledMesh
 
 __all__ = [
     "CROSSING_RANGES",

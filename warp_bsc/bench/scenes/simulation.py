@@ -10,14 +10,14 @@ import newton
 import numpy as np
 import warp as wp
 
-from .._private_names.of_newton import make_style3d
-from ..implicit.solver_implicit import SolverImplicit
-from ..response.solver_ccd import SolverCCD
-from ..response.state.mesh import host_array
-from ..response.strain import edges_at_rest
-from .crossings import CrossingCounter
-from .elastic_energy import ElasticEnergy
-from .response_scenes import Scene
+from ..._private_names.of_newton import make_style3d
+from ...implicit.solver_implicit import SolverImplicit
+from ...response.solver_ccd import SolverCCD
+from ...response.state.mesh import host_array
+from ...response.strain import edges_at_rest
+from ..crossings import CrossingCounter
+from ..elastic_energy import ElasticEnergy
+from .contact import Scene
 
 __all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "total_energy"]
 
@@ -129,7 +129,7 @@ class Simulation:
         stage: The stage, which :class:`.SolverImplicit` is itself; None without one.
         samples: What was measured of each state.
         milliseconds: Time of each step [ms]; two steps are timed together.
-        collisions: Pairs that meet on straight ways in each step, see :class:`.crossings.CrossingCounter`; empty if
+        collisions: Pairs that meet on straight ways in each step, see :class:`..crossings.CrossingCounter`; empty if
             they are not counted.
     """
 
@@ -152,7 +152,7 @@ class Simulation:
 
         Args:
             scene: The scene.
-            solver: One of :data:`.response.SOLVERS`, or ``"implicit"`` for :class:`.SolverImplicit`.
+            solver: One of :data:`..measure.response.SOLVERS`, or ``"implicit"`` for :class:`.SolverImplicit`.
             rate: Steps a second.
             has_self_contact: Whether VBD has contacts between particles of its own.
             has_contacts: Whether the solver gets Newton's contacts.
@@ -224,7 +224,7 @@ class Simulation:
         return CrossingCounter(self._model, strands=self._scene.strands)
 
     def count_crossings(self) -> int:
-        """Returns the number of crossings now, see :class:`.crossings.CrossingCounter`."""
+        """Returns the number of crossings now, see :class:`..crossings.CrossingCounter`."""
         return self._counter.count(self._states[0])
 
     def _take_pair(self) -> float:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import newton
 import numpy as np
 
-from ..response.state.mesh import host_array
-from .response_scenes import Motion
+from ...response.state.mesh import host_array
+from ..scenes.contact import Motion
 
 __all__ = ["Body", "NotInstalled", "Trajectory", "find_bodies", "held_positions"]
 

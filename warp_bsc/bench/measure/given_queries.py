@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .._arguments import checked_integer
-from ..detection.run.settings import METHODS as NARROW_PHASE_METHODS
-from ..detection.run.settings import PairKind
+from ..._arguments import checked_integer
+from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
+from ...detection.run.settings import PairKind
 from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
 
 __all__ = ["METHODS", "GivenQueries", "benchmark_given_queries"]

@@ -1,8 +1,8 @@
-"""A process that runs one of Newton's examples and measures it: ``python -m warp_bsc.bench.newton_process REQUEST``.
+"""A process that runs one of Newton's examples and measures it.
 
-It runs the example as ``python -m newton.examples`` does, with a frame loop that measures in place of
-``newton.examples.run``. The collision stage takes the place of solver classes of :mod:`newton.solvers`, or
-:class:`warp_bsc.SolverImplicit` that of VBD.
+``python -m warp_bsc.bench.measure.newton_process REQUEST`` runs the example as ``python -m newton.examples`` does, with
+a frame loop that measures in place of ``newton.examples.run``. The collision stage takes the place of solver classes of
+:mod:`newton.solvers`, or :class:`warp_bsc.SolverImplicit` that of VBD.
 """
 
 import json
@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from .._garbage import paused_collection
+from ..._garbage import paused_collection
 from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals, describe_download
 
 __all__ = ["SOLVERS", "serve"]
@@ -68,7 +68,7 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
         import newton.examples  # noqa: PLC0415 (slow)
         import newton.utils  # noqa: PLC0415 (slow)
 
-        from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
+        from ..._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
     measurements: list[ExampleMeasurement] = []
     stages: list[Any] = []
@@ -116,7 +116,7 @@ class _StagedType(type):
 
     def __call__(cls, *arguments, **options):
         """Makes a solver and returns the stage behind it, or the solver if it has no particles."""
-        from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
+        from ...response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
 
         is_derived = "original" not in cls.__dict__
         solver = super().__call__(*arguments, **options) if is_derived else cls.original(*arguments, **options)
@@ -128,7 +128,7 @@ class _StagedType(type):
 
     def __instancecheck__(cls, instance):
         """Returns whether an instance, or the solver before a stage, is of the class, or of Newton's in its place."""
-        from ..response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
+        from ...response.solver_ccd import SolverCCD  # noqa: PLC0415 (imports Newton)
 
         solver = instance.solver if isinstance(instance, SolverCCD) else instance
         return super().__instancecheck__(solver) or isinstance(solver, cls.__dict__.get("original", ()))
@@ -139,7 +139,7 @@ class _ImplicitType(_StagedType):
 
     def __call__(cls, *arguments, **options):
         """Makes a solver of the model, whatever the other arguments, or VBD if it has no particles."""
-        from ..implicit.solver_implicit import SolverImplicit  # noqa: PLC0415 (imports Newton)
+        from ...implicit.solver_implicit import SolverImplicit  # noqa: PLC0415 (imports Newton)
 
         model = options["model"] if "model" in options else arguments[0]
         if not model.particle_count:
@@ -157,7 +157,7 @@ def _replace_solvers(replaced: Sequence[str], kind: type[_StagedType], stages: l
     """
     import newton.solvers  # noqa: PLC0415 (slow)
 
-    from .._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
+    from ..._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
     for name in replaced:
         solver = getattr(newton.solvers, name)
@@ -259,7 +259,7 @@ class _Crossings:
     """
 
     def __init__(self, example: Any):
-        from .crossings import CrossingCounter  # noqa: PLC0415 (imports Newton)
+        from ..crossings import CrossingCounter  # noqa: PLC0415 (imports Newton)
 
         model = getattr(example, "model", None)
         self._example = example

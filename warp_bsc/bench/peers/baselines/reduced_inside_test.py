@@ -9,9 +9,9 @@ results differ by the inside tests alone.
 
 import warp as wp
 
-from ...kernels.classification import classify_with
-from ...kernels.polynomials import VERTEX_FACE, Coplanarity, InsideTests, Motion, cross_middle
-from ...kernels.signs import FREE, certified_sign_cubic
+from ....kernels.classification import classify_with
+from ....kernels.polynomials import VERTEX_FACE, Coplanarity, InsideTests, Motion, cross_middle
+from ....kernels.signs import FREE, certified_sign_cubic
 
 __all__ = ["classify_reduced", "reduced_inside_tests"]
 

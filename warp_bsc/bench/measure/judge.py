@@ -8,11 +8,11 @@ import newton
 import numpy as np
 import warp as wp
 
-from ..detection.detector import CollisionDetector
-from ..detection.mesh import CollisionMesh
-from ..response.state.mesh import ModelMesh, host_array
-from ..response.strain import edges_at_rest
-from .response_simulation import largest_stretch
+from ...detection.detector import CollisionDetector
+from ...detection.mesh import CollisionMesh
+from ...response.state.mesh import ModelMesh, host_array
+from ...response.strain import edges_at_rest
+from ..scenes.simulation import largest_stretch
 
 __all__ = ["Judge", "Judgement"]
 

@@ -1,6 +1,6 @@
 """Measures what a solver and the collision stage make of scenes in contact: stretch, rest, energy and time.
 
-The scenes are in :mod:`.response_scenes`, which is imported with Newton when the first one is measured.
+The scenes are in :mod:`..scenes.contact`, which is imported with Newton when the first one is measured.
 """
 
 import contextlib
@@ -225,8 +225,8 @@ def measure_response(
             raise ValueError(f"{name} must be at least 1, not {number}")
     if perturb is not None and not 0.0 < perturb < math.inf:
         raise ValueError(f"perturb must be finite and more than 0, not {perturb}")
-    from .response_scenes import NotRunnable  # noqa: PLC0415 (imports Newton)
-    from .response_simulation import NotFinite  # noqa: PLC0415 (imports Newton)
+    from ..scenes.contact import NotRunnable  # noqa: PLC0415 (imports Newton)
+    from ..scenes.simulation import NotFinite  # noqa: PLC0415 (imports Newton)
 
     if configuration == "self-contact" and solver != "vbd":
         return ResponseRun(scene, solver, configuration, problem="only VBD has contacts between particles of cloth")
@@ -269,8 +269,8 @@ def _measure(
     progress: Callable[[int, int], None],
 ) -> ResponseMeasurement:
     """Runs a scene once, with all particles moved by an offset along x."""
-    from .response_scenes import build_scene  # noqa: PLC0415 (imports Newton)
-    from .response_simulation import Simulation, energy_gained  # noqa: PLC0415 (imports Newton)
+    from ..scenes.contact import build_scene  # noqa: PLC0415 (imports Newton)
+    from ..scenes.simulation import Simulation, energy_gained  # noqa: PLC0415 (imports Newton)
 
     built = build_scene(scene, solver, rate or 60)
     is_explicit = solver == "semi-implicit"

@@ -1,6 +1,6 @@
 """Runs the same scenes through several simulators, and judges each by exact detection on its states.
 
-The scenes are in :mod:`.penetration_scenes`, which is imported with Newton when the first one is run.
+The scenes are in :mod:`..scenes.penetration`, which is imported with Newton when the first one is run.
 """
 
 import contextlib
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .provenance import version_of
+from ..record import version_of
 
 __all__ = [
     "FRAME_RATE",
@@ -218,9 +218,9 @@ def measure_penetration(
             raise ValueError(f"{name} must be one of {', '.join(known)}, not {value!r}")
     if frames is not None and frames < 1:
         raise ValueError(f"frames must be at least 1, not {frames}")
-    from .penetration_states import NotInstalled  # noqa: PLC0415 (imports Newton)
-    from .response_scenes import NotRunnable  # noqa: PLC0415 (imports Newton)
-    from .response_simulation import NotFinite  # noqa: PLC0415 (imports Newton)
+    from ..peers.states import NotInstalled  # noqa: PLC0415 (imports Newton)
+    from ..scenes.contact import NotRunnable  # noqa: PLC0415 (imports Newton)
+    from ..scenes.simulation import NotFinite  # noqa: PLC0415 (imports Newton)
 
     try:
         with wp.ScopedDevice(device), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -234,8 +234,8 @@ def measure_penetration(
 
 def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int, int], None]) -> PenetrationMeasurement:
     """Runs and judges a scene on the current device."""
+    from ..scenes.penetration import build_penetration_scene  # noqa: PLC0415 (imports Newton)
     from .judge import Judge  # noqa: PLC0415 (imports Newton)
-    from .penetration_scenes import build_penetration_scene  # noqa: PLC0415 (imports Newton)
 
     simulator = SIMULATORS[name]
     built = build_penetration_scene(scene, simulator.solver or "vbd", simulator.rate)
@@ -268,16 +268,16 @@ def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], N
     """Runs a scene with a simulator, whose library is imported now; returns the device and the trajectory."""
     simulator = SIMULATORS[name]
     if simulator.solver:
-        from .penetration_newton import simulate_newton  # noqa: PLC0415
+        from ..peers.newton import simulate_newton  # noqa: PLC0415
 
         options = {"has_self_contact": simulator.has_self_contact, "has_stage": simulator.has_stage}
         device = str(built.scene.model.device)
         return device, simulate_newton(built, simulator.solver, simulator.rate, seconds, progress, **options)
     if name == "mujoco-ipc":
-        from .penetration_mujoco import simulate_mujoco  # noqa: PLC0415
+        from ..peers.mujoco import simulate_mujoco  # noqa: PLC0415
 
         return "cpu", simulate_mujoco(built, simulator.rate, seconds, progress)
-    from .penetration_libuipc import simulate_libuipc  # noqa: PLC0415
+    from ..peers.libuipc import simulate_libuipc  # noqa: PLC0415
 
     return "cuda", simulate_libuipc(built, simulator.rate, seconds, progress)
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.run.settings import PairKind
-from .detector_scenes import BenchmarkScene
-from .timing import count_threads
+from ...detection.run.settings import PairKind
+from ..scenes.detector import BenchmarkScene
+from ..timing import count_threads
 
 __all__ = [
     "CCD_CLASSES",

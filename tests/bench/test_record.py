@@ -13,8 +13,8 @@ import pytest
 import warp as wp
 
 import warp_bsc
-from warp_bsc.bench import provenance
-from warp_bsc.bench.provenance import describe_run, shorten_path, with_record, write_measurement
+from warp_bsc.bench import record as records
+from warp_bsc.bench.record import describe_run, shorten_path, with_record, write_measurement
 from warp_bsc.bench.timing import count_threads
 from warp_bsc.cli.main import main
 
@@ -49,10 +49,10 @@ def test_commit_of_the_checkout_and_whether_it_is_changed(tmp_path, monkeypatch)
         return record["commit"], record["changed"]
 
     root = tmp_path.resolve()
-    monkeypatch.setattr(provenance, "_ROOT", root)
-    monkeypatch.setenv(provenance.COMMIT, "0123")
+    monkeypatch.setattr(records, "_ROOT", root)
+    monkeypatch.setenv(records.COMMIT, "0123")
     assert commit() == ("0123", False)
-    monkeypatch.delenv(provenance.COMMIT)
+    monkeypatch.delenv(records.COMMIT)
     assert commit() == (None, None)
     git(root, "init")
     (root / "a.py").write_text("1")
@@ -69,11 +69,11 @@ def test_commit_of_the_checkout_and_whether_it_is_changed(tmp_path, monkeypatch)
     result.write_text("2")  # a result is no change of what is measured
     assert commit() == (head, False)
     (root / "a.py").write_text("2")
-    monkeypatch.setenv(provenance.COMMIT, "0123")  # git knows better
+    monkeypatch.setenv(records.COMMIT, "0123")  # git knows better
     assert commit() == (head, True)
-    monkeypatch.delenv(provenance.COMMIT)
+    monkeypatch.delenv(records.COMMIT)
     (root / "inside").mkdir()
-    monkeypatch.setattr(provenance, "_ROOT", root / "inside")  # installed below a checkout of something else
+    monkeypatch.setattr(records, "_ROOT", root / "inside")  # installed below a checkout of something else
     assert commit() == (None, None)
 
 

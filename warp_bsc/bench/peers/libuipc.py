@@ -11,11 +11,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..response.state.mesh import ModelMesh, host_array
-from .penetration_scenes import PenetrationScene
-from .penetration_states import Body, NotInstalled, Trajectory, find_bodies, held_positions
-from .response_scenes import NotRunnable
-from .response_simulation import NotFinite
+from ...response.state.mesh import ModelMesh, host_array
+from ..scenes.contact import NotRunnable
+from ..scenes.penetration import PenetrationScene
+from ..scenes.simulation import NotFinite
+from .states import Body, NotInstalled, Trajectory, find_bodies, held_positions
 
 try:
     import uipc

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .._arguments import checked_integer
-from ..detection.collisions import DetectionStats, StageCounts
-from ..detection.detector import CollisionDetector
-from ..detection.mesh import CollisionMesh
-from ..detection.run.settings import Method
-from .ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
-from .detector_scenes import BenchmarkScene
-from .timing import replay_graph
+from ..._arguments import checked_integer
+from ...detection.collisions import DetectionStats, StageCounts
+from ...detection.detector import CollisionDetector
+from ...detection.mesh import CollisionMesh
+from ...detection.run.settings import Method
+from ..peers.ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
+from ..scenes.detector import BenchmarkScene
+from ..timing import replay_graph
 
 __all__ = ["DetectorBenchmark", "benchmark_detector"]
 

@@ -9,12 +9,11 @@ the two features meet. They differ as follows:
   leaves to the host, stay UNSURE. On a GPU the narrow phase compares boxes last, because the detector's broad phase has
   compared them already. The benchmark's queries are all candidates, also those that this comparison would have
   excluded, which favors ``cubic``.
-- ``cubic``: :mod:`warp_bsc.bench.baselines.cubic_solver`. It stops at the first root at which the features are close,
-  so it finds a time as well; that time is not written.
-- ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5,
-  :mod:`warp_bsc.bench.baselines.reduced_inside_test`. The culls are those of the narrow phase, in the same order. The
-  paper does not subdivide, so a query that classification leaves open is a collision at once, as the paper's weak
-  inequalities imply.
+- ``cubic``: :mod:`..peers.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
+  finds a time as well; that time is not written.
+- ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5, :mod:`..peers.baselines.reduced_inside_test`. The
+  culls are those of the narrow phase, in the same order. The paper does not subdivide, so a query that classification
+  leaves open is a collision at once, as the paper's weak inequalities imply.
 
 No method finds times of impact, and none checks whether positions are finite, which the detector does once a vertex.
 
@@ -28,23 +27,23 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.narrow.narrow_phase import NarrowPhase
-from ..detection.queries.query_points import query_points
-from ..detection.run.launch import launch_over, launch_over_queue, retry_until_fits
-from ..detection.run.settings import METHODS as NARROW_PHASE_METHODS
-from ..detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, PairCounts, PairKind
-from ..detection.run.stage_timer import StageTimer
-from ..kernels.bits import lowest_bit
-from ..kernels.classification import classify
-from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from ..kernels.motion import edge_edge_motion, vertex_face_motion
-from ..kernels.pipeline.batch_culling import BATCH, cull_batch_of
-from ..kernels.pipeline.queues import take_slot
-from ..kernels.polynomials import coplanarity
-from ..kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
-from ..kernels.time_of_impact import impact
-from .baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
-from .timing import median_milliseconds
+from ...detection.narrow.narrow_phase import NarrowPhase
+from ...detection.queries.query_points import query_points
+from ...detection.run.launch import launch_over, launch_over_queue, retry_until_fits
+from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
+from ...detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, PairCounts, PairKind
+from ...detection.run.stage_timer import StageTimer
+from ...kernels.bits import lowest_bit
+from ...kernels.classification import classify
+from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from ...kernels.motion import edge_edge_motion, vertex_face_motion
+from ...kernels.pipeline.batch_culling import BATCH, cull_batch_of
+from ...kernels.pipeline.queues import take_slot
+from ...kernels.polynomials import coplanarity
+from ...kernels.signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
+from ...kernels.time_of_impact import impact
+from ..peers.baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
+from ..timing import median_milliseconds
 
 __all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace"]
 

@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .. import checker
-from ..detection.mesh import CollisionMesh
-from ..detection.pipeline import DetectionPipeline
-from ..detection.run.launch import cores, retry_until_fits
-from ..detection.run.settings import PairKind
-from ..kernels.signs import UNSURE
+from ... import checker
+from ...detection.mesh import CollisionMesh
+from ...detection.pipeline import DetectionPipeline
+from ...detection.run.launch import cores, retry_until_fits
+from ...detection.run.settings import PairKind
+from ...kernels.signs import UNSURE
+from ..peers.ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
+from ..scenes.detector import BenchmarkScene
+from ..timing import count_threads
 from .detector import benchmark_detector
-from .ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
-from .detector_scenes import BenchmarkScene
-from .timing import count_threads
 from .worst_case import WorstQuery, adversarial_queries, find_worst
 
 __all__ = [

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from .response_scenes import Motion, Scene, SceneBuilder, build_scene
+from .contact import Motion, Scene, SceneBuilder, build_scene
 
 __all__ = ["SCENES", "PenetrationScene", "build_penetration_scene"]
 
@@ -118,7 +118,7 @@ SCENES: dict[str, Callable[[SceneBuilder], PenetrationScene]] = {
     "twist": _build_twist,
     "soft": _build_soft,
 }
-"""Functions that build the scenes, by name, in the order of :data:`.penetration.SCENES`."""
+"""Functions that build the scenes, by name, in the order of :data:`..measure.penetration.SCENES`."""
 
 
 def build_penetration_scene(name: str, solver: str, rate: int) -> PenetrationScene:
@@ -126,7 +126,7 @@ def build_penetration_scene(name: str, solver: str, rate: int) -> PenetrationSce
 
     Args:
         name: A key of :data:`SCENES`.
-        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``.
+        solver: One of :data:`..measure.response.SOLVERS`, or ``"implicit"``.
         rate: Steps a second.
 
     Raises:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..usd.scene import Scene
+from ...usd.scene import Scene
 from .mesh_files import read_mesh
 
 __all__ = [
@@ -75,7 +75,7 @@ def is_scene_name(text: str) -> bool:
 
 def default_scenes() -> list[str]:
     """Returns the scenes that are measured by default: that of a checkout, if this is one, and generated ones."""
-    scene = Path(__file__).parents[2] / "assets" / "cloth_twist.usd"
+    scene = Path(__file__).parents[3] / "assets" / "cloth_twist.usd"
     return [*([str(scene)] if scene.exists() else []), "cloth:5000", "cloth:50000"]
 
 
@@ -110,7 +110,7 @@ def paper_scenes() -> list[str]:
     Raises:
         FileNotFoundError: If this is not a checkout, or a scene is missing.
     """
-    assets = Path(__file__).parents[2] / "assets"
+    assets = Path(__file__).parents[3] / "assets"
     paths = [assets / f"{name}.usd" for name in PAPER_SCENES]
     for path in paths:
         if not path.exists():

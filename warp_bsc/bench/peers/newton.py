@@ -6,12 +6,12 @@ from typing import Any
 import newton
 import numpy as np
 
-from .._private_names.of_newton import make_style3d
-from ..response.state.mesh import host_array
-from ..response.strain import edges_at_rest
-from .penetration_scenes import PenetrationScene
-from .penetration_states import Trajectory
-from .response_simulation import NotFinite, Simulation, largest_stretch
+from ..._private_names.of_newton import make_style3d
+from ...response.state.mesh import host_array
+from ...response.strain import edges_at_rest
+from ..scenes.penetration import PenetrationScene
+from ..scenes.simulation import NotFinite, Simulation, largest_stretch
+from .states import Trajectory
 
 __all__ = ["simulate_newton"]
 
@@ -26,7 +26,7 @@ _BURST = 10.0
 
 
 class _States:
-    """Keeps the positions of each state, in place of :class:`.response_simulation.Samples`."""
+    """Keeps the positions of each state, in place of :class:`..scenes.simulation.Samples`."""
 
     def __init__(self, model: newton.Model):
         self.positions: list[np.ndarray] = []
@@ -64,7 +64,7 @@ def simulate_newton(
 
     Args:
         built: The scene.
-        solver: One of :data:`.response.SOLVERS`, or ``"implicit"``.
+        solver: One of :data:`..measure.response.SOLVERS`, or ``"implicit"``.
         rate: Steps a second.
         seconds: Simulated time [s].
         progress: Called with the number of steps done and the number of all.

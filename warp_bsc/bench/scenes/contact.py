@@ -420,7 +420,7 @@ SCENES: dict[str, Callable[[SceneBuilder], Scene]] = {
     "ball_two_way": _build_ball_two_way,
     "worlds": _build_worlds,
 }
-"""Functions that build the scenes, by name, in the order of :data:`.response.SCENES`."""
+"""Functions that build the scenes, by name, in the order of :data:`..measure.response.SCENES`."""
 
 
 def build_scene(name: str, solver: str, rate: int = 60) -> Scene:
@@ -428,7 +428,7 @@ def build_scene(name: str, solver: str, rate: int = 60) -> Scene:
 
     Args:
         name: A key of :data:`SCENES`.
-        solver: One of :data:`.response.SOLVERS`.
+        solver: One of :data:`..measure.response.SOLVERS`.
         rate: Steps a second for which the springs of XPBD are made.
 
     Raises:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.at_rest.intersections import IntersectionFinder
-from ..detection.mesh import CollisionMesh
+from ...detection.at_rest.intersections import IntersectionFinder
+from ...detection.mesh import CollisionMesh
 from .mesh_files import read_mesh
 
 __all__ = ["KINDS", "KNOWN", "TangledMesh", "damaged", "load_tangled"]

@@ -6,21 +6,21 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from .._arguments import checked_integer
-from ..detection.queries.query import query_edge_edge, query_vertex_face
-from ..detection.queries.query_arrays import QueryArrays
-from ..detection.run.launch import launch_over, launch_over_queue
-from ..detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, PairKind
-from ..kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
-from ..kernels.classification import classify
-from ..kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from ..kernels.exact.first_contact import NONE, decide_in
-from ..kernels.motion import doubles, edge_edge_motion, vertex_face_motion
-from ..kernels.pipeline.queues import take_slot
-from ..kernels.polynomials import coplanarity
-from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
-from ..kernels.time_of_impact import impact
-from .timing import median_milliseconds
+from ..._arguments import checked_integer
+from ...detection.queries.query import query_edge_edge, query_vertex_face
+from ...detection.queries.query_arrays import QueryArrays
+from ...detection.run.launch import launch_over, launch_over_queue
+from ...detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, PairKind
+from ...kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
+from ...kernels.classification import classify
+from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from ...kernels.exact.first_contact import NONE, decide_in
+from ...kernels.motion import doubles, edge_edge_motion, vertex_face_motion
+from ...kernels.pipeline.queues import take_slot
+from ...kernels.polynomials import coplanarity
+from ...kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
+from ...kernels.time_of_impact import impact
+from ..timing import median_milliseconds
 
 __all__ = [
     "MODES",

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from ..detection.run.settings import PairKind
+from ...detection.run.settings import PairKind
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 
 __all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
