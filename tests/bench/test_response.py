@@ -153,7 +153,8 @@ def test_no_energy_is_gained_in_flight_nor_by_a_swing(device):
 def test_the_measures_of_a_run():
     times = [1.0, 1.0, 4.0]
     found = ResponseMeasurement("cpu", 3, 1, 60, 5, 1.0, 2.0, 3.0, None, 0, 0, None, times)
-    assert (found.median, found.mean) == (1.0, 2.0)
+    times = found.to_dict()["milliseconds"]
+    assert (times["median"], times["mean"]) == (1.0, 2.0)
     at, moved = (replace(found, early=np.array([[0.0, 0.0, z], [1.0, 0.0, 0.0]])) for z in (0.0, 0.004))
     assert at.distance_from(moved) == pytest.approx(2.0)
     assert at.distance_from(found) is found.distance_from(at) is at.distance_from(replace(moved, rate=120)) is None

@@ -1,4 +1,4 @@
-"""Says where a measurement comes from: its command, commit, date, machine and versions, and writes it as JSON."""
+"""The JSON of measurements: runs as plain data, where they come from, and the file that has it."""
 
 import contextlib
 import datetime
@@ -9,6 +9,7 @@ import platform
 import shlex
 import subprocess
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,20 @@ import warp as wp
 
 from .._atomic_file import OutputFile
 from .._version import __version__
+from .tables import count
 from .timing import count_threads
 
-__all__ = ["COMMIT", "LIBRARIES", "describe_run", "shorten_path", "version_of", "with_record", "write_measurement"]
+__all__ = [
+    "COMMIT",
+    "LIBRARIES",
+    "Run",
+    "describe_run",
+    "name_place",
+    "shorten_path",
+    "version_of",
+    "with_record",
+    "write_measurement",
+]
 
 COMMIT = "WARP_BSC_COMMIT"
 """Environment variable that names the commit of a copy of the project without git, as on another machine."""
@@ -33,6 +45,23 @@ _NO_CAUSE = ":!warp_bsc/bench/measurements"
 """Files whose change is no change of what is measured: results, which one measurement after another replaces."""
 _OUTPUTS = ("--json", "--figure")
 """Options that name output files, which the recorded command omits with their files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run of which there may be no measurement; other fields say which one it is.
+
+    Attributes:
+        measured: The measurement, a dataclass with ``to_dict``; None if there is none.
+        problem: Why there is no measurement; None if there is one.
+    """
+
+    measured: Any = None
+    problem: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the run as plain data for JSON."""
+        return vars(self) | {"measured": self.measured.to_dict() if self.measured else None}
 
 
 def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> dict[str, Any]:
@@ -90,6 +119,12 @@ def write_measurement(
         file.commit()
     finally:
         file.discard()
+
+
+def name_place(found: dict[str, Any]) -> str:
+    """Returns the device of the JSON of a measurement with its name, of the CPU the number of cores."""
+    device = found["device"]
+    return f"{device}, {count(found['threads'], 'core') if device == 'cpu' else found['device_name']}"
 
 
 def version_of(name: str) -> str | None:

@@ -1,8 +1,11 @@
 """Measures the detector on a scene: the time of a detection, and its counts."""
 
+import os
 import statistics
 import time
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,11 +16,48 @@ from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...detection.run.settings import Method
 from ..peers.ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
+from ..record import name_place, shorten_path
 from ..scenes.detector import BenchmarkScene
+from ..tables import Column, Table, count
 from ..timing import replay_graph
 
-__all__ = ["DetectorBenchmark", "benchmark_detector"]
+__all__ = ["DESCRIPTION", "EXAMPLES", "DetectorBenchmark", "benchmark_detector", "show", "stage_columns"]
 
+DESCRIPTION = """\
+Measure the detector, from positions on the device to results on the device and
+on the host. A scene is one interval of a USD file; two mesh files joined by a
+comma; or generated: cloth:TRIANGLES, a wrinkled sheet that
+folds onto itself, or crash:TRIANGLES, a thin tube that is crushed. Default:
+cloth_twist.usd if this is a checkout, cloth:5000 and cloth:50000."""
+
+EXAMPLES = """\
+examples:
+  warp-bsc bench detector
+  warp-bsc bench detector cloth.usd --interval 3
+  warp-bsc bench detector first.ply,second.ply crash:1100000 --device cuda:0
+  warp-bsc bench detector cloth:50000 --device cpu --threads 1 --compare
+  warp-bsc bench detector cloth:1000 --worlds 1024 --device cuda:0
+  warp-bsc bench detector --json times.json"""
+
+_COUNTS = [Column(name.capitalize(), name) for name in ("triangles", "candidates", "survivors", "hits", "unsure")]
+_TIMES = (
+    Column("Detect", "milliseconds.detect", ",.2f"),
+    Column("Detect\nand read", "milliseconds.detect_and_read", ",.2f"),
+    Column("CUDA\ngraph", "milliseconds.cuda_graph", ",.2f"),
+    Column("Million\npairs/s", lambda scene: scene["candidates_per_second"] / 1e6, ",.1f"),
+    Column("Memory\n[MiB]", lambda scene: scene["memory_bytes"] and scene["memory_bytes"] / 2**20, ",.1f"),
+)
+_COMPARED = (
+    Column(
+        "Candidates",
+        lambda scene: sum(scene["ipc_toolkit"][f"{kind}_candidates"] for kind in ("vertex_face", "edge_edge")),
+    ),
+    Column("Build", "ipc_toolkit.build_milliseconds", ",.1f"),
+    Column("Step\nsize", "ipc_toolkit.step_milliseconds", ",.1f"),
+    Column("Sum", lambda scene: ipc_milliseconds(scene["ipc_toolkit"]), ",.1f"),
+    Column("Detect", "milliseconds.detect", ",.1f"),
+    Column("Ratio", lambda scene: ipc_milliseconds(scene["ipc_toolkit"]) / scene["milliseconds"]["detect"], ",.1f"),
+)
 _GRAPH_REPLAYS = 20
 
 
@@ -75,6 +115,26 @@ class DetectorBenchmark:
     def candidates_per_second(self) -> float:
         """Candidate pairs a second, from positions to results on the device."""
         return 1e3 * self.candidates / self.detect_milliseconds
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurement as plain data for JSON."""
+        names = "precision", "candidates", "survivors", "hits", "unsure", "certified", "candidates_per_second"
+        return {name: getattr(self, name) for name in names} | {
+            "scene": shorten_path(self.scene.name),
+            "triangles": len(self.scene.faces),
+            "vertices": len(self.scene.x0),
+            "vertex_face": asdict(self.vertex_face),
+            "edge_edge": asdict(self.edge_edge),
+            "earliest_toi": self.earliest_toi if self.hits else None,
+            "milliseconds": {
+                "detect": self.detect_milliseconds,
+                "detect_and_read": self.read_milliseconds,
+                "cuda_graph": self.graph_milliseconds,
+                "stages": self.stage_milliseconds,
+            },
+            "memory_bytes": self.memory,
+            "ipc_toolkit": asdict(self.ipc_toolkit) if self.ipc_toolkit else None,
+        }
 
 
 def benchmark_detector(
@@ -151,3 +211,37 @@ def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, s
     if (found.vertex_face, found.edge_edge) != (stats.vertex_face, stats.edge_edge):
         raise RuntimeError("the CUDA graph found other pairs than the detection outside it")
     return milliseconds
+
+
+def ipc_milliseconds(took: dict[str, Any]) -> float:
+    """Returns the time of the IPC Toolkit from positions to the step size [ms]."""
+    return took["build_milliseconds"] + took["step_milliseconds"]
+
+
+def stage_columns(stages: Iterable[str], key: str) -> list[Column]:
+    """Returns columns of the times of the stages of detections, which a row has at a key."""
+    return [
+        Column("\n".join(stage.rsplit(" ", 1)), lambda row, stage=stage: row[key][stage], ",.2f", title=stage)
+        for stage in stages
+    ]
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the tables of the JSON of a measurement, a row a scene, and the lines around them."""
+    place, scenes = name_place(found), found["scenes"]
+    yield f"Method {found['method']} on {place}; medians of {count(found['repeat'], 'repetition')}"
+    rows = [(",".join(map(os.path.basename, scene["scene"].split(","))), scene) for scene in scenes]
+    yield Table("Scene", _COUNTS, rows, caption="Hits: pairs that the method reports.")
+    yield ""
+    caption = "From positions on the device to results on the device, or read on the host."
+    yield Table("Milliseconds", _TIMES, rows, caption=caption)
+    yield ""
+    stages = dict.fromkeys(stage for scene in scenes for stage in scene["milliseconds"]["stages"])
+    took = [(name, scene["milliseconds"]) for name, scene in rows]
+    yield Table("Milliseconds by stage", stage_columns(stages, "stages"), took)
+    if other := scenes[0]["ipc_toolkit"] if scenes else None:
+        yield ""
+        caption = f"Milliseconds on {count(other['threads'], 'core')}; it finds only the earliest time of impact."
+        yield Table(f"IPC Toolkit {other['version']}", _COMPARED, rows, caption=caption)
+    if not all(scene["certified"] for scene in scenes):
+        yield "Not certified: collisions may be missing."

@@ -1,7 +1,9 @@
 """Measures the methods on given queries, such as those of public benchmarks."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -9,12 +11,39 @@ import warp as wp
 from ..._arguments import checked_integer
 from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
 from ...detection.run.settings import PairKind
+from ..record import name_place
+from ..tables import Column, Table, count, two
 from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
 
-__all__ = ["METHODS", "GivenQueries", "benchmark_given_queries"]
+__all__ = ["COLUMNS", "METHODS", "GivenQueries", "benchmark_given_queries", "show"]
 
 METHODS = (*NARROW_PHASE_METHODS, "cubic")
 """The methods, see :mod:`.methods`."""
+
+COLUMNS = (
+    Column("Collide", lambda row: row["hits"] / row["queries"], ".0%", title="collide"),
+    *(
+        Column(
+            method.replace("conservative", "conser-\nvative"),
+            f"nanoseconds.{method}",
+            ",.1f",
+            title="cubic solver" if method == "cubic" else f"`{method}`",
+            page_format=two,
+        )
+        for method in METHODS
+    ),
+    *(
+        Column(
+            f"{method} /\ncubic",
+            lambda row, method=method: row["nanoseconds"][method] / row["nanoseconds"]["cubic"],
+            ".2f",
+            title=f"`{method}` / cubic",
+            page_format=two,
+        )
+        for method in ("float", "exact")
+    ),
+)
+"""Columns of the JSON of :class:`GivenQueries`."""
 
 _SMALLEST_LAUNCH = {False: 2**18, True: 2**22}
 """Queries of a launch on a CPU and on a GPU: fewer are repeated."""
@@ -37,6 +66,10 @@ class GivenQueries:
     queries: int
     hits: int
     nanoseconds: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurements as plain data for JSON."""
+        return vars(self) | {"kind": self.kind.display_name}
 
 
 def _nanoseconds(run: MethodRun) -> float:
@@ -78,3 +111,12 @@ def benchmark_given_queries(
     turns = [{method: _nanoseconds(run) for method, run in runs.items()} for _ in range(repeat)]
     fastest = {method: min(turn[method] for turn in turns) for method in METHODS}
     return GivenQueries(name, kind, len(queries), int(exact.find_hits().sum()), fastest)
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the table of the JSON of measurements, and the line above it."""
+    time = "Nanoseconds of processor time" if found["device"] == "cpu" else "Nanoseconds"
+    yield f"{time} a query on {name_place(found)}; the fastest of {count(found['repeat'], 'turn')}"
+    rows = [(f"{row['name']}, {row['kind']}", row) for row in found["queries"]]
+    caption = "cubic: a floating-point cubic solver, see warp-bsc bench. Times of impact are not sought."
+    yield Table("Queries", [Column("Number", "queries"), *COLUMNS], rows, caption=caption)

@@ -11,9 +11,9 @@ the two features meet. They differ as follows:
   excluded, which favors ``cubic``.
 - ``cubic``: :mod:`..peers.baselines.cubic_solver`. It stops at the first root at which the features are close, so it
   finds a time as well; that time is not written.
-- ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5, :mod:`..peers.baselines.reduced_inside_test`. The
-  culls are those of the narrow phase, in the same order. The paper does not subdivide, so a query that classification
-  leaves open is a collision at once, as the paper's weak inequalities imply.
+- ``reduced``: ``float`` with the inside tests of the paper's Sec. 3.5, :mod:`..peers.baselines.reduced_inside_test`.
+  The culls are those of the narrow phase, in the same order. The paper does not subdivide, so a query that
+  classification leaves open is a collision at once, as the paper's weak inequalities imply.
 
 No method finds times of impact, and none checks whether positions are finite, which the detector does once a vertex.
 

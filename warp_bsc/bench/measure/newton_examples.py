@@ -16,14 +16,19 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..record import Run
+from ..tables import Column, Table
+
 __all__ = [
     "CPU_FRAMES",
+    "DESCRIPTION",
+    "EXAMPLES",
     "FOLDERS",
     "FRAMES",
     "MODES",
@@ -35,8 +40,54 @@ __all__ = [
     "describe_download",
     "describe_needs",
     "find_examples",
+    "list_examples",
     "measure_example",
+    "show",
 ]
+
+DESCRIPTION = """\
+Run Newton's own examples, unchanged, and measure them: plain, with SolverCCD
+put behind their solver, or behind each entry of a coupled solver that has
+particles, and with SolverImplicit in place of VBD. Each run is a process of its
+own, in which the example captures its own CUDA graph and runs its own tests. A
+row has the times of frames, without drawing and without the first two; the
+edges of cloth or soft bodies that cross faces at the start, and the most at
+frame ends, found in exact arithmetic; the steps that were not certified; and
+whether the example's own tests pass. Default: the examples of
+newton.examples.cloth, softbody and multiphysics that have cloth or soft bodies.
+Any other example of Newton can be named. Options of the example itself follow
+its name, in quotes. A run that fails is a row, and a line below the table says
+why. Tests that expect a state at rest fail in short runs, in all modes."""
+
+EXAMPLES = """\
+examples:
+  warp-bsc bench newton --list
+  warp-bsc bench newton cloth_twist softbody_hanging --device cuda:0
+  warp-bsc bench newton "cloth_hanging --solver xpbd" --frames 20 --modes stage
+  warp-bsc bench newton --json examples.json"""
+
+_NEEDS = (
+    Column("Folder", lambda example: example.module.split(".")[2], "", kind="text"),
+    Column("Needs", lambda example: "; ".join(describe_needs(example)), "", kind="text"),
+)
+_TIMES = (
+    Column("Mode", "mode", "", kind="word"),
+    Column("Median\n[ms]", "measured.milliseconds.median", ",.1f"),
+    Column("95%\n[ms]", "measured.milliseconds.percentile_95", ",.1f"),
+    Column("Worst\n[ms]", "measured.milliseconds.worst", ",.1f"),
+    Column("Cross-\nings at\nstart", "measured.crossings_at_start"),
+    Column("At\nmost", "measured.most_crossings"),
+    Column("Its tests", lambda run: _name_result(run["measured"]), "", kind="word"),
+)
+_SIZES = (
+    Column("Partic-\nles", "particles"),
+    Column("Trian-\ngles", "triangles"),
+    Column("Frames", "frames"),
+    Column("Steps", "stage.steps"),
+    Column("Uncer-\ntified", "stage.uncertified_steps"),
+    Column("Trun-\ncated", "stage.truncated_steps"),
+    Column("Frozen", "stage.frozen_steps"),
+)
 
 FOLDERS = ("cloth", "softbody", "multiphysics")
 """The folders of Newton's examples that are measured by default."""
@@ -152,37 +203,26 @@ class ExampleMeasurement:
     test_final: str | None
     test_post_step: str | None
 
-    @property
-    def median(self) -> float:
-        """Median time of a frame [ms]."""
-        return float(np.median(self.frame_milliseconds))
-
-    @property
-    def percentile_95(self) -> float:
-        """95th percentile of the time of a frame [ms]."""
-        return float(np.percentile(self.frame_milliseconds, 95))
-
-    @property
-    def worst(self) -> float:
-        """Longest time of a frame [ms]."""
-        return max(self.frame_milliseconds)
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurement as plain data for JSON."""
+        values = asdict(self)
+        frames = values.pop("frame_milliseconds")
+        median, percentile_95 = (float(np.percentile(frames, share)) for share in (50, 95))
+        times = {"median": median, "percentile_95": percentile_95, "worst": max(frames), "frames": frames}
+        return values | {"milliseconds": times}
 
 
 @dataclass(frozen=True)
-class ExampleRun:
+class ExampleRun(Run):
     """A run of an example in a mode.
 
     Attributes:
         example: Name and options of the example.
         mode: One of :data:`MODES`.
-        measured: The measurement; None if there is none.
-        problem: Why there is no measurement; None if there is one.
     """
 
     example: str
     mode: str
-    measured: ExampleMeasurement | None = None
-    problem: str | None = None
 
 
 def find_examples(requests: Sequence[str] = ()) -> list[NewtonExample]:
@@ -364,3 +404,44 @@ def _describe_end(status: int, line: str) -> str:
             return f"failed: the process was ended by {signal.Signals(-status).name}"
         return f"failed: the process was ended by signal {-status}"
     return f"failed: the process ended with status {status}" + (f": {line}" if line else "")
+
+
+def list_examples(examples: Sequence[NewtonExample]) -> Table:
+    """Returns the table of examples and what they need."""
+    return Table("Example", _NEEDS, [(example.title, example) for example in examples])
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the tables of the JSON of a measurement: times, crossings and tests, a row a run; reports of stages."""
+    device = f"{found['device']}, {found['device_name']}"
+    yield f"Newton's examples on {device}; times of a frame without the first {found['frames_left_out']}"
+    caption = "Crossings of cloth and soft bodies: at the start, and the most at a checked frame end."
+    yield Table("Example", _TIMES, [(run["example"], run) for run in found["runs"]], caption=caption)
+    sizes: dict[str, dict[str, Any]] = {}
+    for run in found["runs"]:
+        took = run["measured"]
+        for remark in _find_failures(took) if took else [run["problem"]]:
+            yield f"{run['example']}, {run['mode']}: {remark}"
+        name = f"{run['example']}, implicit" if run["mode"] == "implicit" else run["example"]
+        if took and (took["stage"] or name not in sizes):
+            sizes[name] = took
+    if sizes:
+        yield ""
+        caption = "Steps: all, not certified, with paths truncated, with vertices frozen."
+        yield Table("Example", _SIZES, sizes.items(), caption=caption)
+
+
+def _name_result(took: dict[str, Any] | None) -> str:
+    """Returns how the tests of an example ended."""
+    if took is None:
+        return "not run"
+    return "fail" if _find_failures(took) else took["test_final"] or "none"
+
+
+def _find_failures(took: dict[str, Any]) -> list[str]:
+    """Returns the messages of an example's tests that failed, and the frame at which positions were not finite."""
+    tests = "test_post_step", "test_final"
+    failures = [f"{test}: {took[test]}" for test in tests if took[test] not in (None, "ok")]
+    if (frame := took["first_frame_not_finite"]) is not None:
+        failures.append(f"positions are not finite at the end of frame {frame}")
+    return failures

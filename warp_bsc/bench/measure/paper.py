@@ -9,19 +9,21 @@ the methods disagree about, and a random sample of the others.
 
 import contextlib
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from ... import checker
-from ...detection.mesh import CollisionMesh
-from ...detection.pipeline import DetectionPipeline
-from ...detection.run.launch import cores, retry_until_fits
+from ...detection.run.launch import cores
 from ...detection.run.settings import PairKind
 from ...kernels.signs import UNSURE
+from ..peers import ipc_toolkit
 from ..peers.ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
-from ..scenes.detector import BenchmarkScene
+from ..record import shorten_path
+from ..scenes.detector import BenchmarkScene, find_overlapping
 from ..timing import count_threads
 from .detector import benchmark_detector
 from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
@@ -36,14 +38,12 @@ __all__ = [
     "benchmark_scene",
     "find_adversarial_worst",
     "find_places",
+    "to_dict",
 ]
 
 SEED = 0
 _TURNS = 8  # of timing all methods
-_CPU_QUERIES, _GPU_QUERIES = (
-    2**18,
-    2**22,
-)  # smallest launches: fewer queries are repeated
+_CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # smallest launches: fewer queries are repeated
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,10 @@ class Place:
     cores: int | None
     name: str
 
+    def limited(self) -> contextlib.AbstractContextManager:
+        """Returns a context in which kernels run on one core if the place is that."""
+        return cores(1) if self.cores == 1 else contextlib.nullcontext()
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -105,6 +109,13 @@ class Timing:
     place: Place
     nanoseconds: dict[str, float]
     worst: dict[str, WorstQuery]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the times as plain data for JSON."""
+        place = self.place
+        where = {"place": place.name, "device": str(place.device), "device_name": place.device.name}
+        took = {"nanoseconds": self.nanoseconds, "worst": _worst_to_dict(self.worst)}
+        return where | {"cores": place.cores} | took
 
 
 @dataclass(frozen=True)
@@ -163,6 +174,39 @@ class SceneBenchmark:
     stage_milliseconds: dict[str, float]
     frame_milliseconds: float
     ipc_toolkit: dict[str, IpcQueryTiming]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurements as plain data for JSON."""
+        values = vars(self) | {
+            "scene": shorten_path(self.name),
+            "name": ",".join(
+                Path(path).stem if "/" in path or path.endswith(".usd") else path for path in self.name.split(",")
+            ),
+            "queries": {kind.label: number for kind, number in self.queries.items()},
+            "errors": {method: asdict(errors) for method, errors in self.errors.items()},
+            "timings": [timing.to_dict() for timing in self.timings],
+            "ipc_toolkit": {method: asdict(took) for method, took in self.ipc_toolkit.items()},
+        }
+        values["decided_by"] = values.pop("stages")
+        return values
+
+
+def to_dict(
+    benchmarks: list[SceneBenchmark], adversarial: list[tuple[Place, dict[str, WorstQuery]]], *, quick: bool
+) -> dict[str, Any]:
+    """Returns measurements of scenes and of :func:`find_adversarial_worst` as plain data for JSON."""
+    return {
+        "benchmark": "paper",
+        "quick": quick,
+        "methods": list(METHODS),
+        "ipc_toolkit": ipc_toolkit.version() if any(found.ipc_toolkit for found in benchmarks) else None,
+        "scenes": [found.to_dict() for found in benchmarks],
+        "adversarial": [{"place": place.name, "worst": _worst_to_dict(worst)} for place, worst in adversarial],
+    }
+
+
+def _worst_to_dict(worst: dict[str, WorstQuery]) -> dict[str, Any]:
+    return {method: query.to_dict() for method, query in worst.items()}
 
 
 def find_places(devices: list[wp.Device]) -> list[Place]:
@@ -256,7 +300,7 @@ def _gather(
     elements, pairs = ({kind: [] for kind in PairKind} for _ in range(2))
     vertices = overlapping = 0
     for _, scene in intervals:
-        found = _find_overlapping(scene, device)
+        found = find_overlapping(scene, device)
         number = sum(len(kind_pairs) for _, kind_pairs in found.values())
         overlapping += number
         share = min(1.0, max_queries / len(intervals) / max(number, 1))
@@ -274,21 +318,6 @@ def _gather(
         kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in PairKind
     }
     return {kind: found for kind, found in queries.items() if len(found)}, overlapping
-
-
-def _find_overlapping(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
-    """Returns the vertices of the elements, and the pairs whose swept boxes overlap, by kind."""
-    mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
-    pipeline = DetectionPipeline(mesh)
-    x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))
-    retry_until_fits(lambda: pipeline.find_overlapping(x0, x1), pipeline, mesh.device)
-    queued = pipeline.counts.vertex_face.queued, pipeline.counts.edge_edge.queued
-    found = {}
-    for narrow_phase, count, elements in zip(pipeline.narrow_phases, queued, (mesh.faces, mesh.edges), strict=True):
-        pairs = narrow_phase.queue.numpy()[:count]
-        # a GPU finds them in an order that varies
-        found[narrow_phase.kind] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-    return found
 
 
 def _find_hits(
@@ -345,14 +374,6 @@ def _compare(
     return errors, collisions, checked, sample, truths
 
 
-def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
-    """Returns the mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
-    if place.cores == 1:
-        with cores(1):
-            return _time_methods_here(queries, place, effort, worst=True)
-    return _time_methods_here(queries, place, effort, worst=place.device.is_cuda)
-
-
 def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Place, dict[str, WorstQuery]]]:
     """Finds the slowest adversarial query of each method, on one core and on GPUs.
 
@@ -364,7 +385,7 @@ def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Pl
     for place in places:
         if place.cores in (1, None):
             queries = [adversarial_queries(kind, effort.adversaries) for kind in PairKind]
-            with cores(1) if place.cores == 1 else contextlib.nullcontext():
+            with place.limited():
                 found.append((place, _find_slowest(queries, place, effort)))
     return found
 
@@ -379,21 +400,24 @@ def _find_slowest(queries: Iterable[Queries], place: Place, effort: Effort) -> d
     return slowest
 
 
-def _time_methods_here(queries: dict[PairKind, Queries], place: Place, effort: Effort, *, worst: bool) -> Timing:
+def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
+    """Returns the mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
     total = sum(map(len, queries.values()))
     nanoseconds = dict.fromkeys(METHODS, 0.0)
-    for found in queries.values():
-        repeated = -(-(_GPU_QUERIES if place.device.is_cuda else _CPU_QUERIES) // len(found))
-        on_device = QuerySet(found, place.device, repeated=repeated)
-        runs = {method: MethodRun(method, on_device) for method in METHODS}
-        # in turns; the fastest counts, as other work on the machine can only slow a turn down
-        repeat = -(-effort.repeat // _TURNS)
-        took = [
-            {method: measure_nanoseconds(run, repeat=repeat) for method, run in runs.items()} for _ in range(_TURNS)
-        ]
-        for method in METHODS:
-            nanoseconds[method] += min(turn[method] for turn in took) * len(found) / total
-    return Timing(place, nanoseconds, _find_slowest(queries.values(), place, effort) if worst else {})
+    with place.limited():
+        for found in queries.values():
+            repeated = -(-(_GPU_QUERIES if place.device.is_cuda else _CPU_QUERIES) // len(found))
+            on_device = QuerySet(found, place.device, repeated=repeated)
+            runs = {method: MethodRun(method, on_device) for method in METHODS}
+            # in turns; the fastest counts, as other work on the machine can only slow a turn down
+            repeat = -(-effort.repeat // _TURNS)
+            took = [
+                {method: measure_nanoseconds(run, repeat=repeat) for method, run in runs.items()} for _ in range(_TURNS)
+            ]
+            for method in METHODS:
+                nanoseconds[method] += min(turn[method] for turn in took) * len(found) / total
+        worst = _find_slowest(queries.values(), place, effort) if place.cores in (1, None) else {}
+    return Timing(place, nanoseconds, worst)
 
 
 def _time_ipc_toolkit(

@@ -7,15 +7,19 @@ import contextlib
 import io
 import math
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ..record import version_of
+from ..record import Run, version_of
+from ..tables import Column, Table, count, grouped
 
 __all__ = [
+    "DESCRIPTION",
+    "EXAMPLES",
     "FRAME_RATE",
     "SCENES",
     "SIMULATORS",
@@ -24,6 +28,7 @@ __all__ = [
     "PenetrationRun",
     "Simulator",
     "measure_penetration",
+    "show",
 ]
 
 SCENES = {
@@ -131,6 +136,41 @@ SIMULATORS = {
 }
 """The simulators by the names of the command."""
 
+_LINES = "\n".join(f"  {name:18}{simulator.title}" for name, simulator in SIMULATORS.items())
+
+DESCRIPTION = f"""\
+Run the same scenes through several simulators, each with the settings that its
+own examples or documentation recommend, and judge each by exact detection on
+its states: edges that pass through faces at frame ends, of cloth and soft
+bodies with themselves, each other and fixed shapes; pairs that meet on the way
+from each state to the next, where the motion passes through; tetrahedra that
+are inverted. A row also has the share of its speed that a freely flying body
+keeps before it meets anything, the largest stretch of an edge, and the time of
+a step. MuJoCo runs on the CPU, libuipc on a GPU, Newton's solvers on --device.
+The simulators:
+{_LINES}
+SolverCCD and SolverImplicit have their default arguments. A simulator that is
+not installed or cannot run a scene is a row, and a line below says why."""
+
+EXAMPLES = f"""\
+scenes:
+{chr(10).join(f"  {name:8}{text}" for name, text in SCENES.items())}
+
+examples:
+  warp-bsc bench penetration
+  warp-bsc bench penetration --scene bullet,twist --simulator vbd,ccd-vbd
+  warp-bsc bench penetration --device cuda:0 --json penetration.json"""
+
+_COLUMNS = (
+    Column("Cross-\nings\nworst", lambda took: max(took["crossings"]), width=6),
+    Column("\n\nsum", lambda took: sum(took["crossings"]), width=9),
+    Column("Met\non the\nway", "collisions", width=10),
+    Column("In-\nver-\nted", lambda took: max(took["inverted"]), width=5),
+    Column("Speed\nkept\n[%]", "speed_kept", lambda share: f"{100.0 * share:.1f}", width=5),
+    Column("Stretch\n\n[%]", "stretch", ",.1f", width=9),
+    Column("Step\n\n[ms]", "milliseconds.median", ",.2f", width=8),
+)
+
 
 @dataclass(frozen=True)
 class PenetrationMeasurement:
@@ -171,22 +211,22 @@ class PenetrationMeasurement:
     uncertified_steps: int | None
     milliseconds: tuple[float, float]
 
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurement as plain data for JSON."""
+        return asdict(self) | {"milliseconds": dict(zip(("median", "mean"), self.milliseconds, strict=True))}
+
 
 @dataclass(frozen=True)
-class PenetrationRun:
+class PenetrationRun(Run):
     """A run of a scene with a simulator.
 
     Attributes:
         scene: A key of :data:`SCENES`.
         simulator: A key of :data:`SIMULATORS`.
-        measured: The measurement; None if there is none.
-        problem: Why there is no measurement; None if there is one.
     """
 
     scene: str
     simulator: str
-    measured: PenetrationMeasurement | None = None
-    problem: str | None = None
 
 
 def measure_penetration(
@@ -295,3 +335,29 @@ def _speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
     gravity = built.scene.model.gravity.numpy().reshape(-1, 3)[0].astype(float)
     free = flight * t + 0.5 * gravity * t * t
     return float((last - first) @ free / (free @ free))
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the tables of the JSON of a measurement, one for each scene, a row a simulator; versions and claims."""
+    runs, device = found["runs"], f"{found['device']}, {found['device_name']}"
+    yield f"Penetration, Newton's solvers on {device}; medians of a step without the first {found['steps_left_out']}"
+    for scene, group in grouped(runs, "scene").items():
+        yield ""
+        rows = [(SIMULATORS[run["simulator"]].title, run["measured"]) for run in group]
+        yield Table(Column(scene, width=20, kind="text"), _COLUMNS, rows)
+        if sizes := next((took for _, took in rows if took), None):
+            parts = (count(sizes[f"{name}s"], name) for name in ("particle", "triangle", "frame"))
+            yield f"{SCENES[scene].capitalize()}: {', '.join(parts)}"
+        for run, (title, took) in zip(group, rows, strict=True):
+            if took is None:
+                yield f"{title}: not run: {run['problem']}"
+            elif took["uncertified_steps"]:
+                yield f"{title}: {count(took['uncertified_steps'], 'step')} of {took['steps']:,} not certified"
+    yield ""
+    yield "Crossings: edges through faces at frame ends, in the worst frame and in all together."
+    yield "Met on the way: pairs that meet on the straight way from a state to the next, in all steps."
+    yield "Inverted: tetrahedra in the worst frame. Speed kept: of a free flight before anything is met."
+    for name, group in grouped((run for run in runs if run["measured"]), "simulator").items():
+        simulator, version = SIMULATORS[name], group[0]["measured"]["version"]
+        claims = f"claims: {simulator.claims}" if simulator.claims else "claims nothing of penetration"
+        yield f"{simulator.title}: {simulator.package} {version}; {simulator.settings}; {claims}."

@@ -1,7 +1,9 @@
 """Measures how many elementary queries a second are decided; queries and results stay on the device."""
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,39 +22,59 @@ from ...kernels.pipeline.queues import take_slot
 from ...kernels.polynomials import coplanarity
 from ...kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ...kernels.time_of_impact import impact
+from ..record import name_place
+from ..scenes.queries import generate_queries, generate_touching_queries
+from ..tables import Column, Table, count
 from ..timing import median_milliseconds
 
 __all__ = [
+    "DESCRIPTION",
+    "EXAMPLES",
     "MODES",
-    "SEED",
     "QueryBenchmark",
     "benchmark_copy",
     "benchmark_queries",
     "check_query_count",
-    "generate_queries",
-    "generate_touching_queries",
+    "show",
 ]
+
+DESCRIPTION = """\
+Measure how many elementary queries a second are decided. The queries are
+random and the same on every device; a third of them survive the culls. Queries
+and results stay on the device. On a GPU, replays of a CUDA graph are timed by
+events. With files of queries, measure the time that each method takes for one
+of them, beside a floating-point cubic solver."""
+
+EXAMPLES = """\
+examples:
+  warp-bsc bench queries
+  warp-bsc bench queries --device cpu --threads 1 --count 1000000
+  warp-bsc bench queries unit-tests 227vf.csv --device cpu --threads 1
+  warp-bsc bench queries --json rates.json"""
 
 MODES = {"status": 96 + 1, "impact": 96 + 57, "queued": 96 + 1, "exact": 96 + 1, "function": 96 + 58}
 """The modes that are measured, with the bytes of a query and its result.
 
-- ``status``: finds the status, one thread a query.
-- ``impact``: finds the time of impact, coordinates and normal as well.
-- ``queued``: finds the status by two kernels: one culls, the other decides the survivors.
-- ``exact``: finds the status by exact integers of one limb a coordinate, for as many queries that floating point cannot
-  certify.
-- ``function``: what a program calls: :func:`warp_bsc.query_vertex_face` or :func:`warp_bsc.query_edge_edge` with
-  ``out=``, method "exact": hit, status, time of impact, coordinates and normal.
+See the last lines of :func:`show`. ``exact`` has integers of one limb a coordinate, for as many queries that floating
+point cannot certify; ``function`` finds hit, status, time of impact, coordinates and normal.
 """
 
-SEED = 0
-"""Seed of the random numbers."""
+_RESULTS = (
+    Column("Queries", "queries"),
+    Column("Survivors", "survivors"),
+    Column("Share", "survivor_share", ".1%"),
+    *(Column(name.capitalize(), f"certified.{name}") for name in ("free", "hit", "unsure")),
+)
+_RATES = (
+    Column("ms", "milliseconds", ",.2f"),
+    Column("Million\nqueries/s", lambda took: took["queries_per_second"] / 1e6, ",.1f"),
+    Column("Bytes\na query", "bytes_per_query"),
+    Column("GB/s", lambda took: took["bytes_per_second"] / 1e9, ",.1f"),
+    Column("Share of\ncopying", "share_of_copy", ".1%"),
+)
 
 _MAX_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
-_MISSES = {PairKind.VERTEX_FACE: 1.32, PairKind.EDGE_EDGE: 2.33}
-"""The largest distance along an axis by which features that fly at each other miss; a third of the queries survive the
-culls."""
 
 
 @dataclass(frozen=True)
@@ -101,58 +123,25 @@ class QueryBenchmark:
         """Bytes of queries read and of results written, by mode [1/s]."""
         return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
 
-
-@wp.kernel(**NO_FUSED_OPERATIONS)
-def _generate_queries(
-    first: int,
-    # in
-    seed: int,
-    miss: float,
-    first_points: int,
-    # out
-    points: wp.array2d[wp.vec3],
-):
-    """Writes two features of unit size that fly at each other from a random distance and deform a little."""
-    i = first + wp.tid()
-    random = wp.rand_init(seed, i)
-    apart = 2.0 * wp.sample_unit_cube(random)
-    relative = 2.0 * miss * wp.sample_unit_cube(random) - 2.0 * apart
-    for j in range(4):
-        point = wp.sample_unit_cube(random)
-        motion = 0.25 * wp.sample_unit_cube(random)
-        if j >= first_points:
-            point = point + apart
-            motion = motion + relative
-        points[i, j] = point
-        points[i, 4 + j] = point + motion
-
-
-@wp.func
-def _rounded(x: wp.vec3) -> wp.vec3:
-    """Returns the nearest multiples of 2^-8."""
-    return wp.vec3(wp.round(256.0 * x[0]), wp.round(256.0 * x[1]), wp.round(256.0 * x[2])) / 256.0
-
-
-@wp.kernel(**NO_FUSED_OPERATIONS)
-def _make_touch(
-    first: int,
-    # in
-    other: int,
-    # in and out
-    points: wp.array2d[wp.vec3],
-):
-    """Moves the first point of each query onto the edge from point ``other`` to the next, at half time.
-
-    After rounding, all numbers are small multiples of 2^-11, so that this is exact.
-    """
-    i = first + wp.tid()
-    for j in range(8):
-        points[i, j] = _rounded(points[i, j])
-    start = 3.0 * points[i, other] + points[i, other + 1]
-    end = 3.0 * points[i, other + 4] + points[i, other + 5]
-    gap = 0.5 * (points[i, 0] + points[i, 4]) - 0.125 * (start + end)
-    points[i, 0] = points[i, 0] - gap
-    points[i, 4] = points[i, 4] - gap
+    def to_dict(self, copy_rate: float) -> dict[str, Any]:
+        """Returns the results as plain data for JSON, given the rate of :func:`benchmark_copy`."""
+        return {
+            "kind": self.kind.display_name,
+            "queries": len(self.status),
+            "survivors": self.survivors,
+            "survivor_share": self.survivor_share,
+            "certified": {"free": self.free, "hit": self.hits, "unsure": self.unsure},
+            "modes": {
+                mode: {
+                    "milliseconds": milliseconds,
+                    "queries_per_second": self.queries_per_second[mode],
+                    "bytes_per_query": MODES[mode],
+                    "bytes_per_second": self.bytes_per_second[mode],
+                    "share_of_copy": self.bytes_per_second[mode] / copy_rate,
+                }
+                for mode, milliseconds in self.milliseconds.items()
+            },
+        }
 
 
 @functools.cache
@@ -276,36 +265,6 @@ def check_query_count(count: int) -> None:
         raise ValueError(f"count must be in [1, {_MAX_QUERIES}], not {count}")
 
 
-def generate_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
-    """Returns random queries, the same on every device; a larger number begins with the queries of a smaller one.
-
-    Args:
-        kind: Kind of pair.
-        count: Number of queries.
-        device: Warp device; default: Warp's default.
-
-    Returns:
-        Positions, rows as of :func:`warp_bsc.query_vertex_face` or :func:`warp_bsc.query_edge_edge`, array of vec3,
-        shape [count, 8].
-    """
-    device = wp.get_device(device)
-    points = wp.empty((count, 8), dtype=wp.vec3, device=device)
-    inputs = [SEED, _MISSES[kind], 1 if kind == PairKind.VERTEX_FACE else 2]
-    launch_over(_generate_queries, count, inputs=inputs, outputs=[points], device=device)
-    return points
-
-
-def generate_touching_queries(kind: PairKind, count: int, *, device: wp.DeviceLike = None) -> wp.array:
-    """Returns random queries whose first point touches an edge at half time: floating point can certify almost none.
-
-    Arguments and result: as of :func:`generate_queries`, whose queries they are made from.
-    """
-    points = generate_queries(kind, count, device=device)
-    other = 1 if kind == PairKind.VERTEX_FACE else 2
-    launch_over(_make_touch, count, inputs=[other], outputs=[points], device=points.device)
-    return points
-
-
 def benchmark_queries(
     kind: PairKind, *, count: int | None = None, device: wp.DeviceLike = None, repeat: int = 20
 ) -> QueryBenchmark:
@@ -395,3 +354,20 @@ def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
     target = wp.empty_like(source)
     milliseconds = median_milliseconds(lambda: wp.copy(target, source), device, repeat)
     return 2e3 * _COPIED_BYTES / milliseconds
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the tables of the JSON of a measurement: results, and how many queries a second were decided."""
+    yield f"Random queries on {name_place(found)}; medians of {count(found['repeat'], 'repetition')}"
+    rows = [(row["kind"], row) for row in found["kinds"]]
+    yield Table("Kind", _RESULTS, rows, caption="Survivors: queries that no cull decides.")
+    yield ""
+    modes = [(f"{kind}, {mode}", took) for kind, row in rows for mode, took in row["modes"].items()]
+    yield Table("Mode", _RATES, modes)
+    yield ""
+    yield "status: finds the status of each query, in one kernel."
+    yield "impact: finds the time of impact, coordinates and normal as well."
+    yield "queued: finds the status by two kernels: culls, and a decision of the survivors."
+    yield "exact: finds the status in integers, where floating point cannot certify it."
+    yield "function: query_vertex_face or query_edge_edge with out=, exact, with times."
+    yield f"A copy on this device reads and writes {found['copy_bytes_per_second'] / 1e9:,.1f} GB/s."

@@ -7,17 +7,22 @@ import contextlib
 import io
 import math
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from ..record import Run
+from ..tables import Column, Table, count, grouped, in_thousands
+
 __all__ = [
     "CONFIGURATIONS",
     "CONVERGED",
+    "DESCRIPTION",
     "EARLY_STEPS",
+    "EXAMPLES",
     "REFERENCE",
     "REFERENCE_RATE",
     "SCENES",
@@ -28,6 +33,8 @@ __all__ = [
     "ResponseRun",
     "Spread",
     "measure_response",
+    "show",
+    "to_dict",
 ]
 
 SCENES = (
@@ -76,6 +83,50 @@ WARM_UP = 2
 
 EARLY_STEPS = 48
 """Steps after which positions are compared with those of :data:`CONVERGED`."""
+
+DESCRIPTION = f"""\
+Run scenes in which cloth, soft bodies, ropes and a ball touch, at 1/60 s, and
+measure what each configuration of a solver and the collision stage makes of
+them: the largest stretch of an edge, at the end and at most; the speed at rest;
+the energy that is gained behind VBD, where nothing does work, with that of
+elastic strain; the edges that cross faces at the end, and the pairs that meet
+on the straight way of a step, found in exact arithmetic; the time of a step, on
+a GPU in a CUDA graph; and the steps that were not certified. The balls take steps of 1/120 s.
+The configurations:
+  plain           the solver with Newton's contacts
+  self-contact    the same with VBD's own contacts between particles
+  stage           SolverCCD with default arguments, without Newton's contacts
+  stage+contacts  the same with Newton's contacts
+  implicit        SolverImplicit with default arguments, in place of VBD
+  converged       the same with as many Newton steps as a step needs
+  reference       SolverCCD at a small step: slow
+Ropes have particle_radius, without which nothing collides with springs. The
+semi-implicit solver takes {SEMI_IMPLICIT_STEPS} times as many steps in all configurations, unless
+--rate is given. A scene that the solver cannot run is a row, and a line below
+says why."""
+
+EXAMPLES = f"""\
+scenes:
+  {" ".join(SCENES[:8])}
+  {" ".join(SCENES[8:])}
+
+examples:
+  warp-bsc bench response --no-reference
+  warp-bsc bench response box_edge --rate 240 --no-reference
+  warp-bsc bench response sphere box_edge --device cuda:0
+  warp-bsc bench response sphere --configurations stage --perturb 1e-6
+  warp-bsc bench response --solver xpbd --json response.json"""
+
+_COLUMNS = (
+    Column("Stretch\nat end\n[%]", "stretch_at_end", in_thousands(2), width=7),
+    Column("at\nmost\n[%]", "stretch_at_most", in_thousands(2), width=7),
+    Column("Speed\nat end\n[mm/s]", "rest_speed", in_thousands(1), width=6),
+    Column("Energy\ngained\n[J]", "energy_gained", ",.4f", width=7),
+    Column("Cross-\nings", "crossings", width=6),
+    Column("Pairs\nmeet", "collisions", width=6),
+    Column("A step:\nmedian\n[ms]", "milliseconds.median", in_thousands(2), width=7),
+    Column("\nmean\n[ms]", "milliseconds.mean", in_thousands(2), width=6),
+)  # 80 columns with the first one and the gaps
 
 _STAGES: dict[str, dict[str, Any]] = {"stage": {}, "stage+contacts": {}, REFERENCE: {}}
 """Arguments of the stage by configuration."""
@@ -148,34 +199,27 @@ class ResponseMeasurement:
             return None
         return 1e3 * float(np.linalg.norm(self.early - other.early, axis=1).mean())
 
-    @property
-    def median(self) -> float:
-        """Median time of a step [ms]."""
-        return float(np.median(self.milliseconds))
-
-    @property
-    def mean(self) -> float:
-        """Mean time of a step [ms]."""
-        return float(np.mean(self.milliseconds))
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurement as plain data for JSON."""
+        values, took = asdict(self), self.milliseconds
+        del values["early"]
+        times = {"median": float(np.median(took)), "mean": float(np.mean(took)), "worst": max(took)}
+        return values | {"milliseconds": times}
 
 
 @dataclass(frozen=True)
-class ResponseRun:
+class ResponseRun(Run):
     """A run of a scene in a configuration.
 
     Attributes:
         scene: One of :data:`SCENES`.
         solver: One of :data:`SOLVERS`.
         configuration: One of :data:`CONFIGURATIONS`.
-        measured: The measurement; None if there is none.
-        problem: Why there is no measurement; None if there is one.
     """
 
     scene: str
     solver: str
     configuration: str
-    measured: ResponseMeasurement | None = None
-    problem: str | None = None
 
 
 def measure_response(
@@ -310,3 +354,48 @@ def _measure(
         milliseconds=simulation.milliseconds[WARM_UP:],
         early=samples.early,
     )
+
+
+def to_dict(runs: list[ResponseRun]) -> list[dict[str, Any]]:
+    """Returns runs as plain data for JSON, with how far particles are from those of the converged run [mm]."""
+    converged = {run.scene: run.measured for run in runs if run.configuration == CONVERGED and run.measured}
+    return [
+        run.to_dict() | {"from_converged": run.measured.distance_from(other) if run.measured and other else None}
+        for run in runs
+        for other in [converged.get(run.scene)]
+    ]
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the tables of the JSON of a measurement, one for each scene, a row a run; why runs are missing."""
+    device = f"{found['device']}, {found['device_name']}"
+    yield f"Contact on {device}; times of a step without the first {found['steps_left_out']}"
+    for scene, runs in grouped(found["runs"], "scene").items():
+        yield ""
+        first = Column(f"{scene}\n{runs[0]['solver']}", width=14, kind="text")
+        yield Table(first, _COLUMNS, [(run["configuration"], run["measured"]) for run in runs])
+        yield from _describe(runs)
+
+
+def _describe(runs: list[dict[str, Any]]) -> Iterator[str]:
+    """Yields the lines below the table of a scene."""
+    if measured := [run["measured"] for run in runs if run["measured"]]:
+        steps = dict.fromkeys(f"{count(took['steps'], 'step')} of 1/{took['rate']} s" for took in measured)
+        sizes = (count(measured[0][f"{name}s"], name) for name in ("particle", "triangle"))
+        yield ", ".join([*sizes, " or ".join(steps)])
+    for run in runs:
+        name, took = run["configuration"], run["measured"]
+        if took is None:
+            yield f"{name}: not run: {run['problem']}"
+            continue
+        if took["uncertified_steps"]:
+            yield f"{name}: {count(took['uncertified_steps'], 'step')} not certified"
+        if spread := took["spread"]:
+            yield (
+                f"{name}, moved by {spread['distance']:g} m: stretch differs by "
+                f"{spread['stretch_at_end']:.2f} at the end, {spread['stretch_at_most']:.2f} at most"
+            )
+    distances = {run["configuration"]: run["from_converged"] for run in runs}
+    shown = [f"{name} {mm:.2f}" for name, mm in distances.items() if mm is not None and name != CONVERGED]
+    if shown:
+        yield f"Mean distance from {CONVERGED} after {EARLY_STEPS} steps [mm]: {', '.join(shown)}"

@@ -7,6 +7,7 @@ On a GPU the copies fill the device, so that all threads of a warp have the same
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -40,6 +41,11 @@ class WorstQuery:
     index: int
     points: np.ndarray
     nanoseconds: dict[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the query as plain data for JSON."""
+        own = {"kind": self.kind.label, "number": self.index, "points": self.points.tolist()}
+        return own | {"nanoseconds": self.nanoseconds}
 
 
 def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str, WorstQuery]:

@@ -6,7 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
+from ...detection.mesh import CollisionMesh
+from ...detection.pipeline import DetectionPipeline
+from ...detection.run.launch import retry_until_fits
+from ...detection.run.settings import PairKind
 from ...usd.scene import Scene
 from .mesh_files import read_mesh
 
@@ -15,6 +20,7 @@ __all__ = [
     "PAPER_SCENES",
     "BenchmarkScene",
     "default_scenes",
+    "find_overlapping",
     "generate_cloth",
     "generate_crash",
     "is_scene_name",
@@ -141,6 +147,21 @@ def load_intervals(name: str, *, most: int) -> list[tuple[int, BenchmarkScene]]:
         motion = scene.interval(index)
         intervals.append((index, BenchmarkScene(name, motion.segment.faces, motion.x0, motion.x1)))
     return intervals
+
+
+def find_overlapping(scene: BenchmarkScene, device: wp.Device) -> dict[PairKind, tuple[np.ndarray, np.ndarray]]:
+    """Returns the vertices of the elements, and the pairs whose swept boxes overlap, by kind."""
+    mesh = CollisionMesh(scene.faces, len(scene.x0), device=device)
+    pipeline = DetectionPipeline(mesh)
+    x0, x1 = (mesh.device_positions(x, name) for x, name in ((scene.x0, "x0"), (scene.x1, "x1")))
+    retry_until_fits(lambda: pipeline.find_overlapping(x0, x1), pipeline, mesh.device)
+    queued = pipeline.counts.vertex_face.queued, pipeline.counts.edge_edge.queued
+    found = {}
+    for narrow_phase, count, elements in zip(pipeline.narrow_phases, queued, (mesh.faces, mesh.edges), strict=True):
+        pairs = narrow_phase.queue.numpy()[:count]
+        # a GPU finds them in an order that varies
+        found[narrow_phase.kind] = elements, pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    return found
 
 
 def _find_generator(name: str, generator: str, triangles: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
