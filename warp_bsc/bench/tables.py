@@ -18,8 +18,8 @@ class Column:
 
     Attributes:
         header: Its header, shown as it is: markup would take "[s]" for a style.
-        value: Key or attribute of a row that it shows, with dots for one of a value; or a function of a row.
-        format: Format specification of the value, or a function that returns its text. None is an empty cell.
+        value: Key, number or attribute of a row, with dots for one of that; or a function of a row.
+        format: Format specification of the value, or a function that returns its text; not of texts and None.
         width: Least width on a terminal.
         kind: Numbers are on the right and do not wrap, words are on the left and do not wrap, text may wrap.
         title: Its header in pages, if that is another one.
@@ -36,15 +36,15 @@ class Column:
 
     def cell(self, row: Any, *, page: bool = False) -> str:
         """Returns the text of the cell in a row, in a page or on a terminal; empty in a row that is None."""
-        if callable(self.value):
-            row = None if row is None else self.value(row)
-        else:
-            for name in self.value.split("."):
-                row = None if row is None else row[name] if isinstance(row, dict) else getattr(row, name)
-        if row is None:
-            return ""
+        value = row
+        for part in [self.value] if callable(self.value) else self.value.split("."):
+            if value is None:
+                return ""
+            value = part(value) if callable(part) else _part(value, part)
         written = self.page_format if page and self.page_format is not None else self.format
-        return written(row) if callable(written) else format(row, written)
+        if value is None or isinstance(value, str):
+            return value or ""
+        return written(value) if callable(written) else format(value, written)
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,12 @@ class Table:
     columns: Sequence[Column]
     rows: Iterable[tuple[str, Any]]
     caption: str | None = None
+
+
+def _part(row: Any, name: str) -> Any:
+    if isinstance(row, dict):
+        return row[name]
+    return row[int(name)] if isinstance(row, (list, tuple)) else getattr(row, name)
 
 
 def markdown(first: str, columns: Iterable[Column], rows: Iterable[tuple[str, Any]]) -> list[tuple[str, ...]]:

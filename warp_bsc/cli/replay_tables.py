@@ -25,7 +25,7 @@ _POSITION = [
 ]
 _WORST = (
     Column("Collisions", "hits"),
-    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), "", kind="text"),
+    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), kind="text"),
     Column("At", lambda interval: round(interval.earliest.time, 6), ".6g"),
 )
 _NEAREST = (Column("Distance", "distance", ".6g"), Column("Time", "time", "g"), *_POSITION)

@@ -21,7 +21,15 @@ from ..scenes.detector import BenchmarkScene
 from ..tables import Column, Table, count
 from ..timing import replay_graph
 
-__all__ = ["DESCRIPTION", "EXAMPLES", "DetectorBenchmark", "benchmark_detector", "show", "stage_columns"]
+__all__ = [
+    "DESCRIPTION",
+    "EXAMPLES",
+    "DetectorBenchmark",
+    "benchmark_detector",
+    "ipc_milliseconds",
+    "show",
+    "stage_columns",
+]
 
 DESCRIPTION = """\
 Measure the detector, from positions on the device to results on the device and

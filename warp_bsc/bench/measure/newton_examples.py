@@ -67,17 +67,17 @@ examples:
   warp-bsc bench newton --json examples.json"""
 
 _NEEDS = (
-    Column("Folder", lambda example: example.module.split(".")[2], "", kind="text"),
-    Column("Needs", lambda example: "; ".join(describe_needs(example)), "", kind="text"),
+    Column("Folder", lambda example: example.module.split(".")[2], kind="text"),
+    Column("Needs", lambda example: "; ".join(describe_needs(example)), kind="text"),
 )
 _TIMES = (
-    Column("Mode", "mode", "", kind="word"),
+    Column("Mode", "mode", kind="word"),
     Column("Median\n[ms]", "measured.milliseconds.median", ",.1f"),
     Column("95%\n[ms]", "measured.milliseconds.percentile_95", ",.1f"),
     Column("Worst\n[ms]", "measured.milliseconds.worst", ",.1f"),
     Column("Cross-\nings at\nstart", "measured.crossings_at_start"),
     Column("At\nmost", "measured.most_crossings"),
-    Column("Its tests", lambda run: _name_result(run["measured"]), "", kind="word"),
+    Column("Its tests", lambda run: _name_result(run["measured"]), kind="word"),
 )
 _SIZES = (
     Column("Partic-\nles", "particles"),

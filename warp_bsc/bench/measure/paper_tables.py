@@ -73,7 +73,7 @@ _SLOWEST = _method_columns(  # of the slowest query of each method
     lambda worst, method: worst[method]["nanoseconds"][method], _few_digits, {"cubic": "cubic /\nfloat"}
 )
 _SLOWEST_OF_ALL = (
-    Column("Kind", lambda query: next(kind.display_name for kind in PairKind if kind.label == query["kind"]), ""),
+    Column("Kind", lambda query: next(kind.display_name for kind in PairKind if kind.label == query["kind"])),
     Column("Number", "number", ""),
     *_method_columns(lambda query, method: query["nanoseconds"][method], _few_digits),
 )

@@ -14,7 +14,7 @@ from ...repair.repair import repair
 from ...repair.results import RepairResult
 from ..peers import ipc_toolkit
 from ..scenes.repair import KINDS, TangledMesh
-from ..tables import LONGEST, Column, Table, count, grouped, list_titles
+from ..tables import LONGEST, Column, Table, count, grouped, list_titles, two
 
 __all__ = [
     "CROSSING_RANGES",
@@ -23,6 +23,8 @@ __all__ = [
     "FILE",
     "HINTS",
     "KNOWN_MESH",
+    "PAGE_COSTS",
+    "PAGE_MESHES",
     "STRAIN",
     "DamageSummary",
     "Hint",
@@ -69,28 +71,45 @@ examples:
   warp-bsc bench repair --kinds folds --random 1 --seed 17"""
 
 _MESHES = (  # of a run and an attempt; the mean move is that of vertices that moved
-    Column("Ver-\ntices", lambda row: row[0].vertices),
-    Column("Crossings\nbefore", lambda row: row[0].crossings),
-    Column("\nafter", lambda row: row[1].crossings),
-    Column("Largest\nmove", lambda row: row[1].largest_move, ".2f"),
-    Column("Mean\nmove", lambda row: row[1].mean_move, ".2f"),
+    Column("Ver-\ntices", "0.vertices"),
+    Column("Crossings\nbefore", "0.crossings"),
+    Column("\nafter", "1.crossings"),
+    Column("Largest\nmove", "1.largest_move", ".2f"),
+    Column("Mean\nmove", "1.mean_move", ".2f"),
     Column("Strain\n[%]", lambda row: 100 * row[1].strain, ".1f"),
-    Column("Time\n[s]", lambda row: row[1].seconds, ".2f"),
+    Column("Time\n[s]", "1.seconds", ".2f"),
 )
+PAGE_MESHES = (
+    Column("vertices", "0.vertices"),
+    Column("crossings", lambda row: f"{row[0].crossings:,} to {row[1].crossings:,}"),
+    Column("largest, mean move", lambda row: f"{two(row[1].largest_move)}, {two(row[1].mean_move)}"),
+    Column("strain", "1.strain", lambda strain: f"{two(100.0 * strain)}%"),
+    Column("time", "1.seconds", "{:.2f} s".format),
+)
+"""Columns of a run and an attempt, in pages."""
 _FREED = (  # of a summary, as the next ones
     Column("Meshes", "meshes"),
     Column("Freed", "freed"),
     *(Column(f"with\n{hint}=", f"freed_by_hint.{hint}") for hint in HINTS),
-    Column("Crossings", "crossings", lambda ends: f"{ends[0]:,} to {ends[1]:,}"),
+    Column("Crossings", "crossings", "{0[0]:,} to {0[1]:,}".format),
 )
 _COSTS = (
-    Column("Largest move,\nmedian", lambda found: found.move[0], ".2f"),
-    Column("at\nmost", lambda found: found.move[1], ".2f"),
+    Column("Largest move,\nmedian", "move.0", ".2f"),
+    Column("at\nmost", "move.1", ".2f"),
     Column("Strain,\nmedian\n[%]", lambda found: 100 * found.strain[0], ".1f"),
     Column("at\nmost\n[%]", lambda found: 100 * found.strain[1], ".1f"),
     Column(f"more\nthan\n{100 * STRAIN:.0f}%", "strained"),
     Column("Time,\nmedian\n[s]", "seconds", ".2f"),
 )
+PAGE_COSTS = (
+    Column("freed", lambda found: f"{found.freed} of {found.meshes}"),
+    Column("crossings", "crossings", "{0[0]:,} to {0[1]:,}".format),
+    Column("largest move, median and most", "move", lambda ends: ", ".join(map(two, ends))),
+    Column("strain, median and most", "strain", lambda ends: f"{two(100.0 * ends[0])}, {two(100.0 * ends[1])}%"),
+    Column(f"more than {100 * STRAIN:.0f}%", "strained"),
+    Column("median time", "seconds", "{:.2f} s".format),
+)
+"""Columns of a :class:`DamageSummary`, in pages."""
 
 
 @dataclass(frozen=True)
