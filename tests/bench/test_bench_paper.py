@@ -15,7 +15,6 @@ from warp_bsc.bench.measure.worst_case import find_worst
 from warp_bsc.bench.peers import ipc_toolkit
 from warp_bsc.bench.peers.ipc_toolkit import time_queries
 from warp_bsc.bench.scenes.detector import load_intervals, load_scene, paper_scenes
-from warp_bsc.cli import bench_paper as bench_command
 from warp_bsc.cli.main import main
 from warp_bsc.detection.run.launch import cores
 from warp_bsc.detection.run.settings import PairKind
@@ -182,5 +181,5 @@ def test_wrong_use(capsys, monkeypatch, tmp_path, arguments, part):
 
 
 def test_figure_needs_matplotlib(capsys, monkeypatch):
-    monkeypatch.setattr(bench_command.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "warp-bsc[bench]" in fail(capsys, "cloth:1000", "--figure", "times.png")

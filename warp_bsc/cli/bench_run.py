@@ -8,8 +8,8 @@ import importlib.util
 import itertools
 import json
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,18 +31,11 @@ from ..bench.measure import (
 )
 from ..bench.peers import ipc_toolkit
 from ..bench.record import with_record
-from ..bench.scenes.detector import (
-    PAPER_SCENES,
-    default_scenes,
-    is_scene_name,
-    load_intervals,
-    load_scene,
-    paper_scenes,
-)
+from ..bench.scenes import detector as scenes_of_detector
 from ..bench.scenes.mesh_files import is_mesh_name
 from ..bench.scenes.queries import SEED
 from ..bench.scenes.repair import KNOWN, damaged, load_tangled
-from ..bench.tables import Table, grouped
+from ..bench.tables import Table
 from ..bench.timing import count_threads, limited_threads
 from ..detection.run.launch import cores
 from ..detection.run.settings import PairKind
@@ -101,11 +94,11 @@ def _report(
     arguments: argparse.Namespace,
     device: wp.Device,
     measured: Generator[_Run, None, None],
-    to_dict: Callable[[list[_Run]], dict[str, Any]],
-    show: Callable[[dict[str, Any]], Iterable[Table | str]],
-    *,
+    module: ModuleType,
     name: str,
+    *,
     what: str = "runs",
+    **settings: Any,
 ) -> None:
     """Measures all runs, prints them, and writes those that were complete if an interrupt ends it.
 
@@ -113,10 +106,10 @@ def _report(
         arguments: The options.
         device: The Warp device.
         measured: Measures a run when its next element is taken.
-        to_dict: Returns runs as plain data for JSON, without what all benchmarks have.
-        show: Yields tables and lines, given the JSON.
+        module: Has ``to_dict``, which makes plain data of runs, and ``show``, which makes tables and lines of that.
         name: Name of the benchmark in JSON.
         what: What runs are called.
+        settings: Further arguments of ``to_dict``.
 
     Raises:
         OSError: If the file of --json cannot be written.
@@ -133,10 +126,10 @@ def _report(
             interrupt = signal
         with INTERRUPTS.held():
             found = {"benchmark": name, "device": str(device), "device_name": device.name, "partial": bool(interrupt)}
-            found |= to_dict(runs)
+            found |= module.to_dict(runs, **settings)
             if arguments.json != STDOUT:
                 ending = [f"Interrupted: the other {what} are missing."] if interrupt else []
-                _draw(itertools.chain(show(found), ending))
+                _draw(itertools.chain(module.show(found), ending))
             write(with_record(found, arguments.command_line, [device]))
         if interrupt:
             raise interrupt
@@ -202,10 +195,14 @@ def run_paper(arguments: argparse.Namespace) -> None:
             raise ValueError(f"--figure {arguments.figure}: its name must end in one of {', '.join(_FIGURES)}")
         if importlib.util.find_spec("matplotlib") is None:
             raise ValueError("--figure needs matplotlib: pip install 'warp-bsc[bench]'")
-    _check_json(arguments.json, is_scene_name, "a scene", "scenes")
+    _check_json(arguments.json, scenes_of_detector.is_scene_name, "a scene", "scenes")
     effort = paper.Effort.quick() if arguments.quick else paper.Effort.full()
-    needs_assets = not arguments.scenes or any(name in PAPER_SCENES for name in arguments.scenes)
-    known = dict(zip(PAPER_SCENES, paper_scenes(), strict=True)) if needs_assets else {}
+    needs_assets = not arguments.scenes or any(name in scenes_of_detector.PAPER_SCENES for name in arguments.scenes)
+    known = (
+        dict(zip(scenes_of_detector.PAPER_SCENES, scenes_of_detector.paper_scenes(), strict=True))
+        if needs_assets
+        else {}
+    )
     names = [known.get(name, name) for name in arguments.scenes or known]
     devices = [find_device(arguments.device)]
     if arguments.device is None:
@@ -213,7 +210,7 @@ def run_paper(arguments: argparse.Namespace) -> None:
     figure = OutputFile(arguments.figure) if arguments.figure else None  # fails before anything is measured
     try:
         with _open_json(arguments.json) as write:
-            scenes = [(name, load_intervals(name, most=effort.intervals)) for name in names]
+            scenes = [(name, scenes_of_detector.load_intervals(name, most=effort.intervals)) for name in names]
             with limited_threads(arguments.threads):
                 places = paper.find_places(devices)
                 benchmarks = _measure_scenes(scenes, places, effort)
@@ -252,10 +249,13 @@ def run_detector(arguments: argparse.Namespace) -> None:
     """Measures the detector."""
     if arguments.compare and arguments.worlds > 1:
         raise ValueError("--compare and --worlds exclude each other: the IPC Toolkit has no worlds")
-    _check_json(arguments.json, is_scene_name, "a scene", "scenes")
+    _check_json(arguments.json, scenes_of_detector.is_scene_name, "a scene", "scenes")
     if arguments.compare and importlib.util.find_spec("ipctk") is None:
         raise ValueError("--compare needs the IPC Toolkit: pip install 'warp-bsc[bench]'")
-    scenes = [load_scene(name, interval=arguments.interval) for name in arguments.scenes or default_scenes()]
+    scenes = [
+        scenes_of_detector.load_scene(name, interval=arguments.interval)
+        for name in arguments.scenes or scenes_of_detector.default_scenes()
+    ]
     scenes = [scene.in_worlds(arguments.worlds) for scene in scenes]
     device = find_device(arguments.device)
     options = {name: getattr(arguments, name) for name in ("method", "repeat", "compare")}
@@ -274,14 +274,7 @@ def run_detector(arguments: argparse.Namespace) -> None:
 
     with limited_threads(arguments.threads):
         settings = {"method": arguments.method, "threads": count_threads(), "repeat": arguments.repeat}
-        _report(
-            arguments,
-            device,
-            measure(),
-            lambda found: settings | {"scenes": [scene.to_dict() for scene in found]},
-            detector.show,
-            name="detector",
-        )
+        _report(arguments, device, measure(), detector, "detector", **settings)
 
 
 def run_queries(arguments: argparse.Namespace) -> None:
@@ -306,20 +299,8 @@ def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
             yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)
 
     copy_rate = queries.benchmark_copy(device=device, repeat=arguments.repeat)
-    settings = {
-        "threads": count_threads(),
-        "repeat": arguments.repeat,
-        "seed": SEED,
-        "copy_bytes_per_second": copy_rate,
-    }
-    _report(
-        arguments,
-        device,
-        measure(),
-        lambda found: settings | {"kinds": [kind.to_dict(copy_rate) for kind in found]},
-        queries.show,
-        name="queries",
-    )
+    settings = {"threads": count_threads(), "repeat": arguments.repeat, "seed": SEED}
+    _report(arguments, device, measure(), queries, "queries", **settings, copy_bytes_per_second=copy_rate)
 
 
 def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> None:
@@ -341,14 +322,7 @@ def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> None:
                 yield measure_kind(Path(path).name, kind, np.concatenate(parts), device=device, repeat=arguments.repeat)
 
     settings = {"threads": threads, "repeat": arguments.repeat}
-    _report(
-        arguments,
-        device,
-        measure(),
-        lambda found: settings | {"queries": [row.to_dict() for row in found]},
-        given_queries.show,
-        name="given queries",
-    )
+    _report(arguments, device, measure(), given_queries, "given queries", **settings)
 
 
 def run_newton(arguments: argparse.Namespace) -> None:
@@ -365,15 +339,7 @@ def run_newton(arguments: argparse.Namespace) -> None:
     options = {name: getattr(arguments, name) for name in ("frames", "check_every", "download")}
     measure = functools.partial(newton_examples.measure_example, device=str(device), **options)
     runs = _measure_each(itertools.product(examples, arguments.modes), measure, device, unit="frame", holds=False)
-    left_out = {"frames_left_out": newton_examples.WARM_UP}
-    _report(
-        arguments,
-        device,
-        runs,
-        lambda found: left_out | {"runs": [run.to_dict() for run in found]},
-        newton_examples.show,
-        name="newton",
-    )
+    _report(arguments, device, runs, newton_examples, "newton")
 
 
 def run_response(arguments: argparse.Namespace) -> None:
@@ -397,14 +363,7 @@ def run_response(arguments: argparse.Namespace) -> None:
     options = {name: getattr(arguments, name) for name in ("solver", "seconds", "rate", "reference_rate", "perturb")}
     measure = functools.partial(response.measure_response, device=device, **options)
     runs = _measure_each(cases, measure, device, unit="step")
-    _report(
-        arguments,
-        device,
-        runs,
-        lambda found: {"steps_left_out": response.WARM_UP, "runs": response.to_dict(found)},
-        response.show,
-        name="response",
-    )
+    _report(arguments, device, runs, response, "response")
 
 
 def run_repair(arguments: argparse.Namespace) -> None:
@@ -422,15 +381,7 @@ def run_repair(arguments: argparse.Namespace) -> None:
         device,
         title=lambda kind, name, make: f"{kind} {name}",
     )
-    _report(
-        arguments,
-        device,
-        runs,
-        lambda found: {"ipc_toolkit": ipc_toolkit.version(), "runs": [asdict(run) for run in found]},
-        repair.show,
-        name="repair",
-        what="repairs",
-    )
+    _report(arguments, device, runs, repair, "repair", what="repairs")
 
 
 def run_penetration(arguments: argparse.Namespace) -> None:
@@ -439,16 +390,4 @@ def run_penetration(arguments: argparse.Namespace) -> None:
     measure = functools.partial(penetration.measure_penetration, device=device, frames=arguments.frames)
     cases = itertools.product(arguments.scene, arguments.simulator)
     runs = _measure_each(cases, measure, device, title=lambda scene, name: f"{scene}, {simulators[name].title}")
-    _report(
-        arguments,
-        device,
-        runs,
-        lambda found: {
-            "steps_left_out": penetration.WARM_UP,
-            "scenes": {name: penetration.SCENES[name] for name in grouped(found, "scene")},
-            "simulators": {name: asdict(simulators[name]) for name in grouped(found, "simulator")},
-            "runs": [run.to_dict() for run in found],
-        },
-        penetration.show,
-        name="penetration",
-    )
+    _report(arguments, device, runs, penetration, "penetration")

@@ -29,6 +29,7 @@ __all__ = [
     "ipc_milliseconds",
     "show",
     "stage_columns",
+    "to_dict",
 ]
 
 DESCRIPTION = """\
@@ -228,10 +229,12 @@ def ipc_milliseconds(took: dict[str, Any]) -> float:
 
 def stage_columns(stages: Iterable[str], key: str) -> list[Column]:
     """Returns columns of the times of the stages of detections, which a row has at a key."""
-    return [
-        Column("\n".join(stage.rsplit(" ", 1)), lambda row, stage=stage: row[key][stage], ",.2f", title=stage)
-        for stage in stages
-    ]
+    return [Column("\n".join(stage.rsplit(" ", 1)), f"{key}.{stage}", ",.2f", title=stage) for stage in stages]
+
+
+def to_dict(benchmarks: list[DetectorBenchmark], **settings: Any) -> dict[str, Any]:
+    """Returns the measurements of scenes as plain data for JSON, with settings."""
+    return settings | {"scenes": [found.to_dict() for found in benchmarks]}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -15,7 +15,7 @@ from ..record import name_place
 from ..tables import Column, Table, count, two
 from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
 
-__all__ = ["COLUMNS", "METHODS", "GivenQueries", "benchmark_given_queries", "show"]
+__all__ = ["COLUMNS", "METHODS", "GivenQueries", "benchmark_given_queries", "show", "to_dict"]
 
 METHODS = (*NARROW_PHASE_METHODS, "cubic")
 """The methods, see :mod:`.methods`."""
@@ -67,10 +67,6 @@ class GivenQueries:
     hits: int
     nanoseconds: dict[str, float]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the measurements as plain data for JSON."""
-        return vars(self) | {"kind": self.kind.display_name}
-
 
 def _nanoseconds(run: MethodRun) -> float:
     """Returns the time of a query in a launch of all queries [ns]."""
@@ -111,6 +107,11 @@ def benchmark_given_queries(
     turns = [{method: _nanoseconds(run) for method, run in runs.items()} for _ in range(repeat)]
     fastest = {method: min(turn[method] for turn in turns) for method in METHODS}
     return GivenQueries(name, kind, len(queries), int(exact.find_hits().sum()), fastest)
+
+
+def to_dict(measured: list[GivenQueries], **settings: Any) -> dict[str, Any]:
+    """Returns measurements as plain data for JSON, with settings."""
+    return settings | {"queries": [vars(found) | {"kind": found.kind.display_name} for found in measured]}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -8,10 +8,10 @@ import newton
 import numpy as np
 import warp as wp
 
-from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
 from ...response.state.mesh import ModelMesh, host_array
 from ...response.strain import edges_at_rest
+from ..crossings import SoftPairs
 from ..scenes.simulation import largest_stretch
 
 __all__ = ["Judge", "Judgement"]
@@ -53,13 +53,10 @@ class Judge:
         mesh = ModelMesh(model)
         if model.body_count or len(mesh.planes.shape):
             raise ValueError("model must have neither bodies nor infinite planes")
-        self._particles = particles = model.particle_count
+        self._particles = model.particle_count
         self._shape_vertices = mesh.shape_vertices.position.astype(np.float64)
         self._mesh = CollisionMesh(mesh.faces, mesh.vertex_count, tets=mesh.tets, device=model.device)
-        self._detector = CollisionDetector(self._mesh, method="exact")
-        self._edge_is_soft, self._face_is_soft = (
-            elements.min(axis=1, initial=particles) < particles for elements in (self._mesh.edges, self._mesh.faces)
-        )
+        self._pairs = SoftPairs(self._mesh, model.particle_count)
         moves = host_array(model.particle_inv_mass) > 0.0
         edges, lengths, _ = edges_at_rest(model)
         moves = moves[edges].any(axis=1)
@@ -80,17 +77,19 @@ class Judge:
         """
         positions = [self._with_shapes(state) for state in states]
         ends = [*range(steps_per_frame, len(states) - 1, steps_per_frame), len(states) - 1]
-        crossings = [self._count_crossings(positions[end]) for end in ends]
-        inverted = [len(self._detector.find_inversions(positions[end])) for end in ends] if len(self._mesh.tets) else []
+        crossings = [self._pairs.count_crossings(positions[end]) for end in ends]
+        inverted = [0] * len(ends)
+        if len(self._mesh.tets):
+            inverted = [len(self._pairs.detector.find_inversions(positions[end])) for end in ends]
         collisions = []
         for step, pair in enumerate(itertools.pairwise(positions)):
-            collisions.append(self._count_collisions(*pair))
+            collisions.append(self._pairs.count_collisions(*pair))
             progress(step + 1)
         return Judgement(
             crossings=tuple(every for every, _ in crossings),
             shape_crossings=tuple(with_shapes for _, with_shapes in crossings),
             collisions=tuple(collisions),
-            inverted=tuple(inverted) or (0,) * len(ends),
+            inverted=tuple(inverted),
             stretch=100.0 * max(largest_stretch(states[end], self._edges, self._lengths) for end in ends),
         )
 
@@ -100,17 +99,3 @@ class Judge:
             raise ValueError(f"states must have shape ({self._particles}, 3), not {state.shape}")
         every = np.concatenate([state.astype(np.float64), self._shape_vertices])
         return wp.array(every, dtype=wp.vec3d, device=self._mesh.device)
-
-    def _count_crossings(self, x: wp.array) -> tuple[int, int]:
-        """Returns the number of crossings, and of those with fixed shapes."""
-        edges, faces = self._detector.find_intersections(x).T
-        edge, face = self._edge_is_soft[edges], self._face_is_soft[faces]
-        return int((edge | face).sum()), int((edge ^ face).sum())
-
-    def _count_collisions(self, x0: wp.array, x1: wp.array) -> int:
-        """Returns the number of pairs that meet on straight ways, at least one of them not of a shape."""
-        found = self._detector.detect(x0, x1)
-        vertices, faces = found.vertex_face.T
-        soft = (vertices < self._particles) | self._face_is_soft[faces]
-        first, second = found.edge_edge.T
-        return int(soft.sum() + (self._edge_is_soft[first] | self._edge_is_soft[second]).sum())

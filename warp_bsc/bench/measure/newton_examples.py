@@ -43,6 +43,7 @@ __all__ = [
     "list_examples",
     "measure_example",
     "show",
+    "to_dict",
 ]
 
 DESCRIPTION = """\
@@ -409,6 +410,11 @@ def _describe_end(status: int, line: str) -> str:
 def list_examples(examples: Sequence[NewtonExample]) -> Table:
     """Returns the table of examples and what they need."""
     return Table("Example", _NEEDS, [(example.title, example) for example in examples])
+
+
+def to_dict(runs: list[ExampleRun]) -> dict[str, Any]:
+    """Returns runs as plain data for JSON."""
+    return {"frames_left_out": WARM_UP, "runs": [run.to_dict() for run in runs]}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -29,6 +29,7 @@ __all__ = [
     "Simulator",
     "measure_penetration",
     "show",
+    "to_dict",
 ]
 
 SCENES = {
@@ -335,6 +336,16 @@ def _speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
     gravity = built.scene.model.gravity.numpy().reshape(-1, 3)[0].astype(float)
     free = flight * t + 0.5 * gravity * t * t
     return float((last - first) @ free / (free @ free))
+
+
+def to_dict(runs: list[PenetrationRun]) -> dict[str, Any]:
+    """Returns runs as plain data for JSON, with their scenes and simulators."""
+    return {
+        "steps_left_out": WARM_UP,
+        "scenes": {name: SCENES[name] for name in grouped(runs, "scene")},
+        "simulators": {name: asdict(SIMULATORS[name]) for name in grouped(runs, "simulator")},
+        "runs": [run.to_dict() for run in runs],
+    }
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -36,6 +36,7 @@ __all__ = [
     "benchmark_queries",
     "check_query_count",
     "show",
+    "to_dict",
 ]
 
 DESCRIPTION = """\
@@ -122,26 +123,6 @@ class QueryBenchmark:
     def bytes_per_second(self) -> dict[str, float]:
         """Bytes of queries read and of results written, by mode [1/s]."""
         return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
-
-    def to_dict(self, copy_rate: float) -> dict[str, Any]:
-        """Returns the results as plain data for JSON, given the rate of :func:`benchmark_copy`."""
-        return {
-            "kind": self.kind.display_name,
-            "queries": len(self.status),
-            "survivors": self.survivors,
-            "survivor_share": self.survivor_share,
-            "certified": {"free": self.free, "hit": self.hits, "unsure": self.unsure},
-            "modes": {
-                mode: {
-                    "milliseconds": milliseconds,
-                    "queries_per_second": self.queries_per_second[mode],
-                    "bytes_per_query": MODES[mode],
-                    "bytes_per_second": self.bytes_per_second[mode],
-                    "share_of_copy": self.bytes_per_second[mode] / copy_rate,
-                }
-                for mode, milliseconds in self.milliseconds.items()
-            },
-        }
 
 
 @functools.cache
@@ -354,6 +335,32 @@ def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
     target = wp.empty_like(source)
     milliseconds = median_milliseconds(lambda: wp.copy(target, source), device, repeat)
     return 2e3 * _COPIED_BYTES / milliseconds
+
+
+def to_dict(benchmarks: list[QueryBenchmark], **settings: Any) -> dict[str, Any]:
+    """Returns results as plain data for JSON, with settings, of which one is the rate of :func:`benchmark_copy`."""
+    return settings | {
+        "kinds": [
+            {
+                "kind": found.kind.display_name,
+                "queries": len(found.status),
+                "survivors": found.survivors,
+                "survivor_share": found.survivor_share,
+                "certified": {"free": found.free, "hit": found.hits, "unsure": found.unsure},
+                "modes": {
+                    mode: {
+                        "milliseconds": milliseconds,
+                        "queries_per_second": found.queries_per_second[mode],
+                        "bytes_per_query": MODES[mode],
+                        "bytes_per_second": found.bytes_per_second[mode],
+                        "share_of_copy": found.bytes_per_second[mode] / settings["copy_bytes_per_second"],
+                    }
+                    for mode, milliseconds in found.milliseconds.items()
+                },
+            }
+            for found in benchmarks
+        ]
+    }
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

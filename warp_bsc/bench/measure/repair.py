@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +33,7 @@ __all__ = [
     "measure_repair",
     "show",
     "summarize",
+    "to_dict",
 ]
 
 Hint = Literal["none", "order", "x_previous"]
@@ -288,6 +289,11 @@ def _attempt(
         ),
     )
     return attempt, result
+
+
+def to_dict(runs: list[RepairRun]) -> dict[str, Any]:
+    """Returns runs as plain data for JSON."""
+    return {"ipc_toolkit": ipc_toolkit.version(), "runs": [asdict(run) for run in runs]}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -356,14 +356,15 @@ def _measure(
     )
 
 
-def to_dict(runs: list[ResponseRun]) -> list[dict[str, Any]]:
+def to_dict(runs: list[ResponseRun]) -> dict[str, Any]:
     """Returns runs as plain data for JSON, with how far particles are from those of the converged run [mm]."""
     converged = {run.scene: run.measured for run in runs if run.configuration == CONVERGED and run.measured}
-    return [
-        run.to_dict() | {"from_converged": run.measured.distance_from(other) if run.measured and other else None}
-        for run in runs
-        for other in [converged.get(run.scene)]
-    ]
+
+    def distance(run: ResponseRun) -> float | None:
+        other = converged.get(run.scene)
+        return run.measured.distance_from(other) if run.measured and other else None
+
+    return {"steps_left_out": WARM_UP, "runs": [run.to_dict() | {"from_converged": distance(run)} for run in runs]}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

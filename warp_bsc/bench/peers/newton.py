@@ -1,16 +1,14 @@
 """Runs the scenes of ``warp-bsc bench penetration`` with solvers of Newton, plain and behind the stage."""
 
 from collections.abc import Callable
-from typing import Any
 
 import newton
 import numpy as np
 
-from ..._private_names.of_newton import make_style3d
 from ...response.state.mesh import host_array
 from ...response.strain import edges_at_rest
 from ..scenes.penetration import PenetrationScene
-from ..scenes.simulation import NotFinite, Simulation, largest_stretch
+from ..scenes.simulation import NotFinite, Simulation, largest_stretch, make_solver, self_contact
 from .states import Trajectory
 
 __all__ = ["simulate_newton"]
@@ -19,8 +17,6 @@ _ITERATIONS = 10
 """Of VBD and XPBD in Newton's examples cloth_hanging, softbody_hanging and, for XPBD, cloth_hanging --solver xpbd."""
 _STYLE3D_ITERATIONS = 4
 """In Newton's example cloth_style3d."""
-_PAIRS = {"particle_vertex_contact_buffer_size": 64, "particle_edge_contact_buffer_size": 128}
-"""VBD's buffers in Newton's example cloth_twist; pairs that do not fit are dropped."""
 _BURST = 10.0
 """Elongation of an edge, as a share of its length at rest, from which on a scene has burst, and is not judged."""
 
@@ -75,14 +71,18 @@ def simulate_newton(
     Raises:
         NotFinite: If positions are not finite, or the scene bursts.
     """
-    states = _States(built.scene.model)
+    model = built.scene.model
+    states, inner = _States(model), None
+    if solver != "implicit":
+        own = self_contact(built.margin, built.gap) if has_self_contact else {"particle_enable_self_contact": False}
+        inner = make_solver(model, solver, _STYLE3D_ITERATIONS if solver == "style3d" else _ITERATIONS, **own)
     simulation = Simulation(
         built.scene,
         solver,
         rate,
         has_contacts=not has_stage,
         stage_options={} if has_stage else None,
-        inner=None if solver == "implicit" else _make_solver(built, solver, has_self_contact=has_self_contact),
+        inner=inner,
         samples=states,
     )
     simulation.run(seconds, progress)
@@ -92,19 +92,3 @@ def simulate_newton(
         simulation.milliseconds,
         uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
     )
-
-
-def _make_solver(built: PenetrationScene, solver: str, *, has_self_contact: bool) -> Any:
-    """Returns a solver with the settings of Newton's examples."""
-    model, solvers = built.scene.model, newton.solvers
-    if solver == "xpbd":
-        # Newton has no example of tetrahedra with XPBD; with its default relaxation they burst in Newton itself
-        return solvers.SolverXPBD(model, iterations=_ITERATIONS, soft_body_relaxation=0.2)
-    if solver == "style3d":
-        return make_style3d(model, _STYLE3D_ITERATIONS)
-    if solver == "semi-implicit":
-        return solvers.SolverSemiImplicit(model)
-    own: dict[str, Any] = {}
-    if has_self_contact:
-        own = {"particle_self_contact_margin": built.margin, "particle_self_contact_gap": built.gap, **_PAIRS}
-    return solvers.SolverVBD(model, iterations=_ITERATIONS, particle_enable_self_contact=has_self_contact, **own)

@@ -19,7 +19,7 @@ from ..crossings import CrossingCounter
 from ..elastic_energy import ElasticEnergy
 from .contact import Scene
 
-__all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "total_energy"]
+__all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "make_solver", "self_contact", "total_energy"]
 
 _ITERATIONS = 10
 _MARGIN = 0.005
@@ -175,7 +175,10 @@ class Simulation:
         if solver == "implicit":
             self.stage = SolverImplicit(model, **scene.stage_options, **(stage_options or {}))
         else:
-            inner = inner or _make_solver(scene, solver, has_self_contact=has_self_contact)
+            moves_bodies = scene.motion is not None and scene.motion.poses is not None
+            own = self_contact(_MARGIN, _MARGIN) if has_self_contact else {}
+            own |= {"integrate_with_external_rigid_solver": moves_bodies}
+            inner = inner or make_solver(model, solver, _ITERATIONS, **own)
             if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
                 inner.collision = None  # its own contacts, which need those of Newton
             self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
@@ -339,26 +342,26 @@ class Samples:
         return total_energy(x, v, self._mass, self._gravity, self._world, self._worlds) + others
 
 
-def _make_solver(scene: Scene, solver: str, *, has_self_contact: bool) -> Any:
-    """Returns a solver of Newton for a scene."""
-    model, solvers = scene.model, newton.solvers
+def make_solver(model: newton.Model, solver: str, iterations: int, **of_vbd: Any) -> Any:
+    """Returns one of :data:`..measure.response.SOLVERS` for a model; only VBD has the other arguments."""
+    solvers = newton.solvers
     if solver == "xpbd":
-        # corrections of tetrahedra are added up at their vertices: with the default relaxation, soft bodies burst
-        return solvers.SolverXPBD(model, iterations=_ITERATIONS, soft_body_relaxation=0.2)
+        # corrections of tetrahedra are added up at their vertices: with the default relaxation, soft bodies burst, and
+        # Newton has no example of them
+        return solvers.SolverXPBD(model, iterations=iterations, soft_body_relaxation=0.2)
     if solver == "style3d":
-        return make_style3d(model, _ITERATIONS)
+        return make_style3d(model, iterations)
     if solver == "semi-implicit":
         return solvers.SolverSemiImplicit(model)
-    own: dict[str, Any] = {}
-    if has_self_contact:
-        own = {
-            "particle_enable_self_contact": True,
-            "particle_self_contact_margin": _MARGIN,
-            "particle_self_contact_gap": _MARGIN,
-            "particle_vertex_contact_buffer_size": 64,
-            "particle_edge_contact_buffer_size": 128,
-        }
-    has_moved_bodies = scene.motion is not None and scene.motion.poses is not None
-    return solvers.SolverVBD(
-        model, iterations=_ITERATIONS, integrate_with_external_rigid_solver=has_moved_bodies, **own
-    )
+    return solvers.SolverVBD(model, iterations=iterations, **of_vbd)
+
+
+def self_contact(margin: float, gap: float) -> dict[str, Any]:
+    """Returns the arguments of VBD for contacts between particles, with the buffers of Newton's cloth_twist."""
+    return {
+        "particle_enable_self_contact": True,
+        "particle_self_contact_margin": margin,
+        "particle_self_contact_gap": gap,
+        "particle_vertex_contact_buffer_size": 64,
+        "particle_edge_contact_buffer_size": 128,
+    }
