@@ -67,7 +67,7 @@ class Table:
 def _part(row: Any, name: str) -> Any:
     if isinstance(row, dict):
         return row[name]
-    return row[int(name)] if isinstance(row, (list, tuple)) else getattr(row, name)
+    return row[int(name)] if name.isdigit() else getattr(row, name)
 
 
 def markdown(first: str, columns: Iterable[Column], rows: Iterable[tuple[str, Any]]) -> list[tuple[str, ...]]:
