@@ -176,7 +176,8 @@ class RepairRun:
     @classmethod
     def of_json(cls, values: dict[str, Any]) -> "RepairRun":
         """Returns what :func:`dataclasses.asdict` made plain."""
-        return cls(**values | {"attempts": tuple(RepairAttempt(**attempt) for attempt in values["attempts"])})
+        attempts: Any = tuple(RepairAttempt(**attempt) for attempt in values["attempts"])
+        return cls(**values | {"attempts": attempts})
 
 
 @dataclass(frozen=True)
