@@ -101,7 +101,7 @@ LIBRARIES = {
         "warp_bsc/repair/state.py",  # repairs a state of a model
         "warp_bsc/repair/model_surface.py",  # takes the surface from it
         "warp_bsc/_private_names/of_newton.py",
-        "warp_bsc/bench/measure/newton_examples.py",  # lists the examples of Newton
+        "warp_bsc/bench/scenes/newton_examples.py",  # lists the examples of Newton
         "warp_bsc/bench/measure/newton_process.py",  # runs them
         "warp_bsc/bench/crossings.py",  # of a model
         "warp_bsc/bench/elastic_energy.py",  # of a model

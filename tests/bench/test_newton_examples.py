@@ -12,13 +12,8 @@ import pytest
 import warp as wp
 
 from warp_bsc.bench.measure import newton_examples, newton_process
-from warp_bsc.bench.measure.newton_examples import (
-    WARM_UP,
-    NewtonExample,
-    describe_needs,
-    find_examples,
-    measure_example,
-)
+from warp_bsc.bench.measure.newton_examples import WARM_UP, measure_example
+from warp_bsc.bench.scenes.newton_examples import NewtonExample, describe_needs, find_examples
 
 # A triangle stands above a pinned sheet and moves down by 1 cm a frame, its tip from 5.5 cm: after the sixth frame two
 # of its edges cross a face of the sheet. Nothing else crosses, and nothing but the stage stops it.

@@ -10,12 +10,7 @@ __all__ = ["options_of", "print_rows", "report"]
 
 
 def options_of(doc, *, device=None):
-    """Returns a parser with the text of a program, ``--json``, and ``--device`` if that has a default.
-
-    Args:
-        doc: The docstring.
-        device: Default of ``--device``; None without this option.
-    """
+    """Returns a parser with the text of a program, ``--json``, and ``--device`` if that has a default."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", metavar="FILE", help="file to which the rows are written as well")
     if device is not None:
@@ -31,15 +26,7 @@ def print_rows(first, columns, rows, **more):
 def report(arguments, benchmark, first, columns, rows, devices, *, name="scene", **settings):
     """Prints the rows of a measurement, plain data, and writes them with its settings where ``--json`` says.
 
-    Args:
-        arguments: The options.
-        benchmark: Name of the measurement.
-        first: Header of the names of the rows.
-        columns: The other columns.
-        rows: The rows.
-        devices: The Warp devices that are measured.
-        name: Key of the name of a row, or a function that returns it.
-        settings: What the file has as well.
+    ``name`` is the key of the name of a row, or a function that returns it.
     """
     print_rows(first, columns, [(name(row) if callable(name) else row[name], row) for row in rows])
     if arguments.json:

@@ -32,6 +32,7 @@ from ..bench.measure import (
 from ..bench.peers import ipc_toolkit
 from ..bench.record import with_record
 from ..bench.scenes import detector as scenes_of_detector
+from ..bench.scenes import newton_examples as examples_of_newton
 from ..bench.scenes.mesh_files import is_mesh_name
 from ..bench.scenes.queries import SEED
 from ..bench.scenes.repair import KNOWN, damaged, load_tangled
@@ -329,12 +330,12 @@ def run_newton(arguments: argparse.Namespace) -> None:
     """Measures Newton's own examples, or lists them."""
     device = find_device(arguments.device)
     with INTERRUPTS.held():  # a library that is interrupted while it loads raises other errors, or none
-        examples = newton_examples.find_examples(arguments.examples)
-        names = {example.name for example in newton_examples.find_examples()} if arguments.json else set()
+        examples = examples_of_newton.find_examples(arguments.examples)
+        names = {example.name for example in examples_of_newton.find_examples()} if arguments.json else set()
     INTERRUPTS.check()
     _check_json(arguments.json, lambda path: path.split(" ")[0] in names, "an example", "examples")
     if arguments.list:
-        _draw([newton_examples.list_examples(examples)])
+        _draw([examples_of_newton.list_examples(examples)])
         return
     options = {name: getattr(arguments, name) for name in ("frames", "check_every", "download")}
     measure = functools.partial(newton_examples.measure_example, device=str(device), **options)

@@ -17,7 +17,8 @@ from typing import Any
 import warp as wp
 
 from ..._garbage import paused_collection
-from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals, describe_download
+from ..scenes.newton_examples import describe_download
+from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals
 
 __all__ = ["SOLVERS", "serve"]
 
