@@ -111,17 +111,17 @@ LIBRARIES = {
         "warp_bsc/repair/state.py",  # repairs a state of a model
         "warp_bsc/repair/model_surface.py",  # takes the surface from it
         "warp_bsc/_private_names/of_newton.py",
-        "warp_bsc/bench/newton_examples.py",  # lists the examples of Newton
-        "warp_bsc/bench/newton_process.py",  # runs them
+        "warp_bsc/bench/scenes/newton_examples.py",  # lists the examples of Newton
+        "warp_bsc/bench/measure/newton_process.py",  # runs them
         "warp_bsc/bench/crossings.py",  # of a model
         "warp_bsc/bench/elastic_energy.py",  # of a model
-        "warp_bsc/bench/response_simulation.py",  # steps its solvers
-        "warp_bsc/bench/response_scenes.py",  # makes models
-        "warp_bsc/bench/penetration_scenes.py",
-        "warp_bsc/bench/penetration_newton.py",  # steps its solvers
-        "warp_bsc/bench/penetration_mujoco.py",  # reads its models
-        "warp_bsc/bench/penetration_states.py",
-        "warp_bsc/bench/judge.py",
+        "warp_bsc/bench/scenes/simulation.py",  # steps its solvers
+        "warp_bsc/bench/scenes/contact.py",  # makes models
+        "warp_bsc/bench/scenes/penetration.py",
+        "warp_bsc/bench/peers/newton.py",  # steps its solvers
+        "warp_bsc/bench/peers/mujoco.py",  # reads its models
+        "warp_bsc/bench/peers/states.py",
+        "warp_bsc/bench/measure/judge.py",
         "torch",  # takes its solvers
         "jax",
     },

@@ -16,8 +16,8 @@ import warp as wp
 from matplotlib.colors import Normalize
 from PIL import Image
 
-from warp_bsc.bench.response_scenes import build_scene
-from warp_bsc.bench.response_simulation import Samples, Simulation
+from warp_bsc.bench.scenes.contact import build_scene
+from warp_bsc.bench.scenes.simulation import Samples, Simulation
 from warp_bsc.response.state.mesh import ModelMesh
 
 sys.path.append(str(Path(__file__).parent))  # for the other figures

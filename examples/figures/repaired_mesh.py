@@ -20,7 +20,7 @@ from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from PIL import Image
 
 import warp_bsc as bsc
-from warp_bsc.bench.repair_scenes import damaged, load_tangled
+from warp_bsc.bench.scenes.repair import damaged, load_tangled
 
 sys.path.append(str(Path(__file__).parent))  # for the other figures
 from scenes import View, axes_of, shade

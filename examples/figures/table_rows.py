@@ -1,12 +1,16 @@
 """The rows of the tables of measurements, each made from what commands wrote with ``--json``."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from statistics import median
 from typing import Any
 
-from warp_bsc.bench.penetration import SIMULATORS
-from warp_bsc.bench.repair import FILE, KNOWN_MESH
+import numpy as np
+
+from warp_bsc.bench.measure import given_queries as given
+from warp_bsc.bench.measure.detector import ipc_milliseconds, stage_columns
+from warp_bsc.bench.measure.penetration import SIMULATORS
+from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH, PAGE_COSTS, PAGE_MESHES, RepairRun, summarize
+from warp_bsc.bench.tables import Column, grouped, markdown, three, two
 
 Found = dict[str, Any]
 """A measurement: what a command wrote with --json."""
@@ -19,14 +23,14 @@ def milliseconds(value: float) -> str:
     return f"{value / 1e3:.3g} s" if value >= 100.0 else f"{value:.3g} ms"
 
 
-def digits(value: float) -> str:
-    """Returns a number with two digits, more if it is large."""
-    return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:,.0f}"
+def percent(value: float) -> str:
+    """Returns a percentage with two digits, more if it is large."""
+    return f"{two(value)}%"
 
 
-def _counts(values: Any) -> str:
-    """Returns the smallest and the largest of some numbers."""
-    return f"{min(values):,} to {max(values):,}"
+def pivot(runs: Iterable[Found], row: str, column: str) -> dict[str, Found]:
+    """Returns runs by the values of two keys."""
+    return {name: {run[column]: run for run in group} for name, group in grouped(runs, row).items()}
 
 
 # Detection ---------------------------------------------------------------------------------------------------------
@@ -45,28 +49,24 @@ def _scene_name(scene: Found) -> str:
 
 def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
     """Detections on a GPU and on the CPU, beside the IPC Toolkit."""
-    rows = [("scene", "candidates", "hits", "GPU", "two cores", "one core", "IPC Toolkit, two cores", "one core")]
-    for scenes in zip(gpu["scenes"], two_cores["scenes"], one_core["scenes"], strict=False):
-        first = scenes[0]
-        times = [scene["milliseconds"]["detect"] for scene in scenes]
-        times += [
-            scene["ipc_toolkit"]["build_milliseconds"] + scene["ipc_toolkit"]["step_milliseconds"]
-            for scene in scenes[1:]
-        ]
-        counts = [f"{first[name]:,}" for name in ("candidates", "hits")]
-        rows.append((_scene_name(first), *counts, *map(milliseconds, times)))
-    return rows
+    places, peers = ("GPU", "two cores", "one core"), {1: "IPC Toolkit, two cores", 2: "one core"}
+    columns = [Column(name, f"0.{name}") for name in ("candidates", "hits")]
+    columns += [Column(place, f"{i}.milliseconds.detect", milliseconds) for i, place in enumerate(places)]
+    columns += [
+        Column(place, lambda row, i=i: ipc_milliseconds(row[i]["ipc_toolkit"]), milliseconds)
+        for i, place in peers.items()
+    ]
+    rows = zip(gpu["scenes"], two_cores["scenes"], one_core["scenes"], strict=False)
+    return markdown("scene", columns, [(_scene_name(row[0]), row) for row in rows])
 
 
 def detector_stages(gpu: Found, worlds: Found) -> Rows:
     """Where the time of a detection goes on a GPU."""
     stages = [stage for stage in gpu["scenes"][0]["milliseconds"]["stages"] if stage not in ("sort", "exact")]
-    rows = [("scene", "whole graph", *stages)]
-    for scene in (*gpu["scenes"], *worlds["scenes"]):
-        took = scene["milliseconds"]
-        numbers = [took["cuda_graph"], *(took["stages"][stage] for stage in stages)]
-        rows.append((f"{_scene_name(scene)}, {scene['hits']:,} hits", *(f"{number:.2f}" for number in numbers)))
-    return rows
+    columns = [Column("whole graph", "cuda_graph", ",.2f"), *stage_columns(stages, "stages")]
+    scenes = (*gpu["scenes"], *worlds["scenes"])
+    rows = [(f"{_scene_name(scene)}, {scene['hits']:,} hits", scene["milliseconds"]) for scene in scenes]
+    return markdown("scene", columns, rows)
 
 
 def queries(gpu: Found, one_core: Found) -> Rows:
@@ -76,66 +76,57 @@ def queries(gpu: Found, one_core: Found) -> Rows:
         "queued": "a second kernel decides the survivors",
         "exact": "queries that are UNSURE in floating point, in exact arithmetic",
     }
-    rows = [("queries", "edge-edge, a second", "vertex-face, a second")]
-    for mode, title in titles.items():
-        for found, place in ((gpu, ""), (one_core, ", on one core of the CPU")):
-            rates = {kind["kind"]: kind["modes"][mode]["queries_per_second"] for kind in found["kinds"]}
-            rows.append((title + place, *(_rate(rates[kind]) for kind in ("edge-edge", "vertex-face"))))
-    return rows
+    rows = [
+        (title + place, {kind["kind"]: kind["modes"][mode]["queries_per_second"] for kind in found["kinds"]})
+        for mode, title in titles.items()
+        for found, place in ((gpu, ""), (one_core, ", on one core of the CPU"))
+    ]
+
+    def rate(number: float) -> str:
+        return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
+
+    return markdown("queries", [Column(f"{kind}, a second", kind, rate) for kind in ("edge-edge", "vertex-face")], rows)
 
 
 def certify(*runs: Found) -> Rows:
     """Answers of adversarial queries by method, of all runs together."""
     titles = {"float": "`float`", "conservative": "`conservative`", "user's kernel": "a kernel with `ccd_*`"}
-    rows = [("answers by", "FREE", "HIT", "UNSURE", "FREE, but colliding", "HIT, but free")]
-    for method in runs[0]["methods"]:
-        answers = [run["methods"][method] for run in runs]
-        sums = (sum(answer[key] for answer in answers) for key in ("free", "hit", "unsure", "missed", "false"))
-        rows.append((titles.get(method, "exact arithmetic on the device"), *(f"{number:,}" for number in sums)))
-    return rows
-
-
-def _rate(number: float) -> str:
-    return f"{number / 1e9:.1f} billion" if number >= 1e9 else f"{number / 1e6:.3g} million"
+    answers = {
+        "FREE": "free",
+        "HIT": "hit",
+        "UNSURE": "unsure",
+        "FREE, but colliding": "missed",
+        "HIT, but free": "false",
+    }
+    columns = [Column(title, lambda row, key=key: sum(run[key] for run in row)) for title, key in answers.items()]
+    methods = {method: [run["methods"][method] for run in runs] for method in runs[0]["methods"]}
+    rows = [(titles.get(method, "exact arithmetic on the device"), row) for method, row in methods.items()]
+    return markdown("answers by", columns, rows)
 
 
 def given_queries(found: Found) -> Rows:
     """Times of a query of public files by method, on one core."""
-    methods = ("float", "conservative", "exact")
-    rows = [
-        ("queries", "collide", *(f"`{name}`" for name in methods), "cubic solver", "`float` / cubic", "`exact` / cubic")
-    ]
     titles = {"queries": "hand-made", "cloth-funnel": "simulated (cloth-funnel)"}
-    for row in found["queries"]:
-        took = row["nanoseconds"]
-        rows.append(
-            (
-                f"{titles.get(row['name'], row['name'])}, {row['queries']:,} {row['kind']}",
-                f"{100.0 * row['hits'] / row['queries']:.0f}%",
-                *(digits(took[name]) for name in (*methods, "cubic")),
-                *(digits(took[name] / took["cubic"]) for name in ("float", "exact")),
-            )
-        )
-    return rows
+    rows = [
+        (f"{titles.get(row['name'], row['name'])}, {row['queries']:,} {row['kind']}", row) for row in found["queries"]
+    ]
+    return markdown("queries", given.COLUMNS, rows)
 
 
 def paper(found: Found) -> Rows:
     """Times of a query on one core in the scenes of the paper."""
-    methods = {"float": "`float`", "conservative": "`conservative`", "exact": "`exact`", "cubic": "cubic solver"}
-    rows = [("scene", *methods.values(), "cubic / `float`", "slowest query, `float` / cubic")]
-    for scene in found["scenes"]:
-        timing = scene["timings"][0]
-        took, worst = timing["nanoseconds"], timing["worst"]
-        slowest = (worst[method]["nanoseconds"][method] for method in ("float", "cubic"))
-        rows.append(
-            (
-                f"{scene['name']}, {scene['triangles']:,} triangles",
-                *(f"{took[method]:.1f}" for method in methods),
-                f"{took['cubic'] / took['float']:.1f}",
-                " / ".join(f"{time:.0f}" for time in slowest),
-            )
-        )
-    return rows
+    titles = {"float": "`float`", "conservative": "`conservative`", "exact": "`exact`", "cubic": "cubic solver"}
+    columns = [Column(title, f"nanoseconds.{method}", ".1f") for method, title in titles.items()]
+    columns += [
+        Column("cubic / `float`", lambda row: row["nanoseconds"]["cubic"] / row["nanoseconds"]["float"], ".1f"),
+        Column(
+            "slowest query, `float` / cubic",
+            "worst",
+            lambda worst: " / ".join(f"{worst[name]['nanoseconds'][name]:.0f}" for name in ("float", "cubic")),
+        ),
+    ]
+    rows = [(f"{scene['name']}, {scene['triangles']:,} triangles", scene["timings"][0]) for scene in found["scenes"]]
+    return markdown("scene", columns, rows)
 
 
 def touching(found: Found) -> Rows:
@@ -145,11 +136,15 @@ def touching(found: Found) -> Rows:
         "at a distance, at rest": "`exact` at their minimum distance, at rest",
         "at a distance, moving": "the same, moving together",
     }
-    rows = [("flat sheets in the same plane", "pairs", "wrong of those checked", "time")]
-    for row in found["rows"]:
-        title = f"{titles[row['question']]}: {row['sheets']} sheets of {row['faces']:,} faces"
-        rows.append((title, f"{row['pairs']:,}", str(row["wrong"]), f"{digits(row['seconds'])} s"))
-    return rows
+    columns = (
+        Column("pairs", "pairs"),
+        Column("wrong of those checked", "wrong"),
+        Column("time", "seconds", lambda seconds: f"{two(seconds)} s"),
+    )
+    rows = [
+        (f"{titles[row['question']]}: {row['sheets']} sheets of {row['faces']:,} faces", row) for row in found["rows"]
+    ]
+    return markdown("flat sheets in the same plane", columns, rows)
 
 
 # Newton ------------------------------------------------------------------------------------------------------------
@@ -160,17 +155,13 @@ def newton(*measurements: Found) -> Rows:
     titles = {"plain": "plain: ms a frame (95th percentile); crossings", "stage": "with `SolverCCD`"}
     if any(run["mode"] == "implicit" for found in measurements for run in found["runs"]):
         titles["implicit"] = "with `SolverImplicit` in place of VBD"
-    rows = [("example", *titles.values(), "steps")]
-    for found in measurements:
-        modes: dict[str, dict[str, Found]] = {}
-        for run in found["runs"]:
-            modes.setdefault(run["example"], {})[run["mode"]] = run
-        for name, run in modes.items():
-            cells = [_newton_cell(run[mode]) for mode in titles]
-            frames = next((r["measured"]["frames"] for r in run.values() if r["measured"]), None)
-            title = f"`{name}`" + (f", {frames} frames" if frames else "")
-            rows.append((title, *cells, _newton_steps(*(run[mode]["measured"] for mode in titles))))
-    return rows
+    columns = [Column(title, mode, _newton_cell) for mode, title in titles.items()]
+    columns.append(Column("steps", lambda row: _newton_steps(*(row[mode]["measured"] for mode in titles))))
+    rows = []
+    for name, row in (item for found in measurements for item in pivot(found["runs"], "example", "mode").items()):
+        frames = next((run["measured"]["frames"] for run in row.values() if run["measured"]), None)
+        rows.append((f"`{name}`" + (f", {frames} frames" if frames else ""), row))
+    return markdown("example", columns, rows)
 
 
 def _newton_cell(run: Found) -> str:
@@ -200,10 +191,8 @@ def _newton_steps(plain: Found | None, stage: Found | None, implicit: Found | No
 
 
 def _newton_tests(took: Found) -> str:
-    ends = [took["test_post_step"], took["test_final"]]
-    if all(end is None for end in ends):
-        return "none"
-    return "ok" if all(end in (None, "ok") for end in ends) else "fail"
+    ends = {took["test_post_step"], took["test_final"]} - {None}
+    return "none" if not ends else "ok" if ends == {"ok"} else "fail"
 
 
 _SCENES_IN_CONTACT = {
@@ -230,40 +219,35 @@ def response(found: Found, reference: Found) -> Rows:
         "stage": "`SolverCCD`, default",
         "implicit": "`SolverImplicit`",
     }
-    runs = {(run["scene"], run["configuration"]): run for run in found["runs"]}
+    runs = pivot(found["runs"], "scene", "configuration")
     measured = {run["scene"]: run["measured"] for run in reference["runs"] if run["configuration"] == "reference"}
-    columns = [name for name in titles if any(name == configuration for _, configuration in runs)]
-    rows = [("scene", *(titles[name] for name in columns), f"reference, 1/{next(iter(measured.values()))['rate']} s")]
-    for scene in dict.fromkeys(scene for scene, _ in runs):
-        cells = [_response_cell(runs[scene, name]) for name in columns]
-        rows.append((f"{scene}: {_SCENES_IN_CONTACT[scene]}", *cells, _stretch_and_speed(measured[scene])))
-    return rows
+    columns = [
+        Column(title, name, _response_cell)
+        for name, title in titles.items()
+        if any(name in row for row in runs.values())
+    ]
+    rate = next(iter(measured.values()))["rate"]
+    columns.append(Column(f"reference, 1/{rate} s", "of reference", _stretch_and_speed))
+    rows = [
+        (f"{scene}: {_SCENES_IN_CONTACT[scene]}", row | {"of reference": measured[scene]})
+        for scene, row in runs.items()
+    ]
+    return markdown("scene", columns, rows)
 
 
 def _response_cell(run: Found) -> str:
     took, distance = run["measured"], run.get("from_converged")
-    mean = "" if took["uncertified_steps"] is None else f" ({_three(took['milliseconds']['mean'])})"
-    parts = [_stretch_and_speed(took), f"{_three(took['milliseconds']['median'])}{mean} ms", *_what_passed(took)]
+    mean = "" if took["uncertified_steps"] is None else f" ({three(took['milliseconds']['mean'])})"
+    parts = [_stretch_and_speed(took), f"{three(took['milliseconds']['median'])}{mean} ms"]
+    counts = {"crossings": "crossings", "collisions": "pairs meet", "uncertified_steps": "steps not certified"}
+    parts += [f"{took[key]:,} {title}" for key, title in counts.items() if took[key]]
     if run["configuration"] == "implicit" and distance is not None:
-        parts.append(f"{digits(distance)} mm from the converged run")
+        parts.append(f"{two(distance)} mm from the converged run")
     return "; ".join(parts)
 
 
 def _stretch_and_speed(took: Found) -> str:
-    return f"{_stretches(took)}; {took['rest_speed']:,.0f} mm/s"
-
-
-def _stretches(took: Found) -> str:
-    return f"{digits(took['stretch_at_end'])}, {digits(took['stretch_at_most'])}%"
-
-
-def _what_passed(took: Found) -> list[str]:
-    counts = ("crossings", "crossings"), ("collisions", "pairs meet"), ("uncertified_steps", "steps not certified")
-    return [f"{took[key]:,} {title}" for key, title in counts if took[key]]
-
-
-def _three(value: float) -> str:
-    return f"{value:,.0f}" if value >= 99.5 else f"{value:#.3g}"
+    return f"{two(took['stretch_at_end'])}, {percent(took['stretch_at_most'])}; {took['rest_speed']:,.0f} mm/s"
 
 
 def implicit_accuracy(found: Found) -> Rows:
@@ -282,22 +266,34 @@ def implicit_accuracy(found: Found) -> Rows:
         "particle_mass": "mass",
         "shape_material_mu": "friction",
     }
-    rows = [("scene", "10 iterations", "20 iterations", "20 and `polish=3`", "materials, with `polish=3`")]
-    for name, title in scenes.items():
-        runs = [run for run in found["rows"] if run["scene"] == name]
-        errors = [f"{run['residual']:.2g}; {digits(100.0 * run['velocity'])}%" for run in runs]
-        materials = [f"{inputs[key]} {digits(100.0 * runs[-1][key])}%" for key in inputs if key in runs[-1]]
-        rows.append((title, *errors, ", ".join(materials)))
-    return rows
+
+    def residual(run: Found) -> str:
+        return f"{run['residual']:.2g}; {percent(100.0 * run['velocity'])}"
+
+    columns = [
+        Column(title, f"{i}", residual)
+        for i, title in enumerate(("10 iterations", "20 iterations", "20 and `polish=3`"))
+    ]
+
+    def materials(run: Found) -> str:
+        return ", ".join(f"{inputs[key]} {percent(100.0 * run[key])}" for key in inputs if key in run)
+
+    columns.append(Column("materials, with `polish=3`", "2", materials))
+    runs = grouped(found["rows"], "scene")
+    return markdown("scene", columns, [(title, runs[name]) for name, title in scenes.items()])
 
 
 def implicit_time(found: Found) -> Rows:
     """Times of a step of VBD on a tape and back."""
-    rows = [("scene", "VBD", "on a tape", "back", "VBD with `polish=3`")]
-    for row in found["rows"]:
-        title = row["scene"].replace("hanging", "a hanging cloth").replace("on a sphere", "a cloth on a sphere")
-        rows.append((title, *(_three(time) for time in row["milliseconds"].values())))
-    return rows
+    titles = {"vbd": "VBD", "on a tape": "on a tape", "back": "back", "polish=3": "VBD with `polish=3`"}
+    scenes = {"hanging": "a hanging cloth", "on a sphere": "a cloth on a sphere"}
+    rows = [
+        (row["scene"].replace(name, title), row["milliseconds"])
+        for row in found["rows"]
+        for name, title in scenes.items()
+        if name in row["scene"]
+    ]
+    return markdown("scene", [Column(title, key, three) for key, title in titles.items()], rows)
 
 
 def arc_cost(small: Found, large: Found) -> Rows:
@@ -309,14 +305,14 @@ def arc_cost(small: Found, large: Found) -> Rows:
         "boxes that tumble": "nine boxes that tumble on a sheet",
         "detect": "one `detect(arcs=)` of the first: nearly all contacts are on arcs",
     }
-    rows = [("scene", "triangles of the cloth", "arcs", "chords", "ratio")]
+    columns = [Column("triangles of the cloth", "triangles")]
+    columns += [Column(key, key, milliseconds) for key in ("arcs", "chords")]
+    columns.append(Column("ratio", lambda row: row["arcs"] / row["chords"], ".2f"))
+    rows = []
     for found in (small, large):
-        times = {row["name"]: row["milliseconds"] for row in found["rows"]}
-        for name, title in titles.items():
-            arcs, chords = times[name]["arcs"], times[name]["chords"]
-            ratio = f"{arcs / chords:.2f}"
-            rows.append((title, f"{2 * found['cells'] ** 2:,}", milliseconds(arcs), milliseconds(chords), ratio))
-    return rows
+        times = {row["name"]: row["milliseconds"] | {"triangles": 2 * found["cells"] ** 2} for row in found["rows"]}
+        rows += [(title, times[name]) for name, title in titles.items()]
+    return markdown("scene", columns, rows)
 
 
 def worlds_throughput(found: Found) -> Rows:
@@ -328,32 +324,35 @@ def worlds_throughput(found: Found) -> Rows:
         "SolverImplicit": "`SolverImplicit`",
     }
     clock = "processor" if not found["record"]["gpus"] else "clock"
-    cells = {
-        (row["solver"], row["worlds"]): f"{_three(row['steps_per_second'][clock])} ({row['crossings']:,})"
-        for row in found["rows"]
-    }
-    worlds = list(dict.fromkeys(number for _, number in cells))
-    rows = [("worlds", *(f"{number:,}" for number in worlds))]
-    return rows + [(title, *(cells[name, number] for number in worlds)) for name, title in titles.items()]
+
+    def cell(row: Found) -> str:
+        return f"{three(row['steps_per_second'][clock])} ({row['crossings']:,})"
+
+    columns = [
+        Column(f"{number:,}", lambda runs, number=number: runs[number], cell)
+        for number in dict.fromkeys(row["worlds"] for row in found["rows"])
+    ]
+    runs = pivot(found["rows"], "solver", "worlds")
+    return markdown("worlds", columns, [(title, runs[name]) for name, title in titles.items()])
 
 
 def inverting_steps(*measurements: Found) -> Rows:
     """Tetrahedra that steps invert, by what the stage does about them, and times of steps."""
-    titles = {"plain": "VBD, Newton's contacts", "left": '`"left"`', "reported": '`"reported"`'}
-    titles |= {"prevented": '`"prevented"`'}
+    titles = {"plain": "VBD, Newton's contacts"} | {name: f'`"{name}"`' for name in ("left", "reported", "prevented")}
     scenes = {"throw": "throw: a block of 2,560 tetrahedra flies at a ball at 20 m/s"}
-    rows = [("scene, steps", *titles.values())]
-    runs: dict[tuple[str, int], dict[str, Found]] = {}
-    for run in (run for found in measurements for run in found["rows"]):
-        runs.setdefault((run["scene"], run["steps"]), {})[run["mode"]] = run
-    for (scene, steps), modes in runs.items():
-        cells = []
-        for run in (modes[mode] for mode in titles):
-            many = f" in {run['inverting_steps']} steps" if run["inverted"] else ""
-            cut = f", {run['truncated_steps']} steps with cut paths" if run["truncated_steps"] else ""
-            cells.append(f"{run['inverted']:,}{many} ({_three(run['milliseconds'])} ms){cut}")
-        rows.append((f"{scenes.get(scene, scene)}, {steps:,}", *cells))
-    return rows
+
+    def cell(run: Found) -> str:
+        many = f" in {run['inverting_steps']} steps" if run["inverted"] else ""
+        cut = f", {run['truncated_steps']} steps with cut paths" if run["truncated_steps"] else ""
+        return f"{run['inverted']:,}{many} ({three(run['milliseconds'])} ms){cut}"
+
+    runs = [
+        run | {"title": f"{scenes.get(run['scene'], run['scene'])}, {run['steps']:,}"}
+        for found in measurements
+        for run in found["rows"]
+    ]
+    columns = [Column(title, mode, cell) for mode, title in titles.items()]
+    return markdown("scene, steps", columns, pivot(runs, "title", "mode").items())
 
 
 def penetration(*measurements: Found) -> Rows:
@@ -368,45 +367,55 @@ def penetration_costs(*measurements: Found) -> Rows:
     """What simulators keep of speed, tetrahedra and lengths, and their time."""
 
     def cell(took: Found) -> str:
-        kept = "" if took["speed_kept"] is None else f"{digits(100.0 * took['speed_kept'])}% kept, "
+        kept = "" if took["speed_kept"] is None else f"{percent(100.0 * took['speed_kept'])} kept, "
         inverted = f"{max(took['inverted'])} inverted, " if max(took["inverted"]) else ""
-        return f"{kept}{inverted}{digits(took['stretch'])}%, {digits(took['milliseconds']['median'])} ms"
+        return f"{kept}{inverted}{percent(took['stretch'])}, {two(took['milliseconds']['median'])} ms"
 
     return _by_scene(measurements, cell)
 
 
 def penetration_simulators(*measurements: Found) -> Rows:
     """Settings and claims of simulators, and what they did not run."""
-    rows = [("simulator", "version", "settings", "says of penetration", "not run")]
-    for name, simulator in _joined(measurements, "simulators").items():
-        runs = [run for found in measurements for run in found["runs"] if run["simulator"] == name]
-        versions = {run["measured"]["version"] for run in runs if run["measured"]}
-        missing: dict[str, list[str]] = {}
-        for run in runs:
-            if run["problem"]:
-                missing.setdefault(run["problem"].partition(": ")[0], []).append(run["scene"])
-        scenes = [
-            f"{reason} ({', '.join(names) if len(names) < len(runs) else 'all'})" for reason, names in missing.items()
-        ]
-        claims = SIMULATORS[name].claims or "nothing"  # not measured
-        rows.append((simulator["title"], ", ".join(versions), simulator["settings"], claims, "; ".join(scenes)))
-    return rows
+
+    def not_run(runs: list[Found]) -> str:
+        missing = grouped(
+            ({"scene": run["scene"], "reason": run["problem"].partition(": ")[0]} for run in runs if run["problem"]),
+            "reason",
+        )
+        scenes = {reason: ", ".join(run["scene"] for run in group) for reason, group in missing.items()}
+        return "; ".join(
+            f"{reason} ({scenes[reason] if len(group) < len(runs) else 'all'})" for reason, group in missing.items()
+        )
+
+    runs = grouped((run for found in measurements for run in found["runs"]), "simulator")
+    simulators = _joined(measurements, "simulators")
+    columns = (
+        Column("version", lambda name: ", ".join({r["measured"]["version"] for r in runs[name] if r["measured"]})),
+        Column("settings", lambda name: simulators[name]["settings"]),
+        Column("says of penetration", lambda name: SIMULATORS[name].claims or "nothing"),  # not measured
+        Column("not run", lambda name: not_run(runs[name])),
+    )
+    return markdown("simulator", columns, [(simulators[name]["title"], name) for name in simulators])
 
 
-def _joined(measurements: Sequence[Found], key: str) -> Found:
+def _joined(measurements: Iterable[Found], key: str) -> Found:
     """Returns what measurements have at a key, together."""
     return {name: value for found in measurements for name, value in found[key].items()}
 
 
-def _by_scene(measurements: Sequence[Found], cell: Callable[[Found], str]) -> Rows:
+def _by_scene(measurements: Iterable[Found], cell: Callable[[Found], str]) -> Rows:
     """Returns a row for each simulator, and a column for each scene."""
-    runs = {(run["scene"], run["simulator"]): run["measured"] for found in measurements for run in found["runs"]}
-    scenes = _joined(measurements, "scenes")
-    rows = [("simulator", *scenes)]
-    for name, simulator in _joined(measurements, "simulators").items():
-        measured = [runs.get((scene, name)) for scene in scenes]
-        rows.append((simulator["title"], *("not run" if took is None else cell(took) for took in measured)))
-    return rows
+
+    def write(run: Found) -> str:
+        return cell(run["measured"]) if run["measured"] else "not run"
+
+    runs = pivot((run for found in measurements for run in found["runs"]), "simulator", "scene")
+    columns = [
+        Column(scene, lambda row, scene=scene: row.get(scene, {"measured": None}), write)
+        for scene in _joined(measurements, "scenes")
+    ]
+    titles = _joined(measurements, "simulators").items()
+    return markdown("simulator", columns, [(simulator["title"], runs.get(name, {})) for name, simulator in titles])
 
 
 # Repair and replay -------------------------------------------------------------------------------------------------
@@ -414,80 +423,57 @@ def _by_scene(measurements: Sequence[Found], cell: Callable[[Found], str]) -> Ro
 
 def repair_named(found: Found, *kinds: str) -> Rows:
     """Repairs of known meshes or files, each with every hint that was tried."""
-    rows = [("`bsc.repair`", "vertices", "crossings", "largest, mean move", "strain", "time")]
-    for run in found["runs"]:
-        if run["kind"] in kinds:
-            for attempt in run["attempts"]:
-                hint = "" if attempt["hint"] == "none" else f", `{attempt['hint']}=`"
-                rows.append((f"{Path(run['name']).stem}{hint}", f"{run['vertices']:,}", *_repair_cells(run, attempt)))
-    return rows
-
-
-def _repair_cells(run: Found, attempt: Found) -> tuple[str, ...]:
-    return (
-        f"{run['crossings']:,} to {attempt['crossings']:,}",
-        f"{digits(attempt['largest_move'])}, {digits(attempt['mean_move'])}",
-        f"{digits(100.0 * attempt['strain'])}%",
-        f"{attempt['seconds']:.2f} s",
-    )
+    rows = []
+    for run in (RepairRun.of_json(run) for run in found["runs"] if run["kind"] in kinds):
+        for attempt in run.attempts:
+            hint = "" if attempt.hint == "none" else f", `{attempt.hint}=`"
+            rows.append((f"{Path(run.name).stem}{hint}", (run, attempt)))
+    return markdown("`bsc.repair`", PAGE_MESHES, rows)
 
 
 def repair_random(found: Found) -> Rows:
     """Random damage by kind."""
-    costs = "largest move, median and most", "strain, median and most", "more than 10%", "median time"
-    rows = [("kind", "freed", "crossings", *costs)]
-    kinds: dict[str, list[Found]] = {}
-    for run in found["runs"]:
-        if run["kind"] not in (KNOWN_MESH, FILE):
-            kinds.setdefault(run["kind"], []).append(run)
-    for kind, runs in kinds.items():
-        first = [run["attempts"][0] for run in runs]
-        moves, strains = ([attempt[name] for attempt in first] for name in ("largest_move", "strain"))
-        rows.append(
-            (
-                kind,
-                f"{sum(attempt['crossings'] == 0 for attempt in first)} of {len(runs)}",
-                _counts([run["crossings"] for run in runs]),
-                f"{digits(median(moves))}, {digits(max(moves))}",
-                f"{digits(100.0 * median(strains))}, {digits(100.0 * max(strains))}%",
-                str(sum(strain > 0.1 for strain in strains)),
-                f"{median(attempt['seconds'] for attempt in first):.2f} s",
-            )
-        )
-    return rows
+    runs = [RepairRun.of_json(run) for run in found["runs"] if run["kind"] not in (KNOWN_MESH, FILE)]
+    return markdown("kind", PAGE_COSTS, [(kind, summarize(group)) for kind, group in grouped(runs, "kind").items()])
 
 
 def repair_shots(found: Found) -> Rows:
     """Repairs of shots: what collides before and after, moves, edges, and times beside those of the replay."""
-    rows = [
-        ("shot", "collisions", "edges in faces", "largest, mean move", "edges", "an interval; its replay", "multiple")
+
+    def each(row: Found, what: str) -> str:
+        return milliseconds(1e3 * row["seconds"][what] / row["intervals"])
+
+    columns = [
+        Column(title, lambda row, key=key: f"{row['before'][key]:,} to {row['left'][key]:,}")
+        for title, key in {"collisions": "collisions", "edges in faces": "intersections"}.items()
     ]
-    for row in found["rows"]:
-        before, left, seconds = row["before"], row["left"], row["seconds"]
-        counts = [f"{before[what]:,} to {left[what]:,}" for what in ("collisions", "intersections")]
-        repairing, finding = (milliseconds(1e3 * seconds[what] / row["intervals"]) for what in ("repairing", "finding"))
-        command = " ".join((row["shot"], *row["options"]))
-        rows.append(
-            (
-                f"`{command}`, {row['intervals']} intervals, {row['vertices']:,} vertices",
-                *counts,
-                f"{row['largest_move']:.2f}, {row['mean_move']:.2f}",
-                f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}",
-                f"{repairing}; {finding}",
-                f"{seconds['repairing'] / seconds['finding']:.1f}",
-            )
+    columns += [
+        Column("largest, mean move", lambda row: f"{row['largest_move']:.2f}, {row['mean_move']:.2f}"),
+        Column("edges", lambda row: f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}"),
+        Column("an interval; its replay", lambda row: f"{each(row, 'repairing')}; {each(row, 'finding')}"),
+        Column("multiple", lambda row: row["seconds"]["repairing"] / row["seconds"]["finding"], ".1f"),
+    ]
+    rows = [
+        (
+            f"`{' '.join((row['shot'], *row['options']))}`, {row['intervals']} intervals, {row['vertices']:,} vertices",
+            row,
         )
-    return rows
+        for row in found["rows"]
+    ]
+    return markdown("shot", columns, rows)
 
 
 def replay_sizes(found: Found) -> Rows:
     """Large, long and crowded scenes."""
-    rows = [("scene", "collisions", "wall", "processor", "memory", "file")]
-    for row in found["rows"]:
-        sizes = f"{row['memory'] / 1e9:.2f} GB", f"{row['size'] / 1e6:.1f} MB"
-        times = f"{row['wall']:.1f} s", f"{row['cpu']:.1f} s"
-        rows.append((f"`{row['scene']}`: {row['description']}", f"{row['hits']:,}", *times, *sizes))
-    return rows
+    seconds = "{:.1f} s".format
+    columns = (
+        Column("collisions", "hits"),
+        Column("wall", "wall", seconds),
+        Column("processor", "cpu", seconds),
+        Column("memory", "memory", lambda size: f"{size / 1e9:.2f} GB"),
+        Column("file", "size", lambda size: f"{size / 1e6:.1f} MB"),
+    )
+    return markdown("scene", columns, [(f"`{row['scene']}`: {row['description']}", row) for row in found["rows"]])
 
 
 # The front page -----------------------------------------------------------------------------------------------------
@@ -495,32 +481,25 @@ def replay_sizes(found: Found) -> Rows:
 
 def front(gpu: Found, two_cores: Found, bullet: Found, drape: Found) -> Rows:
     """What the front page shows."""
-    balls = {}
-    for name, found in (("gpu", gpu), ("cpu", two_cores)):
-        balls[name] = next(scene for scene in found["scenes"] if _scene_name(scene).startswith("cloth-ball"))
-    ball, peer = balls["cpu"], balls["cpu"]["ipc_toolkit"]
-    took = balls["gpu"]["milliseconds"]["cuda_graph"]
+    ball, on_gpu = (
+        next(scene for scene in found["scenes"] if _scene_name(scene).startswith("cloth-ball"))
+        for found in (two_cores, gpu)
+    )
     size = (
         f"{ball['triangles']:,} triangles, {ball['candidates'] / 1e6:.1f} million candidates, {ball['hits']:,} contacts"
     )
+    name = gpu["record"]["gpus"][0].removeprefix("NVIDIA ")
+    peer = f"IPC Toolkit, the earliest time alone: {milliseconds(ipc_milliseconds(ball['ipc_toolkit']))}"
     rows = [
         ("measured", ""),
-        (
-            f"{size}: all, with time and normal",
-            f"{took:.1f} ms on an {gpu['record']['gpus'][0].removeprefix('NVIDIA ')}",
-        ),
-        (
-            "the same on two cores",
-            f"{milliseconds(ball['milliseconds']['detect'])} (IPC Toolkit, the earliest time alone: "
-            f"{milliseconds(peer['build_milliseconds'] + peer['step_milliseconds'])})",
-        ),
+        (f"{size}: all, with time and normal", f"{on_gpu['milliseconds']['cuda_graph']:.1f} ms on an {name}"),
+        ("the same on two cores", f"{milliseconds(ball['milliseconds']['detect'])} ({peer})"),
     ]
     names = {"vbd": "VBD", "vbd-self-contact": "with its self-contact", "ccd-vbd": "with `SolverCCD`"}
     for found, title, what in (
         (bullet, "a patch of cloth is shot at a sheet: pairs that pass through", "collisions"),
         (drape, "a cloth drapes over a ball: edges through faces, worst frame", "crossings"),
     ):
-        runs = {run["simulator"]: run["measured"][what] for run in found["runs"] if run["measured"]}
-        counts = {name: value if isinstance(value, int) else max(value) for name, value in runs.items()}
+        counts = {run["simulator"]: np.max(run["measured"][what]) for run in found["runs"] if run["measured"]}
         rows.append((title, ", ".join(f"{names[name]} {counts[name]:,}" for name in names)))
     return rows

@@ -18,8 +18,8 @@ import table_rows
 from table_rows import Found, Rows
 
 from warp_bsc._atomic_file import OutputFile
-from warp_bsc.bench.penetration import SCENES
-from warp_bsc.bench.repair import FILE, KNOWN_MESH
+from warp_bsc.bench.measure.penetration import SCENES
+from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
 _GUIDES = "configuration", "contacts", "gradients_vbd", "reports", "turning_bodies"

@@ -6,7 +6,7 @@ from benchmark_data import load_queries
 from generators import GENERATORS
 
 from warp_bsc import checker
-from warp_bsc.bench.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
+from warp_bsc.bench.measure.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
 from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
 from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE

@@ -6,8 +6,8 @@ import os
 import pytest
 
 from warp_bsc import CollisionDetector, CollisionMesh
-from warp_bsc.bench.detector import benchmark_detector
-from warp_bsc.bench.scenes import load_scene
+from warp_bsc.bench.measure.detector import benchmark_detector
+from warp_bsc.bench.scenes.detector import load_scene
 from warp_bsc.bench.timing import count_threads, limited_threads
 from warp_bsc.cli.main import main
 

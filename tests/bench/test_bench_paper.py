@@ -8,14 +8,13 @@ import pytest
 import warp as wp
 
 from warp_bsc import CollisionDetector, CollisionMesh, checker
-from warp_bsc.bench import ipc_toolkit
-from warp_bsc.bench import paper as bench_paper
-from warp_bsc.bench.ipc_toolkit import time_queries
-from warp_bsc.bench.methods import METHODS, STAGES
-from warp_bsc.bench.paper import Effort, benchmark_scene, find_places
-from warp_bsc.bench.scenes import load_intervals, load_scene, paper_scenes
-from warp_bsc.bench.worst_case import find_worst
-from warp_bsc.cli import bench_paper as bench_command
+from warp_bsc.bench.measure import paper as bench_paper
+from warp_bsc.bench.measure.methods import METHODS, STAGES
+from warp_bsc.bench.measure.paper import Effort, benchmark_scene, find_places
+from warp_bsc.bench.measure.worst_case import find_worst
+from warp_bsc.bench.peers import ipc_toolkit
+from warp_bsc.bench.peers.ipc_toolkit import time_queries
+from warp_bsc.bench.scenes.detector import load_intervals, load_scene, paper_scenes
 from warp_bsc.cli.main import main
 from warp_bsc.detection.run.launch import cores
 from warp_bsc.detection.run.settings import PairKind
@@ -27,8 +26,8 @@ TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries
 def tiny(monkeypatch):
     monkeypatch.setattr(Effort, "quick", classmethod(lambda cls: TINY))
     monkeypatch.setattr(bench_paper, "_CPU_QUERIES", 1)
-    monkeypatch.setattr("warp_bsc.bench.worst_case._SUSPECTS", 2)
-    monkeypatch.setattr("warp_bsc.bench.worst_case._CPU_NANOSECONDS", 1e4)
+    monkeypatch.setattr("warp_bsc.bench.measure.worst_case._SUSPECTS", 2)
+    monkeypatch.setattr("warp_bsc.bench.measure.worst_case._CPU_NANOSECONDS", 1e4)
 
 
 def bench(capsys, *arguments):
@@ -154,7 +153,9 @@ def test_worst_query_is_one_of_those_asked():
 
 
 def test_scenes_come_with_a_checkout(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr("warp_bsc.bench.scenes.__file__", str(tmp_path / "warp_bsc" / "bench" / "scenes.py"))
+    monkeypatch.setattr(
+        "warp_bsc.bench.scenes.detector.__file__", str(tmp_path / "warp_bsc" / "bench" / "scenes" / "detector.py")
+    )
     with pytest.raises(FileNotFoundError, match="come with a checkout"):
         paper_scenes()
     for arguments in ([], ["--quick"], ["funnel"]):
@@ -180,5 +181,5 @@ def test_wrong_use(capsys, monkeypatch, tmp_path, arguments, part):
 
 
 def test_figure_needs_matplotlib(capsys, monkeypatch):
-    monkeypatch.setattr(bench_command.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert "warp-bsc[bench]" in fail(capsys, "cloth:1000", "--figure", "times.png")

@@ -8,9 +8,10 @@ from generators import GENERATORS
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench import queries as bench_queries
-from warp_bsc.bench import query_files
-from warp_bsc.bench.queries import MODES, benchmark_queries, generate_queries, generate_touching_queries
+from warp_bsc.bench.measure import given_queries as query_files
+from warp_bsc.bench.measure import queries as bench_queries
+from warp_bsc.bench.measure.queries import MODES, benchmark_queries
+from warp_bsc.bench.scenes.queries import generate_queries, generate_touching_queries
 from warp_bsc.cli.main import main
 from warp_bsc.detection.run.settings import PairKind
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from warp_bsc import CollisionDetector, CollisionMesh
-from warp_bsc.bench.scenes import GENERATORS, default_scenes, load_scene
+from warp_bsc.bench.scenes.detector import GENERATORS, default_scenes, load_scene
 
 FACES = np.array([[0, 1, 2], [3, 4, 5]])
 FLOOR = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]

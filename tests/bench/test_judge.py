@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.bench.judge import Judge
-from warp_bsc.bench.response_scenes import SceneBuilder
+from warp_bsc.bench.measure.judge import Judge
+from warp_bsc.bench.scenes.contact import SceneBuilder
 
 CELL = 0.1
 

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.bench import penetration, penetration_libuipc, penetration_mujoco, penetration_newton
-from warp_bsc.bench.judge import Judge
-from warp_bsc.bench.penetration import FRAME_RATE, SCENES, SIMULATORS, measure_penetration
-from warp_bsc.bench.penetration_newton import simulate_newton
-from warp_bsc.bench.penetration_scenes import SCENES as BUILDERS
-from warp_bsc.bench.penetration_scenes import build_penetration_scene
-from warp_bsc.bench.penetration_states import find_bodies, held_positions
-from warp_bsc.bench.response_simulation import NotFinite
+from warp_bsc.bench.measure import penetration
+from warp_bsc.bench.measure.judge import Judge
+from warp_bsc.bench.measure.penetration import FRAME_RATE, SCENES, SIMULATORS, measure_penetration
+from warp_bsc.bench.peers import libuipc as penetration_libuipc
+from warp_bsc.bench.peers import mujoco as penetration_mujoco
+from warp_bsc.bench.peers import newton as penetration_newton
+from warp_bsc.bench.peers.newton import simulate_newton
+from warp_bsc.bench.peers.states import find_bodies, held_positions
+from warp_bsc.bench.scenes.penetration import SCENES as BUILDERS
+from warp_bsc.bench.scenes.penetration import build_penetration_scene
+from warp_bsc.bench.scenes.simulation import NotFinite
 
 each_scene = pytest.mark.parametrize("scene", SCENES)
 

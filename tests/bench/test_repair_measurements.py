@@ -7,9 +7,10 @@ import pytest
 import trimesh
 
 import warp_bsc as bsc
-from warp_bsc.bench import ipc_toolkit, repair
-from warp_bsc.bench.repair import FILE, KNOWN_MESH, RepairAttempt, RepairRun, measure_repair, summarize
-from warp_bsc.bench.repair_scenes import TangledMesh, damaged, load_tangled
+from warp_bsc.bench.measure import repair
+from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH, RepairAttempt, RepairRun, measure_repair, summarize
+from warp_bsc.bench.peers import ipc_toolkit
+from warp_bsc.bench.scenes.repair import TangledMesh, damaged, load_tangled
 
 
 def cross(*, size=32):

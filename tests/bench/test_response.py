@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.bench import response_scenes
 from warp_bsc.bench.crossings import CrossingCounter
 from warp_bsc.bench.elastic_energy import ElasticEnergy
-from warp_bsc.bench.response import (
+from warp_bsc.bench.measure.response import (
     CONFIGURATIONS,
     CONVERGED,
     REFERENCE,
@@ -20,8 +19,9 @@ from warp_bsc.bench.response import (
     ResponseMeasurement,
     measure_response,
 )
-from warp_bsc.bench.response_scenes import NotRunnable, build_scene
-from warp_bsc.bench.response_simulation import Samples, Simulation, energy_gained, largest_stretch, total_energy
+from warp_bsc.bench.scenes import contact as response_scenes
+from warp_bsc.bench.scenes.contact import NotRunnable, build_scene
+from warp_bsc.bench.scenes.simulation import Samples, Simulation, energy_gained, largest_stretch, total_energy
 from warp_bsc.implicit.elastic import Elastic
 
 
@@ -153,7 +153,8 @@ def test_no_energy_is_gained_in_flight_nor_by_a_swing(device):
 def test_the_measures_of_a_run():
     times = [1.0, 1.0, 4.0]
     found = ResponseMeasurement("cpu", 3, 1, 60, 5, 1.0, 2.0, 3.0, None, 0, 0, None, times)
-    assert (found.median, found.mean) == (1.0, 2.0)
+    times = found.to_dict()["milliseconds"]
+    assert (times["median"], times["mean"]) == (1.0, 2.0)
     at, moved = (replace(found, early=np.array([[0.0, 0.0, z], [1.0, 0.0, 0.0]])) for z in (0.0, 0.004))
     assert at.distance_from(moved) == pytest.approx(2.0)
     assert at.distance_from(found) is found.distance_from(at) is at.distance_from(replace(moved, rate=120)) is None
@@ -235,7 +236,7 @@ def test_a_program_moves_bodies_and_particles(device):
 
 def test_newton_steps_are_limited_unless_the_run_is_the_converged_one(device, monkeypatch):
     """After as many steps as are compared, here fewer, while cubes meet."""
-    monkeypatch.setattr("warp_bsc.bench.response.EARLY_STEPS", 14)
+    monkeypatch.setattr("warp_bsc.bench.measure.response.EARLY_STEPS", 14)
     limited, converged = (measure("pile", name, device=device, seconds=14 / 60) for name in ("implicit", CONVERGED))
     assert limited.steps == converged.steps == 14
     assert limited.crossings == limited.collisions == limited.uncertified_steps == 0

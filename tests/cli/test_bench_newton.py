@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from warp_bsc.bench.newton_examples import ExampleMeasurement, ExampleRun, StageTotals
-from warp_bsc.cli import bench_newton
+from warp_bsc.bench.measure import newton_examples
+from warp_bsc.bench.measure.newton_examples import ExampleMeasurement, ExampleRun, StageTotals
 from warp_bsc.cli.main import main
 
 
@@ -54,7 +54,7 @@ def measured(monkeypatch):
             return ExampleRun(example.title, mode, problem=result)
         return ExampleRun(example.title, mode, measured=result)
 
-    monkeypatch.setattr(bench_newton, "measure_example", measure_example)
+    monkeypatch.setattr(newton_examples, "measure_example", measure_example)
     return calls
 
 
@@ -131,14 +131,14 @@ def test_modes(capsys, measured, modes, expected):
 
 @pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
-    made_up = bench_newton.measure_example
+    made_up = newton_examples.measure_example
 
     def interrupt_third(*arguments, **options):
         if len(measured) == 2:
             raise KeyboardInterrupt
         return made_up(*arguments, **options)
 
-    monkeypatch.setattr(bench_newton, "measure_example", interrupt_third)
+    monkeypatch.setattr(newton_examples, "measure_example", interrupt_third)
     path = tmp_path / "found.json"
     output = run(capsys, "cloth_twist", "cloth_hanging --width 9", *["--json", path] * to_file, status=130)
     assert sum(line.startswith("cloth_twist ") for line in output.out.splitlines()) == 3

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from warp_bsc.bench.penetration import SCENES, SIMULATORS, PenetrationMeasurement, PenetrationRun
-from warp_bsc.cli import bench_penetration
+from warp_bsc.bench.measure import penetration
+from warp_bsc.bench.measure.penetration import SCENES, SIMULATORS, PenetrationMeasurement, PenetrationRun
 from warp_bsc.cli.main import main
 
 
@@ -56,7 +56,7 @@ def measured(monkeypatch):
         problem = result if isinstance(result, str) else None
         return PenetrationRun(scene, simulator, measured=None if problem else result, problem=problem)
 
-    monkeypatch.setattr(bench_penetration, "measure_penetration", measure_penetration)
+    monkeypatch.setattr(penetration, "measure_penetration", measure_penetration)
     return calls
 
 
@@ -120,14 +120,14 @@ def test_all_by_default_and_each_once(capsys, measured):
 
 
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured):
-    made_up = bench_penetration.measure_penetration
+    made_up = penetration.measure_penetration
 
     def interrupt_third(*arguments, **options):
         if len(measured) == 2:
             raise KeyboardInterrupt
         return made_up(*arguments, **options)
 
-    monkeypatch.setattr(bench_penetration, "measure_penetration", interrupt_third)
+    monkeypatch.setattr(penetration, "measure_penetration", interrupt_third)
     path = tmp_path / "found.json"
     output = run(capsys, "--json", path, status=130)
     assert "Interrupted: the other runs are missing." in output.out

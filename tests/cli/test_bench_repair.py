@@ -4,9 +4,11 @@ import json
 
 import pytest
 
-from warp_bsc.bench.repair import RepairAttempt, RepairRun
-from warp_bsc.bench.repair_scenes import KINDS, KNOWN
-from warp_bsc.cli import bench_repair
+from warp_bsc.bench.measure import repair
+from warp_bsc.bench.measure.repair import RepairAttempt, RepairRun
+from warp_bsc.bench.peers import ipc_toolkit
+from warp_bsc.bench.scenes.repair import KINDS, KNOWN
+from warp_bsc.cli import bench_run
 from warp_bsc.cli.main import main
 
 
@@ -43,10 +45,9 @@ def measured(monkeypatch):
         attempts = ATTEMPTS.get((kind, name), (attempt(),))
         return RepairRun(kind, name, 2000, 3800, CROSSINGS.get((kind, name), 60), attempts, name != "2")
 
-    monkeypatch.setattr(bench_repair, "measure_repair", measure_repair)
-    monkeypatch.setattr(bench_repair, "damaged", lambda kind, number: (kind, number))
-    monkeypatch.setattr(bench_repair.ipc_toolkit, "is_installed", lambda: True)
-    monkeypatch.setattr(bench_repair.ipc_toolkit, "version", lambda: "1.5")
+    monkeypatch.setattr(repair, "measure_repair", measure_repair)
+    monkeypatch.setattr(bench_run, "damaged", lambda kind, number: (kind, number))
+    monkeypatch.setattr(ipc_toolkit, "version", lambda: "1.5")
     return calls
 
 
@@ -95,7 +96,7 @@ def test_tables(capsys, monkeypatch, tmp_path, measured):
 
 
 def test_without_the_toolkit(capsys, monkeypatch, measured):
-    monkeypatch.setattr(bench_repair.ipc_toolkit, "is_installed", lambda: False)
+    monkeypatch.setattr(ipc_toolkit, "version", lambda: None)
     output = run(capsys, "--random", 0).out
     assert measured == [("known", name) for name in KNOWN]
     assert "The IPC Toolkit, which would check the outputs, is not installed" in output
@@ -124,14 +125,14 @@ def test_json(capsys, tmp_path, measured):
 
 @pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
-    made_up = bench_repair.measure_repair
+    made_up = repair.measure_repair
 
     def interrupt_third(*arguments, **options):
         if len(measured) == 2:
             raise KeyboardInterrupt
         return made_up(*arguments, **options)
 
-    monkeypatch.setattr(bench_repair, "measure_repair", interrupt_third)
+    monkeypatch.setattr(repair, "measure_repair", interrupt_third)
     path = tmp_path / "found.json"
     output = run(capsys, *["--json", path] * to_file, status=130)
     assert "Interrupted: the other repairs are missing." in output.out

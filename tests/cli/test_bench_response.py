@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from warp_bsc.bench.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
-from warp_bsc.cli import bench_response
+from warp_bsc.bench.measure import response
+from warp_bsc.bench.measure.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
 from warp_bsc.cli.main import main
 
 
@@ -58,7 +58,7 @@ def measured(monkeypatch):
         found = None if problem else result
         return ResponseRun(scene, options["solver"], configuration, measured=found, problem=problem)
 
-    monkeypatch.setattr(bench_response, "measure_response", measure_response)
+    monkeypatch.setattr(response, "measure_response", measure_response)
     return calls
 
 
@@ -151,14 +151,14 @@ def test_all_scenes_by_default_and_each_once(capsys, measured):
 
 @pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
-    made_up = bench_response.measure_response
+    made_up = response.measure_response
 
     def interrupt_third(*arguments, **options):
         if len(measured) == 2:
             raise KeyboardInterrupt
         return made_up(*arguments, **options)
 
-    monkeypatch.setattr(bench_response, "measure_response", interrupt_third)
+    monkeypatch.setattr(response, "measure_response", interrupt_third)
     path = tmp_path / "found.json"
     output = run(capsys, "sphere", *["--json", path] * to_file, status=130)
     assert "Interrupted: the other runs are missing." in output.out

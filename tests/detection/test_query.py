@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from benchmark_data import load_cloth_funnel_queries, load_queries
-from certify import KINDS, judge
+from certify_contacts import KINDS, judge
 from generators import GENERATORS
 
 import warp_bsc as bsc

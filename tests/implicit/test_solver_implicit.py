@@ -12,8 +12,8 @@ from newton import ModelFlags, ParticleFlags
 from newton_scenes import SOFT, add_patch, bullet
 
 import warp_bsc as bsc
-from warp_bsc.bench.response_scenes import build_scene
-from warp_bsc.bench.response_simulation import Simulation, energy_gained
+from warp_bsc.bench.scenes.contact import build_scene
+from warp_bsc.bench.scenes.simulation import Simulation, energy_gained
 from warp_bsc.implicit.contact import newton_method, system
 from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.structs import allocate

@@ -6,7 +6,7 @@ import warp as wp
 from generators import GENERATORS
 from simd_packets import in_normal_range
 
-from warp_bsc.bench.methods import Queries, QuerySet
+from warp_bsc.bench.measure.methods import Queries, QuerySet
 from warp_bsc.detection.run.settings import NO_FUSED_OPERATIONS, PairKind
 from warp_bsc.kernels.classification import classify
 from warp_bsc.kernels.motion import relative_motion

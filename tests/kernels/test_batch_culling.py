@@ -6,7 +6,7 @@ import warp as wp
 from generators import GENERATORS
 
 from warp_bsc import checker
-from warp_bsc.bench.methods import Queries, QuerySet
+from warp_bsc.bench.measure.methods import Queries, QuerySet
 from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.kernels.bits import lowest_bit
 from warp_bsc.kernels.culling import (

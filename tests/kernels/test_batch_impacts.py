@@ -7,7 +7,7 @@ from generators import GENERATORS
 from outputs import filled_with_nan
 from simd_packets import in_normal_range
 
-from warp_bsc.bench.methods import Queries, QuerySet
+from warp_bsc.bench.measure.methods import Queries, QuerySet
 from warp_bsc.detection.run.settings import NO_FUSED_OPERATIONS, PairKind
 from warp_bsc.kernels.bits import lowest_bit
 from warp_bsc.kernels.classification import classify

@@ -11,12 +11,14 @@ from typing import Any
 
 import certify
 import certify_device
+import certify_totals
 import device_methods
 import exact_queries
 import numpy as np
 import pytest
 import warp as wp
-from certify_device import KINDS, METHODS, ROWS, Judge, Result, certify_on_device, jobs_of
+from certify_device import KINDS, ROWS, Judge, certify_on_device, jobs_of
+from certify_totals import METHODS, Result
 from device_queries import LATTICE, Generator, make_lattice_queries
 from lattice_truth import LARGEST, decide_lattice
 from rich.console import Console
@@ -90,9 +92,7 @@ def test_nothing_contradicts_the_truth(all_jobs, device):
     failures, printed = run(all_jobs, device, one_in=50)
     assert failures == 0, printed
     assert "0 failures" in printed
-    wrong = dict(
-        re.findall(r"^ (float|conservative|user's kernel|exact) .* ([\d,]+ +[\d,]+) *$", printed, re.MULTILINE)
-    )
+    wrong = dict(re.findall(r"^(float|conservative|user's kernel|exact) .* ([\d,]+ +[\d,]+) *$", printed, re.MULTILINE))
     assert [method for method, numbers in wrong.items() if numbers.split() == ["0", "0"]] == list(METHODS)[1:]
     assert len(wrong) == len(METHODS)
     for name in ("lattice", "reached", "at_distances", *(generator.name.lower() for generator in Generator)):
@@ -234,7 +234,7 @@ def test_totals_count_what_float_misses_and_what_it_reports_in_vain():
     result = Result(checked=1)
     result.counts[UNSURE, HIT, UNSURE, HIT, FREE] = 5  # exact arithmetic stands for the truth
     result.counts[FREE, FREE, FREE, UNSURE, HIT] = 2
-    found = certify_device._report({("grazing", True): result}, 0.5, Console(file=io.StringIO()))
+    found = certify_totals.print_totals({("grazing", True): result}, 0.5, Console(file=io.StringIO()))
     names = ("free", "hit", "unsure", "missed", "false")
     expected = {"float": (5, 2, 0, 5, 2), "conservative": (2, 0, 5, 0, 0), "user's kernel": (0, 5, 2, 0, 0)}
     expected["exact"] = (2, 5, 0, 0, 0)
@@ -253,7 +253,7 @@ def test_the_command_prints_failures_in_full_and_writes_totals(monkeypatch, caps
     assert found["failures"] == 0 and found["record"]["command"].endswith("--lattice 0:100:7")
     for name, answers in found["methods"].items():
         numbers = " +".join(f"{number:,}" for number in answers.values())
-        assert re.search(rf"^ {name} +{numbers}", printed, re.MULTILINE)
+        assert re.search(rf"^{name} +{numbers}", printed, re.MULTILINE)
         assert answers["free"] + answers["hit"] + answers["unsure"] == found["queries"]
         assert name == "float" or answers["missed"] == answers["false"] == 0
     assert found["methods"]["float"]["missed"] > 0
@@ -271,13 +271,13 @@ def test_the_command_prints_failures_in_full_and_writes_totals(monkeypatch, caps
     ("text", "numbers"), [("5:9", range(5, 9)), (":", range(LATTICE)), ("9::7", range(9, LATTICE, 7))]
 )
 def test_numbers_of_the_lattice(text, numbers):
-    assert certify.lattice_range(text) == numbers
+    assert certify_device.lattice_range(text) == numbers
 
 
 @pytest.mark.parametrize("text", ["5", "9:5", "a:b", "1:2:3:4", "1:9:0", "9:1:-1", ""])
 def test_numbers_that_are_none(text):
     with pytest.raises(argparse.ArgumentTypeError, match="FIRST:LAST"):
-        certify.lattice_range(text)
+        certify_device.lattice_range(text)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from benchmark_data import load_cloth_funnel_queries, load_queries
-from certify import KINDS
+from certify_contacts import KINDS
 from compilation import QUICK
 from exact_queries import decide_exactly
 from generators import GENERATORS, _weights, _with_gap

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench.repair_scenes import KINDS, KNOWN, damaged
+from warp_bsc.bench.scenes.repair import KINDS, KNOWN, damaged
 from warp_bsc.repair.closest import closest_points, exit_distances
 from warp_bsc.repair.surface import Surface
 

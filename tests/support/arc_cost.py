@@ -6,9 +6,7 @@ graphs: a ball that turns in a cloth (``--degrees`` a step), the same ball that 
 and dynamic boxes that tumble on a sheet. ``--json`` writes the times to a file as well.
 """
 
-import argparse
 import contextlib
-import sys
 import time
 from unittest import mock
 
@@ -16,13 +14,11 @@ import newton
 import numpy as np
 import trimesh
 import warp as wp
+from measured import options_of, report
 from newton_scenes import SOLVERS, add_patch
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.tables import Column
 from warp_bsc.response.state import motion
 
 DT = 1.0 / 240.0
@@ -129,24 +125,33 @@ def steps(model, turn, count, on_arcs):
     return time_of_step, totals.uncertified_steps
 
 
+COLUMNS = (
+    Column("arcs [ms]", "milliseconds.arcs", ".2f"),
+    Column("chords [ms]", "milliseconds.chords", ".2f"),
+    Column("ratio", lambda row: row["milliseconds"]["arcs"] / row["milliseconds"]["chords"], ".2f"),
+    Column(
+        "contacts, or steps not certified, by each",
+        lambda row: ", ".join(map(str, row.get("contacts") or row.get("uncertified_steps"))),
+        kind="word",
+    ),
+)
+
+
 def main():
     """Runs the program."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--device", default=None)
+    parser = options_of(__doc__)
+    parser.add_argument("--device")
     parser.add_argument("--cells", type=int, default=60, help="cells along a side of a cloth")
     parser.add_argument("--degrees", type=float, default=3.0, help="turn of the ball in a step")
     parser.add_argument("--steps", type=int, default=80)
-    parser.add_argument("--json", metavar="FILE", help="file to which the times are written as well")
     args = parser.parse_args()
     device = wp.get_device(args.device)
-    table, rows = Table(box=box.SIMPLE), []
-    for column in ("", "arcs [ms]", "chords [ms]", "ratio", "contacts, or steps not certified, by each"):
-        table.add_column(column)
+    rows = []
 
     def add(name, times, results):
-        rows.append({"name": name, "milliseconds": dict(zip(("arcs", "chords"), times, strict=True))})
-        rows[-1]["contacts" if name == "detect" else "uncertified_steps"] = list(results)
-        table.add_row(name, *(f"{t:.2f}" for t in times), f"{times[0] / times[1]:.2f}", ", ".join(map(str, results)))
+        milliseconds = dict(zip(("arcs", "chords"), times, strict=True))
+        key = "contacts" if name == "detect" else "uncertified_steps"
+        rows.append({"name": name, "milliseconds": milliseconds, key: list(results)})
 
     add("detect", *detections(args.cells, args.degrees, 20, device))
     for name, build, turn in (
@@ -156,10 +161,8 @@ def main():
     ):
         found = [steps(build(args.cells, device), turn, args.steps, on_arcs) for on_arcs in (True, False)]
         add(name, *zip(*found, strict=True))
-    Console(width=120).print(table)
-    if args.json:
-        found = {"benchmark": "arc_cost", "cells": args.cells, "degrees": args.degrees, "rows": rows}
-        write_measurement(args.json, found, sys.argv, [device])
+    settings = {"cells": args.cells, "degrees": args.degrees}
+    report(args, "arc_cost", "", COLUMNS, rows, [device], name="name", **settings)
 
 
 if __name__ == "__main__":

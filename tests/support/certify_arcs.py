@@ -1,14 +1,12 @@
 """Holds the search for contacts on arcs against interval arithmetic: random screws of triangles, vertices and edges.
 
-``python tests/support/certify_arcs.py --count 100000`` prints, generator by generator, how many pairs collide, how many
-of these are missed, how many are reported that do not collide, all of them within the tolerance, and the share that is
-decided over the whole step, without halving it. It exits with status 1 if a collision is missed, a time of impact is
-late, or a pair is reported that stays farther apart than the tolerance. ``--detector 1000`` asks
-``detect(arcs=)`` about the first thousand pairs of each kind and generator, too. It needs mpmath (extra ``dev``).
+The table has, generator by generator, how many pairs collide, how many of these are missed, how many are reported that
+do not collide, all of them within the tolerance, and the share that is decided over the whole step, without halving it.
+It is a failure if a collision is missed, a time of impact is late, or a pair is reported that stays farther apart than
+the tolerance. ``--detector 1000`` asks ``detect(arcs=)`` about the first thousand pairs of each kind and generator,
+too. It needs mpmath (extra ``dev``).
 """
 
-import argparse
-import sys
 import time
 from dataclasses import dataclass, fields
 
@@ -16,11 +14,10 @@ import numpy as np
 import warp as wp
 from arc_intervals import HIT, UNDECIDED, Pairs, decide
 from arc_truth import sampled_distances
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from measured import print_rows
 
 import warp_bsc as bsc
+from warp_bsc.bench.tables import Column
 from warp_bsc.detection.arcs.rigid_motion import points_on_arcs
 from warp_bsc.detection.narrow.arc_phase import allocate_arcs, bound_arc
 from warp_bsc.kernels.arcs import Arcs, impact_on_arcs
@@ -276,34 +273,24 @@ def certify(count, seed, device, *, of_detector=0, chunk=12500):
     return searches, detections
 
 
-def main():
-    """Runs the program."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--count", type=int, default=8000, help="pairs in all")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--detector", type=int, default=0, help="pairs of each kind and generator for detect(arcs=)")
-    parser.add_argument("--device", default=None)
-    args = parser.parse_args()
+OPTIONS = {
+    "--detector": {"type": int, "default": 0, "help": "pairs of each kind and generator for detect(arcs=)"},
+    "--device": {"default": None},
+}
+
+
+def run(arguments):
+    """Certifies as the options say, prints tables, and returns the number of failures."""
     start = time.perf_counter()
-    searches, detections = certify(args.count, args.seed, wp.get_device(args.device), of_detector=args.detector)
+    device = wp.get_device(arguments.device)
+    searches, detections = certify(arguments.count, arguments.seed, device, of_detector=arguments.detector)
     wrong = 0
-    for title, verdicts in (("search of a pair", searches), ("detect(arcs=)", detections)):
-        if not verdicts:
-            continue
-        table = Table(title=title, box=box.SIMPLE)
-        for column in ("generator", *(f.name for f in fields(Verdict)), "without halving"):
-            table.add_column(column, justify="left" if column == "generator" else "right")
-        total = Verdict()
-        for verdict in verdicts.values():
-            total += verdict
-        for name, verdict in [*verdicts.items(), ("all", total)]:
-            share = f"{verdict.at_once / verdict.pairs:.1%}" if title.startswith("search") else ""
-            table.add_row(name, *(str(getattr(verdict, f.name)) for f in fields(Verdict)), share)
-        Console(width=160).print(table)
-        wrong += total.missed + total.late + total.beyond
+    columns = [Column(f.name, f.name, "d") for f in fields(Verdict)]
+    at_once = Column("without halving", lambda verdict: verdict.at_once / verdict.pairs, ".1%")
+    for title, verdicts, more in (("search of a pair", searches, [at_once]), ("detect(arcs=)", detections, [])):
+        if verdicts:
+            total = sum(verdicts.values(), Verdict())
+            print_rows(title, [*columns, *more], verdicts.items(), total=total)
+            wrong += total.missed + total.late + total.beyond
     print(f"{time.perf_counter() - start:.0f} s")
-    sys.exit(1 if wrong else 0)
-
-
-if __name__ == "__main__":
-    main()
+    return wrong

@@ -1,38 +1,40 @@
 """Makes queries on a device, answers them there by every method, and holds the answers against the truth.
 
-``python tests/support/certify.py --device cuda:0 --count 100000000`` runs it. Queries are made in batches, answered by
-"float", by "conservative", by a user's kernel, and by exact arithmetic whatever the others say, and compared on the
-device. The truth is known for small integers (lattice_truth.py) and for minimum distances that are reached exactly
-(device_distances.py); elsewhere exact arithmetic stands for it. One in 10,000 queries goes to the host, where the
-checker decides it. It is a failure if two certain answers contradict each other, or the truth; those of "float" are not
-certain. ``--count 1 --lattice 5::1000`` runs over a thousandth of {-1, 0, 1}^24, and little else.
+Queries are made in batches, answered by "float", by "conservative", by a user's kernel, and by exact arithmetic
+whatever the others say, and compared on the device. The truth is known for small integers (lattice_truth.py) and for
+minimum distances that are reached exactly (device_distances.py); elsewhere exact arithmetic stands for it. One in
+10,000 queries goes to the host, where the checker decides it. It is a failure if two certain answers contradict each
+other, or the truth; those of "float" are not certain. ``--count 1 --lattice 5::1000`` runs over a thousandth of
+{-1, 0, 1}^24, and little else.
 
 Of the tables, "unsure" are queries that "conservative" does not certify, "unknown" those that exact arithmetic on the
 device leaves to the host. With minimum distances these are many, see :mod:`warp_bsc.kernels.exact.distance`.
 """
 
+import argparse
 import os
+import sys
 import time
 import zlib
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing import get_context
 
 import numpy as np
 import warp as wp
+from certify_totals import Result, print_totals
 from device_distances import choose_distances, make_reached_queries
 from device_methods import answer_kernel, count_answers, distance_kernel, exact_distance_kernel, user_kernel
 from device_queries import LATTICE, Generator, make_lattice_queries, make_queries
 from exact_queries import exact_kernel
 from lattice_truth import decide_lattice
-from rich import box
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
 from warp_bsc import checker
+from warp_bsc.bench.record import write_measurement
+from warp_bsc.cli.tables import Console
 from warp_bsc.kernels.exact.distance import BITS as DISTANCE_BITS
 from warp_bsc.kernels.exact.polygon import BITS
 from warp_bsc.kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
@@ -40,8 +42,6 @@ from warp_bsc.kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 __all__ = ["Job", "Judge", "Result", "certify_on_device", "check_on_host", "jobs_of"]
 
 KINDS = ("vertex_face", "edge_edge", "vertex_edge", "vertex_vertex")
-METHODS = {"float": 4, "conservative": 2, "user's kernel": 3, "exact": 1}
-"""The axis of each method in counts of answers."""
 ONE_IN = 10_000
 """One in this many queries goes to the checker."""
 SHOWN = 16
@@ -78,37 +78,6 @@ class Job:
     count: int
     make: Callable
     has_distance: bool = False
-
-
-@dataclass
-class Result:
-    """What became of queries.
-
-    Attributes:
-        counts: Numbers of queries by answers FREE, HIT and UNSURE: axes truth, exact, conservative, user's kernel,
-            float.
-        checked: Queries that the checker has decided on the host.
-        failed: Failures.
-        failures: Descriptions of failures, of at most SHOWN a batch.
-    """
-
-    counts: np.ndarray = field(default_factory=lambda: np.zeros((3, 3, 3, 3, 3), dtype=np.int64))
-    checked: int = 0
-    failed: int = 0
-    failures: list[str] = field(default_factory=list)
-
-    def add(self, other):
-        """Adds another result to this one."""
-        self.counts += other.counts
-        self.checked += other.checked
-        self.failed += other.failed
-        self.failures += other.failures
-
-    def of_truth(self, truth):
-        """Returns the counts, without their first axis, of queries known to be FREE or HIT."""
-        counts = self.counts[truth].copy()
-        counts[truth] += self.counts[UNSURE, truth]
-        return counts
 
 
 class Judge:
@@ -416,46 +385,32 @@ def certify_on_device(jobs, device, *, one_in=ONE_IN, size=None, pool=None, cons
         while checks.pending:
             checks.collect()
             progress.advance(task)
-    return _report(results, seconds, console)
+    return print_totals(results, seconds, console)
 
 
-def _report(results, seconds, console):
-    """Prints what became of all queries, and returns it as :func:`certify_on_device` does."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), show_edge=False)
-    table.add_column("Queries", no_wrap=True)
-    for column in ("Type", "Number", "Colliding", "Unsure", "Float missed", "False", "Unknown", "Checked", "Failures"):
-        table.add_column(column, justify="right", no_wrap=True)
-    everything = Result()
-    for (name, single), result in results.items():
-        everything.add(result)
-        number = int(result.counts.sum())
-        free, hit = result.of_truth(FREE), result.of_truth(HIT)
-        table.add_row(
-            name,
-            "float" if single else "double",
-            f"{number:,}",
-            f"{hit.sum() / number:.1%}",
-            f"{result.counts[:, :, UNSURE].sum() / number:.2%}",
-            f"{hit[..., FREE].sum():,}",
-            f"{free[..., HIT:].sum():,}",
-            f"{result.counts[UNSURE, UNSURE].sum():,}",
-            f"{result.checked:,}",
-            f"{result.failed:,}",
-        )
-    console.print(table)
-    table = Table("Method", box=box.SIMPLE_HEAD, padding=(0, 1), show_edge=False)
-    for column in ("FREE", "HIT", "UNSURE", "FREE, but colliding", "HIT, but free"):
-        table.add_column(column, justify="right", no_wrap=True)
-    methods = {}
-    for method, axis in METHODS.items():
-        numbers = np.moveaxis(everything.counts, axis, 0).sum(axis=(1, 2, 3, 4))
-        of_free, of_hit = (np.moveaxis(everything.of_truth(truth), axis - 1, 0) for truth in (FREE, HIT))
-        answers = (*numbers, of_hit[FREE].sum(), of_free[HIT].sum())
-        methods[method] = dict(zip(("free", "hit", "unsure", "missed", "false"), map(int, answers), strict=True))
-        table.add_row(method, *(f"{answer:,}" for answer in answers))
-    console.print(table)
-    number = int(everything.counts.sum())
-    rate = f"{number:,} queries in {seconds:.1f} s, {number / seconds:,.0f} a second"
-    console.print(f"{rate}; {everything.checked:,} checked on the host, {everything.failed:,} failures")
-    totals = {"queries": number, "seconds": seconds, "checked": everything.checked, "failures": everything.failed}
-    return totals | {"methods": methods}
+def lattice_range(text):
+    """Returns the numbers of queries that FIRST:LAST or FIRST:LAST:STRIDE stands for."""
+    try:
+        numbers = range(LATTICE)[slice(*(int(part) if part else None for part in text.split(":")))]
+    except (TypeError, ValueError):
+        numbers = range(0)
+    if not numbers or numbers.step < 1 or ":" not in text:
+        raise argparse.ArgumentTypeError(f"not numbers FIRST:LAST or FIRST:LAST:STRIDE in 0:{LATTICE}: {text!r}")
+    return numbers
+
+
+OPTIONS = {
+    "--device": {"help": "the Warp device"},
+    "--lattice": {"type": lattice_range, "help": "numbers of {-1, 0, 1}^24, FIRST:LAST:STRIDE"},
+    "--json": {"metavar": "FILE", "help": "file to which the totals are written as well"},
+}
+
+
+def run(arguments):
+    """Certifies as the options say, and returns the number of failures."""
+    jobs = jobs_of(arguments.count, arguments.seed, arguments.lattice)
+    found = certify_on_device(jobs, arguments.device)
+    if arguments.json:
+        devices = [wp.get_device(arguments.device)]
+        write_measurement(arguments.json, {"benchmark": "certify"} | found, sys.argv, devices)
+    return found["failures"]

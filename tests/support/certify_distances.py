@@ -1,30 +1,26 @@
 """Holds certified answers to queries with a minimum distance against exact arithmetic.
 
-``python tests/support/certify_distances.py --count 200000`` prints the share of queries that floating point could not
-certify, and exits with status 1 if a certified answer or a time is wrong. ``ulp`` and ``2^-40``: parallel planes keep
+The table has the share of queries that floating point could not certify. ``ulp`` and ``2^-40``: parallel planes keep
 features apart by a distance that is reached exactly, and the minimum distance is that one or a neighbour of it in
 floating point, or more or less by 2^-40 of it, scaled from 1e-300 to 1e300. ``trouble``: adversarial queries of the
 other certificates, at distances that they come to, and at any others.
 
-``python tests/support/certify_distances.py --public`` answers the queries of the public benchmark with 1e-3 of the size
-of each query's box, beside the minimum separation of Tight-Inclusion in the IPC Toolkit.
+``--public`` answers the queries of the public benchmark with 1e-3 of the size of each query's box, beside the minimum
+separation of Tight-Inclusion in the IPC Toolkit.
 """
 
-import argparse
-import sys
 import time
 
 import benchmark_data
 import distances
 import numpy as np
 import warp as wp
-from rich import box
-from rich.console import Console
+from measured import print_rows
 from rich.progress import track
-from rich.table import Table
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.bench.tables import Column
 from warp_bsc.detection.narrow.distance_phase import run_distance_phases
 from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
 from warp_bsc.detection.narrow.rings import Rings
@@ -65,13 +61,9 @@ def judge(kind, points, distance, truth=None):
 
 def certify(count, seed):
     """Judges both sets of queries of every kind, prints a table and counts failures."""
-    table = Table("Kind", box=box.SIMPLE_HEAD, padding=0, show_edge=False)
-    for column in ("Aim", "Type", "Queries", "Colliding", "Unsure", "Wrong", "Late", "Early"):
-        table.add_column(column, justify="right", no_wrap=True)
-    console = Console()
-    total = failures = unsure = 0
+    rows = []
     jobs = [(kind, aim) for kind in distances.KINDS for aim in ("ulp", "2^-40", "float32", "float64")]
-    for kind, aim in track(jobs, console=console, description="certifying"):
+    for kind, aim in track(jobs, description="certifying"):
         rng = np.random.default_rng([seed, *kind.encode(), *aim.encode()])
         n = SHARES[kind] * count // sum(SHARES.values())
         truth = None
@@ -83,14 +75,16 @@ def certify(count, seed):
             points, distance = distances.scaled(rng, points, distance)
         else:
             points, distance = distances.adversarial(rng, n // 4, kind, getattr(np, aim))
-        colliding, left, wrong, late, early, _ = judge(kind, points, distance, truth)
-        n = len(points)
-        cells = aim if known else "trouble", points.dtype.name, f"{n}", f"{colliding / n:.1%}"
-        table.add_row(kind, *cells, f"{left / n:.2%}", f"{wrong}", f"{late}", f"{early}")
-        total, failures, unsure = total + n, failures + wrong + late + early, unsure + left
-    console.print(table)
-    console.print(f"{total} queries, {unsure / total:.2%} unsure, {failures} failures")
-    return failures
+        numbers = (len(points), *judge(kind, points, distance, truth))
+        rows.append((kind, (aim if known else "trouble", points.dtype.name, numbers)))
+    shares = (("Colliding", 1, ".1%"), ("Unsure", 2, ".2%"))
+    columns = [Column("Aim", "0"), Column("Type", "1"), Column("Queries", "2.0", "d")]
+    columns += [Column(header, lambda row, i=i: row[2][i] / row[2][0], form) for header, i, form in shares]
+    columns += [Column(header, f"2.{i}", "d") for i, header in enumerate(("Wrong", "Late", "Early"), 3)]
+    print_rows("Kind", columns, rows)
+    total, _, unsure, *failed, _ = np.sum([numbers for _, (*_, numbers) in rows], axis=0)
+    print(f"{total} queries, {unsure / total:.2%} unsure, {sum(failed)} failures")
+    return sum(failed)
 
 
 def answer_by_tight_inclusion(kind, points, distance):
@@ -108,11 +102,7 @@ def answer_by_tight_inclusion(kind, points, distance):
 
 def compare(repeat=5):
     """Answers the public queries, prints a table beside Tight-Inclusion, and counts what conservative answers miss."""
-    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
-    table.add_column("Queries", no_wrap=True)
-    for column in ("Number", "Colliding", "Program", "False positives", "Missed", "Unsure", "ns a query"):
-        table.add_column(column, justify="right", no_wrap=True)
-    missed = 0
+    rows, missed = [], 0
     for name, load in (("hand-made", "load_queries"), ("cloth-funnel", "load_cloth_funnel_queries")):
         files = getattr(benchmark_data, load)()
         for kind in ("vertex_face", "edge_edge"):
@@ -128,15 +118,15 @@ def compare(repeat=5):
                 nanoseconds = time_queries(kind, tiled, distances_of_tiled, toi, repeat)
                 program = "conservative, times" if toi else "conservative"
                 false, lost = (answer.hit & ~truth).sum(), (truth & ~answer.hit).sum()
-                unsure = f"{(answer.status == 2).sum()}"
-                cells = f"{n}", f"{colliding}", program, f"{false}", f"{lost}", unsure, f"{nanoseconds:.0f}"
-                table.add_row(f"{name} {kind}", *cells)
+                unsure = (answer.status == 2).sum()
+                rows.append((f"{name} {kind}", (n, colliding, program, false, lost, unsure, nanoseconds)))
                 missed += lost
             hit, nanoseconds = answer_by_tight_inclusion(kind, points, distance)
             false, lost = (hit & ~truth).sum(), (truth & ~hit).sum()
-            cells = f"{n}", f"{colliding}", "Tight-Inclusion", f"{false}", f"{lost}", "", f"{nanoseconds:.0f}"
-            table.add_row(f"{name} {kind}", *cells)
-    Console(width=120).print(table)
+            rows.append((f"{name} {kind}", (n, colliding, "Tight-Inclusion", false, lost, None, nanoseconds)))
+    headers = "Number", "Colliding", "Program", "False positives", "Missed", "Unsure", "ns a query"
+    columns = [Column(header, f"{i}", ".0f") for i, header in enumerate(headers)]
+    print_rows("Queries", columns, rows)
     return missed
 
 
@@ -169,16 +159,9 @@ def time_queries(kind, points, distance, timed, repeat):
     return 1e9 * min(times) / len(rows)
 
 
-def main():
-    """Certifies, or compares."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=10000, help="queries in all")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--public", action="store_true", help="the public queries, beside Tight-Inclusion")
-    arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    return 1 if (compare() if arguments.public else certify(arguments.count, arguments.seed)) else 0
+OPTIONS = {"--public": {"action": "store_true", "help": "the public queries, beside Tight-Inclusion"}}
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def run(arguments):
+    """Certifies, or compares, and returns the number of failures."""
+    return compare() if arguments.public else certify(arguments.count, arguments.seed)

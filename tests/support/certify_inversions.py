@@ -1,20 +1,18 @@
 """Moving tetrahedra of many kinds, decided by the detector and by the exact checker.
 
-``python tests/support/certify_inversions.py --count 1000000 --seed 0`` prints a row for each kind: how many invert, how
-many floating point cannot certify, and how many results are wrong, which must be none.
+The table has a row for each kind: how many invert, how many floating point cannot certify, and how many results are
+wrong, which must be none.
 """
 
-import argparse
 import time
 from dataclasses import dataclass
 
 import numpy as np
-import warp as wp
-from rich.console import Console
-from rich.table import Table
+from measured import print_rows
 
 import warp_bsc as bsc
 from warp_bsc import checker
+from warp_bsc.bench.tables import Column
 
 __all__ = ["KINDS", "Verdict", "judge"]
 
@@ -142,24 +140,18 @@ def judge(kind, points, device="cpu") -> Verdict:
     )
 
 
-def main():
-    """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=100_000, help="of tetrahedra, over all kinds")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--device", default="cpu")
-    arguments = parser.parse_args()
-    wp.config.quiet = True
-    table = Table("kind", "tetrahedra", "invert", "unsure", "errors")
-    began, errors, each = time.perf_counter(), 0, -(-arguments.count // len(KINDS))
-    for kind, make in KINDS.items():
-        verdict = judge(kind, make(np.random.default_rng([arguments.seed, *kind.encode()]), each), arguments.device)
-        errors += verdict.errors
-        table.add_row(kind, f"{each:,}", f"{verdict.inverting:,}", f"{verdict.unsure:,}", str(verdict.errors))
-    Console().print(table)
-    Console().print(f"{errors} errors of {each * len(KINDS):,}, {time.perf_counter() - began:.0f} s")
-    raise SystemExit(int(errors > 0))
+OPTIONS = {"--device": {"default": "cpu"}}
 
 
-if __name__ == "__main__":
-    main()
+def run(arguments):
+    """Judges tetrahedra of all kinds, prints a table, and returns the number of errors."""
+    began, each = time.perf_counter(), -(-arguments.count // len(KINDS))
+    rows = [
+        (kind, judge(kind, make(np.random.default_rng([arguments.seed, *kind.encode()]), each), arguments.device))
+        for kind, make in KINDS.items()
+    ]
+    columns = [Column("tetrahedra", lambda verdict: each), Column("invert", "inverting"), Column("unsure", "unsure")]
+    print_rows("kind", [*columns, Column("errors", "errors")], rows)
+    errors = sum(verdict.errors for _, verdict in rows)
+    print(f"{errors} errors of {each * len(KINDS):,}, {time.perf_counter() - began:.0f} s")
+    return errors

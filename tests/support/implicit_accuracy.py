@@ -6,20 +6,17 @@ the best of three lengths of the central difference, as float32 rounds short one
 ``--json`` writes them to a file as well.
 """
 
-import argparse
 import functools
-import sys
 import warnings
 
 import newton
 import numpy as np
 import warp as wp
 from implicit_scenes import Rollout, cloth_on_slope, hanging_cloth, soft_block
-from rich.console import Console
-from rich.table import Table
+from measured import options_of, report
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.tables import Column
 
 LENGTHS = 3.0, 1.0, 0.3
 """Lengths of central differences, in units of each array."""
@@ -102,29 +99,36 @@ def _by_velocity(rollout, direction, h):
     return (ends[0] - ends[1]) / (2.0 * h)
 
 
+INPUTS = ("iterations", "polish", "residual")
+
+
+def _describe(row):
+    return ", ".join(f"{name} {100.0 * row[name]:.2g}%" for name in row if name not in ("scene", *INPUTS))
+
+
+COLUMNS = (
+    *(Column(name, name, "" if name != "residual" else ".1e") for name in INPUTS),
+    Column("errors", _describe, kind="text"),
+)
+
+
 def main():
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__, device="cpu")
     parser.add_argument("scenes", nargs="*", default=list(SCENES), help=f"of {', '.join(SCENES)}; default: all")
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--json", metavar="FILE", help="file to which the errors are written as well")
     arguments = parser.parse_args()
     warnings.filterwarnings("ignore", "a step of VBD|a step strained|contacts passed")
     wp.config.quiet = True
-    console, table, rows = Console(), Table("scene", "iterations", "polish", "residual", "errors"), []
+    rows = []
     for scene in arguments.scenes:
         for iterations, polish in ((10, 0), (20, 0), (20, 3)):
-            (_, residual), *errors = found = list(compare(scene, iterations, polish, arguments.steps, arguments.device))
             row = {"scene": scene, "iterations": iterations, "polish": polish}
+            found = compare(scene, iterations, polish, arguments.steps, arguments.device)
             rows.append(row | {name: float(value) for name, value in found})
-            text = ", ".join(f"{name} {100.0 * error:.2g}%" for name, error in errors)
-            table.add_row(scene, str(iterations), str(polish), f"{residual:.1e}", text)
-            console.print(f"{scene} {iterations} {polish}: {residual:.1e}; {text}")
-    console.print(table)
-    if arguments.json:
-        found = {"benchmark": "implicit_accuracy", "steps": arguments.steps, "rows": rows}
-        write_measurement(arguments.json, found, sys.argv, [wp.get_device(arguments.device)])
+            print(f"{scene} {iterations} {polish}: {rows[-1]['residual']:.1e}; {_describe(rows[-1])}", flush=True)
+    devices = [wp.get_device(arguments.device)]
+    report(arguments, "implicit_accuracy", "scene", COLUMNS, rows, devices, steps=arguments.steps)
 
 
 if __name__ == "__main__":

@@ -6,20 +6,15 @@ Steps of 1/60 s with 20 iterations of VBD. On a GPU all steps, and their way bac
 the times to a file as well.
 """
 
-import argparse
-import statistics
-import sys
-import time
-
 import newton
 import numpy as np
 import warp as wp
 from implicit_scenes import CLOTH, add_cloth
-from rich.console import Console
-from rich.table import Table
+from measured import options_of, report
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.tables import Column
+from warp_bsc.bench.timing import median_milliseconds
 
 DT, ITERATIONS = 1.0 / 60.0, 20
 
@@ -97,26 +92,6 @@ class Rollout:
             self.step(solver)
 
 
-def milliseconds(function, device, repeats):
-    """Returns the median time of a call, or of a launch of its graph."""
-    function()
-    if device.is_cuda:
-        with wp.ScopedCapture(device) as capture:
-            function()
-        call = lambda: wp.capture_launch(capture.graph)  # noqa: E731
-        call()
-    else:
-        call = function
-    times = []
-    for _ in range(repeats):
-        wp.synchronize_device(device)
-        start = time.perf_counter()
-        call()
-        wp.synchronize_device(device)
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
-
-
 def measure(scene, device, steps, repeats):
     """Returns milliseconds a step of VBD, of it on a tape, of the way back, and of VBD with ``polish=3``, as data."""
 
@@ -125,7 +100,7 @@ def measure(scene, device, steps, repeats):
         solver = newton.solvers.SolverVBD(rollout.model, iterations=ITERATIONS)
         if polish is not None:
             solver = bsc.SolverImplicitAdjoint(solver, polish=polish)
-        time = milliseconds(lambda: method(rollout, solver), device, repeats) / steps
+        time = median_milliseconds(lambda: method(rollout, solver), device, repeats) / steps
         return time, solver.report if polish is not None else None
 
     plain, _ = run(Rollout.step)
@@ -137,27 +112,30 @@ def measure(scene, device, steps, repeats):
     return {"scene": scene, "milliseconds": times, "failed_solves": int(report.failed_solves)}
 
 
+COLUMNS = (
+    *(
+        Column(header, f"milliseconds.{key}", ".2f")
+        for key, header in {"vbd": "VBD", "on a tape": "on a tape", "back": "back", "polish=3": "VBD, polish=3"}.items()
+    ),
+    Column("back / VBD", lambda row: row["milliseconds"]["back"] / row["milliseconds"]["vbd"], ".2f"),
+    Column("failed solves", "failed_solves"),
+)
+
+
 def main():
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options_of(__doc__, device="cpu")
     parser.add_argument("scenes", nargs="*", default=list(SCENES), help="parts of their names; default: all")
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--json", metavar="FILE", help="file to which the times are written as well")
     arguments = parser.parse_args()
     wp.config.quiet = True
     device = wp.get_device(arguments.device)
-    table, rows = Table("scene", "VBD", "on a tape", "back", "VBD, polish=3", "back / VBD", "failed solves"), []
+    rows = []
     for scene in (scene for scene in SCENES if any(part in scene for part in arguments.scenes)):
         rows.append(measure(scene, device, arguments.steps, arguments.repeats))
-        times = rows[-1]["milliseconds"]
-        figures = [f"{time:.2f}" for time in (*times.values(), times["back"] / times["vbd"])]
-        table.add_row(scene, *figures, str(rows[-1]["failed_solves"]))
-        Console().print(scene, *figures)
-    Console().print(table)
-    if arguments.json:
-        write_measurement(arguments.json, {"benchmark": "implicit_time", "rows": rows}, sys.argv, [device])
+        print(scene, *(column.cell(rows[-1]) for column in COLUMNS), flush=True)
+    report(arguments, "implicit_time", "scene", COLUMNS, rows, [device])
 
 
 if __name__ == "__main__":

@@ -20,9 +20,9 @@ import warp as wp
 from newton.viewer import ViewerNull
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
-from warp_bsc.bench.response_scenes import SCENES, build_scene
-from warp_bsc.bench.response_simulation import Simulation
+from warp_bsc.bench.record import write_measurement
+from warp_bsc.bench.scenes.contact import SCENES, build_scene
+from warp_bsc.bench.scenes.simulation import Simulation
 from warp_bsc.response.state.mesh import ModelMesh
 
 MODES = "plain", "allowed", "reported", "prevented"

@@ -14,7 +14,7 @@ import uipc
 from uipc import constitution, geometry
 
 import warp_bsc as bsc
-from warp_bsc.bench.repair_scenes import KNOWN, load_tangled
+from warp_bsc.bench.scenes.repair import KNOWN, load_tangled
 
 
 def complaints(faces, x, radius, folder):

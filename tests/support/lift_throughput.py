@@ -21,7 +21,7 @@ from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledProx
 
 import warp_bsc as bsc
 from warp_bsc.bench.crossings import CrossingCounter
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 
 SIDE, CELLS = 0.2, 8  # m and cells, of a side of the cloth: 128 triangles
 CLOTH = {"tri_ke": 5e2, "tri_ka": 5e2, "tri_kd": 1e-3, "edge_ke": 0.5, "edge_kd": 1e-3, "particle_radius": 0.002}

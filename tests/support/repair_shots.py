@@ -5,23 +5,19 @@ self-contact, on the CPU, each twice; times are those of the faster run. It prin
 writes them to a file as well.
 """
 
-import argparse
 import contextlib
 import io
 import json
-import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 import warp as wp
 from draped_shot import write_shot
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from measured import options_of, report
 
 import warp_bsc as bsc
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.tables import Column
 from warp_bsc.cli.main import main as run_command
 from warp_bsc.usd.scene import Scene
 
@@ -79,15 +75,22 @@ def compare(path, output):
     }
 
 
+COLUMNS = (
+    *(
+        Column(key.capitalize(), lambda row, key=key: ", ".join(f"{count:,}" for count in row[key].values()))
+        for key in ("before", "left")
+    ),
+    Column("Largest move", "largest_move", ".2f"),
+    Column("Mean", "mean_move", ".2f"),
+    Column("Edges", lambda row: f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}"),
+    *(Column(f"{what.capitalize()} [s]", f"seconds.{what}", ".2f") for what in ("finding", "repairing")),
+)
+
+
 def main():
     """Measures all shots."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__).parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
-    for column in ("Shot", "Before", "Left", "Largest move", "Mean", "Edges", "Finding [s]", "Repairing [s]"):
-        table.add_column(column, justify="left" if column == "Shot" else "right", no_wrap=True)
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -99,14 +102,15 @@ def main():
             row = {"shot": name, "options": list(options), "before": runs[0]["before"], "left": runs[0]["left"]}
             row |= compare(path, output) | {"seconds": seconds}
             rows.append(row)
-            counts = [", ".join(f"{count:,}" for count in row[key].values()) for key in ("before", "left")]
-            moves = [f"{row[key]:.2f}" for key in ("largest_move", "mean_move")]
-            edges = f"{row['shortest_edge']:.2f} to {row['longest_edge']:.2f}"
-            times = [f"{value:.2f}" for value in seconds.values()]
-            table.add_row(" ".join((name, *options)), *counts, *moves, edges, *times)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
-    if arguments.json:
-        write_measurement(arguments.json, {"benchmark": "repair_shots", "rows": rows}, sys.argv, [wp.get_device("cpu")])
+    report(
+        arguments,
+        "repair_shots",
+        "Shot",
+        COLUMNS,
+        rows,
+        [wp.get_device("cpu")],
+        name=lambda row: " ".join((row["shot"], *row["options"])),
+    )
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ process of its own. Memory is that of all its processes at the moment when it is
 share count once. With ``--folder``, scenes and results are kept there, and scenes that are there are not made again.
 """
 
-import argparse
 import json
 import os
 import subprocess
@@ -18,12 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 import warp as wp
+from measured import options_of, report
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.tables import Column
 
 SAMPLING_SECONDS = 0.05
 
@@ -243,18 +240,25 @@ def replay(folder, name, options):
     return Cost(*cost, found, hits.stat().st_size)
 
 
+COLUMNS = (
+    Column("", "description", kind="word"),
+    Column("hits", "hits"),
+    Column("wall", "wall", "{:.1f} s".format),
+    Column("processor", "cpu", "{:.1f} s".format),
+    Column("memory", lambda row: f"{row['memory'] / 1e6:,.0f} MB"),
+    Column("file", lambda row: f"{row['size'] / 1e6:,.2f} MB"),
+)
+
+
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measures scenes."""
+    parser = options_of(__doc__)
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(SCENES)}; default: all")
     parser.add_argument("--folder", type=Path, help="keeps scenes and results there")
-    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
     parser.add_argument("--workers", default="1", help="processes that check intervals (default: 1)")
     arguments = parser.parse_args()
     if unknown := set(arguments.scenes) - SCENES.keys():
         parser.error(f"no scene is named {', '.join(sorted(unknown))}")
-    table = Table(box=box.SIMPLE_HEAD)
-    for title in ("scene", "", "hits", "wall", "processor", "memory", "file"):
-        table.add_column(title, justify="left" if title in ("scene", "") else "right", no_wrap=True)
     found = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.folder or Path(temporary)
@@ -262,18 +266,8 @@ def main():
         for name in arguments.scenes or SCENES:
             cost = replay(folder, name, ["--workers", arguments.workers])
             found.append({"scene": name, "description": SCENES[name][1], **cost._asdict()})
-            numbers = (
-                f"{cost.hits:,}",
-                f"{cost.wall:.1f} s",
-                f"{cost.cpu:.1f} s",
-                f"{cost.memory / 1e6:,.0f} MB",
-                f"{cost.size / 1e6:,.2f} MB",
-            )
-            table.add_row(name, SCENES[name][1], *numbers)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
-    if arguments.json:
-        result = {"benchmark": "replay_sizes", "workers": arguments.workers, "rows": found}
-        write_measurement(arguments.json, result, sys.argv, [wp.get_device("cpu")])
+    workers = {"workers": arguments.workers}
+    report(arguments, "replay_sizes", "scene", COLUMNS, found, [wp.get_device("cpu")], **workers)
 
 
 if __name__ == "__main__":

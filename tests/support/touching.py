@@ -5,20 +5,17 @@ The sheets are flat and have the same vertices. "intersections" are all edges th
 of sheets that lie one above the other exactly at the minimum distance, at rest or moving together.
 """
 
-import argparse
 import sys
 import time
 
 import numpy as np
 import warp as wp
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from measured import options_of, report
 from sheets import grid
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.tables import Column
 from warp_bsc.bench.timing import limited_threads
 from warp_bsc.detection.run.launch import cores
 
@@ -71,30 +68,32 @@ def judge_distances(rng, mesh, x0, x1, collisions, count):
     return sum(hit != (tuple(pair) in known) for pair, hit in zip(pairs.tolist(), truth.tolist(), strict=True))
 
 
+COLUMNS = (
+    Column("Sheets", "sheets"),
+    Column("Faces of each", "faces"),
+    Column("Pairs", "pairs"),
+    Column("Seconds", "seconds", ".2f"),
+    Column("Pairs a second", lambda row: row["pairs"] / row["seconds"], ",.0f"),
+    Column("Wrong", "wrong"),
+)
+
+
 def main():
     """Measures, and judges."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = options_of(__doc__)
     parser.add_argument("--judged", type=int, default=500, help="pairs of each scene to hold against the checker")
-    parser.add_argument("--json", metavar="FILE", help="file to which the results are written as well")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
     rng = np.random.default_rng(0)
-    table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
-    for column in ("Question", "Sheets", "Faces of each", "Pairs", "Seconds", "Pairs a second", "Wrong"):
-        table.add_column(column, justify="left" if column == "Question" else "right", no_wrap=True)
-    failures, results = 0, []
+    rows = []
 
     def add(question, count, faces, pairs, seconds, wrong):
-        nonlocal failures
-        failures += wrong
-        cells = f"{count}", f"{faces // count:,}", f"{pairs:,}", f"{seconds:.2f}", f"{pairs / seconds:,.0f}", f"{wrong}"
-        table.add_row(question, *cells)
-        results.append({"question": question, "sheets": count, "faces": faces // count, "pairs": pairs})
-        results[-1] |= {"seconds": seconds, "wrong": int(wrong)}
+        row = {"question": question, "sheets": count, "faces": faces // count, "pairs": pairs}
+        rows.append(row | {"seconds": seconds, "wrong": int(wrong)})
 
     with limited_threads(1), cores(1):
-        for count, columns, rows in ((2, 32, 32), (2, 42, 42), (8, 32, 16)):
-            x, faces = layers(count, columns, rows)
+        for count, columns, lines in ((2, 32, 32), (2, 42, 42), (8, 32, 16)):
+            x, faces = layers(count, columns, lines)
             mesh = bsc.CollisionMesh(faces, len(x), device="cpu")
             found, seconds = measure(lambda mesh=mesh, x=x: bsc.CollisionDetector(mesh).find_intersections(x))
             wrong = judge_intersections(rng, mesh, x, found, arguments.judged)
@@ -108,11 +107,9 @@ def main():
             pairs = len(collisions.vertex_face) + len(collisions.edge_edge)
             wrong = judge_distances(rng, mesh, x0, x1, collisions, arguments.judged)
             add(question, 2, len(faces), pairs, seconds, wrong)
-    Console(width=120).print(table)
-    if arguments.json:
-        found = {"benchmark": "touching", "judged": arguments.judged, "rows": results}
-        write_measurement(arguments.json, found, sys.argv, [wp.get_device("cpu")])
-    return 1 if failures else 0
+    devices = [wp.get_device("cpu")]
+    report(arguments, "touching", "Question", COLUMNS, rows, devices, name="question", judged=arguments.judged)
+    return 1 if any(row["wrong"] for row in rows) else 0
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import warp as wp
 
 import warp_bsc as bsc
 from warp_bsc.bench.crossings import CrossingCounter
-from warp_bsc.bench.provenance import write_measurement
+from warp_bsc.bench.record import write_measurement
 
 DT = 1.0 / 120.0  # [s]
 CELLS, SIDE, RADIUS = 10, 0.5, 0.2  # m

@@ -8,9 +8,10 @@ from typing import Any
 
 from rich.console import Console
 
+from ..bench.tables import Column, count
 from ..detection.queries.query import QueryResult
 from .query_file import QueryFile
-from .tables import Column, count, print_table, say
+from .tables import print_table, say
 
 __all__ = ["QueryResults", "print_queries", "queries_to_dict"]
 

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+from ..bench.tables import LONGEST, Column, count
 from .option_names import with_option
 from .repair_run import RepairRun
-from .tables import LONGEST, Column, Console, count, print_table, say
+from .tables import Console, print_table, say
 
 __all__ = ["print_repair"]
 

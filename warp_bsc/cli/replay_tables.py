@@ -4,6 +4,7 @@ from collections import defaultdict
 
 from rich.console import Console
 
+from ..bench.tables import LONGEST, Column, count
 from ..repair.shot.findings import kept_meshes
 from ..replay.baseline import NewFinding
 from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
@@ -11,7 +12,7 @@ from ..replay.scene_contacts import PHASES
 from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
 from ..replay.validation import Validation
 from .option_names import with_option
-from .tables import LONGEST, Column, count, print_table, say, say_list
+from .tables import print_table, say, say_list
 
 __all__ = ["print_new", "print_repair", "print_replay", "print_work"]
 
@@ -24,7 +25,7 @@ _POSITION = [
 ]
 _WORST = (
     Column("Collisions", "hits"),
-    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), "", kind="text"),
+    Column("First contact", lambda interval: _contact(interval.earliest) + _others(interval), kind="text"),
     Column("At", lambda interval: round(interval.earliest.time, 6), ".6g"),
 )
 _NEAREST = (Column("Distance", "distance", ".6g"), Column("Time", "time", "g"), *_POSITION)

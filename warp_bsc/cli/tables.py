@@ -1,20 +1,16 @@
 """The console, lines and tables of all commands."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import rich.console
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-__all__ = ["LONGEST", "Column", "Console", "count", "grouped", "print_table", "say", "say_list"]
+from ..bench.tables import LONGEST, Column
 
-_Row = TypeVar("_Row")
-
-LONGEST = 30
-"""Largest number of rows in a table, or of lines in a list."""
+__all__ = ["Console", "print_table", "say", "say_list"]
 
 
 class Console(rich.console.Console):
@@ -23,36 +19,6 @@ class Console(rich.console.Console):
     def on_broken_pipe(self) -> None:
         """Raises the error again; rich would end the program with status 1, which means a collision."""
         raise BrokenPipeError
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of a table: what it shows of each row, and how.
-
-    Attributes:
-        header: Its header, shown as it is: markup would take "[s]" for a style.
-        value: Name of the attribute of a row that it shows, with dots for one of an attribute; or a function of a row.
-        format: Format specification of the value, or a function that returns its text. None is an empty cell.
-        width: Least width.
-        kind: Numbers are on the right and do not wrap, words are on the left and do not wrap, text may wrap.
-    """
-
-    header: str
-    value: str | Callable[[Any], Any] = ""
-    format: str | Callable[[Any], str] = ","
-    width: int | None = None
-    kind: Literal["number", "word", "text"] = "number"
-
-    def cell(self, row: Any) -> str:
-        """Returns the text of the cell in a row; empty in a row that is None."""
-        if callable(self.value):
-            row = None if row is None else self.value(row)
-        else:
-            for name in self.value.split("."):
-                row = None if row is None else getattr(row, name)
-        if row is None:
-            return ""
-        return self.format(row) if callable(self.format) else format(row, self.format)
 
 
 def print_table(
@@ -103,16 +69,3 @@ def say_list(console: rich.console.Console, lines: Sequence[str], more: str) -> 
         say(console, f"  {line}")
     if len(lines) > LONGEST:
         say(console, f"  and {len(lines) - LONGEST} more{more}")
-
-
-def count(number: int, one: str, many: str = "") -> str:
-    """Returns a number with the noun that it counts, singular or plural."""
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
-
-
-def grouped(rows: Iterable[_Row], key: str) -> dict[str, list[_Row]]:
-    """Returns rows by the value of an attribute, in the order of their first."""
-    groups: dict[str, list[_Row]] = {}
-    for row in rows:
-        groups.setdefault(getattr(row, key), []).append(row)
-    return groups

@@ -1,0 +1,123 @@
+"""Measures the methods on given queries, such as those of public benchmarks."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ..._arguments import checked_integer
+from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
+from ...detection.run.settings import PairKind
+from ..record import name_place
+from ..tables import Column, Table, count, two
+from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
+
+__all__ = ["COLUMNS", "METHODS", "GivenQueries", "benchmark_given_queries", "show", "to_dict"]
+
+METHODS = (*NARROW_PHASE_METHODS, "cubic")
+"""The methods, see :mod:`.methods`."""
+
+COLUMNS = (
+    Column("Collide", lambda row: row["hits"] / row["queries"], ".0%", title="collide"),
+    *(
+        Column(
+            method.replace("conservative", "conser-\nvative"),
+            f"nanoseconds.{method}",
+            ",.1f",
+            title="cubic solver" if method == "cubic" else f"`{method}`",
+            page_format=two,
+        )
+        for method in METHODS
+    ),
+    *(
+        Column(
+            f"{method} /\ncubic",
+            lambda row, method=method: row["nanoseconds"][method] / row["nanoseconds"]["cubic"],
+            ".2f",
+            title=f"`{method}` / cubic",
+            page_format=two,
+        )
+        for method in ("float", "exact")
+    ),
+)
+"""Columns of the JSON of :class:`GivenQueries`."""
+
+_SMALLEST_LAUNCH = {False: 2**18, True: 2**22}
+"""Queries of a launch on a CPU and on a GPU: fewer are repeated."""
+
+
+@dataclass(frozen=True)
+class GivenQueries:
+    """The measurements of some queries of one kind.
+
+    Attributes:
+        name: Name of the queries.
+        kind: Kind of pair.
+        queries: Number of queries.
+        hits: Number of queries that collide, by method "exact".
+        nanoseconds: Time of a query by method, the fastest turn; on a CPU processor time, that of all cores [ns].
+    """
+
+    name: str
+    kind: PairKind
+    queries: int
+    hits: int
+    nanoseconds: dict[str, float]
+
+
+def _nanoseconds(run: MethodRun) -> float:
+    """Returns the time of a query in a launch of all queries [ns]."""
+    if run.queries.device.is_cuda:
+        return measure_nanoseconds(run, repeat=1)
+    start = time.process_time()
+    run.launch()
+    return 1e9 * (time.process_time() - start) / run.queries.count
+
+
+def benchmark_given_queries(
+    name: str, kind: PairKind, points: np.ndarray, *, device: wp.DeviceLike = None, repeat: int = 20
+) -> GivenQueries:
+    """Measures all methods on queries, in turns; the fastest counts, as other work can only slow a turn down.
+
+    The first launch of each method, which loads its kernels, is not timed.
+
+    Args:
+        name: Name of the queries.
+        kind: Kind of pair.
+        points: Positions, as of :func:`warp_bsc.query_vertex_face`, NumPy array, shape [n, 8, 3], n more than 0.
+        device: Warp device; default: Warp's default.
+        repeat: Number of turns.
+
+    Raises:
+        TypeError: If ``repeat`` is no integer.
+        ValueError: If ``repeat`` is less than 1.
+    """
+    repeat = checked_integer(repeat, "repeat", 1)
+    device = wp.get_device(device)
+    queries = Queries.of_points(kind, points)
+    exact = MethodRun("exact", QuerySet(queries, device))
+    exact.launch()
+    repeated = QuerySet(queries, device, repeated=-(-_SMALLEST_LAUNCH[device.is_cuda] // len(queries)))
+    runs = {method: MethodRun(method, repeated) for method in METHODS}
+    for run in runs.values():
+        run.launch()
+    turns = [{method: _nanoseconds(run) for method, run in runs.items()} for _ in range(repeat)]
+    fastest = {method: min(turn[method] for turn in turns) for method in METHODS}
+    return GivenQueries(name, kind, len(queries), int(exact.find_hits().sum()), fastest)
+
+
+def to_dict(measured: list[GivenQueries], **settings: Any) -> dict[str, Any]:
+    """Returns measurements as plain data for JSON, with settings."""
+    return settings | {"queries": [vars(found) | {"kind": found.kind.display_name} for found in measured]}
+
+
+def show(found: dict[str, Any]) -> Iterator[Table | str]:
+    """Yields the table of the JSON of measurements, and the line above it."""
+    time = "Nanoseconds of processor time" if found["device"] == "cpu" else "Nanoseconds"
+    yield f"{time} a query on {name_place(found)}; the fastest of {count(found['repeat'], 'turn')}"
+    rows = [(f"{row['name']}, {row['kind']}", row) for row in found["queries"]]
+    caption = "cubic: a floating-point cubic solver, see warp-bsc bench. Times of impact are not sought."
+    yield Table("Queries", [Column("Number", "queries"), *COLUMNS], rows, caption=caption)

@@ -1,0 +1,442 @@
+"""The paper's benchmarks: time and errors of each method on the candidate pairs of five scenes.
+
+Queries are the candidate pairs of the broad phase in some of a scene's intervals: pairs that share no vertex and whose
+swept boxes overlap. If there are too many, a random part of them is measured. All methods read the same arrays.
+
+The exact checker checks every query that any method calls a collision, which includes all that are UNSURE and all that
+the methods disagree about, and a random sample of the others.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ... import checker
+from ...detection.run.launch import cores
+from ...detection.run.settings import PairKind
+from ...kernels.signs import UNSURE
+from ..peers import ipc_toolkit
+from ..peers.ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
+from ..record import shorten_path
+from ..scenes.detector import BenchmarkScene, find_overlapping
+from ..timing import count_threads
+from .detector import benchmark_detector
+from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
+from .worst_case import WorstQuery, adversarial_queries, find_worst
+
+__all__ = [
+    "Effort",
+    "Errors",
+    "Place",
+    "SceneBenchmark",
+    "Timing",
+    "benchmark_scene",
+    "find_adversarial_worst",
+    "find_places",
+    "to_dict",
+]
+
+SEED = 0
+_TURNS = 8  # of timing all methods
+_CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # smallest launches: fewer queries are repeated
+
+
+@dataclass(frozen=True)
+class Effort:
+    """The amount of measurements.
+
+    Attributes:
+        intervals: Number of intervals of a scene, evenly spaced.
+        queries: Largest number of queries of a scene.
+        sample: Number of queries of a scene that are checked although no method calls them a collision.
+        ipc_queries: Number of queries of a scene on which the IPC Toolkit is timed.
+        adversaries: Number of adversarial queries of each kind.
+        repeat: Number of repetitions.
+    """
+
+    intervals: int
+    queries: int
+    sample: int
+    ipc_queries: int
+    adversaries: int
+    repeat: int
+
+    @classmethod
+    def full(cls) -> "Effort":
+        """Returns the effort of the whole benchmark."""
+        return cls(intervals=8, queries=2**19, sample=20_000, ipc_queries=4000, adversaries=100_000, repeat=24)
+
+    @classmethod
+    def quick(cls) -> "Effort":
+        """Returns the effort of a first look."""
+        return cls(intervals=2, queries=2**15, sample=1000, ipc_queries=500, adversaries=5000, repeat=3)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A device, and the number of its cores, on which methods are timed.
+
+    Attributes:
+        device: Warp device.
+        cores: CPU cores, None on a GPU.
+        name: Name in tables.
+    """
+
+    device: wp.Device
+    cores: int | None
+    name: str
+
+    def limited(self) -> contextlib.AbstractContextManager:
+        """Returns a context in which kernels run on one core if the place is that."""
+        return cores(1) if self.cores == 1 else contextlib.nullcontext()
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of the methods at one place.
+
+    Attributes:
+        place: The place.
+        nanoseconds: Mean time of a query by method [ns].
+        worst: The slowest query of each method; empty where it was not searched for.
+    """
+
+    place: Place
+    nanoseconds: dict[str, float]
+    worst: dict[str, WorstQuery]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the times as plain data for JSON."""
+        place = self.place
+        where = {"place": place.name, "device": str(place.device), "device_name": place.device.name}
+        took = {"nanoseconds": self.nanoseconds, "worst": _worst_to_dict(self.worst)}
+        return where | {"cores": place.cores} | took
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The results of a method, compared with the truth.
+
+    Attributes:
+        hits: Number of queries that it calls collisions; all of them were checked.
+        false_positives: Number of hits that are free.
+        false_negatives: Number of collisions among the checked queries that it calls free.
+    """
+
+    hits: int
+    false_positives: int
+    false_negatives: int
+
+
+@dataclass(frozen=True)
+class SceneBenchmark:
+    """The measurements of a scene.
+
+    Attributes:
+        name: Name of the scene.
+        triangles: Number of triangles in the largest mesh of its intervals.
+        precision: Bits of a coordinate, 32 or 64.
+        intervals: The numbers of the intervals that were measured.
+        overlapping: Number of their pairs of elements that share no vertex and whose swept boxes overlap.
+        queries: Number of these pairs that are measured, by kind.
+        collisions: Number of checked queries that collide.
+        unsure: Number of queries that floating point could not certify.
+        checked: Number of queries compared with the truth: all that any method calls a collision, ``sample`` others.
+        sample: Number of checked queries that no method calls a collision.
+        errors: Errors by method.
+        disagreeing: Number of results of a method that differ between devices, which should be 0.
+        stages: Number of queries that each of :data:`STAGES` decides.
+        timings: Times by place.
+        stage_milliseconds: Mean time of a detection with method "exact" by stage, on the last place's device [ms].
+        frame_milliseconds: Mean time of a detection with method "exact" [ms].
+        ipc_toolkit: Measurements of the IPC Toolkit by method; empty if it was not measured.
+    """
+
+    name: str
+    triangles: int
+    precision: int
+    intervals: list[int]
+    overlapping: int
+    queries: dict[PairKind, int]
+    collisions: int
+    unsure: int
+    checked: int
+    sample: int
+    errors: dict[str, Errors]
+    disagreeing: int
+    stages: dict[str, int]
+    timings: list[Timing]
+    stage_milliseconds: dict[str, float]
+    frame_milliseconds: float
+    ipc_toolkit: dict[str, IpcQueryTiming]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the measurements as plain data for JSON."""
+        values = vars(self) | {
+            "scene": shorten_path(self.name),
+            "name": ",".join(
+                Path(path).stem if "/" in path or path.endswith(".usd") else path for path in self.name.split(",")
+            ),
+            "queries": {kind.label: number for kind, number in self.queries.items()},
+            "errors": {method: asdict(errors) for method, errors in self.errors.items()},
+            "timings": [timing.to_dict() for timing in self.timings],
+            "ipc_toolkit": {method: asdict(took) for method, took in self.ipc_toolkit.items()},
+        }
+        values["decided_by"] = values.pop("stages")
+        return values
+
+
+def to_dict(
+    benchmarks: list[SceneBenchmark], adversarial: list[tuple[Place, dict[str, WorstQuery]]], *, quick: bool
+) -> dict[str, Any]:
+    """Returns measurements of scenes and of :func:`find_adversarial_worst` as plain data for JSON."""
+    return {
+        "benchmark": "paper",
+        "quick": quick,
+        "methods": list(METHODS),
+        "ipc_toolkit": ipc_toolkit.version() if any(found.ipc_toolkit for found in benchmarks) else None,
+        "scenes": [found.to_dict() for found in benchmarks],
+        "adversarial": [{"place": place.name, "worst": _worst_to_dict(worst)} for place, worst in adversarial],
+    }
+
+
+def _worst_to_dict(worst: dict[str, WorstQuery]) -> dict[str, Any]:
+    return {method: query.to_dict() for method, query in worst.items()}
+
+
+def find_places(devices: list[wp.Device]) -> list[Place]:
+    """Returns the places of some devices: one core of the CPU, all cores that may be used, and GPUs."""
+    places = []
+    for device in devices:
+        if device.is_cuda:
+            places.append(Place(device, None, device.name))
+            continue
+        threads = count_threads()
+        places.append(Place(device, 1, "CPU, 1 core"))
+        if threads > 1:
+            places.append(Place(device, threads, f"CPU, {threads} cores"))
+    return places
+
+
+def benchmark_scene(
+    name: str,
+    intervals: list[tuple[int, BenchmarkScene]],
+    places: list[Place],
+    effort: Effort,
+    *,
+    compare: bool = False,
+    progress: Callable[[str], None] = lambda doing: None,
+) -> SceneBenchmark:
+    """Measures all methods on a scene.
+
+    Args:
+        name: Name of the scene.
+        intervals: Its intervals, with their numbers.
+        places: The places at which to time the methods.
+        effort: How much to measure.
+        compare: Whether to measure the IPC Toolkit as well.
+        progress: Called before each part with its name.
+
+    Raises:
+        ValueError: If no swept boxes overlap.
+    """
+    progress("candidate pairs")
+    queries, overlapping = _gather(intervals, places[-1].device, effort.queries)
+    if not overlapping:
+        raise ValueError(f"{name}: no pairs: no swept boxes overlap in the intervals measured")
+
+    found_hits, unsure, disagreeing = _find_hits(queries, places, progress)
+    progress("the truth")
+    errors, collisions, checked, sample, truth = _compare(queries, found_hits, effort)
+    stages = np.zeros(len(STAGES), dtype=int)
+    for found in queries.values():
+        stages += np.bincount(trace(QuerySet(found, places[-1].device), "exact")[0], minlength=len(STAGES))
+
+    timings = []
+    for place in places:
+        progress(f"times, {place.name}")
+        timings.append(_time_methods(queries, place, effort))
+    progress("detections")
+    scenes = [scene for _, scene in intervals]
+    frames = [benchmark_detector(s, method="exact", device=places[-1].device, repeat=3) for s in scenes]
+    by_stage = [frame.stage_milliseconds for frame in frames]
+    compared = {}
+    if compare:
+        for method in CCD_CLASSES:
+            progress(f"IPC Toolkit, {method}")
+            compared[method] = _time_ipc_toolkit(method, queries, truth, effort)
+    return SceneBenchmark(
+        name=name,
+        triangles=max(len(scene.faces) for scene in scenes),
+        precision=8 * scenes[0].x0.itemsize,
+        intervals=[number for number, _ in intervals],
+        overlapping=overlapping,
+        queries={kind: len(found) for kind, found in queries.items()},
+        collisions=collisions,
+        unsure=unsure,
+        checked=checked,
+        sample=sample,
+        errors=errors,
+        disagreeing=disagreeing,
+        stages=dict(zip(STAGES, stages.tolist(), strict=True)),
+        timings=timings,
+        stage_milliseconds={stage: float(np.mean([found[stage] for found in by_stage])) for stage in by_stage[0]},
+        frame_milliseconds=float(np.mean([frame.detect_milliseconds for frame in frames])),
+        ipc_toolkit=compared,
+    )
+
+
+def _gather(
+    intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, max_queries: int
+) -> tuple[dict[PairKind, Queries], int]:
+    """Returns the overlapping pairs of some intervals by kind, or a random part of them; and their number."""
+    random = np.random.default_rng(SEED)
+    x0, x1 = (np.concatenate([getattr(scene, end) for _, scene in intervals]) for end in ("x0", "x1"))
+    elements, pairs = ({kind: [] for kind in PairKind} for _ in range(2))
+    vertices = overlapping = 0
+    for _, scene in intervals:
+        found = find_overlapping(scene, device)
+        number = sum(len(kind_pairs) for _, kind_pairs in found.values())
+        overlapping += number
+        share = min(1.0, max_queries / len(intervals) / max(number, 1))
+        for kind, (kind_elements, kind_pairs) in found.items():
+            before = [
+                vertices if kind == PairKind.VERTEX_FACE else sum(map(len, elements[kind])),
+                sum(map(len, elements[kind])),
+            ]
+            count = int(np.ceil(share * len(kind_pairs)))
+            chosen = np.sort(random.permutation(len(kind_pairs))[:count])
+            pairs[kind].append(kind_pairs[chosen] + np.array(before, dtype=np.int32))
+            elements[kind].append(kind_elements + vertices)
+        vertices += len(scene.x0)
+    queries = {
+        kind: Queries(kind, x0, x1, np.concatenate(elements[kind]), np.concatenate(pairs[kind])) for kind in PairKind
+    }
+    return {kind: found for kind, found in queries.items() if len(found)}, overlapping
+
+
+def _find_hits(
+    queries: dict[PairKind, Queries], places: list[Place], progress: Callable[[str], None]
+) -> tuple[dict[tuple[PairKind, str], np.ndarray], int, int]:
+    """Returns which queries collide by kind and method, and the numbers of UNSURE and of device-dependent results."""
+    found_hits, unsure, disagreeing = {}, 0, 0
+    for place in {str(place.device): place for place in places}.values():
+        progress(f"results, {place.device}")
+        for kind, found in queries.items():
+            on_device = QuerySet(found, place.device)
+            for method in METHODS:
+                run = MethodRun(method, on_device)
+                run.launch()
+                hits = run.find_hits()
+                if (kind, method) in found_hits:
+                    disagreeing += int((found_hits[kind, method] != hits).sum())
+                else:
+                    found_hits[kind, method] = hits
+                    if method == "conservative":
+                        unsure += int((run.read_status() == UNSURE).sum())
+    return found_hits, unsure, disagreeing
+
+
+def _compare(
+    queries: dict[PairKind, Queries], found_hits: dict[tuple[PairKind, str], np.ndarray], effort: Effort
+) -> tuple[dict[str, Errors], int, int, int, dict[PairKind, tuple[np.ndarray, np.ndarray]]]:
+    """Compares the results with the truth.
+
+    Returns:
+        Errors by method; numbers of collisions, of checked queries and of those in the random sample; and by kind the
+        indices of the checked queries with their truth.
+    """
+    random = np.random.default_rng(SEED)
+    total = sum(map(len, queries.values()))
+    wrong = {method: np.zeros(3, dtype=int) for method in METHODS}
+    collisions = checked = sample = 0
+    truths = {}
+    for kind, found in queries.items():
+        by_method = {method: found_hits[kind, method] for method in METHODS}
+        suspicious = np.any(list(by_method.values()), axis=0)
+        others = np.flatnonzero(~suspicious)
+        some = random.permutation(others)[: int(np.ceil(effort.sample * len(found) / total))]
+        indices = np.concatenate([np.flatnonzero(suspicious), some])
+        truth = getattr(checker, kind.label)(found.points(indices))
+        truths[kind] = indices, truth
+        collisions += int(truth.sum())
+        checked += len(indices)
+        sample += len(some)
+        for method, hits in by_method.items():
+            hit = hits[indices]
+            wrong[method] += [int(hits.sum()), int((hit & ~truth).sum()), int((~hit & truth).sum())]
+    errors = {method: Errors(*map(int, counts)) for method, counts in wrong.items()}
+    return errors, collisions, checked, sample, truths
+
+
+def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Place, dict[str, WorstQuery]]]:
+    """Finds the slowest adversarial query of each method, on one core and on GPUs.
+
+    Args:
+        places: The places at which to time the methods; other places are skipped.
+        effort: How much to measure.
+    """
+    found = []
+    for place in places:
+        if place.cores in (1, None):
+            queries = [adversarial_queries(kind, effort.adversaries) for kind in PairKind]
+            with place.limited():
+                found.append((place, _find_slowest(queries, place, effort)))
+    return found
+
+
+def _find_slowest(queries: Iterable[Queries], place: Place, effort: Effort) -> dict[str, WorstQuery]:
+    slowest = {}
+    for of_kind in queries:
+        for method, query in find_worst(of_kind, place.device, repeat=effort.repeat).items():
+            known = slowest.get(method)
+            if known is None or query.nanoseconds[method] > known.nanoseconds[method]:
+                slowest[method] = query
+    return slowest
+
+
+def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
+    """Returns the mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
+    total = sum(map(len, queries.values()))
+    nanoseconds = dict.fromkeys(METHODS, 0.0)
+    with place.limited():
+        for found in queries.values():
+            repeated = -(-(_GPU_QUERIES if place.device.is_cuda else _CPU_QUERIES) // len(found))
+            on_device = QuerySet(found, place.device, repeated=repeated)
+            runs = {method: MethodRun(method, on_device) for method in METHODS}
+            # in turns; the fastest counts, as other work on the machine can only slow a turn down
+            repeat = -(-effort.repeat // _TURNS)
+            took = [
+                {method: measure_nanoseconds(run, repeat=repeat) for method, run in runs.items()} for _ in range(_TURNS)
+            ]
+            for method in METHODS:
+                nanoseconds[method] += min(turn[method] for turn in took) * len(found) / total
+        worst = _find_slowest(queries.values(), place, effort) if place.cores in (1, None) else {}
+    return Timing(place, nanoseconds, worst)
+
+
+def _time_ipc_toolkit(
+    method: str, queries: dict[PairKind, Queries], truths: dict[PairKind, tuple[np.ndarray, np.ndarray]], effort: Effort
+) -> IpcQueryTiming:
+    """Measures a method of the IPC Toolkit, on one core: Python calls it query by query."""
+    random = np.random.default_rng(SEED)
+    total = sum(map(len, queries.values()))
+    number = nanoseconds = call = 0
+    wrong = np.zeros(3, dtype=int)
+    for kind, found in queries.items():
+        share = len(found) / total
+        some = random.permutation(len(found))[: int(np.ceil(effort.ipc_queries * share))]
+        took, called = time_queries(method, kind, found.points(some))
+        number += len(some)
+        nanoseconds += took * share
+        call += called * share
+        indices, truth = truths[kind]
+        part = random.permutation(len(indices))[: int(np.ceil(effort.ipc_queries * share))]
+        hit, truth = decide_queries(method, kind, found.points(indices[part])), truth[part]
+        wrong += [len(part), int((hit & ~truth).sum()), int((~hit & truth).sum())]
+    return IpcQueryTiming(number, nanoseconds, call, *map(int, wrong))

@@ -1,0 +1,1 @@
+"""Other programs and methods that measurements compare with."""

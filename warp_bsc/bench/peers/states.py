@@ -1,0 +1,112 @@
+"""What simulators of ``warp-bsc bench penetration`` return, and what they read of a scene: meshes and stiffness."""
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+
+from ...response.state.mesh import host_array
+from ..scenes.contact import Motion
+
+__all__ = ["Body", "NotInstalled", "Trajectory", "find_bodies", "held_positions"]
+
+
+class NotInstalled(Exception):
+    """A simulator is not installed or cannot run on this machine; the message says what it needs."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What a simulator made of a scene.
+
+    Attributes:
+        states: Positions of the particles at the start and after each step [m], each of shape [particle_count, 3].
+        milliseconds: Time of each step [ms].
+        uncertified_steps: Steps that the stage did not certify; None without a stage.
+    """
+
+    states: list[np.ndarray]
+    milliseconds: list[float]
+    uncertified_steps: int | None = None
+
+
+@dataclass(frozen=True)
+class Body:
+    """A connected cloth or soft body of a model.
+
+    Attributes:
+        particles: Its particles, ascending, int, shape [n].
+        elements: Its triangles, or tetrahedra of a soft body, as rows in ``particles``, int, shape [m, 3] or [m, 4].
+        faces: Its triangles, or the surface of a soft body, as rows in ``particles``, int, shape [k, 3].
+        mu, lam: Lamé parameters, of cloth those of the membrane [N/m], of a soft body [Pa].
+        area: Area of cloth at rest [m^2], 0 for a soft body.
+        volume: Volume of a soft body at rest [m^3], 0 for cloth.
+    """
+
+    particles: np.ndarray
+    elements: np.ndarray
+    faces: np.ndarray
+    mu: float
+    lam: float
+    area: float
+    volume: float
+
+    @property
+    def is_soft(self) -> bool:
+        """Whether this is a soft body."""
+        return self.elements.shape[1] == 4
+
+    @property
+    def young(self) -> float:
+        """Young's modulus, of cloth times its thickness [N/m], of a soft body [Pa]."""
+        if self.is_soft:
+            return self.mu * (3.0 * self.lam + 2.0 * self.mu) / (self.lam + self.mu)
+        return 4.0 * self.mu * (self.lam + self.mu) / (self.lam + 2.0 * self.mu)  # plane stress
+
+    @property
+    def poisson(self) -> float:
+        """Poisson's ratio."""
+        return self.lam / (self.lam + self.mu) / 2.0 if self.is_soft else self.lam / (self.lam + 2.0 * self.mu)
+
+
+def find_bodies(model: newton.Model) -> list[Body]:
+    """Returns the connected bodies of a model, each of one material, in the order of their first particles."""
+    triangles, tets = (
+        np.zeros((0, n), dtype=int) if indices is None else host_array(indices).reshape(-1, n).astype(int)
+        for indices, n in ((model.tri_indices, 3), (model.tet_indices, 4))
+    )
+    label = np.arange(model.particle_count)
+    pairs = np.concatenate([elements[:, [i, j]] for elements in (triangles, tets) for i, j in _sides(elements)])
+    while True:  # the least number of each component spreads
+        least = label.copy()
+        np.minimum.at(least, pairs[:, 0], label[pairs[:, 1]])
+        np.minimum.at(least, pairs[:, 1], label[pairs[:, 0]])
+        if (least == label).all():
+            break
+        label = least
+    bodies = []
+    for first in np.unique(label[pairs]):
+        particles = np.flatnonzero(label == first)
+        of_triangles, of_tets = label[triangles[:, 0]] == first, label[tets[:, 0]] == first
+        faces = np.searchsorted(particles, triangles[of_triangles])
+        if of_tets.any():
+            mu, lam = host_array(model.tet_materials)[of_tets, :2].mean(axis=0)
+            volume = float((1.0 / np.linalg.det(host_array(model.tet_poses)[of_tets].astype(float)) / 6.0).sum())
+            elements, area = np.searchsorted(particles, tets[of_tets]), 0.0
+        else:
+            mu, lam = host_array(model.tri_materials)[of_triangles, :2].mean(axis=0)
+            elements, area, volume = faces, float(host_array(model.tri_areas)[of_triangles].sum()), 0.0
+        bodies.append(Body(particles, elements, faces, float(mu), float(lam), area, volume))
+    return bodies
+
+
+def _sides(elements: np.ndarray) -> list[tuple[int, int]]:
+    n = elements.shape[1]
+    return [(i, j) for i in range(n) for j in range(i)]
+
+
+def held_positions(motion: Motion | None, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the particles that a program moves, and where they are at a time [m]; none without a motion."""
+    if motion is None or motion.positions is None:
+        return np.zeros(0, dtype=int), np.zeros((0, 3))
+    return np.array(motion.held, dtype=int), np.asarray(motion.positions(t), dtype=np.float64)

@@ -1,0 +1,1 @@
+"""The scenes that benchmarks measure, read from files or generated."""

@@ -1,0 +1,116 @@
+"""Tables as data: columns, whose cells a terminal draws and a page has as Markdown."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+__all__ = ["LONGEST", "Column", "Table", "count", "grouped", "in_thousands", "list_titles", "markdown", "three", "two"]
+
+_Row = TypeVar("_Row")
+
+LONGEST = 30
+"""Largest number of rows in a table, or of lines in a list."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: the value that it shows of each row, and how.
+
+    Attributes:
+        header: Its header, shown as it is: markup would take "[s]" for a style.
+        value: Key, number or attribute of a row, with dots for one of that; or a function of a row.
+        format: Format specification of the value, or a function that returns its text; not of texts and None.
+        width: Least width on a terminal.
+        kind: Numbers are on the right and do not wrap, words are on the left and do not wrap, text may wrap.
+        title: Its header in pages, if that is another one.
+        page_format: Its format in pages, if that is another one.
+    """
+
+    header: str
+    value: str | Callable[[Any], Any] = ""
+    format: str | Callable[[Any], str] = ","
+    width: int | None = None
+    kind: Literal["number", "word", "text"] = "number"
+    title: str | None = None
+    page_format: str | Callable[[Any], str] | None = None
+
+    def cell(self, row: Any, *, page: bool = False) -> str:
+        """Returns the text of the cell in a row, in a page or on a terminal; empty in a row that is None."""
+        value = row
+        for part in [self.value] if callable(self.value) else self.value.split("."):
+            if value is None:
+                return ""
+            value = part(value) if callable(part) else _part(value, part)
+        written = self.page_format if page and self.page_format is not None else self.format
+        if value is None or isinstance(value, str):
+            return value or ""
+        return written(value) if callable(written) else format(value, written)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with its rows.
+
+    Attributes:
+        first: The column of the names of the rows, or its header.
+        columns: The other columns.
+        rows: The name of each row, and a value of which the columns show parts; None leaves them empty.
+        caption: A sentence below the table.
+    """
+
+    first: str | Column
+    columns: Sequence[Column]
+    rows: Iterable[tuple[str, Any]]
+    caption: str | None = None
+
+
+def _part(row: Any, name: str) -> Any:
+    if isinstance(row, dict):
+        return row[name]
+    return row[int(name)] if name.isdigit() else getattr(row, name)
+
+
+def markdown(first: str, columns: Iterable[Column], rows: Iterable[tuple[str, Any]]) -> list[tuple[str, ...]]:
+    """Returns the rows of a table of a page, the header first.
+
+    Args:
+        first: Header of the names of the rows.
+        columns: The other columns.
+        rows: The name of each row, and a value of which the columns show parts.
+    """
+    columns = list(columns)
+    head = first, *(column.header if column.title is None else column.title for column in columns)
+    return [head, *((name, *(column.cell(row, page=True) for column in columns)) for name, row in rows)]
+
+
+def count(number: int, one: str, many: str = "") -> str:
+    """Returns a number with the noun that it counts, singular or plural."""
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def grouped(rows: Iterable[_Row], key: str) -> dict[str, list[_Row]]:
+    """Returns rows by the value of a key or an attribute, in the order of their first."""
+    groups: dict[str, list[_Row]] = {}
+    for row in rows:
+        groups.setdefault(row[key] if isinstance(row, dict) else getattr(row, key), []).append(row)
+    return groups
+
+
+def list_titles(titles: Sequence[str]) -> str:
+    """Returns the number of titles, with the first of them."""
+    return f"{len(titles):,}" + (f" ({', '.join(titles[:LONGEST])})" if titles else "")
+
+
+def two(value: float) -> str:
+    """Returns a number with two digits, more if it is large."""
+    return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:,.0f}"
+
+
+def three(value: float) -> str:
+    """Returns a number with three digits, more if it is large."""
+    return f"{value:,.0f}" if value >= 99.5 else f"{value:#.3g}"
+
+
+def in_thousands(decimals: int) -> Callable[[float], str]:
+    """Returns a format with some decimals, without decimals from 1,000 on."""
+    return lambda value: f"{value:,.{decimals if value < 1000.0 else 0}f}"
