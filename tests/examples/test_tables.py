@@ -314,7 +314,7 @@ def test_arcs_worlds_and_inversions():
         "inverted": 0,
         "truncated_steps": 0,
     }
-    runs = [run | {"mode": mode} for mode in ("plain", "left", "reported", "prevented")]
+    runs = [run | {"mode": mode} for mode in ("plain", "allowed", "reported", "prevented")]
     runs[1] |= {"inverting_steps": 3, "inverted": 1234}
     runs[3] |= {"truncated_steps": 4}
     _, row = rows_of.inverting_steps({"rows": runs})

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from ...detection.mesh import CollisionMesh
-from ...response.state.mesh import ModelMesh, host_array
 from ...response.report.strain import edges_at_rest
+from ...response.state.mesh import ModelMesh, host_array
 from ..crossings import SoftPairs
 from ..scenes.simulation import largest_stretch
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import newton
 import numpy as np
 
-from ...response.state.mesh import host_array
 from ...response.report.strain import edges_at_rest
+from ...response.state.mesh import host_array
 from ..scenes.penetration import PenetrationScene
 from ..scenes.simulation import NotFinite, Simulation, largest_stretch, make_solver, self_contact
 from .states import Trajectory

@@ -12,9 +12,9 @@ import warp as wp
 
 from ..._private_names.of_newton import make_style3d
 from ...implicit.solver_implicit import SolverImplicit
+from ...response.report.strain import edges_at_rest
 from ...response.solver_ccd import SolverCCD
 from ...response.state.mesh import host_array
-from ...response.report.strain import edges_at_rest
 from ..crossings import CrossingCounter
 from ..elastic_energy import ElasticEnergy
 from .contact import Scene

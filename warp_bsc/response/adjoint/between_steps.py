@@ -46,8 +46,8 @@ _WATCHED: weakref.WeakSet[wp.Tape] = weakref.WeakSet()
 """Tapes that are recording a step that is watched."""
 
 GOES_ON, RESTS, STAYS, LOST, UNKNOWN = (wp.constant(i) for i in range(5))
-"""Where the gradient of an array between two steps is written: to the start of the step (GOES_ON); there, with NaN in the
-array (RESTS); to the array (STAYS); nowhere, with NaN in the array (LOST); or nowhere, with NaN in both (UNKNOWN)."""
+"""Where the gradient of an array between two steps is written: to the start of the step (GOES_ON); there, with NaN in
+the array (RESTS); to the array (STAYS); nowhere, with NaN in the array (LOST); or nowhere, NaN in both (UNKNOWN)."""
 
 
 @wp.kernel
