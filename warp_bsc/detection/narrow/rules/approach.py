@@ -1,0 +1,259 @@
+"""The narrow phase of a response with minimum distances: pairs that come too near, and proximities.
+
+A pair may come as near as its minimum distance, the sum of two radii, see :mod:`.distance`, or as it was at the
+start, if it was nearer, less the rounding of distances. On arcs of bodies that turn, it comes nearer by a 64th, but not
+at the end of the step. Pairs that an edge of the mesh joins must only not touch:
+neighbours are always near. Proximities are the other pairs that come within the reach beyond these distances.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from ....kernels.arcs import Arcs, are_of_one_group, distance_at, impact_on_arcs
+from ....kernels.ccd import impact_at_distance
+from ....kernels.min_distance import clears_at_once, closest_at
+from ....kernels.motion import doubles, motion_and_distance
+from ....kernels.pairs import ABOVE_SUM, distance_of_corners, firsts_of
+from ....kernels.signs import FREE, ROUNDOFF
+from ....kernels.time_of_impact import Impact
+from ...mesh import CollisionMesh
+from ...run.launch import made_once
+from ...run.settings import TOLERANCE
+from ...run.stage_timer import StageTimer
+from ..narrow_phase import Phases, launch_culls, launch_decisions, stages_of
+from ..pair_kernels import PairRule
+from ..rings import Rings, are_within_rings, make_rings
+
+__all__ = [
+    "MinDistances",
+    "distances_of_pair",
+    "impact_on_arcs_at_distance",
+    "make_min_distances",
+    "run_approaches",
+]
+
+KEPT = wp.constant(wp.float64(1.0 - 2.0**-20))
+"""Share of its distance at the start that a pair must keep which starts within its minimum distance.
+
+The search certifies it for a pair at rest, also where that is pressed from both sides, and moves by rounding.
+"""
+SHARE_ON_ARCS = wp.constant(wp.float64(1.0 - 2.0**-6))
+"""Share of its minimum distance that a pair keeps on arcs, between the start and the end of the step."""
+_ZERO = wp.constant(wp.float64(0.0))
+_TWO = wp.constant(wp.float64(2.0))
+
+_RINGS = 1
+
+
+@wp.struct
+class MinDistances:
+    """The minimum distances of a mesh; without arrays there are none.
+
+    Attributes:
+        radius: Radius of each vertex, half of the minimum distance included [m].
+        of_planes: Radius of each infinite plane, half of the minimum distance included [m].
+        reach: Largest distance of proximities beyond their minimum distance [m].
+        rings: Vertices whose elements have no minimum distance.
+        group: Group of each vertex; pairs within a group are skipped. -1 for none.
+    """
+
+    radius: wp.array[wp.float64]
+    of_planes: wp.array[wp.float64]
+    reach: wp.float64
+    rings: Rings
+    group: wp.array[int]
+
+
+def make_min_distances(
+    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, group: np.ndarray
+) -> MinDistances:
+    """Returns the minimum distances of a mesh on its device, see :class:`MinDistances`.
+
+    Args:
+        mesh: The mesh.
+        radius: Radius of each vertex, float64, shape [vertex_count].
+        of_planes: Radius of each infinite plane, float64, shape [plane_count].
+        reach: Largest distance of proximities beyond their minimum distance.
+        group: Group of each vertex, int, shape [vertex_count].
+    """
+    distances = MinDistances()
+    distances.radius = wp.array(radius, dtype=wp.float64, device=mesh.device)
+    distances.of_planes = wp.array(of_planes, dtype=wp.float64, device=mesh.device)
+    distances.reach = reach
+    distances.rings = make_rings(mesh, _RINGS)
+    distances.group = wp.array(group, dtype=int, device=mesh.device)
+    return distances
+
+
+@wp.func
+def distances_of_pair(
+    distances: MinDistances, kind: int, corners: wp.vec4i, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d
+):
+    """Returns the distance of a pair at the start, from its points there, and its minimum distance in the step [m].
+
+    The first is a lower bound; it is 0 if the elements may touch. The second is less, unless the first is 0.
+    """
+    found, error = distance_at(kind, a, b, c, d)
+    start = wp.max(found - _TWO * error, _ZERO)
+    if are_within_rings(corners, firsts_of(kind), distances.rings):
+        return start, _ZERO
+    return start, wp.min(distance_of_corners(kind, corners, distances.radius), KEPT * start)
+
+
+@wp.func
+def impact_on_arcs_at_distance(
+    kind: int,
+    v: wp.vec4i,
+    # points at the start
+    a0: Any,
+    b0: Any,
+    c0: Any,
+    d0: Any,
+    # points at the end
+    a1: Any,
+    b1: Any,
+    c1: Any,
+    d1: Any,
+    arcs: Arcs,
+    kept: wp.float64,
+) -> Impact:
+    """Returns the first time at which a pair comes nearer on its arcs than it may, as of :func:`.impact_on_arcs`.
+
+    It keeps its minimum distance ``kept`` at the end of the step, and :data:`SHARE_ON_ARCS` of it on the way. A pair
+    that rests at its distance would otherwise have to be followed in ever shorter parts.
+    """
+    a, b, c, d = doubles(a1, b1, c1, d1)
+    found, error = distance_at(kind, a, b, c, d)
+    least = wp.where(found - error >= kept, SHARE_ON_ARCS * kept, kept)
+    return impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, least)
+
+
+@wp.struct
+class Options:
+    """Options of the rules.
+
+    Attributes:
+        distances: The minimum distances.
+        arcs: The arcs of bodies that turn.
+        proximities: Whether to report proximities.
+        tolerance: Of the times of impact, as a share of the step.
+    """
+
+    distances: MinDistances
+    arcs: Arcs
+    proximities: bool
+    tolerance: wp.float64
+
+
+@made_once
+def _rule(turning: bool) -> PairRule:
+    """Returns the rule of the pairs with a turning vertex, or of the others.
+
+    Kernels for both take more registers, which costs more than launches over queues in which nothing turns.
+    """
+
+    @wp.func
+    def excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
+        group = options.distances.group[v[0]]
+        if group >= 0 and options.distances.group[v[3]] == group:
+            return True
+        if wp.static(turning):
+            return are_of_one_group(options.arcs, v)
+        return False
+
+    @wp.func
+    def clears(
+        options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
+    ) -> bool:
+        distances = options.distances
+        distance = distance_of_corners(kind, v, distances.radius) + distances.reach
+        reach = distances.reach
+        if wp.static(turning):
+            deviation = distance_of_corners(kind, v, options.arcs.deviation)
+            distance = ABOVE_SUM * (distance + deviation)
+            reach = ABOVE_SUM * (reach + deviation)
+        motion, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
+        if clears_at_once(motion, scaled):
+            return True
+        if are_within_rings(v, firsts_of(kind), distances.rings):
+            _same, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+            return clears_at_once(motion, scaled)
+        return False
+
+    @wp.func
+    def decide(
+        options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
+    ):
+        distances = options.distances
+        tolerance = options.tolerance
+        a, b, c, d = doubles(a0, b0, c0, d0)
+        start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
+        result = Impact()
+        if wp.static(turning):
+            result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, options.arcs, kept)
+        else:
+            result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
+        if not options.proximities:
+            return result, result.status != FREE
+        reach = distances.reach
+        if not are_within_rings(v, firsts_of(kind), distances.rings):
+            reach += distance_of_corners(kind, v, distances.radius)
+        if start < reach:
+            motion, _scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+            coordinates, normal = closest_at(kind, motion, _ZERO)
+            result.coordinates = coordinates
+            result.normal = normal
+        elif not wp.static(turning) or result.status == FREE:
+            near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
+            if near.status == FREE:
+                return result, False
+            result.coordinates = near.coordinates
+            result.normal = near.normal
+        return result, True
+
+    return PairRule(Options, excludes, clears, decide, turning=turning)
+
+
+def run_approaches(
+    phases: Phases,
+    x0: wp.array,
+    x1: wp.array,
+    distances: MinDistances,
+    *,
+    proximities: bool,
+    tolerance: float = TOLERANCE,
+    arcs: "Arcs | None" = None,
+    timer: StageTimer,
+) -> None:
+    """Launches all stages over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
+
+    The status of a proximity is FREE. Times of impact are those at which a pair comes nearer than it may, 2 if it does
+    not. With ``proximities``, coordinates and normals are those at which the pair comes within reach, at the start if
+    it is within reach then: they depend continuously on the motion, and the direction to move the pair apart vanishes
+    with the distance that it is to be moved.
+
+    Args:
+        phases: The narrow phase of each kind, a :class:`DistanceKind`.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        distances: The minimum distances.
+        proximities: Whether to report proximities.
+        tolerance: Of the times of impact, as a share of the step.
+        arcs: The arcs of bodies that turn; None if nothing turns.
+        timer: Measures the stages.
+    """
+    # pairs with a turning vertex last; on the CPU only where there are some
+    some_turn = arcs is not None and not (x0.device.is_cpu and not arcs.turning.numpy()[0])
+    rules = [_rule(turning) for turning in ((False, True) if some_turn else (False,))]
+    options = Options()
+    options.distances, options.proximities, options.tolerance = distances, proximities, tolerance
+    options.arcs = Arcs() if arcs is None else arcs
+    stages = stages_of(phases)
+    with timer.stage("cull"):
+        for rule in rules:
+            launch_culls(rule, stages, x0, x1, options)
+    with timer.stage("classify"):
+        for rule in rules:
+            launch_decisions(rule, stages, x0, x1, options)
