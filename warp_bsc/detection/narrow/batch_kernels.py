@@ -154,7 +154,7 @@ def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
     for_exact = int(0)
     for i in range(first, first + count):
         status = contacts.status[i]
-        write_decision(i, contacts.pairs[i], int(status), stages)
+        write_decision(i, int(status), stages)
         if status != wp.int8(FREE):
             found += 1
             if status == wp.int8(UNSURE):

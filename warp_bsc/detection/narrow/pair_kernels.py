@@ -9,7 +9,7 @@ from typing import NamedTuple
 import warp as wp
 
 from ...kernels.arcs import any_turns, turns
-from ...kernels.pairs import ends_of, points_of_pair
+from ...kernels.pairs import points_of_pair
 from ...kernels.pipeline.queues import append, is_filled, take_slot
 from ...kernels.signs import FREE, UNSURE
 from ...kernels.time_of_impact import Impact
@@ -25,9 +25,9 @@ __all__ = [
     "count_found",
     "cull_kernel",
     "decide_kernel",
+    "entry_of_two",
     "gather_contacts",
     "pad_keys",
-    "pair_of_two",
     "take_contact",
     "write_decision",
     "write_impact",
@@ -71,18 +71,17 @@ class PairStages:
 
 
 @wp.func
-def _entry(
+def _vertices_at(
     i: int, kind: int, queue: wp.array[wp.vec2i], elements: wp.array2d[int], counts: wp.array[wp.int64], count: int
-):
-    """Returns entry i of a queue and the vertices of that pair; (-1, -1) if it has not been written."""
+) -> wp.vec4i:
+    """Returns the vertices of entry i of a queue, -1 if it has not been written."""
     if not is_filled(i, queue, counts, count):
-        return wp.vec2i(-1, -1), wp.vec4i()
-    pair = queue[i]
-    return pair + wp.vec2i(), points_of_pair(kind, elements, pair)
+        return wp.vec4i(-1)
+    return points_of_pair(kind, elements, queue[i])
 
 
 @wp.func
-def pair_of_two(
+def entry_of_two(
     i: int,
     kinds: wp.vec2i,
     queue: wp.array[wp.vec2i],
@@ -91,16 +90,14 @@ def pair_of_two(
     other: PairStages,
     count: int,
 ):
-    """Returns the kind, the index in its queue, the pair and its vertices for a thread over the queues of two kinds.
+    """Returns the kind, the index in its queue, and the vertices of entry i of two queues, -1 if it is not written.
 
-    The pair is (-1, -1) if the entry has not been written.
+    The entries of the other queue follow the capacity of the one.
     """
     if i < queue.shape[0]:
-        pair, v = _entry(i, kinds[0], queue, one.elements, one.counts, count)
-        return kinds[0], i, pair, v
+        return kinds[0], i, _vertices_at(i, kinds[0], queue, one.elements, one.counts, count)
     k = i - queue.shape[0]
-    other_pair, w = _entry(k, kinds[1], other_queue, other.elements, other.counts, count)
-    return kinds[1], k, other_pair, w
+    return kinds[1], k, _vertices_at(k, kinds[1], other_queue, other.elements, other.counts, count)
 
 
 @wp.func
@@ -126,12 +123,13 @@ def write_impact(k: int, result: Impact, stages: PairStages):
 
 
 @wp.func
-def write_decision(k: int, pair: wp.vec2i, status: int, stages: PairStages):
+def write_decision(k: int, status: int, stages: PairStages):
     """Writes what is decided of a row of the contacts, and its place in their order, the last one if it is free."""
     stages.contacts.decided[k] = wp.int8(status)
     stages.order[k] = k
     stages.keys[k] = stages.last_key
     if status != FREE:
+        pair = stages.contacts.pairs[k]
         stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
 
 
@@ -150,7 +148,7 @@ def add_contact(pair: wp.vec2i, result: Impact, stages: PairStages):
     count_found(result.status, stages)
     if k >= 0:
         write_impact(k, result, stages)
-        write_decision(k, pair, result.status, stages)
+        write_decision(k, result.status, stages)
 
 
 @wp.func
@@ -164,8 +162,8 @@ def add_open_contact(pair: wp.vec2i, result: Impact, stages: PairStages):
 class PairRule(NamedTuple):
     """What the narrow phase decides of a pair, by device functions.
 
-    All take the options of the rule, the kind of pair and its vertices; all but the first also its eight points, at
-    the start and at the end of the step, vec3 or vec3d.
+    All take the options of the rule, the kind of pair and its vertices; all but the first also the positions at the
+    start and at the end of the step, arrays of vec3 or vec3d.
 
     Attributes:
         options: The struct of the options.
@@ -216,17 +214,17 @@ def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
                 return
         if wp.static(of_kind >= 0):
             kind = wp.static(of_kind)
-        pair, v = _entry(first + wp.tid(), kind, stages.queue, stages.elements, stages.counts, _QUEUED)
-        if pair[0] < 0:
+        i = first + wp.tid()  # and no pair, which would take registers until the end
+        v = _vertices_at(i, kind, stages.queue, stages.elements, stages.counts, _QUEUED)
+        if v[0] < 0:
             return
         if wp.static(turning is not None):
             if turns(options.arcs, v) != wp.static(turning is True):
                 return
         if excludes(options, kind, v):
             return
-        a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
-        if not clears(options, kind, v, a0, b0, c0, d0, a1, b1, c1, d1):
-            append(pair, stages.survivors, stages.counts, _SURVIVORS)
+        if not clears(options, kind, v, x0, x1):
+            append(stages.queue[i], stages.survivors, stages.counts, _SURVIVORS)
 
     return cull
 
@@ -257,20 +255,20 @@ def decide_kernel(rule: PairRule, dtype: type) -> wp.Kernel:
         if wp.static(turning is True):
             if not any_turns(options.arcs):
                 return
-        kind, _i, pair, v = pair_of_two(first + wp.tid(), kinds, one.survivors, other.survivors, one, other, _SURVIVORS)
-        if pair[0] < 0:
+        i = first + wp.tid()
+        kind, k, v = entry_of_two(i, kinds, one.survivors, other.survivors, one, other, _SURVIVORS)
+        if v[0] < 0:
             return
         if wp.static(turning is not None):
             if turns(options.arcs, v) != wp.static(turning is True):
                 return
-        a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
-        result, is_contact = decide(options, kind, v, a0, b0, c0, d0, a1, b1, c1, d1)
+        result, is_contact = decide(options, kind, v, x0, x1)
         if not is_contact:
             return
         if kind == kinds[0]:
-            add(pair, result, one)
+            add(one.survivors[k], result, one)
         else:
-            add(pair, result, other)
+            add(other.survivors[k], result, other)
 
     return decide_survivors
 

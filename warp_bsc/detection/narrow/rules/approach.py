@@ -164,9 +164,9 @@ def _rule(turning: bool) -> PairRule:
         return False
 
     @wp.func
-    def clears(
-        options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-    ) -> bool:
+    def clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         distances = options.distances
         distance = distance_of_corners(kind, v, distances.radius) + distances.reach
         reach = distances.reach
@@ -183,9 +183,9 @@ def _rule(turning: bool) -> PairRule:
         return False
 
     @wp.func
-    def decide(
-        options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-    ):
+    def decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
+        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
         distances = options.distances
         tolerance = options.tolerance
         a, b, c, d = doubles(a0, b0, c0, d0)
@@ -195,23 +195,23 @@ def _rule(turning: bool) -> PairRule:
             result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, options.arcs, kept)
         else:
             result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
-        if not options.proximities:
-            return result, result.status != FREE
-        reach = distances.reach
-        if not are_within_rings(v, firsts_of(kind), distances.rings):
-            reach += distance_of_corners(kind, v, distances.radius)
-        if start < reach:
-            motion, _scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
-            coordinates, normal = closest_at(kind, motion, _ZERO)
-            result.coordinates = coordinates
-            result.normal = normal
-        elif not wp.static(turning) or result.status == FREE:
-            near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
-            if near.status == FREE:
-                return result, False
-            result.coordinates = near.coordinates
-            result.normal = near.normal
-        return result, True
+        is_contact = result.status != FREE
+        if options.proximities:
+            reach = distances.reach
+            if not are_within_rings(v, firsts_of(kind), distances.rings):
+                reach += distance_of_corners(kind, v, distances.radius)
+            if start < reach:
+                is_contact = True
+                motion, _scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+                coordinates, normal = closest_at(kind, motion, _ZERO)
+                result.coordinates = coordinates
+                result.normal = normal
+            elif not wp.static(turning) or result.status == FREE:
+                near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
+                is_contact = near.status != FREE
+                result.coordinates = near.coordinates
+                result.normal = near.normal
+        return result, is_contact
 
     return PairRule(Options, excludes, clears, decide, turning=turning)
 

@@ -88,18 +88,16 @@ def _excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
 
 
 @wp.func
-def _clears(
-    options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-) -> bool:
+def _clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
     distance = distance_of_corners(kind, v, options.arcs.deviation)
     motion, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
     return clears_at_once(motion, scaled)
 
 
 @wp.func
-def _decide(
-    options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-):
+def _decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
     result = impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, options.arcs, _ZERO)
     return result, result.status != FREE
 
@@ -129,8 +127,7 @@ def _batch_kernel(dtype: type) -> wp.Kernel:
         while i < end and stages.queue[i][0] >= 0:
             pair = stages.queue[i]
             v = vertices_of_pair(kind, stages.elements, pair)
-            a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
-            result, is_contact = _decide(options, kind, v, a0, b0, c0, d0, a1, b1, c1, d1)
+            result, is_contact = _decide(options, kind, v, x0, x1)
             if is_contact:
                 add_contact(pair, result, stages)
             i += 1

@@ -31,7 +31,7 @@ from ..pair_kernels import (
     PairStages,
     add_open_contact,
     count_found,
-    pair_of_two,
+    entry_of_two,
     write_decision,
     write_impact,
 )
@@ -70,23 +70,19 @@ def _never_coplanar(motion: Motion) -> bool:
 
 
 @wp.func
-def _clears(
-    options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-) -> bool:
-    # boxes last, because in single precision queued pairs always pass; but exact at any scale
+def _clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
     if kind == VERTEX_FACE:
-        if _never_coplanar(vertex_face_motion(a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff)):
-            return True
-        return vertex_face_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
-    if _never_coplanar(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff)):
-        return True
-    return edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
+        apart = _never_coplanar(vertex_face_motion(a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff))
+        # last, because in single precision queued pairs always pass; but exact at any scale
+        return apart or vertex_face_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
+    apart = _never_coplanar(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff))
+    return apart or edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
 
 
 @wp.func
-def _decide(
-    options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-):
+def _decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
     result = Impact()
     motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff)
     result.status = classify(motion, coplanarity(motion))
@@ -99,9 +95,9 @@ _RULE = PairRule(Options, _excludes, _clears, _decide, add=add_open_contact, cul
 
 
 @wp.func
-def _finish(i: int, pair: wp.vec2i, status: int, timed: bool, stages: PairStages):
+def _finish(i: int, status: int, timed: bool, stages: PairStages):
     """Writes and counts what is decided of a contact, and enqueues it for the exact stage if that is needed."""
-    write_decision(i, pair, status, stages)
+    write_decision(i, status, stages)
     if status == FREE:
         return
     count_found(status, stages)
@@ -128,10 +124,10 @@ def _impact_kernel(dtype: type) -> wp.Kernel:
         one: PairStages,
         other: PairStages,
     ):
-        kind, i, pair, v = pair_of_two(
+        kind, i, v = entry_of_two(
             first + wp.tid(), kinds, one.contacts.pairs, other.contacts.pairs, one, other, _CONTACTS
         )
-        if pair[0] < 0:
+        if v[0] < 0:
             return
         status = int(0)
         if kind == kinds[0]:
@@ -148,9 +144,9 @@ def _impact_kernel(dtype: type) -> wp.Kernel:
             else:
                 write_impact(i, result, other)
         if kind == kinds[0]:
-            _finish(i, pair, status, timed, one)
+            _finish(i, status, timed, one)
         else:
-            _finish(i, pair, status, timed, other)
+            _finish(i, status, timed, other)
 
     return find_impacts
 

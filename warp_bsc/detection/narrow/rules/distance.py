@@ -65,9 +65,8 @@ def _excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
 
 
 @wp.func
-def _clears(
-    options: Options, kind: int, v: wp.vec4i, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any
-) -> bool:
+def _clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
     distance = distance_of_corners(kind, v, options.radius)
     motion, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, options.roundoff)
     return clears_at_once(motion, scaled) or are_within_rings(v, firsts_of(kind), options.rings)
@@ -95,7 +94,7 @@ def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, stages: Pai
         take_slot(stages.counts, _FOR_EXACT)
     if k >= 0:
         write_impact(k, result, stages)
-        write_decision(k, stages.contacts.pairs[k], result.status, stages)
+        write_decision(k, result.status, stages)
 
 
 @made_once
