@@ -211,15 +211,9 @@ def launch_exact_stage(
 ) -> None:
     """Decides contacts exactly, without synchronizing with a GPU.
 
-    Args:
-        kind: The kind of pair.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        timed: Whether to find times of impact, coordinates and normals of hits.
-        tolerance: Of the times of impact, as a share of the step.
-        stages: The buffers of the narrow phase; without times, of its contacts only ``pairs`` and ``decided`` are used.
-        left: A queue for contacts that are too wide, as long as ``stages.for_exact``; both are overwritten. Array of
-            int.
+    Arguments are those of :func:`launch_exact_distances`, and a queue for contacts that are too wide, as long as
+    ``stages.for_exact``, array of int; both are overwritten. Without times, of the contacts only ``pairs`` and
+    ``decided`` are used.
     """
     digits = max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     queue, filled = stages.for_exact, Count.FOR_EXACT

@@ -157,15 +157,7 @@ def stages_of(phases: Phases) -> dict[PairKind | DistanceKind, PairStages]:
 def launch_culls(
     rule: PairRule, stages: Mapping[PairKind | DistanceKind, PairStages], x0: wp.array, x1: wp.array, options: Any
 ) -> None:
-    """Launches a rule from the queue of each kind to its survivors, without synchronizing with a GPU.
-
-    Args:
-        rule: The rule.
-        stages: The buffers by kind.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        options: The struct of the rule's options.
-    """
+    """Launches a rule from the queue of each kind to its survivors, from both positions and the rule's options."""
     for kind, s in stages.items():
         kernel = cull_kernel(rule, x0.dtype, int(kind) if rule.culls_by_kind else -1)
         inputs = [x0, x1, options, int(kind)]
@@ -175,7 +167,7 @@ def launch_culls(
 def launch_decisions(
     rule: PairRule, stages: Mapping[PairKind | DistanceKind, PairStages], x0: wp.array, x1: wp.array, options: Any
 ) -> None:
-    """Launches a rule from the survivors of all kinds to their contacts; arguments as of :func:`launch_culls`."""
+    """Launches a rule from the survivors of all kinds to their contacts, as :func:`launch_culls`."""
     kernel, inputs = decide_kernel(rule, x0.dtype), [x0, x1, options]
     launch_over_kinds(kernel, stages, "survivors", Count.SURVIVORS, inputs=inputs, block_dim=64)
 

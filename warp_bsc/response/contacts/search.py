@@ -122,7 +122,7 @@ def _decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: w
     result = Impact()
     if motion.distances.radius:
         start, kept = distances_at_start(motion, corners, kind)
-        result = impact_on_arcs_at_distance(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
+        result = impact_on_arcs_at_distance(kind, corners, motion.x0, arguments.step.vertices.x1, arcs, kept)
     else:
         result = impact_on_arcs(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, ZERO)
         start = result.toi

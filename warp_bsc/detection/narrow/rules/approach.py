@@ -104,26 +104,15 @@ def distances_of_pair(
 
 @wp.func
 def impact_on_arcs_at_distance(
-    kind: int,
-    v: wp.vec4i,
-    # points at the start
-    a0: Any,
-    b0: Any,
-    c0: Any,
-    d0: Any,
-    # points at the end
-    a1: Any,
-    b1: Any,
-    c1: Any,
-    d1: Any,
-    arcs: Arcs,
-    kept: wp.float64,
+    kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any], arcs: Arcs, kept: wp.float64
 ) -> Impact:
     """Returns the first time at which a pair comes nearer on its arcs than it may, as of :func:`.impact_on_arcs`.
 
     It keeps its minimum distance ``kept`` at the end of the step, and :data:`SHARE_ON_ARCS` of it on the way. A pair
     that rests at its distance would otherwise have to be followed in ever shorter parts.
     """
+    a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+    a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
     a, b, c, d = doubles(a1, b1, c1, d1)
     found, error = distance_at(kind, a, b, c, d)
     least = wp.where(found - error >= kept, SHARE_ON_ARCS * kept, kept)
@@ -192,7 +181,7 @@ def _rule(turning: bool) -> PairRule:
         start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
         result = Impact()
         if wp.static(turning):
-            result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, options.arcs, kept)
+            result = impact_on_arcs_at_distance(kind, v, x0, x1, options.arcs, kept)
         else:
             result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
         is_contact = result.status != FREE
@@ -234,22 +223,15 @@ def run_approaches(
     it is within reach then: they depend continuously on the motion, and the direction to move the pair apart vanishes
     with the distance that it is to be moved.
 
-    Args:
-        phases: The narrow phase of each kind, a :class:`DistanceKind`.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        distances: The minimum distances.
-        proximities: Whether to report proximities.
-        tolerance: Of the times of impact, as a share of the step.
-        arcs: The arcs of bodies that turn; None if nothing turns.
-        timer: Measures the stages.
+    Arguments are those of :func:`.run_contacts` and the :class:`Options`.
     """
     # pairs with a turning vertex last; on the CPU only where there are some
     some_turn = arcs is not None and not (x0.device.is_cpu and not arcs.turning.numpy()[0])
     rules = [_rule(turning) for turning in ((False, True) if some_turn else (False,))]
     options = Options()
     options.distances, options.proximities, options.tolerance = distances, proximities, tolerance
-    options.arcs = Arcs() if arcs is None else arcs
+    if arcs is not None:
+        options.arcs = arcs
     stages = stages_of(phases)
     with timer.stage("cull"):
         for rule in rules:

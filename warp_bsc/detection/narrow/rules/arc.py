@@ -139,14 +139,8 @@ def _batch_kernel(dtype: type) -> wp.Kernel:
 def run_arcs(phases: Phases, x0: wp.array, x1: wp.array, arcs: Arcs, *, timer: StageTimer) -> None:
     """Adds the contacts of queued pairs with a turning body, after those of :mod:`.contact`, without synchronizing.
 
-    On a CPU, :func:`.batch_culling_kernel` has left the pairs in their batches of the queue.
-
-    Args:
-        phases: The narrow phases of vertex-face and edge-edge pairs.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        arcs: The arcs.
-        timer: Measures the stage.
+    Arguments are those of :func:`.run_contacts`. On a CPU, :func:`.batch_culling_kernel` has left the pairs in their
+    batches of the queue.
     """
     device = x0.device
     if device.is_cpu and not arcs.turning.numpy()[0]:

@@ -177,10 +177,10 @@ def run_contacts(
         arcs: Pairs with a turning vertex are left out, for :mod:`.arc`; None if nothing turns.
         timer: Measures the stages.
     """
-    on_arcs = arcs is not None
     options = Options()
     options.roundoff = 0.0 if method == "float" else ROUNDOFF
-    options.arcs = Arcs() if arcs is None else arcs
+    if arcs is not None:
+        options.arcs = arcs
     stages, is_cpu = stages_of(phases), x0.device.is_cpu
     motion = [x0, x1, options.roundoff]
 
@@ -193,7 +193,7 @@ def run_contacts(
 
     with timer.stage("cull"):
         if is_cpu:
-            cull = functools.partial(batch_culling_kernel, on_arcs=on_arcs)
+            cull = functools.partial(batch_culling_kernel, on_arcs=arcs is not None)
             launch_batches(cull, [options.arcs], "queue", Count.QUEUED, CULLED)
         else:
             launch_culls(_RULE, stages, x0, x1, options)

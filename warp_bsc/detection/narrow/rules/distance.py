@@ -202,18 +202,8 @@ def run_distances(
 ) -> None:
     """Launches all stages but the sorting over the queued pairs, without synchronizing with a GPU.
 
-    Args:
-        phases: The narrow phase of each kind, a :class:`DistanceKind`.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        radius: Radius of each vertex, array of float64.
-        rings: Vertices whose elements are excluded.
-        method: One of :data:`METHODS`; with "exact", pairs that stay UNSURE are left to :func:`.decide_on_host`.
-        body: Body of each vertex, array of int: pairs whose vertices are all of one body from -1 are excluded. None for
-            none.
-        timed: Whether to find times of impact within the tolerance.
-        tolerance: Tolerance of the times of impact, as a share of the step.
-        timer: Measures the stages.
+    Arguments are those of :func:`.run_contacts` and the :class:`Options`. With "exact", pairs that stay UNSURE are left
+    to :func:`.decide_on_host`.
     """
     options = Options()
     options.radius, options.rings, options.body = radius, rings, body
@@ -237,6 +227,6 @@ def run_distances(
                 launch_over(kernel, entries, inputs=inputs, outputs=[s], device=device, block_dim=_BLOCK)
     if method == "exact":
         with timer.stage("exact"):
+            of_times = {"timed": timed, "tolerance": tolerance}
             for kind, s in stages.items():
-                of_times = {"timed": timed, "tolerance": tolerance}
                 launch_exact_distances(x0, x1, radius, DistanceKind(kind), **of_times, stages=s)
