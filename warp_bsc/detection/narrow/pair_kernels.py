@@ -237,6 +237,7 @@ def decide_kernel(rule: PairRule, dtype: type) -> wp.Kernel:
     then that of the other.
     """
     decide, add, turning = rule.decide, rule.add, rule.turning
+    assert decide is not None, "the rule has other kernels"
     limits = {"cuda_max_registers": rule.max_registers} if rule.max_registers else {}
 
     @wp.kernel(**NO_FUSED_OPERATIONS, **limits)

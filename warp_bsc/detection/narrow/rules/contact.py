@@ -132,7 +132,7 @@ def _impact_kernel(dtype: type) -> wp.Kernel:
         status = int(0)
         if kind == kinds[0]:
             status = int(one.contacts.status[i])
-        if kind != kinds[0]:
+        if kind != kinds[0]:  # one expression would read both
             status = int(other.contacts.status[i])
         if timed or status != HIT:
             a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
@@ -194,7 +194,7 @@ def run_contacts(
     with timer.stage("cull"):
         if is_cpu:
             cull = functools.partial(batch_culling_kernel, on_arcs=arcs is not None)
-            launch_batches(cull, [options.arcs], "queue", Count.QUEUED, CULLED)
+            launch_batches(cull, [Arcs() if arcs is None else arcs], "queue", Count.QUEUED, CULLED)
         else:
             launch_culls(_RULE, stages, x0, x1, options)
     with timer.stage("classify"):
