@@ -43,8 +43,8 @@ from .ccd import impact_at_distance
 from .closest import contact_at, contact_weights
 from .distance import closest_points
 from .motion import all_finite, double, doubles, relative_motion
-from .pairs import distance_of_corners, firsts_of
-from .polynomials import EDGE_EDGE, VERTEX_FACE
+from .pairs import distance_of_corners, firsts_of, form_of
+from .polynomials import EDGE_EDGE
 from .signs import FREE, HIT, ROUNDOFF, UNSURE
 from .time_of_impact import Impact
 
@@ -198,12 +198,12 @@ def on_arc_of(arcs: Arcs, vertex: int, x0: Any, x1: Any, time: wp.float64) -> wp
 
 
 @wp.func
-def distance_at(points: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """Returns the distance of the features of a pair at rest, and the bound on its error."""
-    u = wp.where(points == EDGE_EDGE, b - a, c - b)
-    v = wp.where(points == EDGE_EDGE, d - c, d - b)
-    w = wp.where(points == EDGE_EDGE, c - a, a - b)
-    _at, found, error = closest_points(points, u, v, w)
+def distance_at(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    """Returns the distance of the features of a pair of any kind at rest, and the bound on its error."""
+    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
+    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
+    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
+    _at, found, error = closest_points(form_of(kind), u, v, w)
     return found, error
 
 
@@ -322,7 +322,6 @@ def impact_on_arcs(
     result.status = UNSURE
     if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
         return result
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
     p, q, r, s = doubles(a0, b0, c0, d0)
     a, b, c, d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
@@ -366,7 +365,7 @@ def impact_on_arcs(
             advance = _SHORTEST * wp.floor(part.toi * length / _SHORTEST)
             found = _ZERO
             if advance == _ZERO:
-                found, _error = distance_at(points, p, q, r, s)
+                found, _error = distance_at(kind, p, q, r, s)
             is_within = advance == _ZERO and found <= min_distance + _HALF * bounds.tolerance
             is_within = is_within or _TWO * deviation <= bounds.tolerance
             if is_within or parts == MAX_PARTS or length <= _SHORTEST:

@@ -207,8 +207,7 @@ def impact_at_distance(
         result.coordinates = wp.vec3d(_NAN)
         result.normal = wp.vec3d(_NAN)
         return result
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-    motion, distance = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, min_distance, roundoff)
+    motion, distance = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, min_distance, roundoff)
     return min_distance_impact(kind, motion, distance, timed, tolerance)
 
 

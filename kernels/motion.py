@@ -187,10 +187,13 @@ def _motion_of_kind(
     # rounding
     roundoff: wp.float64,
 ) -> Motion:
-    """Returns the scaled relative motion of a query, whose points are in double precision."""
-    if kind == VERTEX_FACE:
-        return _scaled(VERTEX_FACE, roundoff, c0 - b0, c1 - b1, d0 - b0, d1 - b1, a0 - b0, a1 - b1)
-    return _scaled(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
+    """Returns the scaled relative motion of a query of any kind, whose points are in double precision.
+
+    The points of a vertex and an edge, p a b a, and of two vertices, p q q q, are those of a vertex and a face.
+    """
+    if kind == EDGE_EDGE:
+        return _scaled(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
+    return _scaled(VERTEX_FACE, roundoff, c0 - b0, c1 - b1, d0 - b0, d1 - b1, a0 - b0, a1 - b1)
 
 
 @wp.func
@@ -221,7 +224,7 @@ def edge_edge_motion(
 def relative_motion(
     kind: int, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
-    """Returns the relative motion of a query with finite coordinates, of either kind and at any scale."""
+    """Returns the relative motion of a query with finite coordinates, of any kind and at any scale."""
     from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
     to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
     motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)

@@ -9,6 +9,8 @@ References:
     https://doi.org/10.1145/1342250.1342260.
 """
 
+from typing import Any
+
 import warp as wp
 
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX
@@ -86,6 +88,18 @@ def points_of_pair(kind: int, elements: wp.array2d[int], pair: wp.vec2i) -> wp.v
     if kind == VERTEX_VERTEX:
         return wp.vec4i(pair[0], pair[1], pair[1], pair[1])
     return vertices_of_pair(kind, elements, pair)
+
+
+@wp.func
+def ends_of(x0: wp.array[Any], x1: wp.array[Any], v: wp.vec4i):
+    """Returns the positions of four vertices at the start, then at the end."""
+    return x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+
+
+@wp.func
+def form_of(kind: int) -> int:
+    """Returns the form of the four points of a pair of any kind: EDGE_EDGE or VERTEX_FACE."""
+    return wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
 
 
 @wp.func

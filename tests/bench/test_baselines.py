@@ -6,8 +6,8 @@ from benchmark_data import load_queries
 from generators import GENERATORS
 
 from warp_bsc import checker
+from warp_bsc.bench.measure import methods
 from warp_bsc.bench.measure.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
-from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
 from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
@@ -108,7 +108,7 @@ def test_the_detectors_own_methods_are_its_narrow_phase(monkeypatch, kind, metho
     points = GENERATORS["mostly_hits"](np.random.default_rng(5), 100, kind, np.float32)
     run = MethodRun(method, QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu"))
     launched = []
-    monkeypatch.setattr(NarrowPhase, "run", lambda *_, **options: launched.append(options))
+    monkeypatch.setattr(methods, "run_contacts", lambda *_, **options: launched.append(options))
     run.launch()
     (options,) = launched
     assert (options["method"], options["timed"]) == (method, False)

@@ -11,7 +11,7 @@ from warp_bsc.detection import pipeline
 from warp_bsc.detection.at_rest import intersections
 from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.broad.broad_phase_simd import BroadPhaseSimd
-from warp_bsc.detection.narrow.distance_phase import pair_distances
+from warp_bsc.detection.narrow.on_host import pair_distances
 from warp_bsc.detection.narrow.rings import make_rings
 from warp_bsc.detection.run.settings import DistanceKind
 

@@ -7,7 +7,7 @@ from test_detector_min_distance import scene
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.narrow.distance_phase import pair_distances
+from warp_bsc.detection.narrow.on_host import pair_distances
 from warp_bsc.detection.run.settings import DistanceKind
 
 

@@ -19,7 +19,7 @@ from measured import print_rows
 import warp_bsc as bsc
 from warp_bsc.bench.tables import Column
 from warp_bsc.detection.arcs.rigid_motion import points_on_arcs
-from warp_bsc.detection.narrow.arc_phase import allocate_arcs, bound_arc
+from warp_bsc.detection.narrow.rules.arc import allocate_arcs, bound_arc
 from warp_bsc.kernels.arcs import Arcs, impact_on_arcs
 from warp_bsc.kernels.ccd import impact_at_distance
 from warp_bsc.kernels.pairs import distance_of_corners

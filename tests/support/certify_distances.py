@@ -21,9 +21,9 @@ from rich.progress import track
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.bench.tables import Column
-from warp_bsc.detection.narrow.distance_phase import run_distance_phases
 from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
 from warp_bsc.detection.narrow.rings import Rings
+from warp_bsc.detection.narrow.rules.distance import run_distances
 from warp_bsc.detection.run.launch import cores
 from warp_bsc.detection.run.settings import Count, DistanceKind, PairCounts
 from warp_bsc.detection.run.stage_timer import StageTimer
@@ -151,7 +151,7 @@ def time_queries(kind, points, distance, timed, repeat):
         while len(times) < repeat:
             counts.assign(PairCounts(queued=len(rows)).values())
             start = time.perf_counter()
-            run_distance_phases([(phase, elements)], *inputs, **options)
+            run_distances([(phase, elements)], *inputs, **options)
             wp.synchronize()
             times.append(time.perf_counter() - start)
             if phase.grow():

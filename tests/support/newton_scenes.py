@@ -6,7 +6,7 @@ import warp as wp
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.detection.narrow.distance_phase import pair_distances
+from warp_bsc.detection.narrow.on_host import pair_distances
 from warp_bsc.detection.run.settings import DistanceKind
 from warp_bsc.response.state.mesh import ModelMesh
 

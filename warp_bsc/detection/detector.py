@@ -17,12 +17,11 @@ from .differentiable import CollisionArrays
 from .inversions import Inversions, inversions_of_motion
 from .mesh import CollisionMesh
 from .narrow.contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
-from .narrow.distance_phase import decide_distances_on_host
-from .narrow.narrow_phase import decide_on_host
+from .narrow.on_host import decide_on_host
 from .pipeline import DetectionPipeline
 from .run.host_function import run_on_host
 from .run.launch import retry_until_fits
-from .run.settings import TOLERANCE, Counts, DistanceKind, Method, PairKind, add_counts
+from .run.settings import TOLERANCE, Counts, DistanceKind, Method, add_counts
 from .run.stage_timer import StageTimer, StageTimers
 
 __all__ = ["CollisionDetector"]
@@ -502,10 +501,7 @@ class CollisionDetector:
         contacts = rows.read()
         which = (contacts.decided == UNSURE) | ~contacts.within_tolerance
         elements, radius = self.mesh.device_elements(kind), self._pipeline.radius
-        if radius is None:
-            decide_on_host(PairKind(kind), x0, x1, elements, contacts, which)
-        else:
-            decide_distances_on_host(kind, x0, x1, elements, radius, contacts, which)
+        decide_on_host(kind, x0, x1, elements, radius, contacts, which)
         buffer = contacts_from_host(contacts.rows(contacts.hit), self.mesh.device)
         return ContactRows(buffer, len(buffer.pairs))
 

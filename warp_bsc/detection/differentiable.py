@@ -7,8 +7,7 @@ import warp as wp
 from ..kernels.distance_gradients import with_distance_gradients
 from ..kernels.gradients import with_gradients
 from ..kernels.motion import doubles
-from ..kernels.pairs import distance_of_corners, points_of_pair, vertices_of_pair
-from ..kernels.polynomials import EDGE_EDGE, VERTEX_FACE
+from ..kernels.pairs import distance_of_corners, form_of, points_of_pair, vertices_of_pair
 from ..kernels.signs import HIT, UNSURE
 from ..kernels.time_of_impact import Impact
 from .mesh import CollisionMesh
@@ -97,9 +96,8 @@ def _distance_kernel(dtype: type) -> wp.Kernel:
         found.toi = contacts.toi[i]
         a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
         a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
-        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         distance = distance_of_corners(kind, v, radius)
-        contact = with_distance_gradients(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, found, tolerance)
+        contact = with_distance_gradients(form_of(kind), a0, b0, c0, d0, a1, b1, c1, d1, distance, found, tolerance)
         toi[i] = contact.toi
         grazing[i] = contact.grazing == 1
 

@@ -8,11 +8,12 @@ from ..kernels.arcs import Arcs
 from ..kernels.pairs import ABOVE_SUM
 from .broad.broad_phase import BroadPhase, make_broad_phase
 from .mesh import CollisionMesh
-from .narrow.approach_phase import MinDistances, run_approach_phases
-from .narrow.arc_phase import run_arc_phases
-from .narrow.distance_phase import run_distance_phases
-from .narrow.narrow_phase import NarrowPhase, run_narrow_phases
+from .narrow.narrow_phase import NarrowPhase
 from .narrow.rings import Rings, make_rings
+from .narrow.rules.approach import MinDistances, run_approaches
+from .narrow.rules.arc import run_arcs
+from .narrow.rules.contact import run_contacts
+from .narrow.rules.distance import run_distances
 from .run.launch import launch, made_once
 from .run.settings import (
     METHODS,
@@ -146,7 +147,7 @@ class DetectionPipeline:
             tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
             min_distance: Distance up to which pairs collide, see :class:`CollisionDetector`.
             rings: Pairs within this number of edges are excluded, see :class:`CollisionDetector`.
-            min_distances: Minimum distances of a response, see :mod:`.approach_phase`, in place of those from radii and
+            min_distances: Minimum distances of a response, see :mod:`.approach`, in place of those from radii and
                 ``min_distance``; None for these.
             body: Body of each vertex, int, shape [vertex_count]: pairs whose vertices are all of one body from -1 are
                 excluded, and :meth:`add_to_radius` must be called before each run. None for none.
@@ -301,14 +302,14 @@ class DetectionPipeline:
         options = {"method": self.method, "tolerance": self.tolerance, "timer": timer}
         if self._min_distances is not None:
             options = {"tolerance": self.tolerance, "arcs": self._arcs, "timer": timer}
-            run_approach_phases(narrow_phases, x0, x1, self._min_distances, proximities=proximities, **options)
+            run_approaches(narrow_phases, x0, x1, self._min_distances, proximities=proximities, **options)
         elif self.device_radius is None:
-            run_narrow_phases(narrow_phases, x0, x1, arcs=self._arcs, **options)
+            run_contacts(narrow_phases, x0, x1, arcs=self._arcs, **options)
             if self._arcs is not None:
-                run_arc_phases(narrow_phases, x0, x1, self._arcs, timer=timer)
+                run_arcs(narrow_phases, x0, x1, self._arcs, timer=timer)
         else:
             options["body"] = self._body
-            run_distance_phases(narrow_phases, x0, x1, self.device_radius, self._rings, **options)
+            run_distances(narrow_phases, x0, x1, self.device_radius, self._rings, **options)
         if not sort:
             return
         for narrow_phase in self.narrow_phases:

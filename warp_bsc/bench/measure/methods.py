@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from ...detection.narrow.narrow_phase import NarrowPhase
+from ...detection.narrow.rules.contact import run_contacts
 from ...detection.queries.query_points import query_points
 from ...detection.run.launch import launch_over, launch_over_queue, retry_until_fits
 from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
@@ -314,7 +315,9 @@ class MethodRun:
         arrays, device = queries.arrays, queries.device
         if self.method in NARROW_PHASE_METHODS:
             wp.copy(self._counts, self._start_counts)
-            self._narrow_phase.run(*arrays[:3], method=self.method, timed=False, timer=StageTimer(None))
+            x0, x1, elements = arrays[:3]
+            phases = [(self._narrow_phase, elements)]
+            run_contacts(phases, x0, x1, method=self.method, timed=False, timer=StageTimer(None))
             return
         cubic, cull, cull_batches, classify_survivors, _ = _kernels(queries.kind, queries.dtype)
         if self.method == "cubic":

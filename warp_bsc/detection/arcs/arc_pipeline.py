@@ -1,4 +1,4 @@
-"""A detection in which bodies turn by small angles: one pass, also in a CUDA graph, see :mod:`.arc_phase`."""
+"""A detection in which bodies turn by small angles: one pass, also in a CUDA graph, see :mod:`.arc`."""
 
 import numpy as np
 import warp as wp
@@ -7,9 +7,9 @@ from ...kernels.arcs import Arcs
 from ...kernels.motion import double
 from ...kernels.signs import UNSURE
 from ..mesh import CollisionMesh
-from ..narrow.arc_phase import allocate_arcs, bound_arc
 from ..narrow.contact_buffer import ContactRows
-from ..narrow.distance_phase import pair_distances
+from ..narrow.on_host import pair_distances
+from ..narrow.rules.arc import allocate_arcs, bound_arc
 from ..pipeline import DetectionPipeline
 from ..run.launch import launch, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind, Method

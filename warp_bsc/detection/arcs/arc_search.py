@@ -15,7 +15,7 @@ import warp as wp
 
 from ..mesh import CollisionMesh
 from ..narrow.contact_buffer import HostContacts, empty_contacts, read_contacts
-from ..narrow.distance_phase import pair_distances
+from ..narrow.on_host import pair_distances
 from ..pipeline import DetectionPipeline
 from ..run.launch import retry_until_fits
 from ..run.settings import Counts, DistanceKind, Method, add_counts

@@ -1,6 +1,6 @@
 """The kernels of the narrow phase on a CPU: culls, classification and times of impact of many pairs at once.
 
-They decide as those of :mod:`.kernels`, pair by pair where SIMD instructions leave one open.
+They decide as those of :mod:`.pair_kernels`, pair by pair where SIMD instructions leave one open.
 """
 
 import warp as wp
@@ -9,7 +9,7 @@ from ...kernels.arcs import Arcs, any_turns, are_of_one_group, turns
 from ...kernels.bits import count_bits, lowest_bit
 from ...kernels.classification import classify
 from ...kernels.motion import relative_motion
-from ...kernels.pairs import vertices_of_pair
+from ...kernels.pairs import ends_of, vertices_of_pair
 from ...kernels.pipeline.batch_arc_culling import cull_arc_batch_of
 from ...kernels.pipeline.batch_classification import BATCH as CLASSIFIED
 from ...kernels.pipeline.batch_classification import OPEN, classify_batch_of
@@ -22,7 +22,7 @@ from ...kernels.signs import FREE, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
 from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
-from .pair_kernels import PairStages, write_impact
+from .pair_kernels import PairStages, write_decision, write_impact
 
 __all__ = ["batch_classification_kernel", "batch_culling_kernel", "batch_impact_kernel"]
 
@@ -56,7 +56,7 @@ def _move_turning_pairs(kind: int, stages: PairStages, arcs: Arcs, first: int, c
 def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bool) -> wp.Kernel:
     """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position.
 
-    If a vertex turns, each batch of the queue then begins with the pairs on arcs that are left, for :mod:`.arc_phase`,
+    If a vertex turns, each batch of the queue then begins with the pairs on arcs that are left, for :mod:`.arc`,
     and (-1, -1) after them. Without ``on_arcs`` nothing turns.
     """
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
@@ -127,8 +127,7 @@ def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> w
         while left != wp.uint64(0):
             bit = lowest_bit(left)
             v = vertices_of_pair(kind_number, stages.elements, stages.survivors[i + bit // 2])
-            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             status = classify(motion, coplanarity(motion))
             statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
@@ -155,18 +154,13 @@ def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
     for_exact = int(0)
     for i in range(first, first + count):
         status = contacts.status[i]
-        contacts.decided[i] = status
-        stages.order[i] = i
-        key = stages.last_key
+        write_decision(i, int(status), stages)
         if status != wp.int8(FREE):
-            pair = contacts.pairs[i]
-            key = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
             found += 1
             if status == wp.int8(UNSURE):
                 unsure += 1
             if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
                 for_exact += 1
-        stages.keys[i] = key
     raise_count(stages.counts, _FOUND, found)
     raise_count(stages.counts, _UNSURE, unsure)
     if for_exact > 0:
@@ -218,8 +212,7 @@ def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel
         while left != wp.uint64(0):
             row = i + lowest_bit(left)
             v = vertices_of_pair(kind_number, stages.elements, contacts.pairs[row])
-            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+            a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), stages)
             left = left & (left - wp.uint64(1))

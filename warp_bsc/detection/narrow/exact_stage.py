@@ -21,14 +21,13 @@ from ...kernels.exact.distance import decide_distance_in
 from ...kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
 from ...kernels.exact.polygon import BITS
 from ...kernels.motion import doubles, relative_motion
-from ...kernels.pairs import distance_of_corners, points_of_pair, vertices_of_pair
+from ...kernels.pairs import distance_of_corners, form_of, points_of_pair, vertices_of_pair
 from ...kernels.pipeline.queues import take_slot
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import FREE, HIT, UNSURE
 from ...kernels.time_of_impact import MIN_DIGITS
 from ..run.launch import launch_over_queue, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
-from .contact_buffer import ContactBuffer, make_contact_buffer
+from .contact_buffer import make_contact_buffer
 from .pair_kernels import PairStages
 
 __all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_stage"]
@@ -39,6 +38,14 @@ _WIDTHS_ON_GPU = (1, 2, 8)
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _TOO_WIDE = wp.constant(int(Count.TOO_WIDE_8))
 _REFUTED = wp.constant(int(Count.REFUTED))
+
+
+@wp.func
+def _refute(i: int, stages: PairStages):
+    """Writes that a contact is none."""
+    stages.contacts.decided[i] = wp.int8(FREE)
+    stages.keys[i] = stages.last_key
+    take_slot(stages.counts, _REFUTED)
 
 
 @made_once
@@ -52,7 +59,6 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
         # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        elements: wp.array2d[int],
         kind: int,
         timed: bool,
         digits: int,
@@ -60,29 +66,24 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
         queue: wp.array[int],
         filled: int,
         too_wide: int,
-        refuted: int,
-        last_key: wp.int64,
         # in and out
-        counts: wp.array[wp.int64],
-        contacts: ContactBuffer,
+        stages: PairStages,
         # out
-        keys: wp.array[wp.int64],
         left: wp.array[int],
     ):
         slot = first + wp.tid()
-        if wp.int64(slot) >= counts[filled]:
+        if wp.int64(slot) >= stages.counts[filled]:
             return
         i = queue[slot]
-        v = vertices_of_pair(kind, elements, contacts.pairs[i])
+        contacts = stages.contacts
+        v = vertices_of_pair(kind, stages.elements, contacts.pairs[i])
         a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
         a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
         time = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
         if time == TOO_WIDE:
-            left[wp.int32(take_slot(counts, too_wide))] = i
+            left[wp.int32(take_slot(stages.counts, too_wide))] = i
         elif time == NONE:
-            contacts.decided[i] = wp.int8(FREE)
-            keys[i] = last_key
-            take_slot(counts, refuted)
+            _refute(i, stages)
         else:
             contacts.decided[i] = wp.int8(HIT)
             if timed:
@@ -127,13 +128,10 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
         v = points_of_pair(kind, stages.elements, contacts.pairs[k])
         a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
         a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
-        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
         distance = distance_of_corners(kind, v, radius)
-        status = decide(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, contacts.toi[k], digits, timed)
+        status = decide(form_of(kind), a0, b0, c0, d0, a1, b1, c1, d1, distance, contacts.toi[k], digits, timed)
         if status == FREE:
-            contacts.decided[k] = wp.int8(status)
-            stages.keys[k] = stages.last_key
-            take_slot(stages.counts, _REFUTED)
+            _refute(k, stages)
         elif status == HIT:
             # coordinates and normal are those at the time of impact already
             contacts.decided[k] = wp.int8(status)
@@ -196,64 +194,32 @@ def launch_exact_distances(
     """
     digits = 1 + max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     for limbs in DISTANCE_BITS:
-        launch_over_queue(
-            _distance_kernel(x0.dtype, limbs),
-            stages.contacts.pairs,
-            stages.counts,
-            Count.CONTACTS,
-            inputs=[x0, x1, radius, int(kind), timed, digits],
-            outputs=[stages],
-            block_dim=64,
-        )
+        kernel, pairs = _distance_kernel(x0.dtype, limbs), stages.contacts.pairs
+        inputs = [x0, x1, radius, int(kind), timed, digits]
+        launch_over_queue(kernel, pairs, stages.counts, Count.CONTACTS, inputs=inputs, outputs=[stages], block_dim=64)
 
 
 def launch_exact_stage(
     kind: PairKind | DistanceKind,
     x0: wp.array,
     x1: wp.array,
-    elements: wp.array,
     *,
     timed: bool,
     tolerance: float,
-    queues: list[wp.array],
-    counts: wp.array,
-    filled: int,
-    too_wide: dict[int, int],
-    refuted: int,
-    contacts: ContactBuffer,
-    keys: wp.array,
-    last_key: int,
+    stages: PairStages,
+    left: wp.array,
 ) -> None:
     """Decides contacts exactly, without synchronizing with a GPU.
 
-    Args:
-        kind: The kind of pair.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        elements: Vertex indices of the faces or edges, two-dimensional array of int.
-        timed: Whether to find times of impact, coordinates and normals of hits.
-        tolerance: Of the times of impact, as a share of the step.
-        queues: Rows of the contacts to decide, and a queue for those that are too wide; both are overwritten. Arrays
-            of int.
-        counts: Counts of the narrow phase, array of int64.
-        filled: Index of the number of contacts to decide in it.
-        too_wide: Indices of the numbers of those too wide for each number of limbs.
-        refuted: Index of the number of those decided to be free.
-        contacts: The contacts; without times only ``pairs`` and ``decided`` are used.
-        keys: Sorting keys of the contacts, array of int64.
-        last_key: Key of a contact that is refuted.
+    Arguments are those of :func:`launch_exact_distances`, and a queue for contacts that are too wide, as long as
+    ``stages.for_exact``, array of int; both are overwritten. Without times, of the contacts only ``pairs`` and
+    ``decided`` are used.
     """
     digits = max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
-    queue, left = queues
+    queue, filled = stages.for_exact, Count.FOR_EXACT
     for limbs in BITS if queue.device.is_cpu else _WIDTHS_ON_GPU:
-        indices = [int(filled), int(too_wide[limbs]), int(refuted)]
-        launch_over_queue(
-            _kernel(x0.dtype, limbs),
-            queue,
-            counts,
-            filled,
-            inputs=[x0, x1, elements, int(kind), timed, digits, queue, *indices, last_key],
-            outputs=[counts, contacts, keys, left],
-            block_dim=64,
-        )
-        queue, left, filled = left, queue, too_wide[limbs]
+        too_wide = Count[f"TOO_WIDE_{limbs}"]
+        inputs = [x0, x1, int(kind), timed, digits, queue, int(filled), int(too_wide)]
+        kernel, outputs = _kernel(x0.dtype, limbs), [stages, left]
+        launch_over_queue(kernel, queue, stages.counts, filled, inputs=inputs, outputs=outputs, block_dim=64)
+        queue, left, filled = left, queue, too_wide

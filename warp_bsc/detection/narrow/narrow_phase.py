@@ -5,27 +5,19 @@ the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipel
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ... import checker
-from ...kernels.arcs import Arcs
-from ...kernels.pipeline.batch_classification import BATCH as CLASSIFIED
-from ...kernels.pipeline.batch_culling import BATCH as CULLED
-from ...kernels.pipeline.batch_impacts import BATCH as DECIDED
-from ...kernels.signs import FREE, HIT, ROUNDOFF
-from ..run.launch import launch, launch_over, launch_over_queue, max_blocks
-from ..run.settings import TOLERANCE, UNLIMITED, Count, DistanceKind, Method, PairCounts, PairKind, capacity_for
-from ..run.stage_timer import StageTimer
-from .batch_kernels import batch_classification_kernel, batch_culling_kernel, batch_impact_kernel
-from .contact_buffer import ContactBuffer, HostContacts, make_contact_buffer
+from ..run.launch import launch_over, launch_over_queue, max_blocks
+from ..run.settings import UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
+from .contact_buffer import ContactBuffer, make_contact_buffer
 from .exact_stage import launch_exact_stage
-from .pair_kernels import PairStages, culling_kernel, gather_contacts, pad_keys, pair_kernels
+from .pair_kernels import PairRule, PairStages, cull_kernel, decide_kernel, gather_contacts, pad_keys
 
-__all__ = ["NarrowPhase", "decide_on_host", "launch_over_kinds", "run_narrow_phases"]
+__all__ = ["NarrowPhase", "Phases", "launch_culls", "launch_decisions", "launch_over_kinds", "stages_of"]
 
 
 class NarrowPhase:
@@ -108,31 +100,6 @@ class NarrowPhase:
             self._allocate_contacts(capacity_for(counts.contacts, f"{label} contacts"))
         return overflowed
 
-    def run(
-        self,
-        x0: wp.array,
-        x1: wp.array,
-        elements: wp.array,
-        *,
-        method: Method,
-        timed: bool = True,
-        tolerance: float = TOLERANCE,
-        timer: StageTimer,
-    ) -> None:
-        """Launches all stages but the sorting over the queued pairs, without synchronizing with a GPU.
-
-        Args:
-            x0: Positions at the start of the step, array of vec3 or vec3d.
-            x1: Positions at its end, of the same type.
-            elements: Vertex indices of the faces (VERTEX_FACE) or edges (EDGE_EDGE), two-dimensional array of int.
-            method: One of :data:`METHODS`; with "exact", pairs too wide for the device are left to
-                :func:`decide_on_host`.
-            timed: Whether to find times of impact, coordinates and normals.
-            tolerance: Of the times of impact, as a share of the step.
-            timer: Measures the stages.
-        """
-        run_narrow_phases([(self, elements)], x0, x1, method=method, timed=timed, tolerance=tolerance, timer=timer)
-
     def stages(self, elements: wp.array) -> PairStages:
         """Returns the buffers as one argument of kernels, with the vertex indices of the faces or edges."""
         stages = PairStages()
@@ -148,23 +115,9 @@ class NarrowPhase:
         return 1 << sum(self._bits)
 
     def decide_exactly(self, x0: wp.array, x1: wp.array, elements: wp.array, *, timed: bool, tolerance: float) -> None:
-        """Launches the exact stage over the contacts that the last run has left to it; arguments as of :meth:`run`."""
-        launch_exact_stage(
-            self.kind,
-            x0,
-            x1,
-            elements,
-            timed=timed,
-            tolerance=tolerance,
-            queues=self._for_exact,
-            counts=self.counts,
-            filled=Count.FOR_EXACT,
-            too_wide={1: Count.TOO_WIDE_1, 2: Count.TOO_WIDE_2, 4: Count.TOO_WIDE_4, 8: Count.TOO_WIDE_8},
-            refuted=Count.REFUTED,
-            contacts=self.contacts,
-            keys=self._keys,
-            last_key=self._last_key,
-        )
+        """Launches the exact stage over the contacts that the last run has left to it, see :func:`.run_contacts`."""
+        options = {"timed": timed, "tolerance": tolerance}
+        launch_exact_stage(self.kind, x0, x1, **options, stages=self.stages(elements), left=self._for_exact[1])
 
     def sort(self) -> None:
         """Launches the sorting of the contacts by their pairs, without synchronizing with a GPU."""
@@ -192,144 +145,64 @@ class NarrowPhase:
         return buffer
 
 
+Phases = Sequence[tuple[NarrowPhase, wp.array]]
+"""Narrow phases of different kinds, each with the vertex indices of its second elements."""
+
+
+def stages_of(phases: Phases) -> dict[PairKind | DistanceKind, PairStages]:
+    """Returns the buffers of narrow phases by kind, as arguments of kernels."""
+    return {phase.kind: phase.stages(elements) for phase, elements in phases}
+
+
+def launch_culls(
+    rule: PairRule, stages: Mapping[PairKind | DistanceKind, PairStages], x0: wp.array, x1: wp.array, options: Any
+) -> None:
+    """Launches a rule from the queue of each kind to its survivors, from both positions and the rule's options."""
+    for kind, s in stages.items():
+        kernel = cull_kernel(rule, x0.dtype, int(kind) if rule.culls_by_kind else -1)
+        inputs = [x0, x1, options, int(kind)]
+        launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=inputs, outputs=[s])
+
+
+def launch_decisions(
+    rule: PairRule, stages: Mapping[PairKind | DistanceKind, PairStages], x0: wp.array, x1: wp.array, options: Any
+) -> None:
+    """Launches a rule from the survivors of all kinds to their contacts, as :func:`launch_culls`."""
+    kernel, inputs = decide_kernel(rule, x0.dtype), [x0, x1, options]
+    launch_over_kinds(kernel, stages, "survivors", Count.SURVIVORS, inputs=inputs, block_dim=64)
+
+
 def launch_over_kinds(
     kernel: wp.Kernel,
     stages: Mapping[PairKind | DistanceKind, PairStages],
     buffer: str,
+    count: Count,
     *,
     inputs: list,
     block_dim: int,
 ) -> None:
-    """Launches a kernel of a GPU over a buffer of both kinds, or over one after the other if they are too long.
+    """Launches a kernel over a buffer of all kinds: on a GPU two at a time, unless they are too long, on a CPU singly.
 
     Args:
-        kernel: The kernel; its last arguments are the stages of vertex-face and of edge-edge pairs.
+        kernel: The kernel; its last arguments are two kinds of pairs, and the stages of the one and of the other.
         stages: The stages by kind.
-        buffer: Attribute of the stages: the kernel covers the capacity of this buffer, first of vertex-face pairs.
-        inputs: Its arguments between the first entry and the stages.
+        buffer: Attribute of the stages: the kernel covers the capacity of this buffer, first of the one kind.
+        count: Index of the number of entries in it, to which a CPU keeps.
+        inputs: Its arguments between the first entry and the kinds.
         block_dim: Threads of a block.
     """
     entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
-    together = [list(stages)] if sum(entries.values()) < 2**31 else [[kind] for kind in stages]
-    for kinds in together:
-        both = [stages[kind] if kind in kinds else PairStages() for kind in PairKind]
+    kinds, none = list(stages), PairStages()
+    while kinds:
+        of_launch = kinds[:2]
         device = stages[kinds[0]].counts.device
-        blocks, dim = max_blocks(device, block_dim), sum(entries[kind] for kind in kinds)
-        launch_over(kernel, dim, inputs=inputs, outputs=both, device=device, block_dim=block_dim, max_blocks=blocks)
-
-
-def run_narrow_phases(
-    narrow_phases: Sequence[tuple[NarrowPhase, wp.array]],
-    x0: wp.array,
-    x1: wp.array,
-    *,
-    method: Method,
-    timed: bool = True,
-    tolerance: float = TOLERANCE,
-    arcs: "Arcs | None" = None,
-    timer: StageTimer,
-) -> None:
-    """Launches all stages but the sorting over the queued pairs of both kinds, or of one.
-
-    A GPU decides both kinds in the same launches, without synchronizing.
-
-    Args:
-        narrow_phases: Narrow phases of different kinds, each with the vertex indices of its elements.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        method: As of :meth:`NarrowPhase.run`.
-        timed: As of :meth:`NarrowPhase.run`.
-        tolerance: As of :meth:`NarrowPhase.run`.
-        arcs: Pairs with a turning vertex are left out, for :mod:`.arc_phase`; None if nothing turns.
-        timer: Measures the stages.
-    """
-    on_arcs = arcs is not None
-    arcs = Arcs() if arcs is None else arcs
-    device = x0.device
-    motion = [x0, x1, 0.0 if method == "float" else ROUNDOFF]
-    kernels = pair_kernels(x0.dtype)
-    stages = {narrow_phase.kind: narrow_phase.stages(elements) for narrow_phase, elements in narrow_phases}
-
-    def launch_on_cpu(kernel_of: Callable, arguments: list, buffer: str, count: Count, batch: int) -> None:
-        """Launches the kernel of each kind over the filled entries of a buffer, many at a time."""
-        for kind, s in stages.items():
-            filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
-            kernel, inputs = kernel_of(kind, x0.dtype), [*motion, *arguments]
-            launch_over(kernel, -(-filled // batch), inputs=inputs, outputs=[s], device=device, chunk=16)
-
-    with timer.stage("cull"):
+        if device.is_cpu or sum(entries[kind] for kind in of_launch) >= 2**31:
+            of_launch = kinds[:1]
+        kinds = kinds[len(of_launch) :]
+        dim = sum(entries[kind] for kind in of_launch)
         if device.is_cpu:
-            cull = functools.partial(batch_culling_kernel, on_arcs=on_arcs)
-            launch_on_cpu(cull, [arcs], "queue", Count.QUEUED, CULLED)
-        else:
-            for kind, s in stages.items():
-                kernel = culling_kernel(kind, x0.dtype)
-                launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=[*motion, arcs], outputs=[s])
-    with timer.stage("classify"):
-        if device.is_cpu:
-            launch_on_cpu(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
-        else:
-            launch_over_kinds(kernels.classify_survivors, stages, "survivors", inputs=motion, block_dim=64)
-    with timer.stage("time of impact"):
-        arguments = [timed, tolerance]
-        if device.is_cpu:
-            launch_on_cpu(batch_impact_kernel, arguments, "for_exact", Count.CONTACTS, DECIDED)
-        else:
-            inputs = [*motion, *arguments]
-            launch_over_kinds(kernels.find_impacts, stages, "for_exact", inputs=inputs, block_dim=32)
-    if method == "exact":
-        with timer.stage("exact"):
-            for narrow_phase, elements in narrow_phases:
-                narrow_phase.decide_exactly(x0, x1, elements, timed=timed, tolerance=tolerance)
-
-
-def decide_on_host(
-    kind: PairKind,
-    x0: wp.array,
-    x1: wp.array,
-    elements: wp.array,
-    contacts: HostContacts,
-    which: np.ndarray,
-    *,
-    timed: bool = True,
-) -> None:
-    """Decides some contacts with the exact checker, on the host, and changes their rows.
-
-    Args:
-        kind: The kind of pair.
-        x0: Positions at the start of the step, Warp array.
-        x1: Positions at its end.
-        elements: Vertex indices of faces or edges, Warp array.
-        contacts: The contacts.
-        which: Which of them to decide, bool, shape [n].
-        timed: Whether to find times of impact, coordinates and normals.
-    """
-    if not which.any():
-        return
-    pairs = contacts.pairs
-    corners = elements.numpy()[pairs[which, 1]]
-    first = pairs[which, :1] if kind == PairKind.VERTEX_FACE else elements.numpy()[pairs[which, 0]]
-    corners = np.concatenate([first, corners], axis=1)
-    points = np.concatenate([x0.numpy()[corners], x1.numpy()[corners]], axis=1)
-    if not timed:
-        contacts.decided[which] = np.where(getattr(checker, kind.label)(points), HIT, FREE)
-        return
-    toi = contacts.toi
-    toi[which] = getattr(checker, f"{kind.label}_toi")(points)[:, 0]
-    contacts.decided[which] = np.where(np.isnan(toi[which]), FREE, HIT)
-    toi[~contacts.hit] = 2.0
-    contacts.within_tolerance[which] = contacts.hit[which]
-    again = np.flatnonzero(which & contacts.hit)
-    coordinates = wp.empty(len(again), dtype=wp.vec3d, device=x0.device)
-    normal = wp.empty_like(coordinates)
-    times = wp.array(toi[again], dtype=wp.float64, device=x0.device)
-    timed_pairs = wp.array(pairs[again], dtype=wp.vec2i, device=x0.device)
-    launch(
-        pair_kernels(x0.dtype).find_contact_points,
-        len(again),
-        inputs=[x0, x1, elements, int(kind), timed_pairs, times],
-        outputs=[coordinates, normal],
-        device=x0.device,
-        record_tape=False,
-    )
-    contacts.coordinates[again], contacts.normal[again] = coordinates.numpy(), normal.numpy()
+            dim = min(dim, int(stages[of_launch[0]].counts.numpy()[count]))
+        numbers = wp.vec2i(*[int(kind) for kind in of_launch], *[-1] * (2 - len(of_launch)))
+        both = [*(stages[kind] for kind in of_launch), none][:2]
+        options = {"device": device, "block_dim": block_dim, "max_blocks": max_blocks(device, block_dim)}
+        launch_over(kernel, dim, inputs=[*inputs, numbers], outputs=both, **options)

@@ -1,33 +1,35 @@
-"""The kernels of the narrow phase on a GPU: culls, classification, times of impact, and contacts in order.
+"""The kernels of the narrow phase, made from a rule: queue -> cull -> decide -> contacts, and contacts in order.
 
-Those of a CPU that decide many pairs at once are in :mod:`.batch_kernels`.
+A rule says which pairs of the queue are left out, which are certainly free, and what is found of the others. Those of a
+CPU that cull and classify many pairs at once are in :mod:`.batch_kernels`.
 """
 
 from typing import NamedTuple
 
 import warp as wp
 
-from ...kernels.arcs import Arcs, turns
-from ...kernels.classification import classify
-from ...kernels.closest import contact_at
-from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
-from ...kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
-from ...kernels.pairs import vertices_of_pair
+from ...kernels.arcs import any_turns, turns
+from ...kernels.pairs import points_of_pair
 from ...kernels.pipeline.queues import append, is_filled, take_slot
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE, coplanarity
-from ...kernels.signs import FREE, HIT, UNSURE, certified_sign_cubic
-from ...kernels.time_of_impact import Impact, impact
+from ...kernels.signs import FREE, UNSURE
+from ...kernels.time_of_impact import Impact
 from ..run.launch import made_once
-from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count, DistanceKind, PairKind
+from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count
 from .contact_buffer import ContactBuffer
 
 __all__ = [
-    "PairKernels",
+    "PairRule",
     "PairStages",
-    "culling_kernel",
+    "add_contact",
+    "add_open_contact",
+    "count_found",
+    "cull_kernel",
+    "decide_kernel",
+    "entry_of_two",
     "gather_contacts",
     "pad_keys",
-    "pair_kernels",
+    "take_contact",
+    "write_decision",
     "write_impact",
 ]
 
@@ -36,7 +38,6 @@ _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOUND = wp.constant(int(Count.FOUND))
 _UNSURE = wp.constant(int(Count.UNSURE))
-_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 _REFUTED = wp.constant(int(Count.REFUTED))
 
 
@@ -69,189 +70,132 @@ class PairStages:
     last_key: wp.int64
 
 
-class PairKernels(NamedTuple):
-    """The kernels after the culls for one type of position, in the order in which they run.
+@wp.func
+def _vertices_at(
+    i: int, kind: int, queue: wp.array[wp.vec2i], elements: wp.array2d[int], counts: wp.array[wp.int64], count: int
+) -> wp.vec4i:
+    """Returns the vertices of entry i of a queue, -1 if it has not been written."""
+    if not is_filled(i, queue, counts, count):
+        return wp.vec4i(-1)
+    return points_of_pair(kind, elements, queue[i])
 
-    One launch covers both kinds of pair, because a launch costs time even if its queue is empty: first the capacity of
-    the vertex-face pairs, then that of the edge-edge pairs.
+
+@wp.func
+def entry_of_two(
+    i: int,
+    kinds: wp.vec2i,
+    queue: wp.array[wp.vec2i],
+    other_queue: wp.array[wp.vec2i],
+    one: PairStages,
+    other: PairStages,
+    count: int,
+):
+    """Returns the kind, the index in its queue, and the vertices of entry i of two queues, -1 if it is not written.
+
+    The entries of the other queue follow the capacity of the one.
     """
-
-    classify_survivors: wp.Kernel
-    find_impacts: wp.Kernel
-    find_contact_points: wp.Kernel
-
-
-@wp.func
-def _kind_at(i: int, capacity: int):
-    """Returns the kind of pair of a thread, and its index in the queue of that kind, from the capacity of the first."""
-    if i < capacity:
-        return VERTEX_FACE, i
-    return EDGE_EDGE, i - capacity
+    if i < queue.shape[0]:
+        return kinds[0], i, _vertices_at(i, kinds[0], queue, one.elements, one.counts, count)
+    k = i - queue.shape[0]
+    return kinds[1], k, _vertices_at(k, kinds[1], other_queue, other.elements, other.counts, count)
 
 
 @wp.func
-def _pair_at(i: int, queue: wp.array[wp.vec2i], counts: wp.array[wp.int64], count: int):
-    """Returns entry i of a queue, (-1, -1) if it has not been written."""
-    if is_filled(i, queue, counts, count):
-        return queue[i]
-    return wp.vec2i(-1, -1)
-
-
-@wp.func
-def _enqueue_contact(pair: wp.vec2i, status: int, stages: PairStages):
+def take_contact(pair: wp.vec2i, stages: PairStages) -> int:
+    """Returns the row of a new contact, to which the pair is written; -1 if there is no row left."""
     slot = take_slot(stages.counts, _CONTACTS)
-    if slot < wp.int64(stages.contacts.pairs.shape[0]):
-        stages.contacts.pairs[wp.int32(slot)] = pair
-        stages.contacts.status[wp.int32(slot)] = wp.int8(status)
+    if slot >= wp.int64(stages.contacts.pairs.shape[0]):
+        return -1
+    k = wp.int32(slot)
+    stages.contacts.pairs[k] = pair
+    return k
 
 
 @wp.func
-def write_impact(i: int, result: Impact, stages: PairStages):
+def write_impact(k: int, result: Impact, stages: PairStages):
     """Writes the first contact of a pair to a row of the contacts."""
     contacts = stages.contacts
-    contacts.status[i] = wp.int8(result.status)
-    contacts.within_tolerance[i] = result.within_tolerance == 1
-    contacts.toi[i] = result.toi
-    contacts.coordinates[i] = result.coordinates
-    contacts.normal[i] = result.normal
+    contacts.status[k] = wp.int8(result.status)
+    contacts.within_tolerance[k] = result.within_tolerance == 1
+    contacts.toi[k] = result.toi
+    contacts.coordinates[k] = result.coordinates
+    contacts.normal[k] = result.normal
 
 
 @wp.func
-def _decide(i: int, pair: wp.vec2i, status: int, timed: bool, stages: PairStages):
-    """Counts a contact by its status, makes its sorting key, and enqueues it for the exact stage if that is needed."""
-    contacts = stages.contacts
-    contacts.decided[i] = wp.int8(status)
-    stages.order[i] = i
-    if status == FREE:
-        stages.keys[i] = stages.last_key
-        return
-    stages.keys[i] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+def write_decision(k: int, status: int, stages: PairStages):
+    """Writes what is decided of a row of the contacts, and its place in their order, the last one if it is free."""
+    stages.contacts.decided[k] = wp.int8(status)
+    stages.order[k] = k
+    stages.keys[k] = stages.last_key
+    if status != FREE:
+        pair = stages.contacts.pairs[k]
+        stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+
+
+@wp.func
+def count_found(status: int, stages: PairStages):
+    """Counts a contact that is found."""
     take_slot(stages.counts, _FOUND)
     if status == UNSURE:
         take_slot(stages.counts, _UNSURE)
-    if status == UNSURE or (timed and not contacts.within_tolerance[i]):
-        stages.for_exact[wp.int32(take_slot(stages.counts, _FOR_EXACT))] = i
 
 
-@made_once
-def pair_kernels(dtype: type) -> PairKernels:
-    """Returns the kernels for one type of position, each in a module of its own."""
-
-    # fewer registers than the 252 that the compiler takes, so that twice as many warps hide its latency
-    @wp.kernel(**NO_FUSED_OPERATIONS, cuda_max_registers=128)
-    def classify_survivors(
-        first: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        roundoff: wp.float64,
-        # in and out
-        vertex_face: PairStages,
-        edge_edge: PairStages,
-    ):
-        kind, i = _kind_at(first + wp.tid(), vertex_face.survivors.shape[0])
-        pair = wp.vec2i()
-        if kind == VERTEX_FACE:
-            pair = _pair_at(i, vertex_face.survivors, vertex_face.counts, _SURVIVORS)
-        else:
-            pair = _pair_at(i, edge_edge.survivors, edge_edge.counts, _SURVIVORS)
-        if pair[0] < 0:
-            return
-        v = wp.vec4i()
-        if kind == VERTEX_FACE:
-            v = vertices_of_pair(VERTEX_FACE, vertex_face.elements, pair)
-        else:
-            v = vertices_of_pair(EDGE_EDGE, edge_edge.elements, pair)
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        status = classify(motion, coplanarity(motion))
-        if status != FREE:
-            if kind == VERTEX_FACE:
-                _enqueue_contact(pair, status, vertex_face)
-            else:
-                _enqueue_contact(pair, status, edge_edge)
-
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def find_impacts(
-        first: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        roundoff: wp.float64,
-        timed: bool,
-        tolerance: wp.float64,
-        # in and out
-        vertex_face: PairStages,
-        edge_edge: PairStages,
-    ):
-        kind, i = _kind_at(first + wp.tid(), vertex_face.contacts.pairs.shape[0])
-        pair = wp.vec2i()
-        if kind == VERTEX_FACE:
-            pair = _pair_at(i, vertex_face.contacts.pairs, vertex_face.counts, _CONTACTS)
-        else:
-            pair = _pair_at(i, edge_edge.contacts.pairs, edge_edge.counts, _CONTACTS)
-        if pair[0] < 0:
-            return
-        v = wp.vec4i()
-        status = int(0)
-        if kind == VERTEX_FACE:
-            v = vertices_of_pair(VERTEX_FACE, vertex_face.elements, pair)
-            status = int(vertex_face.contacts.status[i])
-        else:
-            v = vertices_of_pair(EDGE_EDGE, edge_edge.elements, pair)
-            status = int(edge_edge.contacts.status[i])
-        if timed or status != HIT:
-            a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-            a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-            result = impact(motion, coplanarity(motion), status, tolerance)
-            status = result.status
-            if kind == VERTEX_FACE:
-                write_impact(i, result, vertex_face)
-            else:
-                write_impact(i, result, edge_edge)
-        if kind == VERTEX_FACE:
-            _decide(i, pair, status, timed, vertex_face)
-        else:
-            _decide(i, pair, status, timed, edge_edge)
-
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def find_contact_points(
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        kind: int,
-        # in
-        pairs: wp.array[wp.vec2i],
-        toi: wp.array[wp.float64],
-        # out
-        coordinates: wp.array[wp.vec3d],
-        normal: wp.array[wp.vec3d],
-    ):
-        i = wp.tid()
-        v = vertices_of_pair(kind, elements, pairs[i])
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
-        at, direction = contact_at(motion, toi[i])
-        coordinates[i] = at
-        normal[i] = direction
-
-    return PairKernels(classify_survivors, find_impacts, find_contact_points)
+@wp.func
+def add_contact(pair: wp.vec2i, result: Impact, stages: PairStages):
+    """Counts a pair as found, and adds it to the contacts if there is a row left."""
+    k = take_contact(pair, stages)
+    count_found(result.status, stages)
+    if k >= 0:
+        write_impact(k, result, stages)
+        write_decision(k, result.status, stages)
 
 
-@made_once
-def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
-    """Returns the kernel that culls on a GPU, for one kind of pair and one type of position.
+@wp.func
+def add_open_contact(pair: wp.vec2i, result: Impact, stages: PairStages):
+    """Adds a pair to the contacts with its status alone, if there is a row left."""
+    k = take_contact(pair, stages)
+    if k >= 0:
+        stages.contacts.status[k] = wp.int8(result.status)
 
-    Each kind has its own, because one for both takes an eighth more registers, which costs more than a launch.
+
+class PairRule(NamedTuple):
+    """What the narrow phase decides of a pair, by device functions.
+
+    All take the options of the rule, the kind of pair and its vertices; all but the first also the positions at the
+    start and at the end of the step, arrays of vec3 or vec3d.
+
+    Attributes:
+        options: The struct of the options.
+        excludes: Returns whether a pair of the queue is left out.
+        clears: Returns whether a pair is certainly free, so that it is no survivor.
+        decide: Returns the :class:`.Impact` of a survivor, and whether it is a contact; None where the rule has other
+            kernels for survivors.
+        add: Adds a contact with its impact: :func:`add_contact`, or :func:`add_open_contact` where another kernel finds
+            all but its status.
+        turning: Whether the pairs of the rule are those with a turning vertex, by its ``options.arcs``, or those
+            without; None if ``excludes`` says so, and all survivors are of this rule.
+        culls_by_kind: Whether each kind of pair has a kernel of its own to cull.
+        max_registers: Largest number of registers of a thread that decides; 0 for the compiler's choice.
     """
-    vertex_face = kind == PairKind.VERTEX_FACE
-    kind_number = int(kind)
-    motion_of = vertex_face_motion if vertex_face else edge_edge_motion
-    boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
+
+    options: type
+    excludes: wp.Function
+    clears: wp.Function
+    decide: wp.Function | None = None
+    add: wp.Function = add_contact
+    turning: bool | None = None
+    culls_by_kind: bool = False
+    max_registers: int = 0
+
+
+@made_once
+def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
+    """Returns the kernel from the queue to the survivors, for one type of position, and for one kind if that is given.
+
+    A kernel of one kind takes fewer registers where the kinds differ in more than their vertices.
+    """
+    excludes, clears, turning = rule.excludes, rule.clears, rule.turning
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def cull(
@@ -259,31 +203,75 @@ def culling_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel:
         # mesh
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        roundoff: wp.float64,
-        arcs: Arcs,
+        # in
+        options: rule.options,
+        kind: int,
         # in and out
         stages: PairStages,
     ):
-        pair = _pair_at(first + wp.tid(), stages.queue, stages.counts, _QUEUED)
-        if pair[0] < 0:
+        if wp.static(turning is True):
+            if not any_turns(options.arcs):
+                return
+        if wp.static(of_kind >= 0):
+            kind = wp.static(of_kind)
+        i = first + wp.tid()  # and no pair, which would take registers until the end
+        v = _vertices_at(i, kind, stages.queue, stages.elements, stages.counts, _QUEUED)
+        if v[0] < 0:
             return
-        v = vertices_of_pair(kind_number, stages.elements, pair)
-        if turns(arcs, v):
+        if wp.static(turning is not None):
+            if turns(options.arcs, v) != wp.static(turning is True):
+                return
+        if excludes(options, kind, v):
             return
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-        motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-        y = coplanarity(motion)
-        if certified_sign_cubic(y.k, y.bound) != 0:
-            return
-        if direction_separates(motion, centroid_direction(motion)):
-            return
-        # last, because in single precision queued pairs always pass; but exact at any scale
-        if boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
-            return
-        append(pair, stages.survivors, stages.counts, _SURVIVORS)
+        if not clears(options, kind, v, x0, x1):
+            append(stages.queue[i], stages.survivors, stages.counts, _SURVIVORS)
 
     return cull
+
+
+@made_once
+def decide_kernel(rule: PairRule, dtype: type) -> wp.Kernel:
+    """Returns the kernel from the survivors to the contacts, for one type of position and pairs of two kinds.
+
+    One launch covers two kinds, because a launch costs time even if its queue is empty: first the capacity of the one,
+    then that of the other.
+    """
+    decide, add, turning = rule.decide, rule.add, rule.turning
+    assert decide is not None, "the rule has other kernels"
+    limits = {"cuda_max_registers": rule.max_registers} if rule.max_registers else {}
+
+    @wp.kernel(**NO_FUSED_OPERATIONS, **limits)
+    def decide_survivors(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        # in
+        options: rule.options,
+        kinds: wp.vec2i,
+        # in and out
+        one: PairStages,
+        other: PairStages,
+    ):
+        if wp.static(turning is True):
+            if not any_turns(options.arcs):
+                return
+        i = first + wp.tid()
+        kind, k, v = entry_of_two(i, kinds, one.survivors, other.survivors, one, other, _SURVIVORS)
+        if v[0] < 0:
+            return
+        if wp.static(turning is not None):
+            if turns(options.arcs, v) != wp.static(turning is True):
+                return
+        result, is_contact = decide(options, kind, v, x0, x1)
+        if not is_contact:
+            return
+        if kind == kinds[0]:
+            add(one.survivors[k], result, one)
+        else:
+            add(other.survivors[k], result, other)
+
+    return decide_survivors
 
 
 @wp.kernel(**NO_GRADIENTS)

@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 from ..._arguments import check_finite, check_instance, checked_choice, checked_distances, checked_flag, checked_shape
 from ...kernels.signs import FREE, HIT, UNSURE
 from ..narrow.contact_buffer import HostContacts, read_contacts
-from ..narrow.distance_phase import decide_distances_on_host, run_distance_phases
-from ..narrow.narrow_phase import NarrowPhase, decide_on_host
+from ..narrow.narrow_phase import NarrowPhase
+from ..narrow.on_host import decide_on_host
 from ..narrow.rings import Rings
+from ..narrow.rules.contact import run_contacts
+from ..narrow.rules.distance import run_distances
 from ..run.launch import retry_until_fits
 from ..run.settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
 from ..run.stage_timer import StageTimer
@@ -302,9 +304,9 @@ def _query(
             counts.assign(all_queued)
             options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
             if contact:
-                narrow_phase.run(x0, x1, elements, **options)
+                run_contacts([(narrow_phase, elements)], x0, x1, **options)
             else:
-                run_distance_phases([(narrow_phase, elements)], x0, x1, device_radius, Rings(), **options)
+                run_distances([(narrow_phase, elements)], x0, x1, device_radius, Rings(), **options)
 
         retry_until_fits(launch, narrow_phase, device)
         contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
@@ -315,10 +317,7 @@ def _query(
             left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":
                 left |= contacts.decided == UNSURE
-            if contact:
-                decide_on_host(PairKind(kind), x0, x1, elements, contacts, left, timed=timed)
-            else:
-                decide_distances_on_host(kind, x0, x1, elements, radius, contacts, left, timed=timed)
+            decide_on_host(kind, x0, x1, elements, None if contact else radius, contacts, left, timed=timed)
         return contacts, contacts.pairs[:, 0] // (2 if kind == DistanceKind.EDGE_EDGE else half)
 
     certified, certified_rows = solve("conservative" if method == "float" else method)

@@ -9,6 +9,7 @@ from ...kernels.polynomials import VERTEX_FACE
 from ...kernels.signs import FREE, UNSURE
 from ..narrow.narrow_phase import NarrowPhase
 from ..narrow.pair_kernels import PairStages
+from ..narrow.rules.contact import run_contacts
 from ..run.host_function import run_on_host
 from ..run.launch import launch_over, launch_over_queue, made_once
 from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, PairKind
@@ -218,7 +219,7 @@ class QueryArrays:
         # the exact stage also finds the times of certified hits that floating point did not find within the tolerance
         stages = "exact" if method == "conservative" and timed else method
         options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
-        narrow_phase.run(x, x[4:], elements, **options)
+        run_contacts([(narrow_phase, elements)], x, x[4:], **options)
         buffers = narrow_phase.stages(elements)
         points = 8 if kind == PairKind.VERTEX_FACE else 2
         inputs = [buffers, points, METHODS.index(method), timed]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...detection.narrow.approach_phase import KEPT, distances_of_pair
+from ...detection.narrow.rules.approach import KEPT, distances_of_pair
 from ...kernels.pipeline.queues import take_slot_of
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...response.contacts.collect import is_stopped_by_plane

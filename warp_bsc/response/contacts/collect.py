@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...detection.narrow.approach_phase import KEPT
+from ...detection.narrow.rules.approach import KEPT
 from ...detection.run.settings import Count
 from ...kernels.arcs import Arcs
 from ...kernels.closest import contact_weights
@@ -109,7 +109,8 @@ def offset_from(step: Step, planes: MovingPlanes, i: int, vertex: int, status: S
 def distances_from_plane(motion: Motion, planes: MovingPlanes, i: int, vertex: int):
     """Returns the distance that a vertex is kept at from a plane, and how much farther away it is near [m].
 
-    Like a pair, a particle may come as near as it was at the start, see :mod:`.narrow.approach_phase`.
+    Like a pair, a particle may come as near as it was at the start, see
+    :mod:`warp_bsc.detection.narrow.rules.approach`.
     """
     if body_of(motion, vertex) >= 0:
         return level(motion, planes, i, vertex), ZERO

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from ...detection.narrow.approach_phase import distances_of_pair
+from ...detection.narrow.rules.approach import distances_of_pair
 from ...kernels.arcs import Arcs, on_arc_of, turns
 from ...kernels.pipeline.queues import take_slot_int
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE, VERTEX_VERTEX

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ...detection.narrow.approach_phase import KEPT
 from ...detection.narrow.rings import are_within_rings
+from ...detection.narrow.rules.approach import KEPT
 from ...detection.run.settings import TOLERANCE
 from ...kernels.closest import closest_weights, contact_weights
 from ...kernels.gradients import SQUARE_SINE, with_gradients

@@ -7,7 +7,7 @@ from newton import ShapeFlags
 
 from ...kernels.crossing import edge_crosses_face
 from ...kernels.exact.rest import meet_at_rest
-from ...kernels.pairs import is_filtered
+from ...kernels.pairs import form_of, is_filtered
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ...kernels.signs import HIT
 from ..state.structs import Bodies, Motion, Step, body_of, can_move
@@ -139,8 +139,7 @@ def classify_contact(
     met = bool(False)
     if not bound > ZERO:
         x = step.motion.x0
-        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-        met = meet_at_rest(points, x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
+        met = meet_at_rest(form_of(kind), x[corners[0]], x[corners[1]], x[corners[2]], x[corners[3]])
     if not met and (may_cross or owner != ContactClass.OURS):
         met = crossed_at_start(step, kind, pair)
     if not met:

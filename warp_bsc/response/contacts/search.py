@@ -7,16 +7,16 @@ import warp as wp
 from ...detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from ...detection.broad.element_pairs import filtered_pairs, pair_functions
 from ...detection.broad.face_hierarchy import FaceHierarchy, traversal_kernel
-from ...detection.narrow.approach_phase import impact_on_arcs_at_distance
+from ...detection.narrow.rules.approach import impact_on_arcs_at_distance
 from ...detection.run.settings import TOLERANCE
 from ...kernels.arcs import Arcs, are_of_one_group, impact_on_arcs, turns
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
 from ...kernels.motion import motion_and_distance, relative_motion
-from ...kernels.pairs import ABOVE_SUM, distance_of_corners
+from ...kernels.pairs import ABOVE_SUM, distance_of_corners, ends_of
 from ...kernels.pipeline.hierarchy import lowest_set_bit
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, coplanarity
+from ...kernels.polynomials import VERTEX_EDGE, VERTEX_VERTEX, coplanarity
 from ...kernels.signs import FREE, ROUNDOFF, certified_sign_cubic
 from ...kernels.time_of_impact import Impact, impact
 from ..schedule import count_contact, count_filtered
@@ -77,19 +77,12 @@ def _resolve(
 
 
 @wp.func
-def _ends(x0: wp.array[wp.vec3], x1: wp.array[wp.vec3], v: wp.vec4i):
-    """Returns the positions of four vertices at the start, then at the end."""
-    return x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-
-
-@wp.func
 def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair if it comes nearer than it may."""
     motion = arguments.step.motion
-    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.step.vertices.x1, corners)
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(motion.x0, arguments.step.vertices.x1, corners)
     most = distance_of_corners(kind, corners, motion.distances.radius)
-    relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
+    relative, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
     if clears_at_once(relative, scaled):
         return
     start, kept = distances_at_start(motion, corners, kind)
@@ -101,7 +94,7 @@ def _decide_distance(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: 
 @wp.func
 def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair if it is in contact."""
-    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(arguments.step.motion.x0, arguments.step.vertices.x1, corners)
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(arguments.step.motion.x0, arguments.step.vertices.x1, corners)
     relative = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF)
     y = coplanarity(relative)
     if certified_sign_cubic(y.k, y.bound) != 0:
@@ -118,12 +111,11 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
 def _decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
     """Resolves a pair with a turning vertex if it is in contact on its arcs, or comes nearer there than it may."""
     motion, arcs = arguments.step.motion, arguments.arcs
-    a0, b0, c0, d0, a1, b1, c1, d1 = _ends(motion.x0, arguments.step.vertices.x1, corners)
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(motion.x0, arguments.step.vertices.x1, corners)
     most = distance_of_corners(kind, corners, arcs.deviation)
     if motion.distances.radius:
         most = ABOVE_SUM * (most + distance_of_corners(kind, corners, motion.distances.radius))
-    relative, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
+    relative, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
     if clears_at_once(relative, scaled):
         return
     start = ZERO
@@ -131,7 +123,7 @@ def _decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: w
     result = Impact()
     if motion.distances.radius:
         start, kept = distances_at_start(motion, corners, kind)
-        result = impact_on_arcs_at_distance(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
+        result = impact_on_arcs_at_distance(kind, corners, motion.x0, arguments.step.vertices.x1, arcs, kept)
     else:
         result = impact_on_arcs(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, ZERO)
         start = result.toi

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from ...detection.narrow.approach_phase import MinDistances
 from ...detection.narrow.rings import are_within_rings
+from ...detection.narrow.rules.approach import MinDistances
 from ...kernels.closest import closest_weights
 from ...kernels.pairs import distance_of_corners, firsts_of
 from ...kernels.polynomials import EDGE_EDGE

@@ -8,7 +8,7 @@ from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
 
 from ..._arguments import checked_integer
 from ...detection.mesh import CollisionMesh
-from ...detection.narrow.approach_phase import MinDistances, make_min_distances
+from ...detection.narrow.rules.approach import MinDistances, make_min_distances
 from ...kernels.pairs import PairFilter
 from ..tuning import SEGMENTS
 from .collision_filter import CollisionFilter, bits_of_model
@@ -196,7 +196,7 @@ class ModelMesh(CollisionMesh):
         self.distances: MinDistances | None = None
 
     def min_distances(self, kept: KeptDistances, *, reach: float) -> MinDistances:
-        """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.narrow.approach_phase`.
+        """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.narrow.rules.approach`.
 
         Args:
             kept: The distances that pairs keep.

@@ -6,7 +6,7 @@ from enum import IntEnum
 import warp as wp
 
 from ..._private_names.of_warp import struct_type
-from ...detection.narrow.approach_phase import MinDistances
+from ...detection.narrow.rules.approach import MinDistances
 from ...kernels.pairs import PairFilter
 
 

@@ -9,7 +9,7 @@ exactly where a hinge has them. Where that axis is far away, as the body hardly 
 import numpy as np
 import warp as wp
 
-from ...detection.narrow.arc_phase import allocate_arcs, bound_arc
+from ...detection.narrow.rules.arc import allocate_arcs, bound_arc
 from ...kernels.arcs import Arcs
 from .mesh import ModelMesh
 from .poses import turn_between

@@ -1,47 +1,39 @@
 """The narrow phase of a response with minimum distances: pairs that come too near, and proximities.
 
-A pair may come as near as its minimum distance, the sum of two radii, see :mod:`.distance_phase`, or as it was at the
+A pair may come as near as its minimum distance, the sum of two radii, see :mod:`.distance`, or as it was at the
 start, if it was nearer, less the rounding of distances. On arcs of bodies that turn, it comes nearer by a 64th, but not
 at the end of the step. Pairs that an edge of the mesh joins must only not touch:
 neighbours are always near. Proximities are the other pairs that come within the reach beyond these distances.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from ...kernels.arcs import Arcs, any_turns, are_of_one_group, distance_at, impact_on_arcs, turns
-from ...kernels.ccd import impact_at_distance
-from ...kernels.distance import closest_points
-from ...kernels.min_distance import clears_at_once, closest_at
-from ...kernels.motion import doubles, motion_and_distance
-from ...kernels.pairs import ABOVE_SUM, distance_of_corners, firsts_of, points_of_pair
-from ...kernels.pipeline.queues import append, is_filled, take_slot
-from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
-from ...kernels.signs import FREE, ROUNDOFF
-from ...kernels.time_of_impact import Impact
-from ..mesh import CollisionMesh
-from ..run.launch import launch_over_queue, made_once
-from ..run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count
-from ..run.stage_timer import StageTimer
-from .narrow_phase import NarrowPhase
-from .pair_kernels import PairStages, write_impact
-from .rings import Rings, are_within_rings, make_rings
+from ....kernels.arcs import Arcs, are_of_one_group, distance_at, impact_on_arcs
+from ....kernels.ccd import impact_at_distance
+from ....kernels.min_distance import clears_at_once, closest_at
+from ....kernels.motion import doubles, motion_and_distance
+from ....kernels.pairs import ABOVE_SUM, distance_of_corners, firsts_of
+from ....kernels.signs import FREE, ROUNDOFF
+from ....kernels.time_of_impact import Impact
+from ...mesh import CollisionMesh
+from ...run.launch import made_once
+from ...run.settings import TOLERANCE
+from ...run.stage_timer import StageTimer
+from ..narrow_phase import Phases, launch_culls, launch_decisions, stages_of
+from ..pair_kernels import PairRule
+from ..rings import Rings, are_within_rings, make_rings
 
 __all__ = [
     "MinDistances",
     "distances_of_pair",
     "impact_on_arcs_at_distance",
     "make_min_distances",
-    "run_approach_phases",
+    "run_approaches",
 ]
 
-_QUEUED = wp.constant(int(Count.QUEUED))
-_SURVIVORS = wp.constant(int(Count.SURVIVORS))
-_CONTACTS = wp.constant(int(Count.CONTACTS))
-_FOUND = wp.constant(int(Count.FOUND))
 KEPT = wp.constant(wp.float64(1.0 - 2.0**-20))
 """Share of its distance at the start that a pair must keep which starts within its minimum distance.
 
@@ -103,11 +95,7 @@ def distances_of_pair(
 
     The first is a lower bound; it is 0 if the elements may touch. The second is less, unless the first is 0.
     """
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-    u = wp.where(kind == EDGE_EDGE, b - a, c - b)
-    v = wp.where(kind == EDGE_EDGE, d - c, d - b)
-    w = wp.where(kind == EDGE_EDGE, c - a, a - b)
-    _at, found, error = closest_points(points, u, v, w)
+    found, error = distance_at(kind, a, b, c, d)
     start = wp.max(found - _TWO * error, _ZERO)
     if are_within_rings(corners, firsts_of(kind), distances.rings):
         return start, _ZERO
@@ -116,149 +104,109 @@ def distances_of_pair(
 
 @wp.func
 def impact_on_arcs_at_distance(
-    kind: int,
-    v: wp.vec4i,
-    # points at the start
-    a0: Any,
-    b0: Any,
-    c0: Any,
-    d0: Any,
-    # points at the end
-    a1: Any,
-    b1: Any,
-    c1: Any,
-    d1: Any,
-    arcs: Arcs,
-    kept: wp.float64,
+    kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any], arcs: Arcs, kept: wp.float64
 ) -> Impact:
     """Returns the first time at which a pair comes nearer on its arcs than it may, as of :func:`.impact_on_arcs`.
 
     It keeps its minimum distance ``kept`` at the end of the step, and :data:`SHARE_ON_ARCS` of it on the way. A pair
     that rests at its distance would otherwise have to be followed in ever shorter parts.
     """
-    points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+    a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
+    a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
     a, b, c, d = doubles(a1, b1, c1, d1)
-    found, error = distance_at(points, a, b, c, d)
+    found, error = distance_at(kind, a, b, c, d)
     least = wp.where(found - error >= kept, SHARE_ON_ARCS * kept, kept)
     return impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, least)
 
 
+@wp.struct
+class Options:
+    """Options of the rules.
+
+    Attributes:
+        distances: The minimum distances.
+        arcs: The arcs of bodies that turn.
+        proximities: Whether to report proximities.
+        tolerance: Of the times of impact, as a share of the step.
+    """
+
+    distances: MinDistances
+    arcs: Arcs
+    proximities: bool
+    tolerance: wp.float64
+
+
 @made_once
-def _kernels(dtype: type, turning: bool) -> tuple[wp.Kernel, wp.Kernel]:
-    """Returns the kernels that cull and decide the pairs with a turning vertex or the others, for one type of position.
+def _rule(turning: bool) -> PairRule:
+    """Returns the rule of the pairs with a turning vertex, or of the others.
 
     Kernels for both take more registers, which costs more than launches over queues in which nothing turns.
     """
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def cull_approaches(
-        first: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        distances: MinDistances,
-        arcs: Arcs,
-        kind: int,
-        # in and out
-        stages: PairStages,
-    ):
+    @wp.func
+    def excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
+        group = options.distances.group[v[0]]
+        if group >= 0 and options.distances.group[v[3]] == group:
+            return True
         if wp.static(turning):
-            if not any_turns(arcs):
-                return
-        i = first + wp.tid()
-        if not is_filled(i, stages.queue, stages.counts, _QUEUED):
-            return
-        pair = stages.queue[i]
-        v = points_of_pair(kind, stages.elements, pair)
-        if turns(arcs, v) != wp.static(turning):
-            return
-        group = distances.group[v[0]]
-        if group >= 0 and distances.group[v[3]] == group:
-            return
+            return are_of_one_group(options.arcs, v)
+        return False
+
+    @wp.func
+    def clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-        points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
+        distances = options.distances
         distance = distance_of_corners(kind, v, distances.radius) + distances.reach
         reach = distances.reach
         if wp.static(turning):
-            if are_of_one_group(arcs, v):
-                return
-            deviation = distance_of_corners(kind, v, arcs.deviation)
+            deviation = distance_of_corners(kind, v, options.arcs.deviation)
             distance = ABOVE_SUM * (distance + deviation)
             reach = ABOVE_SUM * (reach + deviation)
-        motion, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
+        motion, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, distance, ROUNDOFF)
         if clears_at_once(motion, scaled):
-            return
+            return True
         if are_within_rings(v, firsts_of(kind), distances.rings):
-            _same, scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
-            if clears_at_once(motion, scaled):
-                return
-        append(pair, stages.survivors, stages.counts, _SURVIVORS)
+            _same, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+            return clears_at_once(motion, scaled)
+        return False
 
-    @wp.kernel(**NO_FUSED_OPERATIONS)
-    def decide_approaches(
-        first: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        distances: MinDistances,
-        arcs: Arcs,
-        kind: int,
-        proximities: bool,
-        tolerance: wp.float64,
-        # in and out
-        stages: PairStages,
-    ):
-        if wp.static(turning):
-            if not any_turns(arcs):
-                return
-        i = first + wp.tid()
-        if not is_filled(i, stages.survivors, stages.counts, _SURVIVORS):
-            return
-        pair = stages.survivors[i]
-        v = points_of_pair(kind, stages.elements, pair)
-        if turns(arcs, v) != wp.static(turning):
-            return
+    @wp.func
+    def decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
         a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
         a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        distances = options.distances
+        tolerance = options.tolerance
         a, b, c, d = doubles(a0, b0, c0, d0)
         start, kept = distances_of_pair(distances, kind, v, a, b, c, d)
         result = Impact()
         if wp.static(turning):
-            result = impact_on_arcs_at_distance(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, kept)
+            result = impact_on_arcs_at_distance(kind, v, x0, x1, options.arcs, kept)
         else:
             result = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, kept, ROUNDOFF, True, tolerance)
-        status = result.status
-        if proximities:
+        is_contact = result.status != FREE
+        if options.proximities:
             reach = distances.reach
             if not are_within_rings(v, firsts_of(kind), distances.rings):
                 reach += distance_of_corners(kind, v, distances.radius)
             if start < reach:
-                points = wp.where(kind == EDGE_EDGE, EDGE_EDGE, VERTEX_FACE)
-                motion, _scaled = motion_and_distance(points, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
+                is_contact = True
+                motion, _scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF)
                 coordinates, normal = closest_at(kind, motion, _ZERO)
                 result.coordinates = coordinates
                 result.normal = normal
-            elif not wp.static(turning) or status == FREE:
+            elif not wp.static(turning) or result.status == FREE:
                 near = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, reach, ROUNDOFF, True, tolerance)
-                if near.status == FREE:
-                    return
+                is_contact = near.status != FREE
                 result.coordinates = near.coordinates
                 result.normal = near.normal
-        elif status == FREE:
-            return
-        slot = take_slot(stages.counts, _CONTACTS)
-        take_slot(stages.counts, _FOUND)
-        if slot < wp.int64(stages.contacts.pairs.shape[0]):
-            k = wp.int32(slot)
-            stages.contacts.pairs[k] = pair
-            write_impact(k, result, stages)
+        return result, is_contact
 
-    return cull_approaches, decide_approaches
+    return PairRule(Options, excludes, clears, decide, turning=turning)
 
 
-def run_approach_phases(
-    phases: Sequence[tuple[NarrowPhase, wp.array]],
+def run_approaches(
+    phases: Phases,
     x0: wp.array,
     x1: wp.array,
     distances: MinDistances,
@@ -275,29 +223,19 @@ def run_approach_phases(
     it is within reach then: they depend continuously on the motion, and the direction to move the pair apart vanishes
     with the distance that it is to be moved.
 
-    Args:
-        phases: The buffers of each kind, a :class:`DistanceKind`, with the vertex indices of its second elements.
-        x0: Positions at the start of the step, array of vec3 or vec3d.
-        x1: Positions at its end, of the same type.
-        distances: The minimum distances.
-        proximities: Whether to report proximities.
-        tolerance: Of the times of impact, as a share of the step.
-        arcs: The arcs of bodies that turn; None if nothing turns.
-        timer: Measures the stages.
+    Arguments are those of :func:`.run_contacts` and the :class:`Options`.
     """
     # pairs with a turning vertex last; on the CPU only where there are some
     some_turn = arcs is not None and not (x0.device.is_cpu and not arcs.turning.numpy()[0])
-    kernels = [_kernels(x0.dtype, turning) for turning in ((False, True) if some_turn else (False,))]
-    arcs = Arcs() if arcs is None else arcs
+    rules = [_rule(turning) for turning in ((False, True) if some_turn else (False,))]
+    options = Options()
+    options.distances, options.proximities, options.tolerance = distances, proximities, tolerance
+    if arcs is not None:
+        options.arcs = arcs
+    stages = stages_of(phases)
     with timer.stage("cull"):
-        for phase, elements in phases:
-            stages, inputs = phase.stages(elements), [x0, x1, distances, arcs, int(phase.kind)]
-            for cull, _decide in kernels:
-                launch_over_queue(cull, stages.queue, phase.counts, Count.QUEUED, inputs=inputs, outputs=[stages])
+        for rule in rules:
+            launch_culls(rule, stages, x0, x1, options)
     with timer.stage("classify"):
-        for phase, elements in phases:
-            stages, counts = phase.stages(elements), phase.counts
-            options = {"outputs": [stages], "block_dim": 64}
-            options["inputs"] = [x0, x1, distances, arcs, int(phase.kind), proximities, tolerance]
-            for _cull, decide in kernels:
-                launch_over_queue(decide, stages.survivors, counts, Count.SURVIVORS, **options)
+        for rule in rules:
+            launch_decisions(rule, stages, x0, x1, options)

@@ -1,0 +1,214 @@
+"""The narrow phase of contacts: culls -> certified classification -> times of impact -> exact stage.
+
+Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import warp as wp
+
+from ....kernels.arcs import Arcs, turns
+from ....kernels.classification import classify
+from ....kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
+from ....kernels.motion import edge_edge_motion, relative_motion, vertex_face_motion
+from ....kernels.pairs import ends_of
+from ....kernels.pipeline.batch_classification import BATCH as CLASSIFIED
+from ....kernels.pipeline.batch_culling import BATCH as CULLED
+from ....kernels.pipeline.batch_impacts import BATCH as DECIDED
+from ....kernels.pipeline.queues import take_slot
+from ....kernels.polynomials import VERTEX_FACE, Motion, coplanarity
+from ....kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
+from ....kernels.time_of_impact import Impact, impact
+from ...run.launch import launch_over, made_once
+from ...run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, Method
+from ...run.stage_timer import StageTimer
+from ..batch_kernels import batch_classification_kernel, batch_culling_kernel, batch_impact_kernel
+from ..narrow_phase import Phases, launch_culls, launch_decisions, launch_over_kinds, stages_of
+from ..pair_kernels import (
+    PairRule,
+    PairStages,
+    add_open_contact,
+    count_found,
+    entry_of_two,
+    write_decision,
+    write_impact,
+)
+
+__all__ = ["run_contacts"]
+
+_CONTACTS = wp.constant(int(Count.CONTACTS))
+_FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
+
+
+@wp.struct
+class Options:
+    """Options of the rule.
+
+    Attributes:
+        roundoff: Roundoff of floating point, 0 if its computed signs decide.
+        arcs: Pairs with a turning vertex are left out, for :mod:`.arc`.
+    """
+
+    roundoff: wp.float64
+    arcs: Arcs
+
+
+@wp.func
+def _excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
+    return turns(options.arcs, v)
+
+
+@wp.func
+def _never_coplanar(motion: Motion) -> bool:
+    """Returns whether a motion is certainly free, as its points are never coplanar, or a direction separates them."""
+    y = coplanarity(motion)
+    if certified_sign_cubic(y.k, y.bound) != 0:
+        return True
+    return direction_separates(motion, centroid_direction(motion))
+
+
+@wp.func
+def _clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
+    if kind == VERTEX_FACE:
+        apart = _never_coplanar(vertex_face_motion(a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff))
+        # last, because in single precision queued pairs always pass; but exact at any scale
+        return apart or vertex_face_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
+    apart = _never_coplanar(edge_edge_motion(a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff))
+    return apart or edge_edge_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
+
+
+@wp.func
+def _decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
+    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
+    result = Impact()
+    motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, options.roundoff)
+    result.status = classify(motion, coplanarity(motion))
+    return result, result.status != FREE
+
+
+# fewer registers than the 252 that the compiler takes, so that twice as many warps hide its latency; one kernel to cull
+# both kinds takes an eighth more, which costs more than a launch
+_RULE = PairRule(Options, _excludes, _clears, _decide, add=add_open_contact, culls_by_kind=True, max_registers=128)
+
+
+@wp.func
+def _finish(i: int, status: int, timed: bool, stages: PairStages):
+    """Writes and counts what is decided of a contact, and enqueues it for the exact stage if that is needed."""
+    write_decision(i, status, stages)
+    if status == FREE:
+        return
+    count_found(status, stages)
+    if status == UNSURE or (timed and not stages.contacts.within_tolerance[i]):
+        stages.for_exact[wp.int32(take_slot(stages.counts, _FOR_EXACT))] = i
+
+
+@made_once
+def _impact_kernel(dtype: type) -> wp.Kernel:
+    """Returns the kernel that finds the times of impact of contacts on a GPU, for one type of position."""
+
+    @wp.kernel(**NO_FUSED_OPERATIONS)
+    def find_impacts(
+        first: int,
+        # mesh
+        x0: wp.array[dtype],
+        x1: wp.array[dtype],
+        # in
+        roundoff: wp.float64,
+        timed: bool,
+        tolerance: wp.float64,
+        kinds: wp.vec2i,
+        # in and out
+        one: PairStages,
+        other: PairStages,
+    ):
+        kind, i, v = entry_of_two(
+            first + wp.tid(), kinds, one.contacts.pairs, other.contacts.pairs, one, other, _CONTACTS
+        )
+        if v[0] < 0:
+            return
+        status = int(0)
+        if kind == kinds[0]:
+            status = int(one.contacts.status[i])
+        if kind != kinds[0]:  # one expression would read both
+            status = int(other.contacts.status[i])
+        if timed or status != HIT:
+            a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
+            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
+            result = impact(motion, coplanarity(motion), status, tolerance)
+            status = result.status
+            if kind == kinds[0]:
+                write_impact(i, result, one)
+            else:
+                write_impact(i, result, other)
+        if kind == kinds[0]:
+            _finish(i, status, timed, one)
+        else:
+            _finish(i, status, timed, other)
+
+    return find_impacts
+
+
+def run_contacts(
+    phases: Phases,
+    x0: wp.array,
+    x1: wp.array,
+    *,
+    method: Method,
+    timed: bool = True,
+    tolerance: float = TOLERANCE,
+    arcs: "Arcs | None" = None,
+    timer: StageTimer,
+) -> None:
+    """Launches all stages but the sorting over the queued pairs of both kinds, or of one.
+
+    A GPU decides both kinds in the same launches, without synchronizing.
+
+    Args:
+        phases: Narrow phases of different kinds, each with the vertex indices of its elements.
+        x0: Positions at the start of the step, array of vec3 or vec3d.
+        x1: Positions at its end, of the same type.
+        method: One of :data:`METHODS`; with "exact", pairs too wide for the device are left to
+            :func:`.decide_on_host`.
+        timed: Whether to find times of impact, coordinates and normals.
+        tolerance: Of the times of impact, as a share of the step.
+        arcs: Pairs with a turning vertex are left out, for :mod:`.arc`; None if nothing turns.
+        timer: Measures the stages.
+    """
+    options = Options()
+    options.roundoff = 0.0 if method == "float" else ROUNDOFF
+    if arcs is not None:
+        options.arcs = arcs
+    stages, is_cpu = stages_of(phases), x0.device.is_cpu
+    motion = [x0, x1, options.roundoff]
+
+    def launch_batches(kernel_of: Callable, others: list, buffer: str, count: Count, batch: int) -> None:
+        """Launches the kernel of each kind over the filled entries of a buffer, many at a time, on a CPU."""
+        for kind, s in stages.items():
+            filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
+            kernel, inputs = kernel_of(kind, x0.dtype), [*motion, *others]
+            launch_over(kernel, -(-filled // batch), inputs=inputs, outputs=[s], device=x0.device, chunk=16)
+
+    with timer.stage("cull"):
+        if is_cpu:
+            cull = functools.partial(batch_culling_kernel, on_arcs=arcs is not None)
+            launch_batches(cull, [Arcs() if arcs is None else arcs], "queue", Count.QUEUED, CULLED)
+        else:
+            launch_culls(_RULE, stages, x0, x1, options)
+    with timer.stage("classify"):
+        if is_cpu:
+            launch_batches(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
+        else:
+            launch_decisions(_RULE, stages, x0, x1, options)
+    with timer.stage("time of impact"):
+        if is_cpu:
+            launch_batches(batch_impact_kernel, [timed, tolerance], "for_exact", Count.CONTACTS, DECIDED)
+        else:
+            kernel, inputs = _impact_kernel(x0.dtype), [*motion, timed, tolerance]
+            launch_over_kinds(kernel, stages, "for_exact", Count.CONTACTS, inputs=inputs, block_dim=32)
+    if method == "exact":
+        with timer.stage("exact"):
+            for phase, elements in phases:
+                phase.decide_exactly(x0, x1, elements, timed=timed, tolerance=tolerance)
