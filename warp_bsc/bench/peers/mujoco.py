@@ -29,7 +29,7 @@ _THICKNESS = 1e-3
 """Of cloth [m]: "the mode assumes metre-scale models with millimetre-thick flexes" (XMLreference, option/flag/ipc)."""
 _DAMPING = 2e-3
 """Rayleigh damping [s], the least of what the documentation recommends (modeling, Deformables: 0.002 to 0.05)."""
-_OPTIONS = 'integrator="discrete" solver="Newton" tolerance="1e-6"'
+_OPTIONS = 'integrator="discrete" solver="CG" tolerance="1e-6"'
 """As the documentation recommends for IPC contact (modeling, Deformables), which goes with steps of 1 to 4 ms."""
 _HELD_MASS = 10.0
 """Mass of a particle that a program moves [kg]: it is so heavy that a step hardly changes the velocity it is given."""
