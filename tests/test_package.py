@@ -70,9 +70,9 @@ PACKAGES = {
         "_profiling",
         "_warnings",
     },
-    "repair": {"detection", "response", "kernels", "usd", "replay", "_arguments", "_atomic_file"},
+    "repairing": {"detection", "response", "kernels", "usd", "scene_replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread", "_sorted_keys", "_warnings"},
-    "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},
+    "scene_replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},
     "bench": {
         "detection",
         "kernels",
@@ -80,14 +80,14 @@ PACKAGES = {
         "checker",
         "response",
         "implicit",
-        "repair",
+        "repairing",
         "_arguments",
         "_atomic_file",
         "_garbage",
         "_private_names",
         "_version",
     },
-    "cli": {"replay", "repair", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
+    "cli": {"scene_replay", "repairing", "bench", "detection", "usd", "_arguments", "_atomic_file", "_version"},
     "__main__": {"cli", "_garbage"},
     "__init__": {
         "_garbage",
@@ -95,8 +95,8 @@ PACKAGES = {
         "checker",
         "detection",
         "implicit",
-        "repair",
-        "replay",
+        "repairing",
+        "scene_replay",
         "response",
         "usd",
     },  # most for type checkers alone
@@ -107,9 +107,9 @@ LIBRARIES = {
     "newton": {
         "implicit",
         "response",
-        "warp_bsc/repair/shot/playback.py",  # plays positions back as a solver
-        "warp_bsc/repair/state.py",  # repairs a state of a model
-        "warp_bsc/repair/model_surface.py",  # takes the surface from it
+        "warp_bsc/repairing/shot/playback.py",  # plays positions back as a solver
+        "warp_bsc/repairing/state.py",  # repairs a state of a model
+        "warp_bsc/repairing/model_surface.py",  # takes the surface from it
         "warp_bsc/_private_names/of_newton.py",
         "warp_bsc/bench/scenes/newton_examples.py",  # lists the examples of Newton
         "warp_bsc/bench/measure/newton_process.py",  # runs them
@@ -127,8 +127,8 @@ LIBRARIES = {
     },
     "pxr": {
         "usd",
-        "warp_bsc/replay/usd_validation.py",  # a rule of its validation framework
-        "warp_bsc/replay/usdview_plugin.py",  # a plugin of its viewer
+        "warp_bsc/scene_replay/usd_validation.py",  # a rule of its validation framework
+        "warp_bsc/scene_replay/usdview_plugin.py",  # a plugin of its viewer
     },
     "rich": {"cli"},
     "argparse": {"cli"},
@@ -142,7 +142,7 @@ LIBRARIES = {
         "detection",
         "implicit",
         "response",
-        "repair",
+        "repairing",
         "bench",
         "cli",
         "_private_names",

@@ -46,14 +46,9 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.queries.query_points import query_points
     from .implicit.solver import SolverImplicitAdjoint
     from .implicit.solver_implicit import SolverImplicit
-    from .repair.repair import repair
-    from .repair.results import RepairResult, UnresolvedContour
-    from .repair.state import StateRepairResult, repair_state
-    from .replay.intervals import replay
-    from .replay.results import IntervalResult, IntervalSummary
-    from .replay.scene_contacts import SceneContacts
-    from .replay.scene_intersections import SceneIntersections
-    from .replay.scene_proximities import SceneProximities
+    from .repairing.repair import repair
+    from .repairing.results import RepairResult, UnresolvedContour
+    from .repairing.state import StateRepairResult, repair_state
     from .response.captured_steps import CapturedSteps
     from .response.contact_sensor import ContactSensor
     from .response.layer.contact_layer import ContactLayer
@@ -62,6 +57,11 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .response.solver_ccd import SolverCCD
     from .response.state.collision_filter import CollisionFilter
     from .response.state.friction_table import FrictionTable
+    from .scene_replay.intervals import replay
+    from .scene_replay.results import IntervalResult, IntervalSummary
+    from .scene_replay.scene_contacts import SceneContacts
+    from .scene_replay.scene_intersections import SceneIntersections
+    from .scene_replay.scene_proximities import SceneProximities
     from .usd.frames import FrameRange
     from .usd.scene import Scene
     from .usd.selection import Selection
@@ -80,23 +80,23 @@ _MODULES = {
     "DetectionStats": "detection.collisions",
     "FrameRange": "usd.frames",
     "FrictionTable": "response.state.friction_table",
-    "IntervalResult": "replay.results",
-    "IntervalSummary": "replay.results",
+    "IntervalResult": "scene_replay.results",
+    "IntervalSummary": "scene_replay.results",
     "QueryArrays": "detection.queries.query_arrays",
     "QueryResult": "detection.queries.query",
-    "RepairResult": "repair.results",
+    "RepairResult": "repairing.results",
     "RigidMotion": "detection.arcs.rigid_motion",
     "Scene": "usd.scene",
-    "SceneContacts": "replay.scene_contacts",
-    "SceneIntersections": "replay.scene_intersections",
-    "SceneProximities": "replay.scene_proximities",
+    "SceneContacts": "scene_replay.scene_contacts",
+    "SceneIntersections": "scene_replay.scene_intersections",
+    "SceneProximities": "scene_replay.scene_proximities",
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverImplicit": "implicit.solver_implicit",
     "SolverImplicitAdjoint": "implicit.solver",
     "SolverReport": "response.report.report",
-    "StateRepairResult": "repair.state",
-    "UnresolvedContour": "repair.results",
+    "StateRepairResult": "repairing.state",
+    "UnresolvedContour": "repairing.results",
     "distances": "detection.at_rest.proximities",
     "leave_out": "detection.mesh",
     "query_edge_edge": "detection.queries.query",
@@ -104,9 +104,9 @@ _MODULES = {
     "query_vertex_edge": "detection.queries.query",
     "query_vertex_face": "detection.queries.query",
     "query_vertex_vertex": "detection.queries.query",
-    "repair": "repair.repair",
-    "repair_state": "repair.state",
-    "replay": "replay.intervals",
+    "repair": "repairing.repair",
+    "repair_state": "repairing.state",
+    "replay": "scene_replay.intervals",
 }
 
 __all__ = [
@@ -152,13 +152,6 @@ __all__ = [
     "repair_state",
     "replay",
 ]
-
-
-# The functions of these names are public, not the packages. The import system binds a package only at its first import:
-# now.
-for _name in ("repair", "replay"):
-    importlib.import_module(f".{_name}", __name__)
-    del globals()[_name]
 
 
 def __getattr__(name):

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warp_bsc.replay.intervals import replay
+from warp_bsc.scene_replay.intervals import replay
 from warp_bsc.usd.scene import Scene
 
 ASSETS = Path(__file__).parents[2] / "assets"

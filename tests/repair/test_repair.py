@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.bench.scenes.repair import KINDS, KNOWN, damaged
-from warp_bsc.repair.closest import closest_points, exit_distances
-from warp_bsc.repair.surface import Surface
+from warp_bsc.repairing.closest import closest_points, exit_distances
+from warp_bsc.repairing.surface import Surface
 
 
 def crossings(faces, x):

@@ -6,7 +6,7 @@ from chromium import Browser
 from dipping import FRAMES, HIT, dipping_sheet, points_of, repaired
 from replay_files import Page
 
-from warp_bsc.repair.shot import report
+from warp_bsc.repairing.shot import report
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from stages import add_mesh, find, new_stage, save
 
 from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
 from warp_bsc.cli.main import main
-from warp_bsc.repair.shot.blend import BLEND, blend
-from warp_bsc.repair.shot.findings import find_collisions
-from warp_bsc.repair.shot.mesh_groups import groups_of
-from warp_bsc.repair.shot.repair_shot import repair_shot
+from warp_bsc.repairing.shot.blend import BLEND, blend
+from warp_bsc.repairing.shot.findings import find_collisions
+from warp_bsc.repairing.shot.mesh_groups import groups_of
+from warp_bsc.repairing.shot.repair_shot import repair_shot
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from pxr import UsdGeom, Vt
 from stages import new_stage, save
 
 import warp_bsc as bsc
-from warp_bsc.replay.depths import DepthFinder
+from warp_bsc.scene_replay.depths import DepthFinder
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
 

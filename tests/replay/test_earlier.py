@@ -13,7 +13,7 @@ from waving_sheets import OUTPUTS, options, write_old, write_scene
 from warp_bsc._atomic_file import OutputFile, unfinished_path
 from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
-from warp_bsc.replay import hit_files
+from warp_bsc.scene_replay import hit_files
 
 PART = "hits.json.part"
 FRAMES = 12

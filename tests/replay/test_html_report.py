@@ -15,7 +15,7 @@ from replay_files import Page, add_up, falling_through_quads, many_hits, near_an
 from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, with_names
 
 import warp_bsc as bsc
-from warp_bsc.replay import html_report, view_blocks
+from warp_bsc.scene_replay import html_report, view_blocks
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 HOSTILE = "<img src=x onerror=alert(1)>{{script}}"

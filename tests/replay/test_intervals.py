@@ -10,7 +10,7 @@ from pxr import Ts
 from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 import warp_bsc as bsc
-from warp_bsc.replay.results import IntervalResult, IntervalSummary
+from warp_bsc.scene_replay.results import IntervalResult, IntervalSummary
 from warp_bsc.usd.frames import FrameRange
 from warp_bsc.usd.interval import Interval
 
@@ -99,10 +99,10 @@ def test_the_program_of_the_documentation(stage, capsys):
 
 
 PROGRAMS = [
-    "import warp_bsc as bsc; bsc.replay; import warp_bsc.replay.summary",
-    "import warp_bsc.replay.summary; import warp_bsc as bsc",
+    "import warp_bsc as bsc; bsc.replay; import warp_bsc.scene_replay.summary",
+    "import warp_bsc.scene_replay.summary; import warp_bsc as bsc",
     "import warp_bsc as bsc; from warp_bsc.replay import summary, html_report",
-    "from warp_bsc.replay.results import IntervalResult; import warp_bsc as bsc",
+    "from warp_bsc.scene_replay.results import IntervalResult; import warp_bsc as bsc",
     "import warp_bsc.cli.replay; import warp_bsc as bsc; bsc.Scene",
 ]
 """Programs that import the package in one order or another."""
@@ -121,4 +121,4 @@ for program in sys.argv[1:]:
 """
     command = [sys.executable, "-c", runner, *(program + ends for program in PROGRAMS)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == len(PROGRAMS) * ["warp_bsc.replay.intervals", "replay"]
+    assert done.stdout.split() == len(PROGRAMS) * ["warp_bsc.scene_replay.intervals", "replay"]

@@ -12,7 +12,7 @@ from waving_sheets import write_scene
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
-from warp_bsc.replay.limit import limit_rows
+from warp_bsc.scene_replay.limit import limit_rows
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"
 TWIST = str(ASSETS / "cloth_twist.usd")

@@ -29,7 +29,7 @@ from stages import FALLING, add_floor, add_mesh, moved, new_stage, save
 from warp_bsc._atomic_file import OutputFile
 from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
-from warp_bsc.replay import usd_overlay
+from warp_bsc.scene_replay import usd_overlay
 
 
 @pytest.fixture

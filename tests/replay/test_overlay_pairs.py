@@ -21,8 +21,8 @@ from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, save
 import warp_bsc as bsc
 from warp_bsc._version import __version__
 from warp_bsc.cli.main import main
-from warp_bsc.replay import usd_overlay
-from warp_bsc.replay.usd_overlay import MOST_PAIRS, VARIANTS
+from warp_bsc.scene_replay import usd_overlay
+from warp_bsc.scene_replay.usd_overlay import MOST_PAIRS, VARIANTS
 
 
 def pairs_of(overlay):

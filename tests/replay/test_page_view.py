@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
 
-from warp_bsc.replay.page_view import choose_faces, find_outline
+from warp_bsc.scene_replay.page_view import choose_faces, find_outline
 from warp_bsc.usd.scene import Scene
 
 

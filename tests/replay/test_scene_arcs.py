@@ -9,7 +9,7 @@ from stages import FALLING, add_mesh, animate, find, hits, moved, new_stage, sav
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
-from warp_bsc.replay.scene_arcs import arcs_of
+from warp_bsc.scene_replay.scene_arcs import arcs_of
 
 PIN = [(0.0, 1.0, -1.0), (0.0, 1.2, -1.0), (0.0, 1.0, 1.0)]
 BLADE = [(0.2, 0.0, 0.0), (2.0, 0.0, 0.1), (2.0, 0.0, -0.1)]

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from warp_bsc.replay.threads import WriteBehind, read_ahead
+from warp_bsc.scene_replay.threads import WriteBehind, read_ahead
 
 
 def test_the_next_item_is_made_meanwhile_and_no_more():

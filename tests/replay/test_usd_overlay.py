@@ -23,7 +23,7 @@ from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, 
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
-from warp_bsc.replay.usd_overlay import COLORS, LIFT
+from warp_bsc.scene_replay.usd_overlay import COLORS, LIFT
 from warp_bsc.usd.write import layer_writer
 
 ASSETS = Path(__file__).resolve().parents[2] / "assets"

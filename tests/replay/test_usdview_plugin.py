@@ -33,7 +33,7 @@ def stage(tmp_path):
 def menu():
     """The commands by their labels, with a usdview that shows a stage."""
     define_usdview()
-    from warp_bsc.replay.usdview_plugin import HitsContainer  # noqa: PLC0415 (needs the stand-ins)
+    from warp_bsc.scene_replay.usdview_plugin import HitsContainer  # noqa: PLC0415 (needs the stand-ins)
 
     def start(api):
         container, registry, menus = HitsContainer(), Registry(api), {}

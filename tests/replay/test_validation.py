@@ -7,8 +7,8 @@ import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.pipeline import DetectionPipeline
 from warp_bsc.detection.run.launch import retry_until_fits
-from warp_bsc.replay import validation
-from warp_bsc.replay.validation import overlapping_boxes, validate
+from warp_bsc.scene_replay import validation
+from warp_bsc.scene_replay.validation import overlapping_boxes, validate
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])

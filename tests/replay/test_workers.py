@@ -24,7 +24,7 @@ from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, 
 import warp_bsc as bsc
 from warp_bsc.cli import replay_run
 from warp_bsc.cli.main import main
-from warp_bsc.replay import checking, worker, workers
+from warp_bsc.scene_replay import checking, worker, workers
 
 FILES = {"--json": "hits.json", "--csv": "hits.csv", "--overlay": "overlay.usdc", "--report": "page.html"}
 FILES["--npz"] = "hits.npz"

@@ -11,7 +11,7 @@ from replay_files import falling_through_quads, many_hits
 from stages import save
 
 import warp_bsc as bsc
-from warp_bsc.replay.usd_overlay import Overlay
+from warp_bsc.scene_replay.usd_overlay import Overlay
 from warp_bsc.usd.write.points_layer import PointsLayer
 
 

@@ -6,7 +6,7 @@ from pxr import Gf, Usd, UsdGeom
 from stages import FALLING, add_mesh, moved, new_stage, save
 
 import warp_bsc as bsc
-from warp_bsc.replay.scene_arcs import arcs_of
+from warp_bsc.scene_replay.scene_arcs import arcs_of
 
 
 @pytest.fixture

@@ -6,9 +6,9 @@ import json
 import os
 
 from .._atomic_file import STDOUT, unfinished_path
-from ..repair.shot.findings import kept_meshes
-from ..repair.shot.report import RepairPage
-from ..replay.hit_files import replay_facts
+from ..repairing.shot.findings import kept_meshes
+from ..repairing.shot.report import RepairPage
+from ..scene_replay.hit_files import replay_facts
 from .device import find_device, load_detector, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import (

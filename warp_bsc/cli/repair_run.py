@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from .._atomic_file import naming, unfinished_path
-from ..repair.shot.findings import Finding, MeshPair, find_collisions
-from ..repair.shot.journal import Journal
-from ..repair.shot.repair_shot import repair_shot
-from ..repair.shot.report import LEFT_HITS, RepairPage
-from ..repair.shot.stretch import RepairedStretch
-from ..replay.intervals import replay
-from ..replay.results import IntervalResult
+from ..repairing.shot.findings import Finding, MeshPair, find_collisions
+from ..repairing.shot.journal import Journal
+from ..repairing.shot.repair_shot import repair_shot
+from ..repairing.shot.report import LEFT_HITS, RepairPage
+from ..repairing.shot.stretch import RepairedStretch
+from ..scene_replay.intervals import replay
+from ..scene_replay.results import IntervalResult
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
 from .device import loading_kernels

@@ -6,8 +6,8 @@ import shlex
 from typing import Any
 
 from .._atomic_file import STDOUT, naming, unfinished_path
-from ..replay.baseline import Baseline
-from ..replay.workers import device_of_cluster
+from ..scene_replay.baseline import Baseline
+from ..scene_replay.workers import device_of_cluster
 from ..usd.scene import Scene
 from .device import find_device, load_detector, loading_kernels
 from .options import Commands, add_command, scene_path

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._atomic_file import STDOUT
-from ..replay.workers import checked_address
+from ..scene_replay.workers import checked_address
 from ..usd.frames import FrameRange
 from ..usd.read.openusd import check_openusd
 from ..usd.scene import Scene

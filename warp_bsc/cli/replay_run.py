@@ -8,18 +8,18 @@ from collections.abc import Generator
 from typing import Any
 
 from .._atomic_file import STDOUT, naming
-from ..replay.baseline import Baseline
-from ..replay.earlier import find_earlier
-from ..replay.hit_columns import HitsNpz
-from ..replay.hit_files import HitsCsv, HitsJson, replay_facts
-from ..replay.html_report import ReportPage
-from ..replay.intervals import replay
-from ..replay.limit import limit_rows, not_listed
-from ..replay.outputs import ReplayOutput
-from ..replay.results import IntervalResult, IntervalSummary, Work
-from ..replay.summary import Summary
-from ..replay.threads import WriteBehind
-from ..replay.usd_overlay import SHOWN_BY, Overlay
+from ..scene_replay.baseline import Baseline
+from ..scene_replay.earlier import find_earlier
+from ..scene_replay.hit_columns import HitsNpz
+from ..scene_replay.hit_files import HitsCsv, HitsJson, replay_facts
+from ..scene_replay.html_report import ReportPage
+from ..scene_replay.intervals import replay
+from ..scene_replay.limit import limit_rows, not_listed
+from ..scene_replay.outputs import ReplayOutput
+from ..scene_replay.results import IntervalResult, IntervalSummary, Work
+from ..scene_replay.summary import Summary
+from ..scene_replay.threads import WriteBehind
+from ..scene_replay.usd_overlay import SHOWN_BY, Overlay
 from ..usd.scene import Scene
 from .error_boundary import describe
 from .exit_status import ExitStatus

@@ -5,12 +5,12 @@ from collections import defaultdict
 from rich.console import Console
 
 from ..bench.tables import LONGEST, Column, count
-from ..repair.shot.findings import kept_meshes
-from ..replay.baseline import NewFinding
-from ..replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
-from ..replay.scene_contacts import PHASES
-from ..replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
-from ..replay.validation import Validation
+from ..repairing.shot.findings import kept_meshes
+from ..scene_replay.baseline import NewFinding
+from ..scene_replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
+from ..scene_replay.scene_contacts import PHASES
+from ..scene_replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
+from ..scene_replay.validation import Validation
 from .option_names import with_option
 from .tables import print_table, say, say_list
 

@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from ...detection.mesh import CollisionMesh
-from ...repair.repair import repair
-from ...repair.results import RepairResult
+from ...repairing.repair import repair
+from ...repairing.results import RepairResult
 from ..peers import ipc_toolkit
 from ..scenes.repair import KINDS, TangledMesh
 from ..tables import LONGEST, Column, Table, count, grouped, list_titles, two

@@ -81,10 +81,11 @@ class HitsJson(RecordFile):
             print([found["prims"][mesh] for mesh in contact["mesh"]], contact["elements"], contact["time"])
 
     An interval lists the intersections, parts inside others and proximities at its start; if the next interval may
-    start elsewhere, or there is none, those at its end as well. :mod:`~warp_bsc.replay.hit_records` has the lines.
+    start elsewhere, or there is none, those at its end as well. :mod:`~warp_bsc.scene_replay.hit_records` has the
+    lines.
 
     The file holds no measured times, so that it is the same for any number of processes.
-    :class:`~warp_bsc.replay.earlier.EarlierReplay` reads it, or the part of it that a killed process leaves at
+    :class:`~warp_bsc.scene_replay.earlier.EarlierReplay` reads it, or the part of it that a killed process leaves at
     :func:`~warp_bsc._atomic_file.unfinished_path`.
     """
 

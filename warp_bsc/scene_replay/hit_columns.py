@@ -46,7 +46,7 @@ _ROWS_AT_ONCE = 2**16
 
 
 class HitsNpz:
-    """A ``.npz`` file, a :class:`~warp_bsc.replay.outputs.ReplayOutput`: columns with a row for each pair.
+    """A ``.npz`` file, a :class:`~warp_bsc.scene_replay.outputs.ReplayOutput`: columns with a row for each pair.
 
     A pair takes less than 30 bytes, a fifteenth of its text in JSON. Its columns, and what their numbers stand for::
 
@@ -71,7 +71,7 @@ class HitsNpz:
 
         Args:
             path: The file.
-            facts: What :func:`~warp_bsc.replay.hit_files.replay_facts` returns.
+            facts: What :func:`~warp_bsc.scene_replay.hit_files.replay_facts` returns.
             interval_count: Number of intervals of the scene.
 
         Raises:

@@ -53,7 +53,7 @@ class EarlierReplay:
 
         Args:
             path: The file.
-            facts: Facts of the replay that resumes it, see :func:`~warp_bsc.replay.hit_files.replay_facts`.
+            facts: Facts of the replay that resumes it, see :func:`~warp_bsc.scene_replay.hit_files.replay_facts`.
 
         Raises:
             OSError: If it cannot be read.

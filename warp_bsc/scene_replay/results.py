@@ -136,11 +136,11 @@ class IntervalSummary:
         separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None if
             intersections were not checked.
         ignored: Number of pairs that collide and are ignored, by the names of their two meshes, in the scene's order.
-        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.replay.scene_contacts.PHASES`; None if
+        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.scene_replay.scene_contacts.PHASES`; None if
             intersections were not checked.
         proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
-        duplicates: Groups of meshes that are duplicates, see :class:`~warp_bsc.replay.duplicates.Duplicates`, by their
-            names, in the scene's order; empty if intersections were not checked.
+        duplicates: Groups of meshes that are duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by
+            their names, in the scene's order; empty if intersections were not checked.
     """
 
     index: int

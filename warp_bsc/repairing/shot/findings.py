@@ -9,8 +9,8 @@ import numpy as np
 from ..._arguments import check_instance, checked_distance, checked_strings
 from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
-from ...replay.results import IntervalResult
-from ...replay.scene_contacts import find_contacts
+from ...scene_replay.results import IntervalResult
+from ...scene_replay.scene_contacts import find_contacts
 from ...usd.interval import Interval
 from ...usd.scene import Scene
 from ...usd.segment import Segment

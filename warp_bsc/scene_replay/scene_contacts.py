@@ -31,7 +31,7 @@ class SceneContacts(ScenePairs):
 
     Attributes:
         interval: The interval.
-        kind: Index in :data:`~warp_bsc.replay.scene_pairs.KINDS`, shape [n].
+        kind: Index in :data:`~warp_bsc.scene_replay.scene_pairs.KINDS`, shape [n].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].

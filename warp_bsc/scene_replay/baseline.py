@@ -51,7 +51,7 @@ class Baseline:
             path: The file.
             method: Method of detection of the replays that will be compared with it.
             clearance: Their clearance, as of :class:`Summary`.
-            options: Their other options, as of :func:`~warp_bsc.replay.hit_files.replay_facts`.
+            options: Their other options, as of :func:`~warp_bsc.scene_replay.hit_files.replay_facts`.
 
         Raises:
             OSError: If it cannot be read.

@@ -20,7 +20,7 @@ class SceneProximities(ScenePairs):
 
     Attributes:
         time: Time code.
-        kind: Index in :data:`~warp_bsc.replay.scene_pairs.KINDS`, shape [n].
+        kind: Index in :data:`~warp_bsc.scene_replay.scene_pairs.KINDS`, shape [n].
         distance: Distances, in the scene's unit of length, shape [n].
     """
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..._atomic_file import OutputFile
-from ...replay.html_page import block, fill_page, inert, shared_part, spread
-from ...replay.page_view import choose_faces
+from ...scene_replay.html_page import block, fill_page, inert, shared_part, spread
+from ...scene_replay.page_view import choose_faces
 from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.write.points_layer import MovedFrame

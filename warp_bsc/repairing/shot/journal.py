@@ -9,7 +9,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...replay.earlier import describe_difference
+from ...scene_replay.earlier import describe_difference
 from ...usd.scene import Scene
 from ...usd.write.points_layer import MovedFrame
 from .findings import Finding

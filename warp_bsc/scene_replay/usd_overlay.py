@@ -133,8 +133,8 @@ class Overlay:
     smaller.
 
     USD's own layers hold their whole content in memory. This one writes its samples to a
-    :class:`~warp_bsc.replay.sample_spool.SampleSpool`, and sorts them by attribute at the end, a few megabytes at a
-    time. It does not read the scene again, whose file may have become unreadable.
+    :class:`~warp_bsc.scene_replay.sample_spool.SampleSpool`, and sorts them by attribute at the end, a few megabytes at
+    a time. It does not read the scene again, whose file may have become unreadable.
 
     Attributes:
         file: The file.

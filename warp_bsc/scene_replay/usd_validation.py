@@ -4,7 +4,7 @@ Programs that run the framework find the rule if the environment variable ``PXR_
 ``plugin`` beside this module. In Python, importing this module registers it::
 
     from pxr import Usd, UsdValidation
-    import warp_bsc.replay.usd_validation as rules
+    import warp_bsc.scene_replay.usd_validation as rules
 
     validator = UsdValidation.ValidationRegistry().GetOrLoadValidatorByName(rules.NAME)
     for error in validator.Validate(Usd.Stage.Open("scene.usd")):
@@ -98,5 +98,5 @@ def _error(
 
 Plug.Registry().RegisterPlugins(PLUGIN_FOLDER)
 UsdValidation.ValidationRegistry().RegisterPluginStageValidator(NAME, find_errors)
-# "import warp_bsc.replay.usd_validation as rules" looks this module up in the function that hides the package
+# "import warp_bsc.scene_replay.usd_validation as rules" looks this module up in the function that hides the package
 vars(replay)["usd_validation"] = sys.modules[__name__]

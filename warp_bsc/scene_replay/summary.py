@@ -138,8 +138,8 @@ class Summary:
         intervals: The finished intervals, in order.
         stopped: Reason why the replay ended before the scene; empty if it is complete.
         clearance: Distance up to which proximities were found, in the scene's unit of length; None without them.
-        limit: Largest number of rows of each list of an interval in files, see :mod:`~warp_bsc.replay.limit`; None if
-            files list all.
+        limit: Largest number of rows of each list of an interval in files, see :mod:`~warp_bsc.scene_replay.limit`;
+            None if files list all.
     """
 
     scene: Scene

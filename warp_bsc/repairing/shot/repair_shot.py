@@ -9,7 +9,7 @@ import numpy as np
 from ..._arguments import check_instance, checked_distance, checked_integer
 from ...detection.arcs.rigid_motion import RigidMotion
 from ...detection.mesh import CollisionMesh
-from ...replay.scene_arcs import arcs_of
+from ...scene_replay.scene_arcs import arcs_of
 from ...usd.interval import Interval
 from ...usd.scene import Scene
 from ...usd.segment import Segment
