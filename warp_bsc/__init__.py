@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.at_rest.proximities import distances
     from .detection.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.detector import CollisionDetector
-    from .detection.differentiable import CollisionArrays
+    from .detection.differentiable import DifferentiableContacts
     from .detection.mesh import CollisionMesh, leave_out
     from .detection.queries.query import (
         QueryResult,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
         query_vertex_face,
         query_vertex_vertex,
     )
-    from .detection.queries.query_arrays import QueryArrays
+    from .detection.queries.query_arrays import DeviceQueryResult
     from .detection.queries.query_points import query_points
     from .implicit.solver import SolverImplicitAdjoint
     from .implicit.solver_implicit import SolverImplicit
@@ -69,7 +69,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
 _MODULES = {
     "CapturedCollisions": "detection.collisions",
     "CapturedSteps": "response.captured_steps",
-    "CollisionArrays": "detection.differentiable",
+    "DifferentiableContacts": "detection.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionFilter": "response.state.collision_filter",
     "CollisionMesh": "detection.mesh",
@@ -82,7 +82,7 @@ _MODULES = {
     "FrictionTable": "response.state.friction_table",
     "IntervalResult": "scene_replay.results",
     "IntervalSummary": "scene_replay.results",
-    "QueryArrays": "detection.queries.query_arrays",
+    "DeviceQueryResult": "detection.queries.query_arrays",
     "QueryResult": "detection.queries.query",
     "RepairResult": "repairing.results",
     "RigidMotion": "detection.arcs.rigid_motion",
@@ -112,7 +112,6 @@ _MODULES = {
 __all__ = [
     "CapturedCollisions",
     "CapturedSteps",
-    "CollisionArrays",
     "CollisionDetector",
     "CollisionFilter",
     "CollisionMesh",
@@ -121,11 +120,12 @@ __all__ = [
     "ContactLayer",
     "ContactSensor",
     "DetectionStats",
+    "DeviceQueryResult",
+    "DifferentiableContacts",
     "FrameRange",
     "FrictionTable",
     "IntervalResult",
     "IntervalSummary",
-    "QueryArrays",
     "QueryResult",
     "RepairResult",
     "RigidMotion",

@@ -47,7 +47,7 @@ def test_results_are_those_of_the_host(kind, method, toi, device):
     query = getattr(bsc, f"query_{kind}")
     for dtype in (np.float32, np.float64):
         points = queries(kind, dtype)
-        out = bsc.QueryArrays(len(points), toi=toi, device=device)
+        out = bsc.DeviceQueryResult(len(points), toi=toi, device=device)
         assert query(on(device, points), method=method, toi=toi, out=out) is out
         assert 0.3 < out.hit.numpy().mean() < 0.95
         assert_as_on_host(kind, points, out, method)
@@ -57,7 +57,7 @@ def test_results_are_those_of_the_host(kind, method, toi, device):
 
 
 def test_arrays_are_used_again_by_other_kinds_methods_and_types(device):
-    out = bsc.QueryArrays(60 * len(SOURCES), device=device)
+    out = bsc.DeviceQueryResult(60 * len(SOURCES), device=device)
     for seed, (kind, method, dtype) in enumerate(
         [("vertex_face", "exact", np.float64), ("edge_edge", "float", np.float32), ("vertex_face", "exact", np.float32)]
     ):
@@ -73,7 +73,7 @@ def test_a_graph_decides_what_the_array_then_holds(kind, method, device):
     """On the CPU too, where a graph runs the call at each replay."""
     query = getattr(bsc, f"query_{kind}")
     points = on(device, queries(kind, np.float32))
-    out = bsc.QueryArrays(len(points), device=device)
+    out = bsc.DeviceQueryResult(len(points), device=device)
     query(points, method=method, out=out)
     with wp.ScopedCapture(device) as capture:
         query(points, method=method, out=out)
@@ -87,7 +87,7 @@ def test_a_graph_decides_what_the_array_then_holds(kind, method, device):
 @pytest.mark.gpu
 def test_a_graph_needs_a_first_call(device):
     points = on(device, queries("vertex_face", np.float32))
-    out = bsc.QueryArrays(len(points), device=device)
+    out = bsc.DeviceQueryResult(len(points), device=device)
     with wp.ScopedCapture(device), pytest.raises(RuntimeError, match="query once"):
         bsc.query_vertex_face(points, out=out)
 
@@ -100,7 +100,7 @@ def test_points_that_are_not_finite_are_counted_and_hits(kind, method, device):
     bad = np.arange(0, n, 7)
     values = np.resize([np.nan, np.inf, -np.inf], len(bad))
     points[bad, np.resize(np.arange(8), len(bad)), np.resize(np.arange(3), len(bad))] = values
-    out = bsc.QueryArrays(n, device=device)
+    out = bsc.DeviceQueryResult(n, device=device)
     getattr(bsc, f"query_{kind}")(on(device, points), method=method, out=out)
     assert out.not_finite.numpy().item() == len(bad)
     assert out.hit.numpy()[bad].all() and (out.status.numpy()[bad] == 2).all()
@@ -121,7 +121,7 @@ def test_what_is_too_wide_for_the_device_is_counted_and_a_hit(device):
     points[40:, :, 0] *= 2.0**-500
     points[40:, [0, 4], 0] += 1.0
     points[40:, [1, 5], 0] += 1.0
-    out = bsc.QueryArrays(80, device=device)
+    out = bsc.DeviceQueryResult(80, device=device)
     bsc.query_vertex_face(on(device, points), out=out)
     left = out.undecided.numpy().item()
     assert 0 < left < 40
@@ -136,13 +136,13 @@ def test_what_is_too_wide_for_the_device_is_counted_and_a_hit(device):
 
 
 def test_no_queries_need_no_memory(device):
-    out = bsc.QueryArrays(0, device=device)
+    out = bsc.DeviceQueryResult(0, device=device)
     assert bsc.query_edge_edge(wp.empty((0, 8), dtype=wp.vec3, device=device), out=out).hit.shape == (0,)
 
 
 def test_calls_on_one_core_and_on_all_find_the_same(device):
     points = queries("edge_edge", np.float64, n=600)
-    out = bsc.QueryArrays(len(points), device=device)
+    out = bsc.DeviceQueryResult(len(points), device=device)
     bsc.query_edge_edge(on(device, points), out=out)
     toi = out.toi.numpy().copy()
     with cores(1):
@@ -165,11 +165,11 @@ def test_calls_on_one_core_and_on_all_find_the_same(device):
         ({"min_distance": 0.1}, ValueError, "min_distance must be 0"),
         ({"method": "fast"}, ValueError, "method"),
         ({"tolerance": 2.0}, ValueError, "tolerance"),
-        ({"out": np.zeros(3)}, TypeError, "out must be a QueryArrays"),
+        ({"out": np.zeros(3)}, TypeError, "out must be a DeviceQueryResult"),
     ],
 )
 def test_bad_arguments_are_refused(change, error, message):
-    arguments = {"points": wp.zeros((3, 8), dtype=wp.vec3, device="cpu"), "out": bsc.QueryArrays(3, device="cpu")}
+    arguments = {"points": wp.zeros((3, 8), dtype=wp.vec3, device="cpu"), "out": bsc.DeviceQueryResult(3, device="cpu")}
     with pytest.raises(error, match=message):
         bsc.query_vertex_face(**(arguments | change))
 
@@ -177,4 +177,4 @@ def test_bad_arguments_are_refused(change, error, message):
 @pytest.mark.parametrize("count", [-1, 2**28, 1.5])
 def test_bad_counts_are_refused(count):
     with pytest.raises((TypeError, ValueError), match="count"):
-        bsc.QueryArrays(count, device="cpu")
+        bsc.DeviceQueryResult(count, device="cpu")

@@ -311,8 +311,8 @@ def calls() -> dict[str, Call]:
         {"mesh": OBJECTS, "distance": POSITIVE, "rings": NOT_COUNT},
         raises=ProximityFinder.__init__,
     )
-    found["QueryArrays"] = Call(
-        bsc.QueryArrays,
+    found["DeviceQueryResult"] = Call(
+        bsc.DeviceQueryResult,
         {"count": 1, "device": "cpu"},
         {"count": NOT_COUNT | {"huge": 2**28}, "toi": FLAGS, "device": without(DEVICES)},
     )
@@ -658,7 +658,7 @@ def calls_of_solvers() -> dict[str, Call]:
 
 RESULTS = {
     "CapturedCollisions",
-    "CollisionArrays",
+    "DifferentiableContacts",
     "Collisions",
     "DetectionStats",
     "IntervalResult",

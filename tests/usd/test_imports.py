@@ -21,7 +21,7 @@ def imported_by(path):
 
 def test_openusd_is_imported_in_one_package_only():
     importing = {path for path in PACKAGE.rglob("*.py") if "pxr" in imported_by(path)}
-    plugins = {PACKAGE / "replay" / f"{name}.py" for name in ("usd_validation", "usdview_plugin")}  # of its programs
+    plugins = {PACKAGE / "scene_replay" / f"{name}.py" for name in ("usd_validation", "usdview_plugin")}  # of its programs
     assert plugins <= importing
     assert {path.parent.name for path in importing - plugins} == {"usd"}
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 import warp as wp
 
-from .differentiable import CollisionArrays
+from .differentiable import DifferentiableContacts
 from .narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
 from .run.settings import Counts, DistanceKind, Method, PairCounts
 from .run.stage_timer import StageTimer, StageTimers
@@ -159,7 +159,7 @@ class Collisions:
 
     certified: bool
     overflows: tuple[str, ...]
-    arrays: CollisionArrays | None
+    arrays: DifferentiableContacts | None
     _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
@@ -324,7 +324,7 @@ class CapturedCollisions:
             gradients.
     """
 
-    arrays: CollisionArrays | None
+    arrays: DifferentiableContacts | None
     _read: Callable[[], Collisions] = field(repr=False)
 
     def __bool__(self) -> bool:

@@ -13,7 +13,7 @@ from .arcs.rigid_motion import ArcBounds, RigidMotion
 from .at_rest.intersections import IntersectionFinder, find_intersections
 from .at_rest.proximities import Proximities, ProximityFinder, least_distance
 from .collisions import Candidates, CapturedCollisions, Collisions, FreeStep
-from .differentiable import CollisionArrays
+from .differentiable import DifferentiableContacts
 from .inversions import Inversions, inversions_of_motion
 from .mesh import CollisionMesh
 from .narrow.contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
@@ -579,7 +579,7 @@ class CollisionDetector:
         return CapturedCollisions(arrays, read_alone)
 
     def _differentiable(self, x0, x1, contacts):
-        return CollisionArrays(x0, x1, self.mesh, self.tolerance, contacts, self._pipeline.device_radius)
+        return DifferentiableContacts(x0, x1, self.mesh, self.tolerance, contacts, self._pipeline.device_radius)
 
 
 def _partway(x0: np.ndarray, x1: np.ndarray, share: float, last: np.ndarray) -> np.ndarray:

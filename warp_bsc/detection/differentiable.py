@@ -15,7 +15,7 @@ from .narrow.contact_buffer import ContactBuffer
 from .run.launch import launch, made_once
 from .run.settings import DistanceKind
 
-__all__ = ["CollisionArrays"]
+__all__ = ["DifferentiableContacts"]
 
 
 @made_once
@@ -104,7 +104,7 @@ def _distance_kernel(dtype: type) -> wp.Kernel:
     return differentiate_distances
 
 
-class CollisionArrays:
+class DifferentiableContacts:
     """The collisions of one motion as Warp arrays on the device, in the order of :class:`Collisions`.
 
     Times, coordinates and normals are differentiable functions of the positions; which pairs collide is a constant.

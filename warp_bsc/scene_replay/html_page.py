@@ -24,7 +24,7 @@ _SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
 
 def shared_part(name: str) -> Traversable:
     """Returns a part that pages share."""
-    return resources.files("warp_bsc.replay") / "page" / name
+    return resources.files("warp_bsc.scene_replay") / "page" / name
 
 
 def fill_page(page: Traversable, scripts: Iterable[Traversable], title: str) -> tuple[str, str, str]:

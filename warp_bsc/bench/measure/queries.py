@@ -10,7 +10,7 @@ import warp as wp
 
 from ..._arguments import checked_integer
 from ...detection.queries.query import query_edge_edge, query_vertex_face
-from ...detection.queries.query_arrays import QueryArrays
+from ...detection.queries.query_arrays import DeviceQueryResult
 from ...detection.run.launch import launch_over, launch_over_queue
 from ...detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, PairKind
 from ...kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, impact_vertex_face
@@ -272,7 +272,7 @@ def benchmark_queries(
     find_status, find_impact, cull, classify_survivors, find_exact_status = _kernels(kind)
     points = generate_queries(kind, count, device=device)
     query = query_vertex_face if kind == PairKind.VERTEX_FACE else query_edge_edge
-    out = QueryArrays(count, device=device)
+    out = DeviceQueryResult(count, device=device)
     touching = generate_touching_queries(kind, count, device=device)
     # no status is -1
     status = {mode: wp.full(count, -1, dtype=wp.int8, device=device) for mode in MODES} | {"function": out.status}

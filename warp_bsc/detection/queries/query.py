@@ -19,7 +19,7 @@ from ..run.launch import retry_until_fits
 from ..run.settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
 from ..run.stage_timer import StageTimer
 from ..run.start import checked_device
-from .query_arrays import QueryArrays, query_into
+from .query_arrays import DeviceQueryResult, query_into
 from .query_points import mesh_of_rows
 
 __all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_face", "query_vertex_vertex"]
@@ -68,8 +68,8 @@ def query_vertex_face(
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
-    out: QueryArrays,
-) -> QueryArrays: ...
+    out: DeviceQueryResult,
+) -> DeviceQueryResult: ...
 def query_vertex_face(
     points: ArrayLike | wp.array,
     *,
@@ -78,8 +78,8 @@ def query_vertex_face(
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
-    out: QueryArrays | None = None,
-) -> QueryResult | QueryArrays:
+    out: DeviceQueryResult | None = None,
+) -> QueryResult | DeviceQueryResult:
     """Returns which moving vertices meet their moving triangles.
 
     Args:
@@ -92,8 +92,8 @@ def query_vertex_face(
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
         out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
-            call, see :class:`QueryArrays`. The points must be a contiguous Warp array on the same device, and there
-            must be no minimum distance.
+            call, see :class:`DeviceQueryResult`. The points must be a contiguous Warp array on the same device, and
+            there must be no minimum distance.
 
     Returns:
         QueryResult: One row a query; or ``out``.
@@ -129,8 +129,8 @@ def query_edge_edge(
     method: Method = "exact",
     toi: bool = True,
     tolerance: float = TOLERANCE,
-    out: QueryArrays,
-) -> QueryArrays: ...
+    out: DeviceQueryResult,
+) -> DeviceQueryResult: ...
 def query_edge_edge(
     points: ArrayLike | wp.array,
     *,
@@ -139,8 +139,8 @@ def query_edge_edge(
     toi: bool = True,
     tolerance: float = TOLERANCE,
     device: wp.DeviceLike = None,
-    out: QueryArrays | None = None,
-) -> QueryResult | QueryArrays:
+    out: DeviceQueryResult | None = None,
+) -> QueryResult | DeviceQueryResult:
     """Returns which pairs of moving edges meet.
 
     Args:
@@ -153,8 +153,8 @@ def query_edge_edge(
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
         out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
-            call, see :class:`QueryArrays`. The points must be a contiguous Warp array on the same device, and there
-            must be no minimum distance.
+            call, see :class:`DeviceQueryResult`. The points must be a contiguous Warp array on the same device, and
+            there must be no minimum distance.
 
     Returns:
         QueryResult: One row a query; or ``out``.
@@ -233,7 +233,7 @@ def query_vertex_vertex(
 
 
 def _query_into(
-    out: QueryArrays,
+    out: DeviceQueryResult,
     kind: PairKind,
     points: ArrayLike | wp.array,
     min_distance: ArrayLike,
@@ -241,9 +241,9 @@ def _query_into(
     timed: bool,
     tolerance: float,
     device: wp.DeviceLike,
-) -> QueryArrays:
+) -> DeviceQueryResult:
     """Decides queries whose results stay on the device."""
-    check_instance(out, "out", QueryArrays, "a QueryArrays")
+    check_instance(out, "out", DeviceQueryResult, "a DeviceQueryResult")
     if not isinstance(points, wp.array):
         raise TypeError(f"points must be a Warp array if there is out, not {type(points).__name__}")
     checked_choice(method, "method", METHODS)

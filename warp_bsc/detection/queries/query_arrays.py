@@ -16,7 +16,7 @@ from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, Pai
 from ..run.stage_timer import StageTimer
 from ..run.start import checked_device
 
-__all__ = ["QueryArrays", "query_into"]
+__all__ = ["DeviceQueryResult", "query_into"]
 
 _MAX_QUERIES = 2**28 - 1
 """Their eight points each are numbered by int32."""
@@ -121,13 +121,13 @@ def _write_contacts(
         rows.normal[i] = contacts.normal[slot]
 
 
-class QueryArrays:
+class DeviceQueryResult:
     """Results of elementary queries as arrays on their device, for ``out=`` of the functions that query.
 
     Nothing is copied to the host, and nothing waits for the device. After a first call, which allocates buffers and
     loads kernels, a CUDA graph may capture the calls; each replay decides the points that the array then holds::
 
-        out = bsc.QueryArrays(len(points), device=points.device)
+        out = bsc.DeviceQueryResult(len(points), device=points.device)
         bsc.query_vertex_face(points, out=out)
         with wp.ScopedCapture(points.device) as capture:
             bsc.query_vertex_face(points, out=out)
@@ -233,7 +233,7 @@ class QueryArrays:
         )
 
 
-def query_into(out: QueryArrays, kind: PairKind, points: wp.array, method: Method, tolerance: float) -> None:
+def query_into(out: DeviceQueryResult, kind: PairKind, points: wp.array, method: Method, tolerance: float) -> None:
     """Decides queries on the device of their points, or adds this to the graph that the device captures.
 
     Args:
@@ -260,7 +260,7 @@ def query_into(out: QueryArrays, kind: PairKind, points: wp.array, method: Metho
     out._loaded.add(key)
 
 
-def _vectors_of(points: wp.array, out: QueryArrays) -> wp.array:
+def _vectors_of(points: wp.array, out: DeviceQueryResult) -> wp.array:
     """Returns the points of queries as a view, array of vec3 or vec3d, shape [8 n], see :func:`query_into`."""
     dtypes = {wp.float32: wp.vec3, wp.float64: wp.vec3d, wp.vec3: wp.vec3, wp.vec3d: wp.vec3d}
     if points.dtype not in dtypes:

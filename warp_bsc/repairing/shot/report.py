@@ -73,7 +73,7 @@ class RepairPage:
             OSError: If the disk is full.
             ValueError: If the scene cannot be read again.
         """
-        page = resources.files("warp_bsc.repair.shot") / "page"
+        page = resources.files("warp_bsc.repairing.shot") / "page"
         shared = (shared_part(name) for name in ("blocks.js", "elements.js", "view3d.js"))
         head, between, end = fill_page(page / "page.html", [*shared, page / "repair.js"], _title(scene))
         self.file.write(head)

@@ -101,7 +101,7 @@ def test_the_program_of_the_documentation(stage, capsys):
 PROGRAMS = [
     "import warp_bsc as bsc; bsc.replay; import warp_bsc.scene_replay.summary",
     "import warp_bsc.scene_replay.summary; import warp_bsc as bsc",
-    "import warp_bsc as bsc; from warp_bsc.replay import summary, html_report",
+    "import warp_bsc as bsc; from warp_bsc.scene_replay import summary, html_report",
     "from warp_bsc.scene_replay.results import IntervalResult; import warp_bsc as bsc",
     "import warp_bsc.cli.replay; import warp_bsc as bsc; bsc.Scene",
 ]

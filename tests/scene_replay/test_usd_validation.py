@@ -89,7 +89,7 @@ def test_a_mesh_inside_another_is_a_warning(tmp_path):
 
 @pytest.mark.parametrize(
     "statement",
-    ["import warp_bsc.scene_replay.usd_validation as rules", "from warp_bsc.replay import usd_validation as rules"],
+    ["import warp_bsc.scene_replay.usd_validation as rules", "from warp_bsc.scene_replay import usd_validation as rules"],
 )
 def test_the_module_is_imported_although_a_function_hides_its_package(statement):
     program = f"{statement}; import warp_bsc; assert callable(warp_bsc.replay); print(rules.NAME)"

@@ -15,7 +15,7 @@ from usdview import Menu, Registry, UsdviewApi, define_usdview
 import warp_bsc as bsc
 
 SUPPORT = Path(__file__).parents[1] / "support"
-PLUGIN = Path(bsc.__file__).parent / "replay" / "plugin"
+PLUGIN = Path(bsc.__file__).parent / "scene_replay" / "plugin"
 
 
 @pytest.fixture
