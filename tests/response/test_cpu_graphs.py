@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from test_solver import DT, SOLVERS, bullet
+from newton_scenes import DT, SOLVERS, bullet
 
 import warp_bsc as bsc
 from warp_bsc.detection.run import host_function

@@ -6,7 +6,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from test_solver import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
+from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
 

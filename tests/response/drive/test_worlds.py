@@ -6,9 +6,9 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from body_scenes import add_body, free
 from newton_scenes import DT, SOLVERS, STIFF, Changed, add_crossing_sheets, add_patch, add_plates, bullet
-from test_bodies import add_body, free
-from test_search import stage
+from small_queues import stage
 
 import warp_bsc as bsc
 

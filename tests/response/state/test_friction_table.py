@@ -6,10 +6,10 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from body_scenes import add_body, free
+from body_scenes import finalize as finalize_bodies
 from newton_scenes import DT, SOLVERS, add_patch, semi_implicit
-from test_bodies import add_body, free
-from test_bodies import finalize as finalize_bodies
-from test_style3d_contacts import drape
+from style3d_scenes import drape
 
 import warp_bsc as bsc
 

@@ -30,6 +30,6 @@ def test_an_openusd_that_is_too_old_is_named(monkeypatch):
 
 
 def test_the_oldest_openusd_is_that_of_the_extra():
-    project = Path(__file__).parents[2] / "pyproject.toml"
+    project = Path(__file__).parents[3] / "pyproject.toml"
     extras = tomllib.loads(project.read_text())["project"]["optional-dependencies"]
     assert extras["usd"] == ["usd-core>={}.{}".format(*OLDEST)]

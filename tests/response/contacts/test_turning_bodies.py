@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 from newton_scenes import SOLVERS, STIFF, Changed, add_patch
 from scipy.spatial.transform import Rotation
-from test_search import stage as hierarchy_stage
+from small_queues import stage as hierarchy_stage
 
 import warp_bsc as bsc
 from warp_bsc.response.state import motion as motion_module

@@ -16,7 +16,7 @@ from newton_scenes import DT, bullet
 
 import warp_bsc as bsc
 
-PAGE = Path(__file__).parents[2] / "docs" / "newton" / "isaac_lab.md"
+PAGE = Path(__file__).parents[3] / "docs" / "newton" / "isaac_lab.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
 SOLVERS = {"Implicit": bsc.SolverImplicit, "CCD": bsc.SolverCCD}
 

@@ -8,37 +8,15 @@ from newton_scenes import DT, SOLVERS, STIFF, Rollout, bullet, crossing_sheets
 from pile_energy import DT as PILE_DT
 from pile_energy import pile
 from sheets import crumpled
+from small_queues import stage
 
 import warp_bsc as bsc
-from warp_bsc.detection import pipeline
-from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.response.contacts.detect import inspect
 from warp_bsc.response.contacts.proximities import add_proximities
 from warp_bsc.response.state.motion import arrays_of
 from warp_bsc.response.state.status import Result
 from warp_bsc.response.state.structs import NEVER
 from warp_bsc.response.state.workspace import pairs_of
-
-CAPACITY = 4
-
-
-def make_hierarchy(mesh, count, *, capacity=None, not_finite=None, checked_vertices=None, **options):
-    """The broad phase of a GPU, which stages on the CPU get here too."""
-    assert checked_vertices is None
-    return BroadPhaseHierarchy(mesh, count, capacity=capacity, not_finite=not_finite, **options)
-
-
-def stage(model, monkeypatch, *, tiny, inner="vbd", make=bsc.SolverCCD, **options):
-    """A stage, with queues for four pairs that cannot grow if it is ``tiny``: those of a CUDA graph cannot."""
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "make_broad_phase", make_hierarchy)
-        solver = make(SOLVERS[inner](model) if isinstance(inner, str) else inner, **options)
-    if tiny:
-        detector = solver._work.detector
-        detector.broad_phase._face_pairs = wp.empty(CAPACITY, dtype=wp.vec2i, device=detector.mesh.device)
-        detector.capacities = detector._device_capacities()
-        detector.grow = lambda: False
-    return solver
 
 
 def test_static_faces_have_little_room_in_queues(device):

@@ -19,7 +19,7 @@ from newton_scenes import (
     place_plates,
     strands,
 )
-from test_search import stage
+from small_queues import stage
 
 import warp_bsc as bsc
 

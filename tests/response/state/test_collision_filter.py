@@ -6,11 +6,11 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from body_scenes import add_body, boxes, free
+from body_scenes import finalize as finalize_bodies
 from filtered_models import judge
 from newton_scenes import DT, SOLVERS, Changed, Rollout, add_patch, bullet
-from test_bodies import add_body, boxes, free
-from test_bodies import finalize as finalize_bodies
-from test_search import stage
+from small_queues import stage
 
 import warp_bsc as bsc
 from warp_bsc.response.state.mesh import ModelMesh
