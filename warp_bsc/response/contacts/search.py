@@ -107,28 +107,34 @@ def _decide_pair(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.v
         _resolve(arguments, kind, pair, corners, owner, result.toi, result.toi, ZERO)
 
 
-@wp.func
-def _decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
-    """Resolves a pair with a turning vertex if it is in contact on its arcs, or comes nearer there than it may."""
-    motion, arcs = arguments.step.motion, arguments.arcs
-    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(motion.x0, arguments.step.vertices.x1, corners)
-    most = distance_of_corners(kind, corners, arcs.deviation)
-    if motion.distances.radius:
-        most = ABOVE_SUM * (most + distance_of_corners(kind, corners, motion.distances.radius))
-    relative, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
-    if clears_at_once(relative, scaled):
-        return
-    start = ZERO
-    kept = ZERO
-    result = Impact()
-    if motion.distances.radius:
-        start, kept = distances_at_start(motion, corners, kind)
-        result = impact_on_arcs_at_distance(kind, corners, motion.x0, arguments.step.vertices.x1, arcs, kept)
-    else:
-        result = impact_on_arcs(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, ZERO)
-        start = result.toi
-    if result.status != FREE:
-        _resolve(arguments, kind, pair, corners, owner, start, result.toi, kept)
+@functools.cache
+def _arc_function(keep_distances: bool) -> wp.Function:
+    """Returns the function for pairs with a turning vertex: with distances or without, each is large to compile."""
+
+    @wp.func
+    def decide_on_arcs(arguments: _Arguments, kind: int, pair: wp.vec2i, corners: wp.vec4i, owner: int):
+        """Resolves a pair with a turning vertex if it is in contact on its arcs, or comes nearer there than it may."""
+        motion, arcs = arguments.step.motion, arguments.arcs
+        a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(motion.x0, arguments.step.vertices.x1, corners)
+        most = distance_of_corners(kind, corners, arcs.deviation)
+        if wp.static(keep_distances):
+            most = ABOVE_SUM * (most + distance_of_corners(kind, corners, motion.distances.radius))
+        relative, scaled = motion_and_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, most, ROUNDOFF)
+        if clears_at_once(relative, scaled):
+            return
+        start = ZERO
+        kept = ZERO
+        result = Impact()
+        if wp.static(keep_distances):
+            start, kept = distances_at_start(motion, corners, kind)
+            result = impact_on_arcs_at_distance(kind, corners, motion.x0, arguments.step.vertices.x1, arcs, kept)
+        else:
+            result = impact_on_arcs(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, ZERO)
+            start = result.toi
+        if result.status != FREE:
+            _resolve(arguments, kind, pair, corners, owner, start, result.toi, kept)
+
+    return decide_on_arcs
 
 
 @wp.func
@@ -146,7 +152,7 @@ def _point_pair(mesh: FaceHierarchy, point: int, other: int):
 @functools.cache
 def _kernel(keep_distances: bool, padded: bool, on_arcs: bool) -> wp.Kernel:
     """The kernel, made where it is first needed, as it takes long to compile."""
-    decide = _decide_distance if keep_distances else _decide_pair
+    decide, decide_on_arcs = _decide_distance if keep_distances else _decide_pair, _arc_function(keep_distances)
     element_pairs = pair_functions(padded, False).element_pairs
 
     @wp.func
@@ -181,7 +187,7 @@ def _kernel(keep_distances: bool, padded: bool, on_arcs: bool) -> wp.Kernel:
                         if turns(arguments.arcs, corners):
                             straight = False
                             if not are_of_one_group(arguments.arcs, corners):
-                                _decide_on_arcs(arguments, kind, pair, corners, owner)
+                                decide_on_arcs(arguments, kind, pair, corners, owner)
                 if owner != ContactClass.NONE and straight:
                     decide(arguments, kind, pair, corners, owner)
 
