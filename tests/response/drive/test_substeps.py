@@ -55,7 +55,7 @@ def read(report):
     }
     return said | {
         "contacts": report.forces.contacts.numpy(),
-        "bits": report.find_vertices(0xFFFF),
+        "bits": report.outcomes.find(0xFFFF),
         "cut": report.truncated,
     }
 

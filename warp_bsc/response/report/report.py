@@ -12,12 +12,13 @@ from newton.viewer import ViewerBase
 from ..._arguments import check_instance, checked_number
 from ...detection.at_rest.intersections import find_intersections
 from ..state.status import Result, views_of
-from ..state.structs import FROZEN, INVALID, NOT_FINITE, TRUNCATED, UNCERTIFIED
+from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, UNCERTIFIED
 from ..state.workspace import Workspace
 from .count_steps import StepResults
 from .drawing import Drawing
 from .forces.contact_report import ContactReport
 from .inside import Inside, InsideFinder
+from .outcomes import Outcomes
 from .step_warnings import StepWarnings
 from .text import line_of
 from .totals import GradientTotals, Penetrated, StepTotals, Totals
@@ -46,6 +47,7 @@ class SolverReport:
 
     Attributes:
         step_results: What the last step did, on the device, which the other attributes read.
+        outcomes: What became of each vertex and body in it, read on the host, :class:`.outcomes.Outcomes`.
         impulses_elsewhere: What resolves contacts before the stage in the last step, so that its impulses on them are
             small; None if nothing is known to.
     """
@@ -63,6 +65,7 @@ class SolverReport:
         self.step_results.results = wp.zeros(len(Result), dtype=int, device=work.device)
         self.step_results.of_vertices = wp.zeros_like(work.vertices.outcome)
         self.step_results.of_bodies = wp.zeros(work.body_count, dtype=int, device=work.device)
+        self.outcomes = Outcomes(work.mesh, self.step_results)
         self.last_strain = wp.zeros(work.worlds, dtype=float, device=work.device)  # by world
         self.set_steps = wp.zeros(work.body_count, dtype=int, device=work.device)  # of bodies, see find_set_bodies
         self.total_values = wp.zeros(len(StepTotals.vars), dtype=wp.int64, device=work.device)
@@ -247,7 +250,7 @@ class SolverReport:
         They stood where they were at its start, and the step is not certified. Without a response they are left as the
         inner solver made them.
         """
-        count = int(np.count_nonzero(self.find_vertices(NOT_FINITE)[: self._mesh.model.particle_count]))
+        count = int(np.count_nonzero(self.outcomes.find(NOT_FINITE)[: self._mesh.model.particle_count]))
         self.warn()
         return count
 
@@ -261,7 +264,8 @@ class SolverReport:
         the array is also empty if nothing but the position of a body is not finite. Gathered on the host, on each
         access.
         """
-        listed = self.find_uncertified()[: self._mesh.model.particle_count]
+        listed = self.outcomes.find_uncertified()[: self._mesh.model.particle_count]
+        self.warn()
         return np.flatnonzero(listed).astype(np.int32)
 
     @property
@@ -276,19 +280,10 @@ class SolverReport:
         if self.certified or not model.body_count:
             return np.empty(0, dtype=np.int32)
         first = model.particle_count
-        bodies = np.unique(self._mesh.shape_vertices.body[self.find_vertices(UNCERTIFIED)[first:]])
+        bodies = np.unique(self._mesh.shape_vertices.body[self.outcomes.find(UNCERTIFIED)[first:]])
         if self.coupled is not None:
             bodies = np.union1d(bodies, self.coupled.find_bodies())
         return bodies[bodies >= 0].astype(np.int32)
-
-    def find_uncertified(self) -> np.ndarray:
-        """Returns which vertices of the mesh the certificate of the last step lacks, bool, shape [vertex_count]."""
-        outcome = self.step_results.of_vertices.numpy()
-        listed, invalid = ((outcome & int(bit)) != 0 for bit in (UNCERTIFIED, INVALID))
-        for elements in (self._mesh.faces, self._mesh.edges):
-            listed[elements[invalid[elements].any(axis=1)]] = True
-        self.warn()
-        return listed
 
     @property
     def detection_incomplete(self) -> bool:
@@ -307,12 +302,12 @@ class SolverReport:
     @property
     def truncated(self) -> int:
         """Vertices and bodies whose paths were truncated in the last step, so that they stay on their side."""
-        return self._count_vertices(TRUNCATED)
+        return self._count(TRUNCATED)
 
     @property
     def frozen(self) -> int:
         """Vertices and bodies that were frozen where they were at the start of the last step."""
-        return self._count_vertices(FROZEN)
+        return self._count(FROZEN)
 
     @property
     def intersections(self) -> np.ndarray:
@@ -446,8 +441,8 @@ class SolverReport:
                 self._warnings.once("undrawn", lambda: _INCOMPLETE)
         elif self.responds:
             self._warnings.once("undrawn", lambda: _NOT_DRAWN)
-        vertices = {"truncated": self.find_vertices(TRUNCATED), "frozen": self.find_vertices(FROZEN)}
-        vertices["uncertified"] = self.find_uncertified()
+        vertices = {"truncated": self.outcomes.find(TRUNCATED), "frozen": self.outcomes.find(FROZEN)}
+        vertices["uncertified"] = self.outcomes.find_uncertified()
         self._drawing.draw(viewer, self._work.vertices.x1.numpy(), contacts, vertices, impulse_scale)
 
     @functools.cached_property
@@ -470,18 +465,8 @@ class SolverReport:
         """Whether the stage keeps tetrahedra from inverting, so that its certificate covers that."""
         return self._work.ends is not None
 
-    def find_vertices(self, bit) -> np.ndarray:
-        """Returns which vertices have a bit of the outcome, themselves or their body, bool, shape [vertex_count]."""
-        results, mesh = self.step_results, self._mesh
-        found = (results.of_vertices.numpy() & int(bit)) != 0
-        if len(results.of_bodies):
-            body = mesh.shape_vertices.body
-            of_bodies = np.append((results.of_bodies.numpy() & int(bit)) != 0, False)  # last: of no body
-            found[mesh.model.particle_count :] |= of_bodies[body]
-        return found
-
-    def _count_vertices(self, bit):
-        outcomes = self.step_results.of_vertices, self.step_results.of_bodies
-        count = sum(int(np.count_nonzero(outcome.numpy() & int(bit))) for outcome in outcomes)
+    def _count(self, bit):
+        """Returns the number of vertices and bodies that have a bit of the outcome, and warns."""
+        count = self.outcomes.count(bit)
         self.warn()
         return count

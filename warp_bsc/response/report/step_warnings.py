@@ -74,7 +74,7 @@ class StepWarnings:
 
     def _of_not_finite(self):
         model = self._report.model
-        found = self._report.find_vertices(NOT_FINITE)[: model.particle_count]
+        found = self._report.outcomes.find(NOT_FINITE)[: model.particle_count]
         return not_finite_warning(model, np.flatnonzero(found))
 
     def _of_revoked(self):
@@ -84,7 +84,7 @@ class StepWarnings:
 
     def _of_uncertified(self):
         report, model = self._report, self._report.model
-        listed, first = report.find_uncertified(), model.particle_count
+        listed, first = report.outcomes.find_uncertified(), model.particle_count
         particles, shapes = np.flatnonzero(listed[:first]), np.unique(report.shape_of_vertices[listed[first:]])
         return uncertified_warning(model, particles, shapes, may_invert=report.prevents_inversions)
 
