@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from .._sorted_keys import expand_ranges
 from ..detection.mesh import CollisionMesh
 
 __all__ = ["ContourKind", "Contours", "trace_contours"]
@@ -70,9 +71,8 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
 def faces_of_edges(mesh: CollisionMesh, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the faces of edges: the row of the edge, and the face, each of shape [m], in the order of the rows."""
     first, faces = mesh.edge_faces
-    counts = first[edges + 1] - first[edges]
-    rows = np.repeat(np.arange(len(edges)), counts)
-    return rows, faces[np.arange(len(rows)) + np.repeat(first[edges] - (np.cumsum(counts) - counts), counts)]
+    rows, places = expand_ranges(first[edges], first[edges + 1])
+    return rows, faces[places]
 
 
 def connected_components(count: int, edges: np.ndarray) -> np.ndarray:

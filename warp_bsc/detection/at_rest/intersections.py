@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from ... import checker
 from ..._arguments import check_finite, check_instance
 from ..._one_thread import one_at_a_time
-from ..._sorted_keys import distinct
+from ..._sorted_keys import distinct, expand_ranges
 from ...kernels.crossing import edge_beside_face, edge_crosses_face
 from ...kernels.exact.edge_face import BITS, edge_meets_face_in
 from ...kernels.motion import double
@@ -397,9 +397,7 @@ class _Incidence:
 
     def of(self, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns all elements that have some parts: the row of the part, and the element, each of shape [m]."""
-        first, counts = self._starts[parts], self._starts[parts + 1] - self._starts[parts]
-        rows = np.repeat(np.arange(len(parts)), counts)
-        places = np.arange(len(rows)) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+        rows, places = expand_ranges(self._starts[parts], self._starts[parts + 1])
         return rows, self._elements[places]
 
 
