@@ -260,6 +260,10 @@ class CollisionMesh:
         """Vertex indices of the tetrahedra on the device, two-dimensional Warp array of int."""
         return wp.array(self.tets, dtype=int, device=self.device)
 
+    def elements(self, kind: PairKind | DistanceKind) -> np.ndarray:
+        """Returns the faces for pairs of a vertex and a face, else the edges."""
+        return self.faces if kind == PairKind.VERTEX_FACE else self.edges
+
     def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
         """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.
 

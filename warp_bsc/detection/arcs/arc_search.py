@@ -85,10 +85,7 @@ class ArcSearch:
             body=body,
             only_used_vertices=True,
         )
-        self._elements = {
-            DistanceKind(phase.kind): mesh.faces if phase.kind == DistanceKind.VERTEX_FACE else mesh.edges
-            for phase in self._pipeline.narrow_phases
-        }
+        self._elements = {DistanceKind(n.kind): mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
 
     def find(
         self, bounds: ArcBounds, x0: wp.array, changed: wp.array | None, timer: StageTimer

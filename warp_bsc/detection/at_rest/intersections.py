@@ -18,8 +18,8 @@ from ...kernels.motion import double
 from ...kernels.pipeline.queues import is_filled, take_slot
 from ...kernels.signs import FREE, HIT, UNSURE
 from ..broad.broad_phase import BroadPhase, make_broad_phase
-from ..collisions import Collisions
 from ..mesh import CollisionMesh
+from ..results.collisions import Collisions
 from ..run.launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 

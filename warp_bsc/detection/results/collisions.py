@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 import warp as wp
 
+from ..narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
+from ..run.settings import Counts, DistanceKind, Method, PairCounts
+from ..run.stage_timer import StageTimer, StageTimers
 from .differentiable import CollisionArrays
-from .narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
-from .run.settings import Counts, DistanceKind, Method, PairCounts
-from .run.stage_timer import StageTimer, StageTimers
 
 __all__ = [
     "Candidates",
