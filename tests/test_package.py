@@ -70,7 +70,7 @@ PACKAGES = {
         "_profiling",
         "_warnings",
     },
-    "repair": {"detection", "response", "kernels", "usd", "replay", "_arguments", "_atomic_file", "_sorted_keys"},
+    "repair": {"detection", "response", "kernels", "usd", "replay", "_arguments", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread", "_sorted_keys", "_warnings"},
     "replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},
     "bench": {

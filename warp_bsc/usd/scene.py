@@ -19,9 +19,6 @@ USD stores points in single precision, transforms in double. If every transform 
 stored ones in single precision; otherwise all are computed and returned in double precision.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import math
 import os
 import threading

@@ -1,8 +1,5 @@
 """Warns of transforms that straight paths hide: large turns between two times, and scales of 0. Imports pxr."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import math
 
 import numpy as np

@@ -31,9 +31,7 @@ class ArcDetector:
             min_distance: As of :class:`.detector.CollisionDetector`.
             rings: The same.
         """
-        self._mesh, self._lock = straight.mesh, straight.broad_phase.lock
-        self._has_distance = straight.radius is not None
-        self._options = {"method": straight.method, "tolerance": straight.tolerance}
+        self._straight = straight
         self._distances = {"min_distance": min_distance, "rings": rings}
         self.at_once: ArcPipeline | None = None
         self._by_parts: tuple[ArcSearch, CollisionFinder | None] | None = None  # the second for vertices without bodies
@@ -49,23 +47,24 @@ class ArcDetector:
         """
         if x0.requires_grad or x1.requires_grad:
             raise ValueError("arcs: x0 and x1 must not require gradients")
-        mesh, body = self._mesh, arcs.body
+        mesh, method, body = self._straight.mesh, self._straight.method, arcs.body
         bounds = ArcBounds(arcs, mesh.device_vertices, x0, x1)
-        if not self._has_distance and ArcPipeline.is_for(bounds):
+        if self._straight.radius is None and ArcPipeline.is_for(bounds):
             at_once = self.at_once
             if at_once is None or not np.array_equal(at_once.body, body):
-                at_once = self.at_once = ArcPipeline(mesh, bounds, self._lock, **self._options)
+                at_once = self.at_once = ArcPipeline(self._straight, bounds)
             at_once.set_motion(bounds)
             at_once.bound(x0, x1)
             found = at_once.finder.find(x0, x1, changed=changed)
             if not at_once.has_unsure_pairs(found._rows):
                 return found
         if self._by_parts is None or not np.array_equal(self._by_parts[0].body, body):
-            options, others = self._options | self._distances, None
+            others = None
             if (body[mesh.vertices] < 0).any():
-                straight = DetectionPipeline(straight_mesh(mesh, body >= 0), **options, only_used_vertices=True)
-                others = CollisionFinder(straight, self._lock)
-            self._by_parts = ArcSearch(mesh, body, **options), others
+                options = {"method": method, "tolerance": self._straight.tolerance, "only_used_vertices": True}
+                apart = DetectionPipeline(straight_mesh(mesh, body >= 0), **self._distances, **options)
+                others = CollisionFinder(apart, self._straight.broad_phase.lock)
+            self._by_parts = ArcSearch(self._straight, body, **self._distances), others
         search, others = self._by_parts
         timer = StageTimer(mesh.device)
         contacts, counts = search.find(bounds, x0, changed, timer)
@@ -77,7 +76,6 @@ class ArcDetector:
             counts = add_counts(counts, found._counts.without_filtered())
         buffers = {kind: contacts_from_host(rows, mesh.device) for kind, rows in contacts.items()}
         rows = {kind: ContactRows(buffer, len(buffer.pairs)) for kind, buffer in buffers.items()}
-        method = self._options["method"]
         return Collisions(method != "float", (), None, method, counts, rows, timer)
 
     def capture(self, arcs: RigidMotion, x0: wp.array, x1: wp.array) -> CapturedCollisions:
@@ -85,7 +83,7 @@ class ArcDetector:
 
         Arguments are those of the last call of :meth:`find`, errors those of :meth:`.CollisionDetector.capture`.
         """
-        if self._has_distance:
+        if self._straight.radius is not None:
             raise NotImplementedError("arcs: a graph holds none with min_distance or radius; detect outside the graph")
         at_once = self.at_once
         if at_once is None or at_once.bounds.motion is not arcs:

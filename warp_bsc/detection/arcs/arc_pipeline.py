@@ -1,21 +1,18 @@
 """A detection in which bodies turn by small angles: one pass, also in a CUDA graph, see :mod:`.arc_phase`."""
 
-import threading
-
 import numpy as np
 import warp as wp
 
 from ...kernels.arcs import Arcs
 from ...kernels.motion import double
 from ...kernels.signs import UNSURE
-from ..mesh import CollisionMesh
 from ..narrow.arc_phase import allocate_arcs, bound_arc
 from ..narrow.contact_buffer import ContactRows
 from ..narrow.distance_phase import pair_distances
 from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
 from ..run.launch import launch, made_once
-from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind, Method
+from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind
 from .rigid_motion import ArcBounds
 
 __all__ = ["LARGEST_TURN", "ArcPipeline"]
@@ -47,25 +44,19 @@ class ArcPipeline:
         bounds: The motion that it was set to last.
     """
 
-    def __init__(
-        self, mesh: CollisionMesh, bounds: ArcBounds, lock: threading.RLock, *, method: Method, tolerance: float
-    ):
+    def __init__(self, straight: DetectionPipeline, bounds: ArcBounds):
         """Allocates buffers.
 
         Args:
-            mesh: The mesh, without radii.
-            bounds: A motion of its bodies.
-            lock: As of :class:`.CollisionFinder`.
-            method: As of :class:`.detector.CollisionDetector`.
-            tolerance: As of :class:`.detector.CollisionDetector`.
+            straight: The pipeline for motions without turns, whose lock it shares; without radii.
+            bounds: A motion of bodies.
         """
         motion = bounds.motion
         self.body, self.bounds = motion.body, bounds
-        self._arcs = allocate_arcs(motion.body, len(motion.centre), mesh.device)
-        self.pipeline = DetectionPipeline(
-            mesh, method=method, tolerance=tolerance, arcs=self._arcs, only_used_vertices=True
-        )
-        self.finder = CollisionFinder(self.pipeline, lock)
+        options = {"method": straight.method, "tolerance": straight.tolerance, "only_used_vertices": True}
+        self._arcs = allocate_arcs(motion.body, len(motion.centre), straight.mesh.device)
+        self.pipeline = DetectionPipeline(straight.mesh, arcs=self._arcs, **options)
+        self.finder = CollisionFinder(self.pipeline, straight.broad_phase.lock)
 
     @staticmethod
     def is_for(bounds: ArcBounds) -> bool:

@@ -7,7 +7,7 @@ import warp as wp
 from newton import GeoType, Model, ParticleFlags, ShapeFlags
 
 from ..._arguments import checked_integer
-from ...detection.mesh import CollisionMesh
+from ...detection.mesh import CollisionMesh, ElementsOfParts
 from ...detection.narrow.approach_phase import MinDistances, make_min_distances
 from ...kernels.pairs import PairFilter
 from ..tuning import SEGMENTS
@@ -187,8 +187,8 @@ class ModelMesh(CollisionMesh):
         self.device_world = self._on_device(world)
         self.connectivity = connectivity = Connectivity()
         connectivity.faces, connectivity.edges = self.device_faces, self.device_edges
-        connectivity.vertex_edges = _incidence(self.edges, vertex_count, self.device)
-        connectivity.edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
+        connectivity.vertex_edges = _for_kernels(ElementsOfParts.of(self.edges, vertex_count), self.device)
+        connectivity.edge_faces = _for_kernels(self.edge_faces, self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
@@ -313,15 +313,10 @@ def host_array(array: wp.array | None) -> np.ndarray:
     return array.numpy()
 
 
-def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence:
-    """Returns the rows of ``elements`` that each of ``count`` numbers is in; negative numbers are left out."""
-    numbers = elements.ravel()
-    rows = np.repeat(np.arange(len(elements)), elements.shape[1])
-    order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
+def _for_kernels(found: ElementsOfParts, device: wp.Device) -> Incidence:
     incidence = Incidence()
-    first = np.concatenate([[0], np.cumsum(np.bincount(numbers[order], minlength=count))])
-    incidence.first = wp.array(first, dtype=int, device=device)
-    incidence.items = wp.array(rows[order], dtype=int, device=device)
+    incidence.first = wp.array(found.first, dtype=int, device=device)
+    incidence.items = wp.array(found.elements, dtype=int, device=device)
     return incidence
 
 

@@ -1,8 +1,5 @@
 """Reads transforms of a mesh, or of its instances, to the world. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -65,7 +62,7 @@ class MeshTransforms:
             if (self.moves & were_there).all():
                 break
         self.stays: np.ndarray = (first == np.eye(4)).all(axis=(1, 2))
-        self.is_finite: np.ndarray = np.isfinite(first).all(axis=(1, 2))
+        self.is_finite = np.asarray(np.isfinite(first).all(axis=(1, 2)))
         self._bent: dict[tuple[float, float], np.ndarray] = {}
 
     def read(self, instance: Instance | None, time: Usd.TimeCode) -> tuple[np.ndarray, np.ndarray]:

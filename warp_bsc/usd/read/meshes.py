@@ -1,8 +1,5 @@
 """Reads a mesh of a USD stage, or curves or points of a prim. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import copy
 import math
 import os

@@ -1,8 +1,5 @@
 """The polygons of a mesh, checked and triangulated. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import bisect
 import hashlib
 import math
