@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from warp_bsc._sorted_keys import distinct, search, search_ranges
+from warp_bsc._sorted_keys import distinct, expand_ranges, search, search_ranges
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 50, 5000])
@@ -25,3 +25,9 @@ def test_values_of_any_shape_are_made_distinct():
     values = np.array([[[3, 1], [2, 3]], [[1, 1], [9, -4]]])
     assert distinct(values).tolist() == [-4, 1, 2, 3, 9]
     assert search(np.zeros(0, dtype=np.int64), np.arange(2000)).tolist() == [0] * 2000
+
+
+def test_ranges_are_expanded_one_after_the_other():
+    rows, indices = expand_ranges(np.array([3, 7, 0]), np.array([5, 7, 3]))
+    assert rows.tolist() == [0, 0, 2, 2, 2]
+    assert indices.tolist() == [3, 4, 0, 1, 2]

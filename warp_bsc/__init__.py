@@ -31,9 +31,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from . import checker
     from .detection.arcs.rigid_motion import RigidMotion
     from .detection.at_rest.proximities import distances
-    from .detection.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.detector import CollisionDetector
-    from .detection.differentiable import DifferentiableContacts
     from .detection.mesh import CollisionMesh, leave_out
     from .detection.queries.query import (
         QueryResult,
@@ -44,6 +42,8 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     )
     from .detection.queries.query_arrays import DeviceQueryResult
     from .detection.queries.query_points import query_points
+    from .detection.results.collisions import CapturedCollisions, Collisions, DetectionStats
+    from .detection.results.differentiable import DifferentiableContacts
     from .implicit.solver import SolverImplicitAdjoint
     from .implicit.solver_implicit import SolverImplicit
     from .repairing.repair import repair
@@ -67,17 +67,17 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .usd.selection import Selection
 
 _MODULES = {
-    "CapturedCollisions": "detection.collisions",
+    "CapturedCollisions": "detection.results.collisions",
     "CapturedSteps": "response.captured_steps",
-    "DifferentiableContacts": "detection.differentiable",
+    "DifferentiableContacts": "detection.results.differentiable",
     "CollisionDetector": "detection.detector",
     "CollisionFilter": "response.state.collision_filter",
     "CollisionMesh": "detection.mesh",
     "CollisionMonitor": "response.monitor",
-    "Collisions": "detection.collisions",
+    "Collisions": "detection.results.collisions",
     "ContactLayer": "response.layer.contact_layer",
     "ContactSensor": "response.contact_sensor",
-    "DetectionStats": "detection.collisions",
+    "DetectionStats": "detection.results.collisions",
     "FrameRange": "usd.frames",
     "FrictionTable": "response.state.friction_table",
     "IntervalResult": "scene_replay.results",

@@ -120,7 +120,7 @@ def test_an_early_collision_takes_less_work_than_all(device, monkeypatch):
     x0, x1, faces = crumpled(1, n=40)
     x1 = x0 + 20.0 * (x1 - x0)
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device))
-    work, run = [], detector._run
+    work, run = [], detector._finder.find
 
     def counted(*arguments, **options):
         found = run(*arguments, **options)
@@ -128,7 +128,7 @@ def test_an_early_collision_takes_less_work_than_all(device, monkeypatch):
         work.append(np.array([stats.vertex_face.candidates + stats.edge_edge.candidates, len(found)]))
         return found
 
-    monkeypatch.setattr(detector, "_run", counted)
+    monkeypatch.setattr(detector._finder, "find", counted)
     assert detector.collision_free_step(x0, x1).certified
     candidates, contacts = sum(work)
     detector.detect(x0, x1)

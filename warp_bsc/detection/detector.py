@@ -4,25 +4,20 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from .._arguments import as_numpy, check_finite, check_instance, checked_distance
+from .._arguments import as_numpy, check_instance, checked_distance
 from .._one_thread import one_at_a_time
-from ..kernels.signs import UNSURE
-from .arcs.arc_pipeline import LARGEST_TURN, ArcPipeline
-from .arcs.arc_search import ArcSearch, join_contacts, straight_mesh
-from .arcs.rigid_motion import ArcBounds, RigidMotion
+from .arcs.arc_detector import ArcDetector
+from .arcs.rigid_motion import RigidMotion
 from .at_rest.intersections import IntersectionFinder, find_intersections
 from .at_rest.proximities import Proximities, ProximityFinder, least_distance
-from .collisions import Candidates, CapturedCollisions, Collisions, FreeStep
-from .differentiable import DifferentiableContacts
 from .inversions import Inversions, inversions_of_motion
 from .mesh import CollisionMesh
-from .narrow.contact_buffer import ContactBufferPool, ContactRows, contacts_from_host, make_contact_buffer
-from .narrow.on_host import decide_on_host
 from .pipeline import DetectionPipeline
+from .results.collision_finder import CollisionFinder
+from .results.collisions import Candidates, CapturedCollisions, Collisions, FreeStep
 from .run.host_function import run_on_host
 from .run.launch import retry_until_fits
-from .run.settings import TOLERANCE, Counts, DistanceKind, Method, add_counts
-from .run.stage_timer import StageTimer, StageTimers
+from .run.settings import TOLERANCE, DistanceKind, Method
 
 __all__ = ["CollisionDetector"]
 
@@ -96,12 +91,9 @@ class CollisionDetector:
         self.tolerance = self._pipeline.tolerance
         self.min_distance = checked_distance(min_distance, "min_distance")
         self._lock = self._pipeline.broad_phase.lock
-        self._result_buffers = ContactBufferPool(mesh.device)
-        self._side_stream = wp.Stream(mesh.device) if mesh.device.is_cuda else None
         self._has_run = False
-        self._rings = rings
-        self._arcs: tuple[ArcSearch, CollisionDetector | None] | None = None
-        self._arc_pipeline: ArcPipeline | None = None
+        self._finder = CollisionFinder(self._pipeline, self._lock)
+        self._arcs = ArcDetector(self._pipeline, min_distance=self.min_distance, rings=rings)
 
     @one_at_a_time
     def detect(
@@ -143,35 +135,9 @@ class CollisionDetector:
         changed = None if only is None else self._checked_vertices(only)
         arcs = self._checked_arcs(arcs)
         if arcs is not None:
-            return self._detect_arcs(x0, x1, only, changed, self._bounds_of(arcs, x0, x1))
+            return self._arcs.find(arcs, x0, x1, changed)
         self._has_run = True
-        return self._run(self._pipeline, x0, x1, changed)
-
-    def _run(
-        self, pipeline: DetectionPipeline, x0: wp.array, x1: wp.array, changed: wp.array | None = None, **options: bool
-    ) -> Collisions:
-        """Returns the collisions that a pipeline finds; options are those of its ``find_contacts``."""
-
-        def launch() -> StageTimer:
-            timer = StageTimer(self.mesh.device)
-            pipeline.find_contacts(x0, x1, changed=changed, sort=True, timer=timer, **options)
-            return timer
-
-        timer = retry_until_fits(launch, pipeline, self.mesh.device)
-        counts = pipeline.counts
-        self._check_counted_finite(counts, x0, x1)
-        differentiable = x0.requires_grad or x1.requires_grad
-        with timer.stage("sort"):
-            contacts = self._ordered_contacts(pipeline, counts, recycle=not differentiable)
-        if self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values()):
-            with timer.stage("exact"):  # now, while the arrays hold these positions
-                for narrow_phase in pipeline.narrow_phases:
-                    kind = DistanceKind(narrow_phase.kind)
-                    contacts[kind] = self._decide_on_host(kind, contacts[kind], x0, x1)
-        arrays = None
-        if differentiable:
-            arrays = self._differentiable(x0, x1, {kind: rows.buffer for kind, rows in contacts.items()})
-        return Collisions(self.method != "float", (), arrays, self.method, counts, contacts, timer)
+        return self._finder.find(x0, x1, changed=changed)
 
     @one_at_a_time
     def collision_free_step(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> FreeStep:
@@ -208,7 +174,7 @@ class CollisionDetector:
         while True:
             x = _partway(*ends, step, x)
             end.assign(x)
-            found = self._run(self._pipeline, start, end, keep_separated=True, queued=queued)
+            found = self._finder.find(start, end, keep_separated=True, queued=queued)
             if not found or step == 0.0:
                 return FreeStep(step, _like(x, x1), found.free)
             step *= found.earliest_toi * (1.0 - retreat)
@@ -234,7 +200,7 @@ class CollisionDetector:
         x0, x1 = self._checked_positions(x0, x1)
         pipeline = self._pipeline
         retry_until_fits(lambda: pipeline.find_candidates(x0, x1), pipeline, self.mesh.device)
-        self._check_counted_finite(pipeline.counts, x0, x1)
+        self._finder.check_counted_finite(x0, x1)
         found = {kind.label: np.zeros((0, 2), dtype=np.int32) for kind in DistanceKind}
         for phase in pipeline.narrow_phases:
             kind = DistanceKind(phase.kind)
@@ -282,12 +248,8 @@ class CollisionDetector:
                 raise RuntimeError(
                     "detect once before capturing, so that kernels are loaded and buffers are large enough"
                 )
-            return self._capture_on_cuda(self._pipeline, x0, x1)
-        at_once = self._arcs_to_capture(arcs)
-        if x0.requires_grad or x1.requires_grad:
-            raise ValueError("arcs: x0 and x1 must not require gradients")
-        at_once.bound(x0, x1)
-        return self._capture_on_cuda(at_once.pipeline, x0, x1, at_once)
+            return self._finder.capture(x0, x1)
+        return self._arcs.capture(arcs, x0, x1)
 
     def find_intersections(self, x: ArrayLike | wp.array) -> np.ndarray:
         """Returns the edges that meet faces in one configuration, exactly.
@@ -401,12 +363,6 @@ class CollisionDetector:
         if self.mesh.device.is_capturing:
             raise RuntimeError(f"{self.mesh.device} captures a graph: {what}{instead}")
 
-    def _check_counted_finite(self, counts: Counts, x0: wp.array, x1: wp.array) -> None:
-        """Raises a ValueError that names a vertex whose position is not finite, if the broad phase has counted one."""
-        if counts.not_finite:
-            for name, x in (("x0", x0), ("x1", x1)):
-                check_finite(x.numpy(), name, self.mesh.vertices)
-
     def _checked_arcs(self, arcs: RigidMotion | None) -> RigidMotion | None:
         """Returns the motion of bodies, None if no vertex has one."""
         if arcs is None:
@@ -415,45 +371,6 @@ class CollisionDetector:
         if len(arcs.body) != self.mesh.vertex_count:
             raise ValueError(f"arcs must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}")
         return arcs if (arcs.body >= 0).any() else None
-
-    def _bounds_of(self, arcs: RigidMotion, x0: wp.array, x1: wp.array) -> ArcBounds:
-        """Returns the motion of turning bodies from one configuration to another, with bounds."""
-        if x0.requires_grad or x1.requires_grad:
-            raise ValueError("arcs: x0 and x1 must not require gradients")
-        return ArcBounds(arcs, self.mesh.device_vertices, x0, x1)
-
-    def _detect_arcs(
-        self, x0: wp.array, x1: wp.array, only: ArrayLike | None, changed: wp.array | None, bounds: ArcBounds
-    ) -> Collisions:
-        """Returns the collisions of a motion in which bodies turn."""
-        body, options = bounds.motion.body, {"method": self.method, "tolerance": self.tolerance}
-        if self._pipeline.radius is None and ArcPipeline.is_for(bounds):
-            at_once = self._arc_pipeline
-            if at_once is None or not np.array_equal(at_once.body, body):
-                at_once = self._arc_pipeline = ArcPipeline(self.mesh, bounds, **options)
-            at_once.set_motion(bounds)
-            at_once.bound(x0, x1)
-            found = self._run(at_once.pipeline, x0, x1, changed)
-            if not at_once.has_unsure_pairs(found._rows):
-                return found
-        options |= {"min_distance": self.min_distance, "rings": self._rings}
-        if self._arcs is None or not np.array_equal(self._arcs[0].body, body):
-            straight = None
-            if (body[self.mesh.vertices] < 0).any():
-                straight = CollisionDetector(straight_mesh(self.mesh, body >= 0), **options)
-            self._arcs = ArcSearch(self.mesh, body, **options), straight
-        search, straight = self._arcs
-        timer = StageTimer(self.mesh.device)
-        contacts, counts = search.find(bounds, x0, changed, timer)
-        if straight is not None:
-            others = straight.detect(x0, x1, only=only)
-            timer = StageTimers(timer, others._timer)
-            for kind, rows in others._rows.items():
-                contacts[kind] = join_contacts([contacts[kind], rows.read()])
-            counts = add_counts(counts, others._counts.without_filtered())
-        buffers = {kind: contacts_from_host(rows, self.mesh.device) for kind, rows in contacts.items()}
-        found = {kind: ContactRows(buffer, len(buffer.pairs)) for kind, buffer in buffers.items()}
-        return Collisions(self.method != "float", (), None, self.method, counts, found, timer)
 
     def _checked_vertices(self, only: ArrayLike) -> wp.array:
         """Returns which vertices are given, on the device, array of int."""
@@ -473,51 +390,6 @@ class CollisionDetector:
             )
         return x0, x1
 
-    def _ordered_contacts(
-        self, pipeline: DetectionPipeline, counts: Counts, *, recycle: bool
-    ) -> dict[DistanceKind, ContactRows]:
-        """Returns the sorted contacts of each kind of pair, without those that overflowed.
-
-        Args:
-            pipeline: The pipeline that found them.
-            counts: The counts of the detection.
-            recycle: Whether to use buffers of earlier results that are garbage, and to let later results use these;
-                not where others refer to the arrays. Otherwise the buffers are new, without spare rows.
-        """
-        contacts = {}
-        for narrow_phase in pipeline.narrow_phases:
-            kind = DistanceKind(narrow_phase.kind)
-            count = min(counts.pairs[kind].collisions, len(narrow_phase.contacts.pairs))
-            if recycle:
-                rows = self._result_buffers.acquire(count)
-            else:
-                rows = ContactRows(make_contact_buffer(count, self.mesh.device), count)
-            narrow_phase.ordered_contacts(count, rows.buffer)
-            contacts[kind] = rows
-        return contacts
-
-    def _decide_on_host(self, kind: DistanceKind, rows: ContactRows, x0: wp.array, x1: wp.array) -> ContactRows:
-        """Returns the contacts without those that the host refutes; the others get its times and points."""
-        contacts = rows.read()
-        which = (contacts.decided == UNSURE) | ~contacts.within_tolerance
-        elements, radius = self.mesh.device_elements(kind), self._pipeline.radius
-        decide_on_host(kind, x0, x1, elements, radius, contacts, which)
-        buffer = contacts_from_host(contacts.rows(contacts.hit), self.mesh.device)
-        return ContactRows(buffer, len(buffer.pairs))
-
-    def _arcs_to_capture(self, arcs: RigidMotion) -> ArcPipeline:
-        """Returns the pipeline that has detected with these arcs last; raises errors as of :meth:`capture`."""
-        if self._pipeline.radius is not None:
-            raise NotImplementedError("arcs: a graph holds none with min_distance or radius; detect outside the graph")
-        at_once = self._arc_pipeline
-        if at_once is None or at_once.bounds.motion is not arcs:
-            if (np.linalg.norm(arcs.turn, axis=1) > LARGEST_TURN).any():
-                raise NotImplementedError(
-                    "arcs: a graph holds turns of at most a quarter of a turn; detect outside the graph"
-                )
-            raise RuntimeError("detect with these arcs once before capturing, which copies them to the device")
-        return at_once
-
     def _capture_on_cpu(self, x0: wp.array, x1: wp.array, arcs: RigidMotion | None) -> CapturedCollisions:
         """Adds a detection to the graph that the CPU captures."""
         if x0.requires_grad or x1.requires_grad:
@@ -534,52 +406,6 @@ class CollisionDetector:
 
         run_on_host(detect, self.mesh.device)
         return CapturedCollisions(None, read)
-
-    def _capture_on_cuda(
-        self, pipeline: DetectionPipeline, x0: wp.array, x1: wp.array, at_once: ArcPipeline | None = None
-    ) -> CapturedCollisions:
-        """Adds a detection by a pipeline to the graph that a GPU captures.
-
-        Contacts are sorted when they are read, as the graph would sort the whole capacity; in the graph with gradients.
-        """
-        differentiable = x0.requires_grad or x1.requires_grad
-        pipeline.find_contacts(x0, x1, sort=differentiable, side_stream=self._side_stream)
-        generation = pipeline.generation
-
-        def read() -> Collisions:
-            if generation != pipeline.generation:
-                raise RuntimeError("the detector's buffers have grown since this detection was captured: capture again")
-            counts = pipeline.counters.read()
-            overflows = tuple(pipeline.overflows(counts))
-            left_to_host = self.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values())
-            certified = self.method != "float" and not (overflows or counts.not_finite or left_to_host)
-            for narrow_phase in pipeline.narrow_phases:
-                narrow_phase.sort()
-            contacts = self._ordered_contacts(pipeline, counts, recycle=True)
-            if at_once is not None:
-                pipeline.counts = counts
-                certified = certified and at_once.leaves_out_rigid_bodies_alone()
-                certified = certified and not (self.method == "exact" and at_once.has_unsure_pairs(contacts))
-            return Collisions(certified, overflows, arrays, self.method, counts, contacts, StageTimer(None))
-
-        def read_alone() -> Collisions:
-            with self._lock:
-                return read()
-
-        arrays = None
-        if differentiable:
-            capacities = [len(narrow_phase.contacts.pairs) for narrow_phase in pipeline.narrow_phases]
-            whole = {
-                DistanceKind(narrow_phase.kind): narrow_phase.ordered_contacts(
-                    capacity, make_contact_buffer(capacity, self.mesh.device)
-                )
-                for narrow_phase, capacity in zip(pipeline.narrow_phases, capacities, strict=True)
-            }
-            arrays = self._differentiable(x0, x1, whole)
-        return CapturedCollisions(arrays, read_alone)
-
-    def _differentiable(self, x0, x1, contacts):
-        return DifferentiableContacts(x0, x1, self.mesh, self.tolerance, contacts, self._pipeline.device_radius)
 
 
 def _partway(x0: np.ndarray, x1: np.ndarray, share: float, last: np.ndarray) -> np.ndarray:

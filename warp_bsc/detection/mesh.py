@@ -2,18 +2,20 @@
 
 import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
 from .._arguments import as_numpy, checked_bits, checked_distances, checked_flag, checked_integer, checked_shape
+from .._sorted_keys import expand_ranges
 from ..kernels.pairs import PairFilter
 from .face_order import order_faces
 from .run.settings import DistanceKind, PairKind
 from .run.start import checked_device
 
-__all__ = ["CollisionMesh", "DevicePlaces", "leave_out"]
+__all__ = ["CollisionMesh", "DevicePlaces", "ElementsOfParts", "leave_out"]
 
 _MOST_LISTED = 31
 
@@ -33,6 +35,30 @@ class DevicePlaces:
     faces: wp.array
     face_edges: wp.array
     owned: wp.array
+
+
+class ElementsOfParts(NamedTuple):
+    """The elements that have each part, such as the faces of each edge.
+
+    Attributes:
+        first: Where the elements of each part begin, int, shape [part_count + 1].
+        elements: The elements, ascending for each part, int, shape [n].
+    """
+
+    first: np.ndarray
+    elements: np.ndarray
+
+    @classmethod
+    def of(cls, parts: np.ndarray, count: int) -> "ElementsOfParts":
+        """Returns the elements of ``count`` parts, given the parts of each, shape [n, k]; negative ones are none."""
+        order = np.argsort(parts, axis=None, kind="stable")[np.count_nonzero(parts < 0) :]
+        counts = np.bincount(parts.ravel()[order], minlength=count)
+        return cls(np.concatenate([[0], np.cumsum(counts)]), order // parts.shape[1])
+
+    def find(self, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns all elements that have some parts: the row of the part, and the element, each of shape [m]."""
+        rows, places = expand_ranges(self.first[parts], self.first[parts + 1])
+        return rows, self.elements[places]
 
 
 class CollisionMesh:
@@ -157,12 +183,8 @@ class CollisionMesh:
         self.device_vertices = wp.array(self.vertices, dtype=int, device=self.device)
         self.device_faces = wp.array(self.faces, dtype=int, device=self.device)
         self.device_edges = wp.array(self.edges, dtype=int, device=self.device)
-        self.radius = None
-        if radius is not None:
-            self.radius = self._checked_radius(radius)
-        self.world = None
-        if world is not None:
-            self.world = self._checked_world(world)
+        self.radius = None if radius is None else self._checked_radius(radius)
+        self.world = None if world is None else self._checked_world(world)
         self.group = self.mask = None
         if group is not None or mask is not None:
             self.group = self._checked_bits(1 if group is None else group, "group")
@@ -203,12 +225,9 @@ class CollisionMesh:
         return owned
 
     @functools.cached_property
-    def edge_faces(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the faces of each edge begin, int, shape [edge_count + 1], and these faces, int, shape [n]."""
-        sides = self.face_edges.ravel()
-        order = np.argsort(sides, kind="stable")[np.count_nonzero(sides < 0) :]
-        first = np.concatenate([[0], np.cumsum(np.bincount(sides[order], minlength=len(self.edges)))])
-        return first, order // 3
+    def edge_faces(self) -> ElementsOfParts:
+        """The faces of each edge."""
+        return ElementsOfParts.of(self.face_edges, len(self.edges))
 
     @functools.cached_property
     def across(self) -> np.ndarray:
@@ -259,6 +278,10 @@ class CollisionMesh:
     def device_tets(self) -> wp.array:
         """Vertex indices of the tetrahedra on the device, two-dimensional Warp array of int."""
         return wp.array(self.tets, dtype=int, device=self.device)
+
+    def elements(self, kind: PairKind | DistanceKind) -> np.ndarray:
+        """Returns the faces for pairs of a vertex and a face, else the edges."""
+        return self.faces if kind == PairKind.VERTEX_FACE else self.edges
 
     def device_elements(self, kind: PairKind | DistanceKind) -> wp.array:
         """Returns the vertex indices of the second elements of a kind of pair, two-dimensional Warp array of int.

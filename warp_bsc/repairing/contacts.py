@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from ..detection.collisions import Collisions
 from ..detection.mesh import CollisionMesh
+from ..detection.results.collisions import Collisions
 from ..detection.run.launch import launch_repeatedly
 from .kernels import Planes, find_shortfalls, move_apart
 

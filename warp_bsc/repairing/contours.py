@@ -41,7 +41,7 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
         pairs: (edge, face), int, shape [n, 2].
     """
     n = len(pairs)
-    rows, owners = faces_of_edges(mesh, pairs[:, 0])
+    rows, owners = mesh.edge_faces.find(pairs[:, 0])
     across = pairs[rows, 1]
     keys = np.minimum(owners, across).astype(np.int64) * len(mesh.faces) + np.maximum(owners, across)
     order = np.argsort(keys, kind="stable")
@@ -65,14 +65,6 @@ def trace_contours(mesh: CollisionMesh, pairs: np.ndarray) -> Contours:
         for inside, border in zip(ends_inside, ends_at_border, strict=True)
     ]
     return Contours(number, np.sign(minus - plus), kinds)
-
-
-def faces_of_edges(mesh: CollisionMesh, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the faces of edges: the row of the edge, and the face, each of shape [m], in the order of the rows."""
-    first, faces = mesh.edge_faces
-    counts = first[edges + 1] - first[edges]
-    rows = np.repeat(np.arange(len(edges)), counts)
-    return rows, faces[np.arange(len(rows)) + np.repeat(first[edges] - (np.cumsum(counts) - counts), counts)]
 
 
 def connected_components(count: int, edges: np.ndarray) -> np.ndarray:

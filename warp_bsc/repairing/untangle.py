@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from ..detection.run.launch import launch
-from .contours import faces_of_edges, trace_contours
+from .contours import trace_contours
 from .elastic import Springs, near, within
 from .kernels import contour_gradients
 from .surface import Surface
@@ -150,7 +150,7 @@ def _ways_to_ends(surface: Surface, x: np.ndarray, ends: np.ndarray) -> np.ndarr
 def _gradients(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the results of :func:`.kernels.contour_gradients` for positions in units."""
     mesh, n = surface.mesh, len(crossings)
-    rows, faces = faces_of_edges(mesh, crossings[:, 0])
+    rows, faces = mesh.edge_faces.find(crossings[:, 0])
     opposite = mesh.faces[faces].sum(axis=1) - mesh.edges[crossings[rows, 0]].sum(axis=1)
     along = wp.empty(n, dtype=wp.float64, device=surface.device)
     coordinates, gradient = (wp.empty(n, dtype=wp.vec3d, device=surface.device) for _ in range(2))

@@ -15,9 +15,9 @@ from ..detection.arcs.rigid_motion import RigidMotion
 from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.at_rest.intersections import Intersections
 from ..detection.at_rest.proximities import Proximities, ProximityFinder
-from ..detection.collisions import Collisions, add_stats
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..detection.results.collisions import Collisions, add_stats
 from ..detection.run.settings import Method
 from ..detection.run.start import is_cpu
 from ..usd.interval import Interval

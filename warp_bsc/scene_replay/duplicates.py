@@ -6,8 +6,7 @@ from collections.abc import Callable, Hashable, Iterable
 
 import numpy as np
 
-from .._sorted_keys import distinct
-from ..detection.at_rest.body_parts import expand_ranges
+from .._sorted_keys import distinct, expand_ranges
 from ..detection.at_rest.containment import Containment
 from ..usd.segment import Segment
 from ..usd.selection import Selection

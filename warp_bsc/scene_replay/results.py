@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.results.collisions import DetectionStats, StageCounts
 from ..detection.run.settings import DistanceKind
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections

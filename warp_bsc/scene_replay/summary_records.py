@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from ..detection.collisions import DetectionStats, StageCounts
+from ..detection.results.collisions import DetectionStats, StageCounts
 from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
 from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary

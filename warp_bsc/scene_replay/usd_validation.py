@@ -11,9 +11,6 @@ Programs that run the framework find the rule if the environment variable ``PXR_
         print(error.GetName(), error.GetMessage())
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import math
 import os
 import sys

@@ -5,9 +5,6 @@ its Python finds warp-bsc. What it finds is what ``warp-bsc replay`` finds in th
 that are not saved.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

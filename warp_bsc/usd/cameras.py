@@ -1,8 +1,5 @@
 """The cameras of a stage at some times. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 from dataclasses import dataclass, field
 
 import numpy as np

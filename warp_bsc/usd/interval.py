@@ -1,4 +1,4 @@
-"""The motion of a scene from one of its times to the next."""
+"""The motion of a scene from one of its times to the next, and what reading it reveals, in notes and warnings."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -8,7 +8,9 @@ import numpy as np
 from .segment import Segment
 from .turns import Turn
 
-__all__ = ["Interval", "LeftOutMesh", "ReadingNotes", "jump_warning", "left_out_warning", "message_warning"]
+__all__ = ["Interval", "LeftOutMesh", "ReadingNotes", "ReadingRecord"]
+
+_NAMED = 5  # largest number of parts left out, and of messages of OpenUSD, in the warnings
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,55 @@ class ReadingNotes:
     left_out: tuple[LeftOutMesh, ...] = ()
     messages: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
+
+
+class ReadingRecord:
+    """What reading a scene has revealed so far.
+
+    Attributes:
+        parts: The meshes left out after the file was opened.
+        messages: Messages of OpenUSD.
+        welded: Largest number of welded vertices of a segment.
+    """
+
+    def __init__(self):
+        self.parts: list[LeftOutMesh] = []
+        self.messages: list[str] = []
+        self.welded = 0
+        self._jump_times: dict[str, set[float]] = {}  # by the mesh's name
+        self._noted = 0, 0  # numbers of parts and of messages that notes contain
+
+    def add_jumps(self, names: tuple[str, ...], time: float) -> None:
+        """Adds the names of meshes that jump at a time."""
+        for name in names:
+            self._jump_times.setdefault(name, set()).add(time)
+
+    def take(self, jumps: tuple[str, ...]) -> ReadingNotes:
+        """Returns the notes since the last call, and given jumps."""
+        parts, messages = self._noted
+        self._noted = len(self.parts), len(self.messages)
+        return ReadingNotes(tuple(self.parts[parts:]), tuple(self.messages[messages:]), jumps)
+
+    def warnings(self, reasons: list[str], missing: list[str], others: list[str]) -> list[str]:
+        """Returns sentences on all of it, and of what is too much the number.
+
+        Args:
+            reasons: Parts left out and why, a sentence each.
+            missing: Parts that are missing and allowed to be, a sentence each.
+            others: Sentences on unread contents and on changes to the motion.
+        """
+        sentences = [*map(left_out_warning, reasons[:_NAMED])]
+        if len(reasons) > _NAMED:
+            sentences.append(f"left out: {len(reasons) - _NAMED} more, {len(reasons)} in all")
+        sentences += map(message_warning, self.messages[:_NAMED])
+        sentences += missing[:_NAMED]
+        if len(missing) > _NAMED:
+            sentences.append(f"missing: {len(missing) - _NAMED} more, {len(missing)} in all")
+        sentences += others
+        sentences += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
+        if self.welded:
+            sentences.append(f"vertices with the same position at all times were welded: {self.welded}")
+        return sentences
 
 
 @dataclass(frozen=True)

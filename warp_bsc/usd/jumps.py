@@ -4,7 +4,7 @@ import numpy as np
 
 from .segment import Segment
 
-__all__ = ["JumpFinder"]
+__all__ = ["JumpFinder", "jumps_at"]
 
 _JUMP = 1e-4  # a jump is more than this share of a mesh's way in an interval; merged times make smaller gaps
 _ROUNDING = 1e-12
@@ -51,3 +51,14 @@ class JumpFinder:
             if gaps[own].max() > _JUMP * ways[own].max() + rounding:
                 names.append(segment.meshes[number].name)
         return tuple(names)
+
+
+def jumps_at(time: float, segment: Segment) -> bool:
+    """Returns whether a mesh jumps at a time, the last of a segment that has two.
+
+    Raises:
+        UnreadableError: If a mesh is broken then.
+    """
+    finder, end = JumpFinder(), segment.positions(time)
+    finder.find(0, segment, segment.start_positions, segment.positions(time, before=True))
+    return bool(finder.find(1, segment, end, end))

@@ -1,55 +1,23 @@
 """The meshes of a USD scene as motion between time samples: fixed faces, and positions in world space.
 
-What is read
-------------
 Every ``UsdGeom.Mesh`` that is loaded and selected is read, including those of references, payloads, variants, native
-instances and point instancers. Cubes, spheres, capsules, cylinders, cones and planes are read as polyhedra, linear
-``UsdGeom.BasisCurves`` as edges, and ``UsdGeom.Points`` as points. The radius of curves and points is half their width,
-multiplied by the largest stretch of their transform, or 0 without widths. Below, all of these are called meshes. Meshes
-are merged to one list of vertices and one of faces, so that collisions of a mesh with itself and with others are found
-in the same way. A mesh with a subdivision scheme is read as its control cage. Polygons are cut into triangles once;
-holes and points without faces are omitted. Blend shapes and joints move the points as UsdSkel computes them.
+instances and point instancers, with blend shapes and joints. Cubes, spheres, capsules, cylinders, cones and planes are
+read as polyhedra, linear ``UsdGeom.BasisCurves`` as edges, and ``UsdGeom.Points`` as points; all count as meshes. They
+are merged to one list of vertices and one of faces. One with a subdivision scheme is read as its control cage. Polygons
+are cut into triangles once; holes and points without faces are omitted. Vertices that have the same position at every
+time are welded to one: those on the two sides of a seam would touch all the time. Broken meshes are left out while they
+are broken, and named.
 
-Vertices that have the same position at every time are welded to one. Examples are the two sides of a seam, or a cloth
-that was written as one mesh for each of its colours: unwelded, they would touch all the time.
+A scene's times are those of the points, transforms and skeletons of all meshes together; at a time that is not a mesh's
+own sample, USD interpolates. Rotating transforms and skeletons do not move points straight from one sample to the next:
+they are sampled at every whole time code between as well, and splines as :func:`~.read.samples.sample_times` describes.
+From one time to the next, each vertex moves straight, to its position just before the second; a mesh that only its
+transform moves turns instead, if :mod:`~warp_bsc.usd.turns` finds that it does. Where a mesh changes its topology,
+appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next begins.
 
-What moves
-----------
-The points, the transforms and the skeleton of a mesh may all have time samples. A scene's times are those of all
-meshes together; at a time that is not a mesh's own sample, USD interpolates. Rotating transforms and skeletons do not
-move points straight from one sample to the next: they are sampled at every whole time code between as well, and splines
-as :func:`~.read.samples.sample_times` describes. From one time to the next, each vertex moves straight from its
-position at the first time to its position just before the second; a mesh that only its transform moves turns instead,
-if :mod:`~warp_bsc.usd.turns` finds that it does. A mesh that jumps at the second time, from one value clip to the next
-or because a value was held, ends at its position before the jump.
-
-Times that differ by less than a millionth of a time code, or of the whole time if that is shorter, count as one:
-rounding produces them in files, and OpenUSD uses them to separate the end of a value clip from the start of the next.
-
-When a mesh changes its topology, appears or vanishes, one :class:`~warp_bsc.usd.segment.Segment` ends and the next
-begins. Points keep their places until a sample with other polygons, whether or not it has as many points. If a mesh
-changes or jumps at the last time, one more interval, without motion, has it as it is then.
-
-Blend shapes bend the paths of points where a weight is that of an in-between: these times are sampled as well.
-
-Precision
----------
 USD stores points in single precision, transforms in double. If every transform is the identity, positions are the
 stored ones in single precision; otherwise all are computed and returned in double precision.
-
-What cannot be read
--------------------
-Broken meshes and instances are left out while they are broken. Files that cannot be opened and may hold geometry, value
-clips that OpenUSD passes over and tetrahedra are left out as a whole. :attr:`Scene.left_out` names all of them. The
-rest is read. A scene in which nothing ever moves is read at one time.
-
-:attr:`Scene.warnings` names the contents that are not read (other curves and shapes without polygons, unselected
-meshes), the changes to the motion, turns by half a turn or more from one time to the next, which straight paths do not
-show, and meshes that a scale of 0 hides.
 """
-
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
 
 import math
 import os
@@ -61,18 +29,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._arguments import check_instance, checked_flag, checked_integer, checked_strings, given
+from .._arguments import given
 from .._one_thread import one_at_a_time
 from .frames import FrameRange
-from .interval import (
-    Interval,
-    LeftOutMesh,
-    ReadingNotes,
-    jump_warning,
-    left_out_warning,
-    message_warning,
-)
-from .jumps import JumpFinder
+from .interval import Interval, LeftOutMesh, ReadingNotes, ReadingRecord
+from .jumps import JumpFinder, jumps_at
 from .read.files import SceneFiles
 from .read.openusd import check_openusd
 from .scene_options import Revealed, SceneOptions
@@ -86,9 +47,6 @@ if TYPE_CHECKING:
     from .read.meshes import UsdMesh  # which imports pxr
 
 __all__ = ["Scene"]
-
-_MOST_PARTS = 10_000  # of a step between two times
-_NAMED = 5  # largest number of parts left out, and of messages of OpenUSD, in the warnings
 
 # If a crate file is mapped into memory, every page read counts as memory of this process, which seems to grow with each
 # frame. USD reads these variables when it is loaded; without the second one it reports the first on standard error.
@@ -183,20 +141,9 @@ class Scene:
 
             stage = given_stage(source)
             path = name_of(stage)
-        if selection is not None:
-            check_instance(selection, "selection", Selection, "a Selection")
-        if frames is not None:
-            check_instance(frames, "frames", FrameRange, "a FrameRange")
+        options = SceneOptions.of(selection, frames, subdivide, sample_turns, strict, allow_missing)
         if progress is not None and not callable(progress):
             raise TypeError(f"progress must be a function, not {given(progress)}")
-        options = SceneOptions(
-            selection,
-            frames,
-            checked_integer(subdivide, "subdivide", 1, _MOST_PARTS),
-            checked_flag(sample_turns, "sample_turns"),
-            checked_flag(strict, "strict"),
-            checked_strings(allow_missing, "allow_missing"),
-        )
         self._open(path, options, Revealed(), progress, stage)
 
     def _open(
@@ -222,15 +169,13 @@ class Scene:
         self._unreadable = UnreadableError
         self._left_out = LeftOut(path, options.strict, options.allow_missing)
         self._is_given, self._written = stage is not None, None
-        if stage is None:
-            self.stage = open_stage(path, self._left_out)  # prims expire with their stage
-        else:
-            self.stage = stage
+        self.stage = open_stage(path, self._left_out) if stage is None else stage  # prims expire with their stage
+        if stage is not None:
             check_stage(stage, path, self._left_out)
         self.files = SceneFiles(self.stage)
-        self._messages = []  # OpenUSD's
+        self._record = record = ReadingRecord()
         self._collecting = collecting
-        with self._collecting(self._messages, path):
+        with collecting(record.messages, path):
             self.time_codes_per_second = self.stage.GetTimeCodesPerSecond()
             # Old exporters store it in single precision, which UsdGeom.GetStageMetersPerUnit rejects.
             self.meters_per_unit = float(self.stage.GetMetadata("metersPerUnit"))
@@ -254,10 +199,6 @@ class Scene:
             self._segment: Segment | None = None
             self._span: tuple[int, int] | None = None
             self._jumps = JumpFinder()
-            self._jump_times = {}  # by the mesh's name
-            self._welded = 0
-            self._parts: list[LeftOutMesh] = []  # left out after the file was opened
-            self._noted = 0, 0  # numbers of these and of messages that notes contain
             self._welds = {}  # by span
             for part in revealed.left_out:
                 self._left_out.reasons.append(part.reason)
@@ -280,18 +221,7 @@ class Scene:
     @property
     def warnings(self) -> list[str]:
         """Sentences on unread contents and on changes to the motion; on jumps in the intervals read so far."""
-        sentences = [*map(left_out_warning, self.left_out[:_NAMED])]
-        if len(self.left_out) > _NAMED:
-            sentences.append(f"left out: {len(self.left_out) - _NAMED} more, {len(self.left_out)} in all")
-        sentences += map(message_warning, self._messages[:_NAMED])
-        sentences += self._left_out.notes[:_NAMED]
-        if len(self._left_out.notes) > _NAMED:
-            sentences.append(f"missing: {len(self._left_out.notes) - _NAMED} more, {len(self._left_out.notes)} in all")
-        sentences += self._warnings
-        sentences += (jump_warning(name, sorted(times)) for name, times in self._jump_times.items())
-        if self._welded:
-            sentences.append(f"vertices with the same position at all times were welded: {self._welded}")
-        return sentences
+        return self._record.warnings(self.left_out, self._left_out.notes, self._warnings)
 
     @property
     def has_file(self) -> bool:
@@ -313,7 +243,7 @@ class Scene:
 
     def __reduce__(self):
         """Returns the call that opens the scene again."""
-        revealed = Revealed(tuple(self._parts), self._welds)
+        revealed = Revealed(tuple(self._record.parts), self._welds)
         if self._is_given:
             from .read.stage import write_for_others  # noqa: PLC0415 (imports pxr)
 
@@ -387,7 +317,7 @@ class Scene:
             else:
                 self._span = span
                 self._welds[span] = self._segment.welds
-                self._welded = max(self._welded, self._segment.welded)
+                self._record.welded = max(self._record.welded, self._segment.welded)
         return self._segment
 
     def prim_of(self, name: str) -> "UsdMesh":
@@ -397,9 +327,7 @@ class Scene:
     @one_at_a_time
     def take_notes(self, jumps: tuple[str, ...] = ()) -> ReadingNotes:
         """Returns the notes on reading since the last call, or since the scene was opened, and given jumps."""
-        parts, messages = self._noted
-        self._noted = len(self._parts), len(self._messages)
-        return ReadingNotes(tuple(self._parts[parts:]), tuple(self._messages[messages:]), jumps)
+        return self._record.take(jumps)
 
     @one_at_a_time
     def note(self, index: int, notes: ReadingNotes) -> None:
@@ -412,9 +340,9 @@ class Scene:
         for part in notes.left_out:
             self._left_out.reasons.append(part.reason)
             self._apply(part)
-        self._messages += [message for message in notes.messages if message not in self._messages]
-        for name in notes.jumps:
-            self._jump_times.setdefault(name, set()).add(self.times[index])
+        messages = self._record.messages
+        messages += [message for message in notes.messages if message not in messages]
+        self._record.add_jumps(notes.jumps, self.times[index])
 
     @one_at_a_time
     def _read(self, index) -> Interval:
@@ -422,7 +350,7 @@ class Scene:
         self.files.check_stage()
         segment, x0, x1, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
-        with self._collecting(self._messages, self.path):
+        with self._collecting(self._record.messages, self.path):
             turns = segment.turns(start, end) if self.turning and end > start else {}
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
         return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), turns)
@@ -431,7 +359,7 @@ class Scene:
     def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
         """Returns the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
         start, end = self.times[index : index + 2]
-        with self._collecting(self._messages, self.path):
+        with self._collecting(self._record.messages, self.path):
             while True:
                 segment = self.segment(index)
                 try:
@@ -441,8 +369,7 @@ class Scene:
                 except self._unreadable as error:
                     self._leave_out(error, index)
         jumps = self._jumps.find(index, segment, x0, x1)
-        for name in jumps:
-            self._jump_times.setdefault(name, set()).add(start)
+        self._record.add_jumps(jumps, start)
         return segment, x0, x1, jumps
 
     def _checked_index(self, index, name, last) -> int:
@@ -450,8 +377,7 @@ class Scene:
         if not isinstance(index, Integral) or isinstance(index, bool):
             raise TypeError(f"{name} must be an integer, not {given(index)}")
         if not 0 <= int(index) <= last:
-            number = given(int(index))
-            raise IndexError(f"{name}: {self.path} has no interval {number}, only 0 to {len(self) - 1}")
+            raise IndexError(f"{name}: {self.path} has no interval {given(int(index))}, only 0 to {len(self) - 1}")
         return int(index)
 
     def _contents(self) -> tuple:
@@ -473,10 +399,7 @@ class Scene:
             return False
         nothing = np.zeros(0, dtype=np.int64)
         try:
-            segment = Segment(jumping, times, self.dtype, welds=(nothing, nothing))
-            finder, end = JumpFinder(), segment.positions(times[1])
-            finder.find(0, segment, segment.start_positions, segment.positions(times[1], before=True))
-            return bool(finder.find(1, segment, end, end))
+            return jumps_at(times[1], Segment(jumping, times, self.dtype, welds=(nothing, nothing)))
         except self._unreadable:
             return True
 
@@ -486,8 +409,7 @@ class Scene:
         It is there again from the first later interval at whose start it can be read.
         """
         since = max(index, self.times.index(error.time) - 1)
-        mesh = self.prim_of(error.mesh)
-        later = range(since + 1, len(self))
+        mesh, later = self.prim_of(error.mesh), range(since + 1, len(self))
         until = next((number for number in later if mesh.can_be_read(self.times[number])), len(self))
         start = f"from time {self.times[since]:g} " if since or until < len(self) else ""
         end = f"to {self.times[until]:g}: " if until < len(self) else "on: " * bool(since)
@@ -496,7 +418,7 @@ class Scene:
 
     def _apply(self, part: LeftOutMesh) -> None:
         """Leaves a mesh out of intervals."""
-        self._parts.append(part)
+        self._record.parts.append(part)
         since, until = part.since, part.until
         times = self.times[since] if since else -math.inf, self.times[until] if until < len(self) else math.inf
         self.prim_of(part.name).leave_out(*times)

@@ -1,10 +1,10 @@
-"""The part of a segment that one mesh of the scene becomes."""
+"""The part of a segment that one mesh of the scene becomes, and where elements of the segment are in their prims."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["SceneMesh"]
+__all__ = ["InPrims", "SceneMesh"]
 
 
 @dataclass(frozen=True)
@@ -36,3 +36,27 @@ class SceneMesh:
     point_count: int
     polygons: np.ndarray = field(repr=False)
     polygon_count: int
+
+
+class InPrims:
+    """The mesh of each vertex or face, and its index among the points or polygons of its prim, shared by instances."""
+
+    def __init__(self, indices: list[np.ndarray]):
+        """Joins the indices of the elements of each mesh, given the same array for meshes that share them."""
+        counts = [len(array) for array in indices]
+        self._mesh_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        distinct_arrays = {id(array): array for array in indices}
+        self._indices = np.concatenate([np.zeros(0, dtype=np.int64), *distinct_arrays.values()])
+        starts = np.cumsum([0, *map(len, distinct_arrays.values())])
+        start_of = dict(zip(distinct_arrays, starts.tolist(), strict=False))
+        starts = np.array([start_of[id(array)] for array in indices], dtype=np.int64)
+        self._shifts = starts - np.cumsum([0, *counts])[:-1]
+
+    def meshes(self, elements: np.ndarray) -> np.ndarray:
+        """Returns the mesh of each element, int64."""
+        return self._mesh_of[elements].astype(np.int64)
+
+    def locate(self, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the mesh of each element, and its index in the prim."""
+        meshes = self.meshes(elements)
+        return meshes, self._indices[elements + self._shifts[meshes]]

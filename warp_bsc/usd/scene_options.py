@@ -4,11 +4,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .._arguments import check_instance, checked_flag, checked_integer, checked_strings
 from .frames import FrameRange
 from .interval import LeftOutMesh
 from .selection import Selection
 
 __all__ = ["Revealed", "SceneOptions"]
+
+_MOST_PARTS = 10_000  # of a step between two times
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,22 @@ class SceneOptions:
     sample_turns: bool
     strict: bool
     allow_missing: tuple[str, ...]
+
+    @classmethod
+    def of(cls, selection, frames, subdivide, sample_turns, strict, allow_missing) -> "SceneOptions":
+        """Returns the options of arguments, with errors as of :class:`~warp_bsc.usd.scene.Scene`."""
+        if selection is not None:
+            check_instance(selection, "selection", Selection, "a Selection")
+        if frames is not None:
+            check_instance(frames, "frames", FrameRange, "a FrameRange")
+        return cls(
+            selection,
+            frames,
+            checked_integer(subdivide, "subdivide", 1, _MOST_PARTS),
+            checked_flag(sample_turns, "sample_turns"),
+            checked_flag(strict, "strict"),
+            checked_strings(allow_missing, "allow_missing"),
+        )
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .._sorted_keys import distinct, search, search_ranges
+from .._sorted_keys import distinct, expand_ranges, search, search_ranges
 from .read.position_reader import PositionReader
-from .scene_mesh import SceneMesh
+from .scene_mesh import InPrims, SceneMesh
 from .turns import Turn, find_turns
 from .welding import group_by_position, split_by_position
 
@@ -62,29 +62,25 @@ class Segment:
         self.meshes, faces = [], []
         edges, curves, points_alone, radius = [], [], [], []
         vertex_count = face_count = 0
-        compact: dict[
-            int, tuple
-        ] = {}  # by identity of the triangles, which instances share: used points, corners, and the triangles
+        compact = {}  # by identity of the triangles, which instances share: used points, corners, and the triangles
         for mesh in usd_meshes:
             points = mesh.read_points(times[0])
             triangles, polygons, polygon_count = mesh.read_triangles(times[0], points)
-            strands = mesh.read_strands(times, len(points)) if mesh.is_strands else None
-            if strands:
+            if mesh.is_strands:
                 used, corners = np.arange(len(points)), triangles
-                own_edges, own_curves, own_radius = strands
+                own_edges, own_curves, own_radius = mesh.read_strands(times, len(points))
                 edges.append(own_edges + vertex_count)
                 curves.append(np.where(own_curves < 0, -1, own_curves + vertex_count))  # unique in the segment
                 points_alone.append(vertex_count + np.flatnonzero(own_curves < 0))
                 radius.append(own_radius)
-                compact[id(triangles)] = used, corners, triangles
-            elif id(triangles) not in compact:
-                compact[id(triangles)] = *_renumber(triangles, len(points)), triangles
-            used, corners, _ = compact[id(triangles)]
-            if not strands:
+            else:
+                if id(triangles) not in compact:
+                    compact[id(triangles)] = *_renumber(triangles, len(points)), triangles
+                used, corners, _ = compact[id(triangles)]
                 curves.append(np.full(len(used), -1))
                 radius.append(np.zeros(len(used)))
-            if not mesh.group or strands:
-                compact.clear()
+                if not mesh.group:
+                    compact.clear()
             faces.append(corners + vertex_count)
             self.meshes.append(
                 SceneMesh(
@@ -103,8 +99,8 @@ class Segment:
             )
             vertex_count += len(used)
             face_count += len(triangles)
-        self._points = _InPrims([mesh.points for mesh in self.meshes])  # of vertices, numbered before welding
-        self._polygons = _InPrims([mesh.polygons for mesh in self.meshes])  # of faces
+        self._points = InPrims([mesh.points for mesh in self.meshes])  # of vertices, numbered before welding
+        self._polygons = InPrims([mesh.polygons for mesh in self.meshes])  # of faces
         self._corners = np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
         self._unwelded_edges = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
         curve_of_vertex, radii = (np.concatenate([[], *arrays]) for arrays in (curves, radius))
@@ -211,7 +207,7 @@ class Segment:
     def meshes_at_vertices(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``vertices`` and a mesh with that vertex, welded or not, in two arrays."""
         unwelded, order = self._unwelded
-        rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
+        rows, indices = expand_ranges(*search_ranges(unwelded, self._kept[vertices]))
         return rows, self._points.meshes(order[indices])
 
     def meshes_at_edges(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -255,7 +251,7 @@ class Segment:
     def find_points(self, meshes: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """Returns the indices of vertices among the points of given meshes' prims, the first if welded, shape [n]."""
         unwelded, order = self._unwelded
-        rows, indices = _expand(*search_ranges(unwelded, self._kept[vertices]))
+        rows, indices = expand_ranges(*search_ranges(unwelded, self._kept[vertices]))
         own_meshes, points = self._points.locate(order[indices])
         (own,) = np.nonzero(own_meshes == meshes[rows])
         return points[own[np.unique(rows[own], return_index=True)[1]]]
@@ -370,7 +366,7 @@ class Segment:
     def _find_sides(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns pairs of a row of ``ends``, shape [n, 2], smaller vertex first, and a side, in two arrays."""
         keys, sides = self._sides
-        rows, indices = _expand(*search_ranges(keys, self._side_keys(ends)))
+        rows, indices = expand_ranges(*search_ranges(keys, self._side_keys(ends)))
         return rows, sides[indices]
 
     def _ends_of_sides(self, sides: np.ndarray) -> np.ndarray:
@@ -440,30 +436,6 @@ class Segment:
         return welded_to
 
 
-class _InPrims:
-    """The mesh of each vertex or face, and its index among the points or polygons of its prim, shared by instances."""
-
-    def __init__(self, indices: list[np.ndarray]):
-        """Joins the indices of the elements of each mesh, given the same array for meshes that share them."""
-        counts = [len(array) for array in indices]
-        self._mesh_of = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        distinct_arrays = {id(array): array for array in indices}
-        self._indices = np.concatenate([np.zeros(0, dtype=np.int64), *distinct_arrays.values()])
-        starts = np.cumsum([0, *map(len, distinct_arrays.values())])
-        start_of = dict(zip(distinct_arrays, starts.tolist(), strict=False))
-        starts = np.array([start_of[id(array)] for array in indices], dtype=np.int64)
-        self._shifts = starts - np.cumsum([0, *counts])[:-1]
-
-    def meshes(self, elements: np.ndarray) -> np.ndarray:
-        """Returns the mesh of each element, int64."""
-        return self._mesh_of[elements].astype(np.int64)
-
-    def locate(self, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the mesh of each element, and its index in the prim."""
-        meshes = self.meshes(elements)
-        return meshes, self._indices[elements + self._shifts[meshes]]
-
-
 def _groups(meshes: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Yields each of the given meshes with its rows."""
     order = np.argsort(meshes, kind="stable")
@@ -476,10 +448,3 @@ def _renumber(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     is_used = np.zeros(count, dtype=bool)
     is_used[indices] = True
     return np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[indices]
-
-
-def _expand(first, last) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the elements of some ranges one after the other: the number of the range of each, and the elements."""
-    counts = last - first
-    rows = np.repeat(np.arange(len(counts)), counts)
-    return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)

@@ -1,8 +1,5 @@
 """Warns of transforms that straight paths hide: large turns between two times, and scales of 0. Imports pxr."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import math
 
 import numpy as np
@@ -42,7 +39,7 @@ def transform_warnings(meshes: list[UsdMesh], times: list[float]) -> list[str]:
     for mesh in meshes:
         key = mesh.group or mesh.name
         if key not in ops_of:
-            ops_of[key] = list(mesh.transform_ops())
+            ops_of[key] = list(mesh.transforms.ops(mesh.instance))
         for op in ops_of[key]:
             placed.setdefault(op.GetAttr().GetPath(), (op, []))[1].append(mesh)
         if instance := mesh.instance:
@@ -110,7 +107,7 @@ def _turn_warning(op: UsdGeom.XformOp, meshes: list[UsdMesh], times: list[float]
 
 def _varying(mesh: UsdMesh) -> tuple[Sdf.Path, ...]:
     """Returns the attributes of the operations of a mesh's transform that vary."""
-    return tuple(op.GetAttr().GetPath() for op in mesh.transform_ops() if op.MightBeTimeVarying())
+    return tuple(op.GetAttr().GetPath() for op in mesh.transforms.ops(mesh.instance) if op.MightBeTimeVarying())
 
 
 def _on_arcs(mesh: UsdMesh, intervals: list[int], times: list[float]) -> dict[int, Turn]:

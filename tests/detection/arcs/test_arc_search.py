@@ -512,7 +512,7 @@ def test_a_graph_in_which_a_body_deforms_finds_its_pairs_or_is_not_certified(dev
         assert found.certified == (device.is_cpu or not sunk)
         assert found.vertex_face.tolist() == ([[3, 0]] if device.is_cpu and sunk else [])
     # what a GPU measures in the graph
-    bounds = detector._arc_pipeline.bounds
+    bounds = detector._arcs.at_once.bounds
     for off, rigid in ((0.0, True), (sinks, False)):
         bounds.measure(start, wp.array(x1 + off, dtype=wp.vec3d, device=device))
         assert bounds.are_rigid().tolist() == [rigid]

@@ -8,6 +8,7 @@ from sheets import grid
 import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.detection.at_rest.intersections import IntersectionFinder, find_intersections
+from warp_bsc.detection.mesh import ElementsOfParts
 
 
 def test_intersections_are_exactly_those_of_all_pairs(broad_phase):
@@ -142,3 +143,12 @@ def test_intersections_at_the_end_of_a_motion(broad_phase):
         np.testing.assert_array_equal(at_start.pairs, find_intersections(mesh, x0))
         np.testing.assert_array_equal(at_end.pairs, find_intersections(mesh, x1))
         assert len(at_end.pairs)
+
+
+def test_elements_are_found_by_their_parts():
+    found = ElementsOfParts.of(np.array([[0, 1], [1, -1], [3, 0]]), 4)
+    assert found.first.tolist() == [0, 2, 4, 4, 5]
+    assert found.elements.tolist() == [0, 2, 0, 1, 2]
+    rows, elements = found.find(np.array([1, 2, 0]))
+    assert rows.tolist() == [0, 0, 2, 2]
+    assert elements.tolist() == [0, 1, 0, 2]

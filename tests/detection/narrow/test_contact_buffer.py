@@ -84,7 +84,8 @@ def test_many_results_dropped_at_once_leave_few_buffers():
     again = [detector.detect(x0, x1) for _ in range(8)]
     reused = set.union(*addresses) & set.union(*(buffer_addresses(c) for c in again))
     assert len(reused) >= 2 * len(addresses[0])
-    assert len(detector._result_buffers._free) + len(detector._result_buffers._returned) <= 4
+    buffers = detector._finder._buffers
+    assert len(buffers._free) + len(buffers._returned) <= 4
 
 
 def test_buffers_of_differentiable_results_stay_theirs(device):

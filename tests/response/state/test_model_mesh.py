@@ -187,8 +187,8 @@ def test_segments_are_checked():
 
 def test_equal_shapes_are_tessellated_once(monkeypatch):
     calls = []
-    tessellate = model_mesh._tessellate
-    monkeypatch.setattr(model_mesh, "_tessellate", lambda *given: calls.append(given) or tessellate(*given))
+    tessellate = model_mesh.tessellate
+    monkeypatch.setattr(model_mesh, "tessellate", lambda *given: calls.append(given) or tessellate(*given))
     builder = newton.ModelBuilder()
     for x, radius in ((0.0, 0.5), (2.0, 0.5), (4.0, 0.25)):
         builder.add_shape_sphere(-1, xform=pose(x, 0.0, 0.0), radius=radius)

@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from ..._arguments import checked_integer
-from ...detection.collisions import DetectionStats, StageCounts
 from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
+from ...detection.results.collisions import DetectionStats, StageCounts
 from ...detection.run.settings import Method
 from ..peers.ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
 from ..record import name_place, shorten_path

@@ -6,13 +6,13 @@ import warp as wp
 from ...kernels.arcs import Arcs
 from ...kernels.motion import double
 from ...kernels.signs import UNSURE
-from ..mesh import CollisionMesh
 from ..narrow.contact_buffer import ContactRows
 from ..narrow.on_host import pair_distances
 from ..narrow.rules.arc import allocate_arcs, bound_arc
 from ..pipeline import DetectionPipeline
+from ..results.collision_finder import CollisionFinder
 from ..run.launch import launch, made_once
-from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind, Method
+from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind
 from .rigid_motion import ArcBounds
 
 __all__ = ["LARGEST_TURN", "ArcPipeline"]
@@ -39,25 +39,24 @@ class ArcPipeline:
 
     Attributes:
         pipeline: The pipeline, whose contacts include those on arcs.
+        finder: Finds collisions by it, once :meth:`bound` has bounded their arcs.
         body: Body of each vertex that it is for, int32, shape [vertex_count].
         bounds: The motion that it was set to last.
     """
 
-    def __init__(self, mesh: CollisionMesh, bounds: ArcBounds, *, method: Method, tolerance: float):
+    def __init__(self, straight: DetectionPipeline, bounds: ArcBounds):
         """Allocates buffers.
 
         Args:
-            mesh: The mesh, without radii.
-            bounds: A motion of its bodies.
-            method: As of :class:`.detector.CollisionDetector`.
-            tolerance: As of :class:`.detector.CollisionDetector`.
+            straight: The pipeline for motions without turns, whose lock it shares; without radii.
+            bounds: A motion of bodies.
         """
         motion = bounds.motion
         self.body, self.bounds = motion.body, bounds
-        self._arcs = allocate_arcs(motion.body, len(motion.centre), mesh.device)
-        self.pipeline = DetectionPipeline(
-            mesh, method=method, tolerance=tolerance, arcs=self._arcs, only_used_vertices=True
-        )
+        options = {"method": straight.method, "tolerance": straight.tolerance, "only_used_vertices": True}
+        self._arcs = allocate_arcs(motion.body, len(motion.centre), straight.mesh.device)
+        self.pipeline = DetectionPipeline(straight.mesh, arcs=self._arcs, **options)
+        self.finder = CollisionFinder(self.pipeline, straight.broad_phase.lock)
 
     @staticmethod
     def is_for(bounds: ArcBounds) -> bool:
@@ -73,8 +72,7 @@ class ArcPipeline:
         for kind, counts in self.pipeline.counts.pairs.items():
             if counts.unsure:
                 rows = contacts[kind].read()
-                elements = mesh.faces if kind == DistanceKind.VERTEX_FACE else mesh.edges
-                corners, _distance = pair_distances(kind, elements, rows.pairs, self.bounds.lever)
+                corners, _distance = pair_distances(kind, mesh.elements(kind), rows.pairs, self.bounds.lever)
                 if (turns[corners].any(axis=1) & (rows.status == UNSURE)).any():
                     return True
         return False
@@ -87,10 +85,14 @@ class ArcPipeline:
         self._arcs.turn.assign(bounds.motion.turn)
         self._arcs.tolerance = bounds.tolerance
 
-    def leaves_out_rigid_bodies_alone(self) -> bool:
-        """Returns whether all bodies within which pairs are left out were rigid in the last run of a CUDA graph."""
+    def certifies(self, contacts: dict[DistanceKind, ContactRows]) -> bool:
+        """Returns whether the last run of a CUDA graph proves its result, by its bodies and, if exact, its pairs.
+
+        All bodies within which pairs are left out must have been rigid.
+        """
         body = self.bounds.body
-        return bool(self.bounds.are_rigid()[body[body >= 0]].all())
+        are_rigid = bool(self.bounds.are_rigid()[body[body >= 0]].all())
+        return are_rigid and not (self.pipeline.method == "exact" and self.has_unsure_pairs(contacts))
 
     def bound(self, x0: wp.array, x1: wp.array) -> None:
         """Bounds the arcs from one configuration to another; before each run, also in a CUDA graph."""

@@ -18,7 +18,7 @@ from ..narrow.contact_buffer import HostContacts, empty_contacts, read_contacts
 from ..narrow.on_host import pair_distances
 from ..pipeline import DetectionPipeline
 from ..run.launch import retry_until_fits
-from ..run.settings import Counts, DistanceKind, Method, add_counts
+from ..run.settings import Counts, DistanceKind, add_counts
 from ..run.stage_timer import StageTimer
 from .rigid_motion import ArcBounds
 
@@ -54,41 +54,28 @@ def straight_mesh(mesh: CollisionMesh, turns: np.ndarray) -> CollisionMesh:
 class ArcSearch:
     """Finds the pairs with a turning body that collide, or come near, along arcs. It reuses its buffers."""
 
-    def __init__(
-        self,
-        mesh: CollisionMesh,
-        body: np.ndarray,
-        *,
-        method: Method,
-        tolerance: float,
-        min_distance: float,
-        rings: int,
-    ):
+    def __init__(self, straight: DetectionPipeline, body: np.ndarray, *, min_distance: float, rings: int):
         """Allocates the buffers on the mesh's device.
 
         Args:
-            mesh: The mesh.
+            straight: The pipeline for motions without turns. The methods "conservative" and "exact" decide alike here,
+                as the tolerance is wider than any doubt.
             body: Body of each vertex, -1 for those that move straight, int32, shape [vertex_count].
-            method: "float" by computed signs; the others decide alike, as the tolerance is wider than any doubt.
-            tolerance: Of the times of impact, as a share of a part of the step.
             min_distance: As of :class:`.detector.CollisionDetector`.
             rings: As of :class:`.detector.CollisionDetector`.
         """
         self.body = body
-        self._mesh = mesh
+        self._mesh = mesh = straight.mesh
         self._pipeline = DetectionPipeline(
             mesh,
-            method="float" if method == "float" else "conservative",
-            tolerance=tolerance,
+            method="float" if straight.method == "float" else "conservative",
+            tolerance=straight.tolerance,
             min_distance=min_distance,
             rings=rings,
             body=body,
             only_used_vertices=True,
         )
-        self._elements = {
-            DistanceKind(phase.kind): mesh.faces if phase.kind == DistanceKind.VERTEX_FACE else mesh.edges
-            for phase in self._pipeline.narrow_phases
-        }
+        self._elements = {DistanceKind(n.kind): mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
 
     def find(
         self, bounds: ArcBounds, x0: wp.array, changed: wp.array | None, timer: StageTimer

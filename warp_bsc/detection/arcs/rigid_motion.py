@@ -78,8 +78,7 @@ class RigidMotion:
     body's largest coordinate, of the largest distance of a vertex from the centre, and of that distance for each radian
     of the turn, together. Detections leave out pairs within a rigid body, as their distance does not change by more
     than twice that. A body may deform by up to 2^-9 of that distance; pairs within it are then looked at as others are.
-
-    Its arrays are read-only.
+    Arrays are read-only.
 
     Attributes:
         body: Body of each vertex, -1 for those that move straight, int32, shape [vertex_count].
@@ -397,10 +396,8 @@ class ArcBounds:
         excess = misfit - (_MISFIT * distance + _MISFIT * _ROUNDED_MISFIT * size)
         if (excess > 0.0).any():
             worst = int(np.argmax(excess))
-            raise ValueError(
-                f"x1 must be where arcs take body {worst}, up to a translation: a vertex is {misfit[worst]:g} "
-                "away from there"
-            )
+            where = f"x1 must be where arcs take body {worst}, up to a translation"
+            raise ValueError(f"{where}: a vertex is {misfit[worst]:g} away from there")
         self.body = np.where(np.append(self.are_rigid(), True)[motion.body], motion.body, NOT_RIGID).astype(np.int32)
         least = 16.0 * float(values[2])  # that parts of the step can reach
         if motion.tolerance is not None and motion.tolerance < least:

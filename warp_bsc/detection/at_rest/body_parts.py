@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ..._sorted_keys import distinct
+from ..._sorted_keys import distinct, expand_ranges
 from ..mesh import CollisionMesh
 from .intersections import Intersections
 
-__all__ = ["BodyParts", "connect_cells", "expand_ranges", "pair_keys"]
+__all__ = ["BodyParts", "connect_cells", "pair_keys"]
 
 
 class BodyParts:
@@ -175,13 +175,6 @@ def connect_cells(nodes: np.ndarray, count: int) -> np.ndarray:
             np.minimum.at(roots, column, lowest)
         while not np.array_equal(roots, roots[roots]):
             roots = roots[roots]
-
-
-def expand_ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the range of each index in some ranges, and all these indices."""
-    counts = last - first
-    rows = np.repeat(np.arange(len(counts)), counts)
-    return rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts - first, counts)
 
 
 def pair_keys(pairs: np.ndarray, count: int) -> np.ndarray:

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ... import checker
+from ..._sorted_keys import expand_ranges
 from ..mesh import CollisionMesh
-from .body_parts import BodyParts, expand_ranges, pair_keys
+from .body_parts import BodyParts, pair_keys
 from .intersections import Intersections, points_on_faces
 
 __all__ = ["Containment", "ContainmentFinder"]

@@ -18,8 +18,8 @@ from ...kernels.motion import double
 from ...kernels.pipeline.queues import is_filled, take_slot
 from ...kernels.signs import FREE, HIT, UNSURE
 from ..broad.broad_phase import BroadPhase, make_broad_phase
-from ..collisions import Collisions
-from ..mesh import CollisionMesh
+from ..mesh import CollisionMesh, ElementsOfParts
+from ..results.collisions import Collisions
 from ..run.launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
@@ -358,10 +358,10 @@ class IntersectionFinder:
         Pairs that share a vertex are excluded; each other pair is listed once. Shape [n, 2], int32.
         """
         mesh = self._mesh
-        rows, edges = self._edges_of_vertices.of(collisions.vertex_face[:, 0])
+        rows, edges = self._edges_of_vertices.find(collisions.vertex_face[:, 0])
         pairs = [start.pairs, np.stack([edges, collisions.vertex_face[rows, 1]], axis=1)]
         for one, other in (collisions.edge_edge.T, collisions.edge_edge[:, ::-1].T):
-            rows, faces = self._faces_of_edges.of(other)
+            rows, faces = mesh.edge_faces.find(other)
             pairs.append(np.stack([one[rows], faces], axis=1))
         keys = distinct(np.concatenate(pairs).astype(np.int64) @ np.array([len(mesh.faces), 1]))
         edges, faces = np.divmod(keys, max(1, len(mesh.faces)))
@@ -374,33 +374,8 @@ class IntersectionFinder:
         return not self._mesh.only_free and bool((self._mesh.face_edges >= 0).any(axis=1).all())
 
     @functools.cached_property
-    def _edges_of_vertices(self) -> "_Incidence":
-        return _Incidence(self._mesh.edges, self._mesh.vertex_count)
-
-    @functools.cached_property
-    def _faces_of_edges(self) -> "_Incidence":
-        return _Incidence(self._mesh.face_edges, len(self._mesh.edges))
-
-
-class _Incidence:
-    """The elements that have a part, such as the edges of a vertex, for each part."""
-
-    def __init__(self, parts: np.ndarray, count: int):
-        """Sorts by parts.
-
-        Args:
-            parts: Indices of the parts of each element, or -1, shape [n, k].
-            count: Number of parts.
-        """
-        self._elements = np.argsort(parts, axis=None) // parts.shape[1]
-        self._starts = np.cumsum(np.bincount(parts.ravel() + 1, minlength=count + 1))
-
-    def of(self, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns all elements that have some parts: the row of the part, and the element, each of shape [m]."""
-        first, counts = self._starts[parts], self._starts[parts + 1] - self._starts[parts]
-        rows = np.repeat(np.arange(len(parts)), counts)
-        places = np.arange(len(rows)) + np.repeat(first - (np.cumsum(counts) - counts), counts)
-        return rows, self._elements[places]
+    def _edges_of_vertices(self) -> ElementsOfParts:
+        return ElementsOfParts.of(self._mesh.edges, self._mesh.vertex_count)
 
 
 def find_intersections(mesh: CollisionMesh, x: ArrayLike | wp.array) -> np.ndarray:

@@ -4,6 +4,7 @@ import numpy as np
 import warp as wp
 
 from ..._arguments import checked_integer
+from ..._sorted_keys import expand_ranges
 from ..mesh import CollisionMesh
 
 __all__ = ["Rings", "are_within_rings", "make_rings"]
@@ -70,9 +71,8 @@ def make_rings(mesh: CollisionMesh, rings: int) -> Rings:
         degrees = np.diff(starts)[neighbours]
         if sum(map(len, reached)) > most or degrees.sum() > 2 * most:
             break
-        first = np.repeat(starts[neighbours] - (np.cumsum(degrees) - degrees), degrees)
-        ends = edges[first + np.arange(degrees.sum()), 1]
-        further = np.unique(np.repeat(vertices, degrees) * n + ends)
+        rows, places = expand_ranges(starts[neighbours], starts[neighbours + 1])
+        further = np.unique(vertices[rows] * n + edges[places, 1])
         further = np.setdiff1d(further, ring, assume_unique=True)
         ring, before = np.setdiff1d(further, before, assume_unique=True), ring
         reached.append(ring)

@@ -4,10 +4,10 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import warp as wp
-from newton import GeoType, Mesh, Model, ParticleFlags, ShapeFlags
+from newton import GeoType, Model, ParticleFlags, ShapeFlags
 
 from ..._arguments import checked_integer
-from ...detection.mesh import CollisionMesh
+from ...detection.mesh import CollisionMesh, ElementsOfParts
 from ...detection.narrow.rules.approach import MinDistances, make_min_distances
 from ...kernels.pairs import PairFilter
 from ..tuning import SEGMENTS
@@ -15,14 +15,12 @@ from .collision_filter import CollisionFilter, bits_of_model
 from .kept_distances import KeptDistances
 from .shapes import PlacedShapes, place_shapes, shapes_of, take_shapes
 from .structs import Connectivity, Incidence
+from .tessellation import tessellate, tessellation_key
 
 MAX_SEGMENTS = 1024
 """Most triangles around a round shape; a sphere has about the square of them."""
 _STRAIGHT = 0.9
 """Length of a spring, as a share of that of two others between its ends, from which it runs along them."""
-
-_BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
-"""Options of a ``newton.Mesh`` whose triangles alone are used."""
 
 _Array = TypeVar("_Array", np.ndarray, wp.array)
 
@@ -145,9 +143,9 @@ class ModelMesh(CollisionMesh):
         faces = [triangles, outer_sides(tetrahedra, triangles)]
         shapes, worlds, units, unit_of_vertex, unit_count = [], [], [np.empty((0, 4))], [np.empty(0, dtype=int)], 0
         for shape in np.flatnonzero(collides & ~infinite):
-            key = _tessellation_key(model, shape, GeoType(shape_type[shape]), shape_scale[shape])
+            key = tessellation_key(model, shape, GeoType(shape_type[shape]), shape_scale[shape])
             if key not in tessellations:
-                unit, shape_faces = _tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments)
+                unit, shape_faces = tessellate(model, shape, GeoType(shape_type[shape]), shape_scale[shape], segments)
                 tessellations[key] = unit_count + np.arange(len(unit)), shape_faces
                 units.append(unit)
                 unit_count += len(unit)
@@ -189,8 +187,8 @@ class ModelMesh(CollisionMesh):
         self.device_world = self._on_device(world)
         self.connectivity = connectivity = Connectivity()
         connectivity.faces, connectivity.edges = self.device_faces, self.device_edges
-        connectivity.vertex_edges = _incidence(self.edges, vertex_count, self.device)
-        connectivity.edge_faces = _incidence(self.face_edges, len(self.edges), self.device)
+        connectivity.vertex_edges = _for_kernels(ElementsOfParts.of(self.edges, vertex_count), self.device)
+        connectivity.edge_faces = _for_kernels(self.edge_faces, self.device)
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
@@ -315,15 +313,10 @@ def host_array(array: wp.array | None) -> np.ndarray:
     return array.numpy()
 
 
-def _incidence(elements: np.ndarray, count: int, device: wp.Device) -> Incidence:
-    """Returns the rows of ``elements`` that each of ``count`` numbers is in; negative numbers are left out."""
-    numbers = elements.ravel()
-    rows = np.repeat(np.arange(len(elements)), elements.shape[1])
-    order = np.argsort(numbers, kind="stable")[np.count_nonzero(numbers < 0) :]
+def _for_kernels(found: ElementsOfParts, device: wp.Device) -> Incidence:
     incidence = Incidence()
-    first = np.concatenate([[0], np.cumsum(np.bincount(numbers[order], minlength=count))])
-    incidence.first = wp.array(first, dtype=int, device=device)
-    incidence.items = wp.array(rows[order], dtype=int, device=device)
+    incidence.first = wp.array(found.first, dtype=int, device=device)
+    incidence.items = wp.array(found.elements, dtype=int, device=device)
     return incidence
 
 
@@ -415,77 +408,3 @@ def unseen_strands(mesh: ModelMesh) -> str | None:
     names = "springs", "particles without faces and springs"
     numbers = [np.count_nonzero(has_others[worlds]) for worlds in lacking]
     return " and ".join(f"{n} {name}" for n, name in zip(numbers, names, strict=True) if n) or None
-
-
-def _tessellation_key(model, shape, shape_type, scale):
-    """Returns what the triangles of a shape, for a scale of 1, depend on."""
-    is_barrel = shape_type == GeoType.CYLINDER and scale[2] > 0.0
-    is_sphere = shape_type == GeoType.CAPSULE and not scale[1] > 0.0
-    return shape_type, id(model.shape_source[shape]), is_sphere, tuple(scale) if is_barrel else None
-
-
-def _tessellate(model, shape, shape_type, scale, segments):
-    """Returns the surface of a shape for a scale of 1, see :mod:`.shapes`.
-
-    That is its vertices, float64, shape [n, 4], and faces, shape [m, 3]; no two vertices are in one place. Raises
-    NotImplementedError if there are no triangles for the type.
-    """
-    match shape_type:
-        case GeoType.MESH | GeoType.CONVEX_MESH:
-            return _weld(model.shape_source[shape])
-        case GeoType.PLANE:
-            return _weld(Mesh.create_plane(1.0, 1.0, **_BARE))
-        case GeoType.BOX:
-            return _weld(Mesh.create_box(1.0, 1.0, 1.0, **_BARE))
-        case GeoType.SPHERE | GeoType.ELLIPSOID:
-            return _revolve(_capsule_profile(segments, is_sphere=True), segments)
-        case GeoType.CAPSULE:
-            return _revolve(_capsule_profile(segments, is_sphere=not scale[1] > 0.0), segments)
-        case GeoType.CYLINDER:
-            x, y, z = scale.astype(np.float64)
-            if not z > 0.0:
-                return _revolve([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.0, 1.0], [0.0, 0.0, 1.0]], segments)
-            # a barrel, whose side is an arc of radius z
-            angle = np.linspace(-1.0, 1.0, segments // 2 + 1)[1:-1] * np.arcsin(y / z)
-            arc = np.column_stack([x - np.sqrt(z * z - y * y) + z * np.cos(angle), z * np.sin(angle)])
-            profile = np.concatenate([[[0.0, -y], [x, -y]], arc, [[x, y], [0.0, y]]])
-            return _revolve(np.column_stack([profile, np.zeros(len(profile))]), segments)
-        case GeoType.CONE:
-            return _revolve([[0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [0.0, 0.0, 1.0]], segments)
-    raise NotImplementedError(
-        f"shape {shape} ({model.shape_label[shape]!r}) of type {shape_type.name} collides with particles, but has no "
-        "triangles to collide with: use a mesh, or clear its flag COLLIDE_PARTICLES"
-    )
-
-
-def _weld(mesh):
-    """Returns the vertices and triangles of a ``newton.Mesh``, with vertices that are in one place merged.
-
-    Seams of texture or normals have several, and the triangles on both sides would always collide with each other.
-    """
-    positions, vertex = np.unique(mesh.vertices.astype(np.float64), axis=0, return_inverse=True)
-    return np.column_stack([positions, np.zeros(len(positions))]), vertex.reshape(-1)[mesh.indices].reshape(-1, 3)
-
-
-def _capsule_profile(segments, *, is_sphere):
-    """Returns the profile of a capsule from pole to pole, as of :func:`_revolve`; that of a sphere has one equator."""
-    angle = np.linspace(0.0, np.pi / 2.0, segments // 4 + 1)
-    lower = np.column_stack([np.sin(angle), -np.cos(angle), np.full(len(angle), -1.0)])
-    upper = lower[::-1] * (1.0, -1.0, -1.0)
-    return np.concatenate([lower, upper[1:] if is_sphere else upper])
-
-
-def _revolve(profile, segments):
-    """Returns the surface that a profile makes when it turns around the z axis, as :func:`_tessellate` does.
-
-    The profile has radius and height, and the share of the half height that is added to it, from the lower pole to the
-    upper, both on the axis, shape [n, 3].
-    """
-    from trimesh import creation  # noqa: PLC0415 (slow)
-
-    # trimesh drops triangles and merges vertices by absolute sizes: revolve a unit profile, and scale its rings
-    unit = np.column_stack([np.ones(len(profile)), np.arange(len(profile))])
-    unit[[0, -1], 0] = 0.0
-    surface = creation.revolve(unit, sections=segments)
-    rings = np.asarray(profile)[surface.vertices[:, 2].astype(int)]
-    return np.column_stack([surface.vertices[:, :2] * rings[:, :1], rings[:, 1:]]), np.array(surface.faces)

@@ -1,8 +1,5 @@
 """Finds value clips that OpenUSD passes over, most without a word. Imports pxr, which is slow: import where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import os
 from collections.abc import Iterator
 from typing import Any

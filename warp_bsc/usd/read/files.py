@@ -1,8 +1,5 @@
 """Tracks the files of a USD stage, which must not be overwritten or change during a replay."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import os
 from typing import TYPE_CHECKING
 

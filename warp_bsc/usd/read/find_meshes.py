@@ -1,8 +1,5 @@
 """Reads the selected meshes, curves and points of a USD stage. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import os
 from collections import Counter
 from collections.abc import Mapping

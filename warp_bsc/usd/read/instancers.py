@@ -1,8 +1,5 @@
 """The instances of point instancers and their transforms. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import math
 import os
 from collections.abc import Iterable, Iterator

@@ -1,11 +1,7 @@
 """Finds the prims of a USD stage that are read as meshes. Imports pxr, which is slow: import this where it is used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import os
 from collections import Counter
-from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -77,7 +73,7 @@ class MeshPrimFinder:
         self.unread: list[MeshPrim] = []
         self.other: Counter[str] = Counter()
 
-    def walk(self, prims: Iterator[Usd.Prim], instance: Instance | None = None) -> None:
+    def walk(self, prims: Any, instance: Instance | None = None) -> None:
         """Adds what is found among prims.
 
         Args:

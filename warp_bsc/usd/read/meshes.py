@@ -1,9 +1,5 @@
 """Reads a mesh of a USD stage, or curves or points of a prim. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
-import bisect
 import copy
 import math
 import os
@@ -13,29 +9,19 @@ from itertools import pairwise
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from .instancers import (
-    Instance,
-    are_finite,
-    is_shown,
-    masking_attributes,
-    transform_attributes,
-    transform_ops,
-    transform_times,
-    visibility_times,
-)
+from .instancers import is_shown, visibility_times
 from .mesh_prims import MeshPrim
-from .samples import as_time_code, may_jump, sample_times
+from .mesh_transforms import MeshTransforms
+from .samples import as_time_code, sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
-from .topology import BROKEN, Topology, as_topology, is_empty
+from .topology import BROKEN, Topologies, is_empty
 from .unreadable import UnreadableError, reading
 
 __all__ = ["UsdMesh"]
 
-_BETWEEN = 0.382  # where between two samples transforms are tested for bends; halfway, two whole turns look like none
 _MOST_TIMES = 1_000_000
-_ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 
 _States = dict[float, tuple[bytes, bytes] | None]
 
@@ -44,8 +30,12 @@ class UsdMesh:
     """A mesh prim, or one instance of it.
 
     Attributes:
-        path: The prim's path.
+        prim: The prim.
+        path: Its path.
         name: The path, with the number of the instance if a point instancer places it.
+        instance: The instance that it is, None for a mesh without an instancer.
+        index: Number of the instance, 0 without an instancer.
+        transforms: The transforms of all instances to the world.
         group: The same value for all instances of a prim that one instancer places; empty without an instancer.
         display_name: Display name in the file, empty if there is none.
         type_name: Type of the prim.
@@ -55,6 +45,7 @@ class UsdMesh:
         states: Its states by the time from which on they hold, the first by minus infinity: None where it is invisible,
             absent or empty, else digests of its topology.
         turns: Whether a transform or a skeleton moves it, so that it may move nonlinearly between the samples.
+        is_skinned: Whether a skeleton or blend shapes deform it.
         deforms: Whether anything except its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
         is_placed: Whether its transform is the identity at all times, so that its points are in world space.
@@ -74,75 +65,37 @@ class UsdMesh:
         """
         prim, instance = found.prim, found.instance
         self._file = file
+        self.prim = prim
         self.path = found.path
         self.display_name = prim.GetDisplayName()
         self.type_name = str(prim.GetTypeName())
         self.is_shape = is_shape(prim)
-        self._prim = prim
         self._strands = Strands(prim) if is_strands(prim) else None
         self.is_strands = self._strands is not None
         shaped = ShapePolygons if self.is_shape else MeshPolygons
         self._polygons: Polygons = self._strands or shaped(prim)
         self._skin = skin = Skin(*found.binding, where=f"{file}: {self.path}") if found.binding else None
-        self._root = instance.root if instance else None
-        # Joints move points to the space of their skeleton.
-        self._frame = skin.skeleton if skin and skin.skeleton else prim
-        self._masking = () if instance else masking_attributes(self._frame)
-        self._where = f"{file}: {found.name}"
-        instancer = instance.instancer if instance else None
-        self.group = (id(instancer), self.path) if instancer else ()
+        self.is_skinned = skin is not None
+        self.group = found.group
         self._last_points: dict[tuple, np.ndarray] = {}  # these two are shared by all instances
         self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
 
-        breaks = visibility_times(prim, self._root) | sample_times(*self._polygons.topology_attributes)
-        if instancer:
-            breaks |= instancer.break_times
-        self._breaks = (-math.inf, *sorted(breaks))
-        self._break_codes = tuple(
-            Usd.TimeCode.EarliestTime() if time == -math.inf else Usd.TimeCode(time) for time in self._breaks
-        )
-        self._topologies = self._read_topologies()
-        self.is_empty = not any(self._topologies)
-        self._states = [
-            topology if topology and is_shown(prim, self._root, code) else None
-            for code, topology in zip(self._break_codes, self._topologies, strict=True)
-        ]
-        # Points that are renumbered do not move to those of their number.
-        are_renumbered = len({polygons for polygons, _ in filter(None, self._topologies)}) > 1
+        root, breaks = (instance.root, instance.instancer.break_times) if instance else (None, set())
+        breaks = breaks | visibility_times(prim, root)
         has_numbers = not self._strands or self._strands.has_edges  # points without edges have ids
-        self._numbered_times = sorted(sample_times(*self._polygons.point_attributes)) * (are_renumbered and has_numbers)
-        self._deformed_times = frozenset(
-            sample_times(*self._polygons.point_attributes) | (skin.times if skin else set())
-        )
+        where = f"{file}: {found.name}"
+        self._topologies = topologies = Topologies(self._polygons, breaks, has_numbers=has_numbers, where=where)
+        self.is_empty = not any(topologies.digests)
+        self._states = [
+            topology if topology and is_shown(prim, root, code) else None
+            for code, topology in zip(topologies.codes, topologies.digests, strict=True)
+        ]
+        point_times = sample_times(*self._polygons.point_attributes)
+        self._deformed_times = frozenset(point_times | (skin.times if skin else set()))
         self.deforms = bool(self._deformed_times)
-        self.may_jump = (
-            may_jump(transform_attributes(self._frame, self._root))
-            or self._polygons.may_jump
-            or bool(instancer and instancer.may_jump)
-            or bool(skin and skin.may_jump)
-        )
-
-        self._transform_times = sorted(
-            transform_times(self._frame, self._root) | (instancer.times if instancer else set())
-        )
-        # Between samples as well, because a whole turn ends where it began.
-        between = [start + _BETWEEN * (end - start) for start, end in pairwise(self._transform_times)]
-        codes = [Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, sorted([*self._transform_times, *between]))]
-        first, were_there = (values.copy() for values in self._read_transforms(instance, codes[0]))
-        # Some writers sample a transform at every time although it never changes.
-        self._moved = np.zeros(len(first), dtype=bool)
-        for code in codes[1:]:
-            transforms, are_there = self._read_transforms(instance, code)
-            differs = (transforms != first) & ~(np.isnan(transforms) & np.isnan(first))
-            self._moved |= are_there & were_there & differs.any(axis=(1, 2))
-            appears = are_there & ~were_there
-            first[appears] = transforms[appears]
-            were_there |= are_there
-            if (self._moved & were_there).all():
-                break
-        self._stays: np.ndarray = (first == np.eye(4)).all(axis=(1, 2))
-        self._is_finite: np.ndarray = np.isfinite(first).all(axis=(1, 2))
-        self._bent: dict[tuple[float, float], np.ndarray] = {}
+        # Joints move points to the space of their skeleton.
+        self.transforms = MeshTransforms((skin and skin.skeleton) or prim, instance)
+        self.may_jump = self.transforms.may_jump or self._polygons.may_jump or bool(skin and skin.may_jump)
         self._set_instance(found)
 
     def again(self, found: MeshPrim) -> "UsdMesh":
@@ -155,21 +108,23 @@ class UsdMesh:
         """Sets what differs between instances."""
         self.name = found.name
         self._where = f"{self._file}: {self.name}"
-        self._instance = instance = found.instance
+        self.instance = instance = found.instance
+        self.index = instance.index if instance else 0
         self._whole: _States = {}  # its states before parts are left out, if any are
         self._own_times = {}  # by time of the scene: the first and the last of the mesh's times that it stands for
         states = self._states
         if instance:
-            present = instance.are_present(self._break_codes)
+            present = instance.are_present(self._topologies.codes)
             states = [state if here else None for state, here in zip(states, present.tolist(), strict=True)]
         self.states: _States = {}
         last = b"", b""
-        for time, state in zip(self._breaks, states, strict=True):
+        for time, state in zip(self._topologies.times, states, strict=True):
             if state != last:
                 self.states[time] = last = state
-        self.is_placed = bool(self._stays[self.index]) and not self._moved[self.index]
-        self.is_nowhere = not (self._is_finite[self.index] or self._moved[self.index])
-        self._placed_times = self._transform_times if self._moved[self.index] else []
+        moves = bool(self.transforms.moves[self.index])
+        self.is_placed = bool(self.transforms.stays[self.index]) and not moves
+        self.is_nowhere = not (self.transforms.is_finite[self.index] or moves)
+        self._placed_times = self.transforms.times if moves else []
         self.times = self._deformed_times | set(self._placed_times)
         self.turns = bool(self._placed_times) or bool(self._skin and self._skin.times)
 
@@ -177,8 +132,7 @@ class UsdMesh:
     def may_thicken(self) -> bool:
         """Whether the radii of curves or points may change."""
         return self._strands is not None and (
-            self._strands.width_attribute.ValueMightBeTimeVarying()
-            or float(np.ptp(self._scales(self._placed_times))) > 0
+            self._strands.width_attribute.ValueMightBeTimeVarying() or len({*self._scales(self._placed_times)}) > 1
         )
 
     def turning_times(self, start: float, end: float) -> set[float]:
@@ -201,7 +155,7 @@ class UsdMesh:
                     f"frames: {self._where} turns from time {first:g} to {last:g} and is sampled at every whole time "
                     "code, more than a million; a step takes fewer"
                 )
-            if low <= high and (bends or self._bends(first, last)):
+            if low <= high and (bends or self.transforms.bend(self.instance, first, last)[self.index]):
                 times.update(map(float, range(low, high + 1)))
         return times
 
@@ -256,9 +210,9 @@ class UsdMesh:
     @property
     def why_not_written(self) -> str | None:
         """Why a layer over the scene cannot give the mesh points of its own, in words; None if it can."""
-        if self._instance:
+        if self.instance:
             return "a point instancer places it"
-        if self._prim.IsInstanceProxy():
+        if self.prim.IsInstanceProxy():
             return "it is in an instance, which shares its points with others"
         if self.is_shape or self.is_strands:
             return f"a {self.type_name} has no faces of its own"
@@ -271,23 +225,13 @@ class UsdMesh:
             return self.why_not_written
         return "its points do not move, only its transform" if self.times else "it does not move"
 
-    @property
-    def prim(self) -> Usd.Prim:
-        """The prim."""
-        return self._prim
-
-    @property
-    def is_skinned(self) -> bool:
-        """Whether a skeleton or blend shapes deform it."""
-        return self._skin is not None
-
     def read_own_points(self, time: float, *, before: bool = False) -> np.ndarray:
         """Returns the points in the space of the prim itself, also if a skeleton deforms them, shape [point_count, 3].
 
         Those that nothing deforms have the bits of the file. Arguments and errors are those of :meth:`read_points`.
         """
         points = self.read_points(time, before=before)
-        if self._frame is self._prim:
+        if not (self._skin and self._skin.skeleton):
             return points
         transform = self._transform(time, before=before)
         return self.to_own_space(points @ transform[:3, :3] + transform[3, :3], time, before=before)
@@ -303,7 +247,7 @@ class UsdMesh:
         if self.is_placed:
             return positions.astype(np.float32)
         code = self.time_code(time, before)
-        inverse = np.linalg.inv(np.array(UsdGeom.Imageable(self._prim).ComputeLocalToWorldTransform(code)))
+        inverse = np.linalg.inv(np.array(UsdGeom.Imageable(self.prim).ComputeLocalToWorldTransform(code)))
         return (positions @ inverse[:3, :3] + inverse[3, :3]).astype(np.float32)
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
@@ -323,7 +267,8 @@ class UsdMesh:
                 return self._last_points[key]
             # A number of points that changes without the topology is an error, which the moment before would hide.
             at_time = before and time not in self.states
-            points = self._polygons.read_points(self._held(Usd.TimeCode(code.GetValue()) if at_time else code))
+            held = self._topologies.held(Usd.TimeCode(code.GetValue()) if at_time else code)
+            points = self._polygons.read_points(held)
             if is_empty(points):
                 raise UnreadableError(f"{self._where}: the mesh has no points at time {time:g}")
             if self._skin:
@@ -385,7 +330,7 @@ class UsdMesh:
             time: Time code, of the scene or between its times.
             before: As of :meth:`read_positions`.
         """
-        return self._find_transform(self.time_code(time, before))
+        return self.transforms.read_one(self.instance, self.time_code(time, before))
 
     def read_instances(
         self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
@@ -407,30 +352,11 @@ class UsdMesh:
         """
         points = self.read_points(time, before=before).astype(np.float64)
         with reading(self._where, self.name, time):
-            transforms, are_there = self._read_transforms(self._instance, self.time_code(time, before))
+            transforms, are_there = self.transforms.read(self.instance, self.time_code(time, before))
             transforms = transforms[instances]
             if len(points) != point_count or not are_there[instances].all() or not np.isfinite(transforms).all():
                 return None
             return points @ transforms[:, :3, :3] + transforms[:, 3:, :3]
-
-    @property
-    def instance(self) -> Instance | None:
-        """The instance that it is, None for a mesh without an instancer."""
-        return self._instance
-
-    def transform_ops(self) -> Iterator[UsdGeom.XformOp]:
-        """Yields the operations of its transform to the world, except those of instancers on their instances."""
-        yield from transform_ops(self._frame, self._root)
-        instance = self._instance
-        while instance:
-            instancer = instance.instancer
-            instance = instancer.parent
-            yield from transform_ops(instancer.prim, instance.root if instance else None)
-
-    @property
-    def index(self) -> int:
-        """Number of the instance, 0 for a mesh without an instancer."""
-        return self._instance.index if self._instance else 0
 
     def read_triangles(self, time: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
         """Returns the polygons without the holes, as triangles that turn counterclockwise seen from outside.
@@ -477,7 +403,7 @@ class UsdMesh:
         if not self._strands:
             return np.zeros((0, 2), dtype=np.int64), np.full(point_count, -1), np.zeros(point_count)
         with reading(self._where, self.name, times[0]):
-            topology = self._read_topology(self.time_code(times[0], False))
+            topology = self._topologies.read(self.time_code(times[0], False), self._where)
             edges, curves = self._strands.read_edges(topology.counts, point_count, self._where)
         own = sample_times(self._strands.width_attribute)
         radius = np.zeros(point_count)
@@ -488,20 +414,13 @@ class UsdMesh:
         return edges, curves, radius * max(self._scales(times if self._placed_times else times[:1]))
 
     def _scales(self, times: list[float]) -> list[float]:
-        """Returns the largest stretch of the transform at each time, to nine digits; [1] without times."""
-        found = [self._find_transform(self.time_code(time, False)) for time in times if not self.is_placed]
-        scales = [
-            np.linalg.norm(transform[:3, :3], 2)
-            for transform in found
-            if transform is not None and np.isfinite(transform).all()  # reading positions reports the others
-        ]
-        return [float(f"{scale:.9g}") for scale in scales] or [1.0]
+        return self.transforms.scales(self.instance, [self.time_code(time, False) for time in times])
 
     def _find_triangles(self, code, points, is_mirrored) -> tuple[np.ndarray, np.ndarray, int]:
         """Returns the result of :meth:`read_triangles`."""
-        topology = self._read_topology(code)
+        topology = self._topologies.read(code, self._where)
         triangles, polygons = topology.triangles(points, self._where)
-        is_left_handed = UsdGeom.Gprim(self._prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        is_left_handed = UsdGeom.Gprim(self.prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if is_left_handed != is_mirrored:
             triangles = triangles[:, ::-1]
         return triangles, polygons, len(topology.counts)
@@ -514,85 +433,12 @@ class UsdMesh:
 
     def _transform(self, time, *, before=False) -> np.ndarray:
         """Returns the matrix that transforms points, as rows, to world space, shape [4, 4]."""
-        transform = self._find_transform(self.time_code(time, before))
+        transform = self.read_transform(time, before=before)
         if transform is None:
             raise UnreadableError(f"{self._where}: its instancer has no valid transform for it at time {time:g}")
         if not np.isfinite(transform).all():
             raise UnreadableError(f"{self._where}: its transform is not finite at time {time:g}")
         return transform
-
-    def _bends(self, start, end) -> bool:
-        """Returns whether the transform leaves the straight path from one sample to the next."""
-        if (start, end) not in self._bent:
-            codes = Usd.TimeCode(start), Usd.TimeCode(start + _BETWEEN * (end - start)), Usd.TimeCode.PreTime(end)
-            (first, *_), (between, *_), (last, *_) = found = [self._read_transforms(self._instance, c) for c in codes]
-            off = np.abs(between - (first + _BETWEEN * (last - first)))
-            size = np.maximum(np.abs(first), np.abs(last))
-            self._bent[start, end] = np.zeros(len(first), dtype=bool)
-            for rows in (slice(0, 3), slice(3, 4)):
-                self._bent[start, end] |= off[:, rows].max(axis=(1, 2)) > _ROUNDING * size[:, rows].max(axis=(1, 2))
-            self._bent[start, end] &= np.all([are_there for _, are_there in found], axis=0)
-        return bool(self._bent[start, end][self.index])
-
-    def _find_transform(self, time) -> np.ndarray | None:
-        if not self._instance:
-            return self._read_transforms(None, time)[0][0]
-        return self._instance.transform(self._frame, time)
-
-    def _read_transforms(self, instance, time) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the result of :meth:`Instancer.transforms`, or one matrix for a mesh without an instancer."""
-        if instance:
-            return instance.instancer.transforms(self._frame, instance.root, time)
-        return self.compute_transform(UsdGeom.XformCache(time))[None], np.ones(1, dtype=bool)
-
-    def compute_transform(self, cache: UsdGeom.XformCache) -> np.ndarray:
-        """Returns the matrix of a mesh without an instancer, finite or not, at the time of a cache, shape [4, 4]."""
-        transform = np.array(cache.GetLocalToWorldTransform(self._frame))
-        if not are_finite(self._masking, cache.GetTime()):
-            transform[:] = np.nan
-        return transform
-
-    def _read_topology(self, time) -> Topology:
-        return as_topology(self._polygons.read_topology(time), self._where)
-
-    def _read_topologies(self) -> list[tuple[bytes, bytes] | None]:
-        """Returns digests of the topology at each time at which it may change; None where it is empty.
-
-        A mesh may be empty for some time, such as a fluid before it flows. Where a sample is blocked it is not empty,
-        but broken.
-        """
-        topologies, is_empty, last = [], True, []
-        for code in self._break_codes:
-            values = self._polygons.read_topology(code)
-            if not last or any(old is not new and old != new for old, new in zip(last, values, strict=True)):
-                topology = as_topology(values, self._where)
-                has_elements = len(topology.counts) > 0
-                without = BROKEN if values[0] is None else None
-                topologies.append(topology.digests() if has_elements else without)
-                is_empty &= not has_elements
-            else:
-                topologies.append(topologies[-1])  # reading the digests of equal values would take longer
-            last = values
-        return [None] * len(topologies) if is_empty else topologies
-
-    def _held(self, code: Usd.TimeCode) -> Usd.TimeCode:
-        """Returns the time code of the last sample of the points where the next one is of other polygons, else a code.
-
-        USD holds points until the next sample if that has another number of points, and interpolates them if it has as
-        many. Neither value is a motion if the points have other numbers.
-        """
-        times, time = self._numbered_times, code.GetValue()
-        search = bisect.bisect_left if code.IsPreTime() else bisect.bisect_right
-        following = search(times, time)
-        if 0 < following < len(times):
-            topologies = (
-                self._topologies[max(0, search(self._breaks, time) - 1)],
-                self._topologies[bisect.bisect_right(self._breaks, times[following]) - 1],
-            )
-            now, then = (topology and topology[0] for topology in topologies)
-            if now and then and now != then:
-                return Usd.TimeCode(times[following - 1])
-        return code
 
 
 def _state_at(states: _States, time: float) -> tuple[bytes, bytes] | None:

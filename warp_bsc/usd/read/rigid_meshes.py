@@ -46,7 +46,7 @@ class RigidMeshes:
                 self._cache.SetTime(code)
                 for number in numbers:
                     mesh, _, rows, _ = self._parts[number]
-                    transform = mesh.compute_transform(self._cache)
+                    transform = mesh.transforms.compute(self._cache)
                     placed = positions[rows]
                     np.matmul(self._points[number], transform[:3, :3], out=placed)
                     placed += transform[3, :3]

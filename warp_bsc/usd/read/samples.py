@@ -1,8 +1,5 @@
 """The time codes at which attributes of a USD stage are sampled. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 from collections.abc import Iterable
 from itertools import pairwise
 

@@ -1,8 +1,5 @@
 """The polygons of meshes, and of USD's shapes as polyhedra. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import functools
 import math
 from collections.abc import Sequence
@@ -123,7 +120,7 @@ class ShapePolygons:
             points = points * [values["radius"], values["radius"], values["height"]]
         return np.roll(points, {"X": 1, "Y": 2, "Z": 0}[values["axis"]], axis=1)
 
-    def read_topology(self, _time: Usd.TimeCode) -> list[Any]:
+    def read_topology(self, time: Usd.TimeCode) -> list[Any]:
         """Returns numbers of corners, the points at the corners and no holes."""
         _, counts, indices = _unit_shape(self._type, self._segments)
         return [counts, indices, None]

@@ -1,8 +1,5 @@
 """Deforms meshes by skeletons and blend shapes, with UsdSkel. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import numpy as np
 from pxr import Sdf, Usd, UsdSkel, Vt
 

@@ -1,8 +1,5 @@
 """Opens a USD file with everything that it refers to. Imports pxr, which is slow: import this where it is used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import math
 import os
 import re

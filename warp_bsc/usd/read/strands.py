@@ -1,8 +1,5 @@
 """The edges of linear curves, and points, with their radii. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import bisect
 from typing import Any
 

@@ -1,26 +1,27 @@
-"""The polygons of a mesh at one time, checked and triangulated. Imports pxr, which is slow: import this where used."""
+"""The polygons of a mesh, checked and triangulated. Imports pxr, which is slow: import this where used."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
+import bisect
 import hashlib
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from pxr import Vt
+from pxr import Usd, Vt
 
+from .samples import sample_times
+from .shapes import Polygons
 from .triangulation import triangulate
 from .unreadable import UnreadableError
 
-__all__ = ["BROKEN", "Topology", "as_topology", "is_empty"]
+__all__ = ["BROKEN", "Topologies", "Topology", "as_topology", "is_empty"]
 
 BROKEN = b"", b""
 """The digests of polygons of which a sample is blocked."""
 
 
 class Topology(NamedTuple):
-    """The polygons of a mesh: of a ``UsdGeom.Mesh``, the values of the attributes that are named here, int64.
+    """The polygons of a mesh at one time: of a ``UsdGeom.Mesh``, values of the attributes that are named here, int64.
 
     Attributes:
         counts: ``faceVertexCounts``, number of corners of each polygon, shape [polygon_count].
@@ -74,6 +75,71 @@ class Topology(NamedTuple):
         if not solid.any():
             raise UnreadableError(f"{where}: all faces of the mesh are holes")
         return triangles[solid], polygons[solid]
+
+
+class Topologies:
+    """The polygons of a mesh at all times.
+
+    Attributes:
+        times: Time codes from which on they may be others, ascending, the first minus infinity.
+        codes: The same for OpenUSD.
+        digests: Digests of the polygons at each time, None where there are none. A mesh may be empty for some time,
+            such as a fluid before it flows. Where a sample is blocked it is not empty, but broken.
+    """
+
+    def __init__(self, polygons: Polygons, times: set[float], *, has_numbers: bool, where: str):
+        """Reads the polygons.
+
+        Args:
+            polygons: Their attributes.
+            times: Time codes at which the mesh changes for other reasons.
+            has_numbers: Whether the polygons tell which points stay the same from one sample to the next.
+            where: File and prim, for messages.
+
+        Raises:
+            UnreadableError: If an attribute is not a list of integers.
+        """
+        self._polygons = polygons
+        self.times = (-math.inf, *sorted(times | sample_times(*polygons.topology_attributes)))
+        self.codes = (Usd.TimeCode.EarliestTime(), *map(Usd.TimeCode, self.times[1:]))
+        self.digests: list[tuple[bytes, bytes] | None] = []
+        is_empty, last = True, []
+        for code in self.codes:
+            values = polygons.read_topology(code)
+            if not last or any(old is not new and old != new for old, new in zip(last, values, strict=True)):
+                topology = as_topology(values, where)
+                has_elements = len(topology.counts) > 0
+                without = BROKEN if values[0] is None else None
+                self.digests.append(topology.digests() if has_elements else without)
+                is_empty &= not has_elements
+            else:
+                self.digests.append(self.digests[-1])  # reading the digests of equal values would take longer
+            last = values
+        if is_empty:
+            self.digests = [None] * len(self.digests)
+        # Points that are renumbered do not move to those of their number.
+        are_renumbered = len({own for own, _ in filter(None, self.digests)}) > 1
+        self._numbered_times = sorted(sample_times(*polygons.point_attributes)) * (are_renumbered and has_numbers)
+
+    def read(self, time: Usd.TimeCode, where: str) -> Topology:
+        """Returns the polygons at a time, with errors as of :func:`as_topology`."""
+        return as_topology(self._polygons.read_topology(time), where)
+
+    def held(self, code: Usd.TimeCode) -> Usd.TimeCode:
+        """Returns the time code of the last sample of the points where the next one is of other polygons, else a code.
+
+        USD holds points until the next sample if that has another number of points, and interpolates them if it has as
+        many. Neither value is a motion if the points have other numbers.
+        """
+        times, time = self._numbered_times, code.GetValue()
+        search = bisect.bisect_left if code.IsPreTime() else bisect.bisect_right
+        following = search(times, time)
+        if 0 < following < len(times):
+            now = self.digests[max(0, search(self.times, time) - 1)]
+            then = self.digests[bisect.bisect_right(self.times, times[following]) - 1]
+            if now and then and now[0] != then[0]:
+                return Usd.TimeCode(times[following - 1])
+        return code
 
 
 def as_topology(values: Sequence[Any], where: str) -> Topology:

@@ -1,8 +1,5 @@
 """Errors in damaged USD data, and the parts of a scene that are left out for them. Imports pxr, which is slow."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import contextlib
 import os
 from collections.abc import Iterator

@@ -1,8 +1,5 @@
 """Metadata, unused paths and time codes of a scene, for a layer over it."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 from ..scene import Scene
 
 __all__ = ["just_before", "layer_metadata", "unused_path"]

@@ -1,8 +1,5 @@
 """Writes a layer of light-emitting prims over a scene, without holding all time samples in memory."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import contextlib
 import errno
 import os

@@ -1,8 +1,5 @@
 """Writes a layer over a scene that gives meshes other points, with the normals, extents and velocities of these."""
 
-# pyright: reportAttributeAccessIssue=false
-# (OpenUSD's stubs leave out the classes of its modules.)
-
 import os
 import secrets
 import tempfile

@@ -4,16 +4,16 @@ from collections.abc import Mapping
 
 import warp as wp
 
-from ..kernels.distance_gradients import with_distance_gradients
-from ..kernels.gradients import with_gradients
-from ..kernels.motion import doubles
-from ..kernels.pairs import distance_of_corners, form_of, points_of_pair, vertices_of_pair
-from ..kernels.signs import HIT, UNSURE
-from ..kernels.time_of_impact import Impact
-from .mesh import CollisionMesh
-from .narrow.contact_buffer import ContactBuffer
-from .run.launch import launch, made_once
-from .run.settings import DistanceKind
+from ...kernels.distance_gradients import with_distance_gradients
+from ...kernels.gradients import with_gradients
+from ...kernels.motion import doubles
+from ...kernels.pairs import distance_of_corners, form_of, points_of_pair, vertices_of_pair
+from ...kernels.signs import HIT, UNSURE
+from ...kernels.time_of_impact import Impact
+from ..mesh import CollisionMesh
+from ..narrow.contact_buffer import ContactBuffer
+from ..run.launch import launch, made_once
+from ..run.settings import DistanceKind
 
 __all__ = ["DifferentiableContacts"]
 

@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 import warp as wp
 
+from ..narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
+from ..run.settings import Counts, DistanceKind, Method, PairCounts
+from ..run.stage_timer import StageTimer, StageTimers
 from .differentiable import DifferentiableContacts
-from .narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
-from .run.settings import Counts, DistanceKind, Method, PairCounts
-from .run.stage_timer import StageTimer, StageTimers
 
 __all__ = [
     "Candidates",
@@ -164,6 +164,7 @@ class Collisions:
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
     _timer: StageTimer | StageTimers = field(repr=False)
+    _read: dict[DistanceKind, HostContacts] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
         """Returns the number of pairs of all kinds."""
@@ -180,35 +181,21 @@ class Collisions:
         """Whether the motion is certified to be free of collisions."""
         return self.certified and not len(self)
 
-    @functools.cached_property
-    def _vertex_face_contacts(self) -> HostContacts:
-        return self._rows[DistanceKind.VERTEX_FACE].read()
-
-    @functools.cached_property
-    def _edge_edge_contacts(self) -> HostContacts:
-        return self._rows[DistanceKind.EDGE_EDGE].read()
-
-    @functools.cached_property
-    def _vertex_edge_contacts(self) -> HostContacts:
-        return self._contacts_of_points(DistanceKind.VERTEX_EDGE)
-
-    @functools.cached_property
-    def _vertex_vertex_contacts(self) -> HostContacts:
-        return self._contacts_of_points(DistanceKind.VERTEX_VERTEX)
-
-    def _contacts_of_points(self, kind: DistanceKind) -> HostContacts:
-        """Returns the contacts of a kind that only meshes with points have."""
-        return self._rows[kind].read() if kind in self._rows else empty_contacts()
+    def _contacts(self, kind: DistanceKind) -> HostContacts:
+        """Returns the contacts of a kind of pair, read once; only meshes with points have those of points."""
+        if kind not in self._read:
+            self._read[kind] = self._rows[kind].read() if kind in self._rows else empty_contacts()
+        return self._read[kind]
 
     @property
     def vertex_face(self) -> np.ndarray:
         """(vertex, face), int32, shape [n, 2]."""
-        return self._vertex_face_contacts.pairs
+        return self._contacts(DistanceKind.VERTEX_FACE).pairs
 
     @property
     def edge_edge(self) -> np.ndarray:
         """(edge, edge), the smaller first, as in ``mesh.edges``, int32, shape [m, 2]."""
-        return self._edge_edge_contacts.pairs
+        return self._contacts(DistanceKind.EDGE_EDGE).pairs
 
     @property
     def vertex_face_toi(self) -> np.ndarray:
@@ -216,22 +203,22 @@ class Collisions:
 
         They are at most the tolerance before the first contact, except for UNSURE pairs of "float" and "conservative".
         """
-        return self._vertex_face_contacts.toi
+        return self._contacts(DistanceKind.VERTEX_FACE).toi
 
     @property
     def edge_edge_toi(self) -> np.ndarray:
         """Times of impact of the edges, as :attr:`vertex_face_toi`, float64, shape [m]."""
-        return self._edge_edge_contacts.toi
+        return self._contacts(DistanceKind.EDGE_EDGE).toi
 
     @property
     def vertex_face_coordinates(self) -> np.ndarray:
         """Barycentric coordinates of the contact in the face, float64, shape [n, 3]."""
-        return self._vertex_face_contacts.coordinates
+        return self._contacts(DistanceKind.VERTEX_FACE).coordinates
 
     @property
     def edge_edge_coordinates(self) -> np.ndarray:
         """(s, r, 0) along the two edges, float64, shape [m, 3]."""
-        return self._edge_edge_contacts.coordinates
+        return self._contacts(DistanceKind.EDGE_EDGE).coordinates
 
     @property
     def vertex_face_normal(self) -> np.ndarray:
@@ -243,7 +230,7 @@ class Collisions:
         opposite to the velocity, and (0, 0, 1) where there is none.
         With a minimum distance those of all pairs are along the closest points, from the second element to the first.
         """
-        return self._vertex_face_contacts.normal
+        return self._contacts(DistanceKind.VERTEX_FACE).normal
 
     @property
     def edge_edge_normal(self) -> np.ndarray:
@@ -253,7 +240,7 @@ class Collisions:
         :attr:`vertex_face_normal`: perpendicular to that velocity for edges that move in their plane, opposite to it
         for edges that are parallel.
         """
-        return self._edge_edge_contacts.normal
+        return self._contacts(DistanceKind.EDGE_EDGE).normal
 
     @property
     def vertex_edge(self) -> np.ndarray:
@@ -261,37 +248,37 @@ class Collisions:
 
         With a minimum distance only, as :attr:`vertex_vertex`: pairs of points with faces are in :attr:`vertex_face`.
         """
-        return self._vertex_edge_contacts.pairs
+        return self._contacts(DistanceKind.VERTEX_EDGE).pairs
 
     @property
     def vertex_vertex(self) -> np.ndarray:
         """(point, point), the smaller first, int32, shape [l, 2]."""
-        return self._vertex_vertex_contacts.pairs
+        return self._contacts(DistanceKind.VERTEX_VERTEX).pairs
 
     @property
     def vertex_edge_toi(self) -> np.ndarray:
         """Times of impact of points with edges, as :attr:`vertex_face_toi`, float64, shape [k]."""
-        return self._vertex_edge_contacts.toi
+        return self._contacts(DistanceKind.VERTEX_EDGE).toi
 
     @property
     def vertex_vertex_toi(self) -> np.ndarray:
         """Times of impact of points with points, as :attr:`vertex_face_toi`, float64, shape [l]."""
-        return self._vertex_vertex_contacts.toi
+        return self._contacts(DistanceKind.VERTEX_VERTEX).toi
 
     @property
     def vertex_edge_coordinates(self) -> np.ndarray:
         """(s, 0, 0) along the edge, float64, shape [k, 3]."""
-        return self._vertex_edge_contacts.coordinates
+        return self._contacts(DistanceKind.VERTEX_EDGE).coordinates
 
     @property
     def vertex_edge_normal(self) -> np.ndarray:
         """Unit normals from the edge to the point, float64, shape [k, 3]."""
-        return self._vertex_edge_contacts.normal
+        return self._contacts(DistanceKind.VERTEX_EDGE).normal
 
     @property
     def vertex_vertex_normal(self) -> np.ndarray:
         """Unit normals from the second point to the first, float64, shape [l, 3]."""
-        return self._vertex_vertex_contacts.normal
+        return self._contacts(DistanceKind.VERTEX_VERTEX).normal
 
     @functools.cached_property
     def earliest_toi(self) -> float:

@@ -1,0 +1,1 @@
+"""Collisions as results of a detection: on the host, and on the device with gradients."""
