@@ -303,7 +303,7 @@ def arc_cost(small: Found, large: Found) -> Rows:
         f"ball, {degrees} a step": f"a cloth on a ball that the program turns by {degrees} a step",
         "ball, nothing turns": "the same, the ball does not turn",
         "boxes that tumble": "nine boxes that tumble on a sheet",
-        "detect": "one `detect(arcs=)` of the first: nearly all contacts are on arcs",
+        "detect": "one `detect(rigid_motion=)` of the first: nearly all contacts are on arcs",
     }
     columns = [Column("triangles of the cloth", "triangles")]
     columns += [Column(key, key, milliseconds) for key in ("arcs", "chords")]

@@ -14,7 +14,7 @@ def test_lists_of_whole_numbers_are_positions(device):
     found, expected = detector.detect(X0, X1), detector.detect(np.array(X0, float), np.array(X1, float))
     assert found.vertex_face.tolist() == [[3, 0]]
     assert found.vertex_face_toi[0] == expected.vertex_face_toi[0]
-    assert len(detector.detect(X0, X1, only=[False] * 4 + [True])) <= len(found)
+    assert len(detector.detect(X0, X1, vertices=[False] * 4 + [True])) <= len(found)
     assert detector.has_intersections(X1) and detector.least_distance(X0) == 1.0
     assert detector.collision_free_step(X0, X1).certified and len(detector.candidates(X0, X1)) > 0
     assert detector.find_proximities(X0, 1.5).vertex_face.tolist() == [[3, 0]]

@@ -328,7 +328,7 @@ def test_collisions_of_the_vertices_of_interest_are_found(broad_phase):
     full = detector.detect(x0, x1)
     for share in (0.0, 0.02, 0.3, 1.0):
         only = np.random.default_rng(0).random(len(x0)) < share
-        found = detector.detect(x0, x1, only=only)
+        found = detector.detect(x0, x1, vertices=only)
         for name, corners in (
             ("vertex_face", lambda pairs: np.column_stack([pairs[:, 0], mesh.faces[pairs[:, 1]]])),
             ("edge_edge", lambda pairs: mesh.edges[pairs].reshape(-1, 4)),

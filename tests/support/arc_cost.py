@@ -1,9 +1,9 @@
 """Measures what arcs cost: in a detection, and in steps of the stage with bodies that turn, against chords.
 
-``python tests/support/arc_cost.py --device cuda:0`` prints the median time of ``detect(arcs=)`` and of ``detect`` on
-the same motion, a cloth around a ball that turns, and of steps of three scenes by arcs and by chords, on a GPU in CUDA
-graphs: a ball that turns in a cloth (``--degrees`` a step), the same ball that moves straight, so that nothing turns,
-and dynamic boxes that tumble on a sheet. ``--json`` writes the times to a file as well.
+``python tests/support/arc_cost.py --device cuda:0`` prints the median time of ``detect(rigid_motion=)`` and of
+``detect`` on the same motion, a cloth around a ball that turns, and of steps of three scenes by arcs and by chords, on
+a GPU in CUDA graphs: a ball that turns in a cloth (``--degrees`` a step), the same ball that moves straight, so that
+nothing turns, and dynamic boxes that tumble on a sheet. ``--json`` writes the times to a file as well.
 """
 
 import contextlib

@@ -226,8 +226,8 @@ def calls() -> dict[str, Call]:
         {
             "x0": COORDINATES,
             "x1": COORDINATES,
-            "only": without(bad_arrays(np.ones(6, dtype=bool)), "None", "bools") | {"rows": np.ones(5, dtype=bool)},
-            "arcs": without(OBJECTS, "None") | {"rows": bsc.RigidMotion(np.zeros(5, int), ORIGIN, ORIGIN)},
+            "vertices": without(bad_arrays(np.ones(6, dtype=bool)), "None", "bools") | {"rows": np.ones(5, dtype=bool)},
+            "rigid_motion": without(OBJECTS, "None") | {"rows": bsc.RigidMotion(np.zeros(5, int), ORIGIN, ORIGIN)},
         },
     )
     body = np.array([0, 0, 0, -1, -1, -1])
@@ -263,15 +263,15 @@ def calls() -> dict[str, Call]:
         {"x0": COORDINATES, "x1": COORDINATES, "time": NUMBERS | {"early": -0.1, "late": 1.1}},
     )
 
-    def capture(x0, x1, arcs=None):
+    def capture(x0, x1, rigid_motion=None):
         with wp.ScopedCapture("cpu"):
-            detector.capture(x0, x1, arcs=arcs)
+            detector.capture(x0, x1, rigid_motion=rigid_motion)
 
     on_device = wp.array(X, dtype=wp.vec3d, device="cpu")
     found["CollisionDetector.capture"] = Call(
         capture,
         {"x0": on_device, "x1": on_device},
-        {"x0": COORDINATES, "x1": COORDINATES, "arcs": without(OBJECTS, "None")},
+        {"x0": COORDINATES, "x1": COORDINATES, "rigid_motion": without(OBJECTS, "None")},
         raises=detector.capture,
     )
     for name in ("candidates", "collision_free_step"):
@@ -685,6 +685,7 @@ INTERNAL = {
     "CollisionFilter.bits_of_particles",
     "CollisionFilter.bits_of_shapes",
     "CollisionMesh.device_elements",
+    "CollisionMesh.elements",
     "FrameRange.bounds",
     "FrameRange.times",
     "FrictionTable.materials",

@@ -3,8 +3,8 @@
 The table has, generator by generator, how many pairs collide, how many of these are missed, how many are reported that
 do not collide, all of them within the tolerance, and the share that is decided over the whole step, without halving it.
 It is a failure if a collision is missed, a time of impact is late, or a pair is reported that stays farther apart than
-the tolerance. ``--detector 1000`` asks ``detect(arcs=)`` about the first thousand pairs of each kind and generator,
-too. It needs mpmath (extra ``dev``).
+the tolerance. ``--detector 1000`` asks ``detect(rigid_motion=)`` about the first thousand pairs of each kind and
+generator, too. It needs mpmath (extra ``dev``).
 """
 
 import time
@@ -169,7 +169,7 @@ def search(pairs, device):
 
 
 def detect(pairs, device):
-    """Which pairs ``detect(arcs=)`` reports, each in a world of its own, their times of impact, and its tolerance."""
+    """The pairs that ``detect(rigid_motion=)`` reports, each in its own world, their times of impact, tolerance."""
     n = len(pairs)
     first = 4 * np.arange(n)[:, None]
     body = (2 * np.arange(n)[:, None] + pairs.body).ravel()
@@ -181,7 +181,7 @@ def detect(pairs, device):
     else:
         edges = np.concatenate([first + np.array([0, 1]), first + np.array([2, 3])])
         mesh = bsc.CollisionMesh(np.zeros((0, 3), dtype=int), 4 * n, edges=edges, **options)
-    found = bsc.CollisionDetector(mesh).detect(pairs.x0.reshape(-1, 3), pairs.x1.reshape(-1, 3), arcs=motion)
+    found = bsc.CollisionDetector(mesh).detect(pairs.x0.reshape(-1, 3), pairs.x1.reshape(-1, 3), rigid_motion=motion)
     rows = getattr(found, pairs.kind)
     of_pair = (rows[:, 0] if pairs.kind == "vertex_face" else mesh.edges[rows[:, 0], 0]) // 4
     status, toi = np.zeros(n, dtype=int), np.full(n, 2.0)
@@ -274,7 +274,7 @@ def certify(count, seed, device, *, of_detector=0, chunk=12500):
 
 
 OPTIONS = {
-    "--detector": {"type": int, "default": 0, "help": "pairs of each kind and generator for detect(arcs=)"},
+    "--detector": {"type": int, "default": 0, "help": "pairs of each kind and generator for detect(rigid_motion=)"},
     "--device": {"default": None},
 }
 
@@ -287,7 +287,7 @@ def run(arguments):
     wrong = 0
     columns = [Column(f.name, f.name, "d") for f in fields(Verdict)]
     at_once = Column("without halving", lambda verdict: verdict.at_once / verdict.pairs, ".1%")
-    for title, verdicts, more in (("search of a pair", searches, [at_once]), ("detect(arcs=)", detections, [])):
+    for title, verdicts, more in (("search of a pair", searches, [at_once]), ("detect(rigid_motion=)", detections, [])):
         if verdicts:
             total = sum(verdicts.values(), Verdict())
             print_rows(title, [*columns, *more], verdicts.items(), total=total)

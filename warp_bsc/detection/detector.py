@@ -101,39 +101,40 @@ class CollisionDetector:
         x0: ArrayLike | wp.array,
         x1: ArrayLike | wp.array,
         *,
-        only: ArrayLike | None = None,
-        arcs: RigidMotion | None = None,
+        vertices: ArrayLike | None = None,
+        rigid_motion: RigidMotion | None = None,
     ) -> Collisions:
         """Returns all collisions of a motion.
 
-        With ``arcs``, the vertices of turning bodies move along arcs, and no collision on these is missed. A pair with
-        such a vertex may be reported that does not collide, if it comes within ``arcs.tolerance`` of that, whatever the
-        method. Its time of impact is a lower bound, before which it does not collide; its coordinates and normal are
-        those of points within that distance. Pairs within a body that is rigid up to rounding, see
-        :class:`.RigidMotion`, are left out, as they stay as they are; pairs without a turning body are those found
-        without ``arcs``. Counts are those of all parts of the step together. Without a body ``arcs`` change nothing.
+        With ``rigid_motion``, the vertices of turning bodies move along arcs, and no collision on these is missed. A
+        pair with such a vertex may be reported that does not collide, if it comes within ``rigid_motion.tolerance`` of
+        that, whatever the method. Its time of impact is a lower bound, before which it does not collide; its
+        coordinates and normal are those of points within that distance. Pairs within a body that is rigid up to
+        rounding, see :class:`.RigidMotion`, are left out, as they stay as they are; pairs without a turning body are
+        those found without ``rigid_motion``. Counts are those of all parts of the step together. Without a body
+        ``rigid_motion`` change nothing.
 
         Args:
             x0: Positions at the start, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp
                 array. They are taken as exact; those of vertices that no face uses may be anything. If it requires
                 gradients, a Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type; each vertex moves linearly from one to the other.
-            only: Vertices of interest, bool, shape [vertex_count]: collisions that have none of them may be missing, at
-                less cost. None for all.
-            arcs: The bodies that turn and how; None if all vertices move straight.
+            vertices: Those of interest, bool, shape [vertex_count]: collisions that have none of them may be missing,
+                at less cost. None for all.
+            rigid_motion: The bodies that turn and how; None if all vertices move straight.
 
         Raises:
-            TypeError: If the positions are no arrays of numbers, or ``arcs`` is no :class:`.RigidMotion`.
-            ValueError: If they or ``only`` have another shape or type, if the positions differ in type, or if they are
-                not finite; with ``arcs``, also if it is for another number of vertices, ``x1`` is too far from where it
-                takes its bodies, coordinates are more than 2^500, its tolerance is too small for the rounding of
-                positions, or the positions require gradients.
+            TypeError: If the positions are no arrays of numbers, or ``rigid_motion`` is no :class:`.RigidMotion`.
+            ValueError: If they or ``vertices`` have another shape or type, if the positions differ in type, or if they
+                are not finite; with ``rigid_motion``, also if it is for another number of vertices, ``x1`` is too far
+                from where it takes its bodies, coordinates are more than 2^500, its tolerance is too small for the
+                rounding of positions, or the positions require gradients.
             RuntimeError: If the device captures a graph, see :meth:`capture`.
         """
         self._check_not_capturing("call capture(x0, x1) there", " instead of detect")
         x0, x1 = self._checked_positions(x0, x1)
-        changed = None if only is None else self._checked_vertices(only)
-        arcs = self._checked_arcs(arcs)
+        changed = None if vertices is None else self._checked_vertices(vertices)
+        arcs = self._checked_arcs(rigid_motion)
         if arcs is not None:
             return self._arcs.find(arcs, x0, x1, changed)
         self._has_run = True
@@ -169,7 +170,7 @@ class CollisionDetector:
         if len(vertices) >= _SAMPLED_OF:
             sample = np.zeros(self.mesh.vertex_count, dtype=bool)
             sample[vertices[:: len(vertices) // _SAMPLED]] = True
-            step = min(1.0, self.detect(start, end, only=sample).earliest_toi)
+            step = min(1.0, self.detect(start, end, vertices=sample).earliest_toi)
         x, queued, retreat = ends[1], False, 2.0**-20  # where the rounded end collides, it is further back each time
         while True:
             x = _partway(*ends, step, x)
@@ -209,7 +210,7 @@ class CollisionDetector:
         return Candidates(**found)
 
     @one_at_a_time
-    def capture(self, x0: wp.array, x1: wp.array, *, arcs: RigidMotion | None = None) -> CapturedCollisions:
+    def capture(self, x0: wp.array, x1: wp.array, *, rigid_motion: RigidMotion | None = None) -> CapturedCollisions:
         """Adds a detection to the graph that the device captures, and returns its results, to be read after a replay.
 
         Each replay detects the collisions of the positions that the arrays then hold::
@@ -224,23 +225,23 @@ class CollisionDetector:
             x0: Positions at the start, as of :meth:`detect`, Warp array of vec3 or vec3d on the mesh's device. On the
                 CPU it must not require gradients.
             x1: Positions at the end, of the same type.
-            arcs: The bodies that turn and how, as of :meth:`detect`, in each replay alike. On a GPU, detect with them
-                once before; a replay in which a body is not rigid that was rigid then is not certified.
+            rigid_motion: The bodies that turn and how, as of :meth:`detect`, in each replay alike. On a GPU, detect
+                with them once before; a replay in which a body is not rigid that was rigid then is not certified.
 
         Raises:
-            TypeError: If the positions are no arrays of numbers, or ``arcs`` is no :class:`.RigidMotion`.
+            TypeError: If the positions are no arrays of numbers, or ``rigid_motion`` is no :class:`.RigidMotion`.
             ValueError: If they have another shape or type, differ in type, are elsewhere, or require gradients on the
-                CPU or with ``arcs``.
-            NotImplementedError: If a GPU is to capture ``arcs`` of more than a quarter of a turn, or with a minimum
-                distance or radii.
+                CPU or with ``rigid_motion``.
+            NotImplementedError: If a GPU is to capture ``rigid_motion`` of more than a quarter of a turn, or with a
+                minimum distance or radii.
             RuntimeError: If the device captures no graph, or if a GPU captures one before the first :meth:`detect`, or
-                before that with ``arcs``.
+                before that with ``rigid_motion``.
         """
         device = self.mesh.device
         if not device.is_capturing:
             raise RuntimeError(f"{device} captures no graph: call capture(x0, x1) within wp.ScopedCapture, or detect")
         x0, x1 = self._checked_positions(x0, x1)
-        arcs = self._checked_arcs(arcs)
+        arcs = self._checked_arcs(rigid_motion)
         if device.is_cpu:
             return self._capture_on_cpu(x0, x1, arcs)
         if arcs is None:
@@ -367,16 +368,20 @@ class CollisionDetector:
         """Returns the motion of bodies, None if no vertex has one."""
         if arcs is None:
             return None
-        check_instance(arcs, "arcs", RigidMotion, "a RigidMotion")
+        check_instance(arcs, "rigid_motion", RigidMotion, "a RigidMotion")
         if len(arcs.body) != self.mesh.vertex_count:
-            raise ValueError(f"arcs must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}")
+            raise ValueError(
+                f"rigid_motion must have a body for {self.mesh.vertex_count} vertices, not {len(arcs.body)}"
+            )
         return arcs if (arcs.body >= 0).any() else None
 
-    def _checked_vertices(self, only: ArrayLike) -> wp.array:
+    def _checked_vertices(self, vertices: ArrayLike) -> wp.array:
         """Returns which vertices are given, on the device, array of int."""
-        mask = as_numpy(only, "only", "an array of bool")
+        mask = as_numpy(vertices, "vertices", "an array of bool")
         if mask.dtype != bool or mask.shape != (self.mesh.vertex_count,):
-            raise ValueError(f"only must be bool of shape ({self.mesh.vertex_count},), not {mask.dtype} {mask.shape}")
+            raise ValueError(
+                f"vertices must be bool of shape ({self.mesh.vertex_count},), not {mask.dtype} {mask.shape}"
+            )
         return wp.array(mask, dtype=int, device=self.mesh.device)
 
     def _checked_positions(self, x0: ArrayLike | wp.array, x1: ArrayLike | wp.array) -> tuple[wp.array, wp.array]:
@@ -397,7 +402,7 @@ class CollisionDetector:
         replayed: list[Collisions] = []
 
         def detect() -> None:
-            replayed[:] = [self.detect(x0, x1, arcs=arcs)]
+            replayed[:] = [self.detect(x0, x1, rigid_motion=arcs)]
 
         def read() -> Collisions:
             if not replayed:

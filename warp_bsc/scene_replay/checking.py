@@ -187,7 +187,7 @@ class _SegmentDetector:
             detector = CollisionDetector(nothing, method=detector.method)
             collisions = detector.detect(np.zeros((0, 3)), np.zeros((0, 3)))
         else:
-            collisions = detector.detect(interval.x0, interval.x1, arcs=arcs)
+            collisions = detector.detect(interval.x0, interval.x1, rigid_motion=arcs)
         of_strands = self.strands.detect(interval, arcs) if self.strands and not interval.is_at_rest else None
         intersections = None
         if start:
@@ -355,7 +355,7 @@ class _StrandChecker:
 
     def detect(self, interval: Interval, arcs: RigidMotion | None) -> Collisions:
         """Returns the collisions of curves and points in an interval, some of whose vertices may move on arcs."""
-        return self._detector.detect(interval.x0, interval.x1, arcs=arcs)
+        return self._detector.detect(interval.x0, interval.x1, rigid_motion=arcs)
 
     def with_intersections(self, found: Intersections, x: np.ndarray, *, is_end: bool) -> Intersections:
         """Returns intersections of meshes followed by those of curves, with the edges numbered as in :attr:`mesh`.

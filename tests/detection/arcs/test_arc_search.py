@@ -79,7 +79,7 @@ def test_all_that_collides_is_found_and_nothing_far(seed, device):
     """Against 200 samples of every pair, with a bound of what lies between them."""
     dtype = np.float32 if seed % 2 else np.float64
     mesh, x0, x1, motion, number = random_scene(seed, dtype)
-    found = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=motion)
+    found = bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=motion)
     assert found.certified
     samples = 200
     times = np.arange(samples + 1) / samples
@@ -171,7 +171,7 @@ def test_two_bodies_that_meet_at_some_time_are_found_by_then(seed):
         mesh, pair = bsc.CollisionMesh([], 4, edges=[[0, 1], [2, 3]]), [0, 1]
     volumes = [np.linalg.det(x[1:] - x[0]) for x in (before, after)]
     hypothesis.assume(volumes[0] * volumes[1] < 0 and min(map(abs, volumes)) > 1e-8)
-    found = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=motion)
+    found = bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=motion)
     assert pair in getattr(found, kind).tolist()
     row = getattr(found, kind).tolist().index(pair)
     assert getattr(found, f"{kind}_toi")[row] <= time + 1e-9
@@ -192,14 +192,14 @@ def test_a_tip_that_reaches_a_wall_in_the_middle_of_a_turn_only(depth, device, b
     assert path(x0[0], x1[0], arcs.centre[0], arcs.turn[0], 0.5)[0] > wall  # the truth
     detector = bsc.CollisionDetector(mesh, method="exact")
     assert len(detector.detect(x0, x1).vertex_face) == 0  # the chord does not reach it
-    found = detector.detect(x0, x1, arcs=arcs)
+    found = detector.detect(x0, x1, rigid_motion=arcs)
     assert found.vertex_face.tolist() == [[0, 1]] and found.certified
     true_time = 0.5 - np.arccos(wall) / 1.4
     within = np.arccos(min(1.0, wall - 1.1e-4)) / 1.4  # half of the time that it spends within the tolerance
     assert 0.5 - within - 2.0**-5 * 0.1 <= found.vertex_face_toi[0] <= true_time
     np.testing.assert_allclose(found.vertex_face_normal[0], -X, atol=0.02)
     x0[3:, 0] = x1[3:, 0] = 1.0 + 1.01e-4
-    assert len(detector.detect(x0, x1, arcs=arcs).vertex_face) == 0
+    assert len(detector.detect(x0, x1, rigid_motion=arcs).vertex_face) == 0
 
 
 def test_inside_of_an_arc_no_pair_is_reported_beyond_the_tolerance(device):
@@ -213,7 +213,7 @@ def test_inside_of_an_arc_no_pair_is_reported_beyond_the_tolerance(device):
         x1[:2] = moved(x0[:2], 0.0, Z)
         arcs = bsc.RigidMotion([0, 0, -1, -1], [[0.0, 0, 0]], [Z], tolerance=tolerance)
         mesh = bsc.CollisionMesh([], 4, edges=[[0, 1], [2, 3]])
-        assert bsc.CollisionDetector(mesh).detect(x0, x1, arcs=arcs).edge_edge.tolist() == hits
+        assert bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=arcs).edge_edge.tolist() == hits
 
 
 def test_a_screw_reaches_the_obstacle_in_its_third_turn(device):
@@ -223,11 +223,11 @@ def test_a_screw_reaches_the_obstacle_in_its_third_turn(device):
     x1[:3] = moved(x0[:3], 0.0, turn, rise)
     arcs = bsc.RigidMotion([0, 0, 0, -1, -1, -1], [[0.0, 0, 0]], [turn], tolerance=1e-4)
     mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)
-    found = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=arcs)
+    found = bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=arcs)
     # at z = 0.5, after two and a half turns, it is on the other side, at the height of the next pass below or above
     assert found.earliest_toi == 2.0
     x0[3:, 2] = x1[3:, 2] = 0.6
-    found = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=arcs)
+    found = bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=arcs)
     assert 0.74 < found.earliest_toi < 0.75  # of the edge to the vertex that is higher
     assert [0, 1] in found.vertex_face.tolist()
 
@@ -248,7 +248,7 @@ def test_pairs_that_do_not_turn_are_those_without_arcs(device, broad_phase):
         for method in ("conservative", "exact", "float"):
             mesh = bsc.CollisionMesh(all_faces, len(body))
             detector = bsc.CollisionDetector(mesh, method=method, **options)
-            plain, found = detector.detect(*all_x), detector.detect(*all_x, arcs=arcs)
+            plain, found = detector.detect(*all_x), detector.detect(*all_x, rigid_motion=arcs)
             assert found.certified == (method != "float")
             for kind in KINDS:
                 pairs = getattr(plain, kind)
@@ -260,13 +260,13 @@ def test_pairs_that_do_not_turn_are_those_without_arcs(device, broad_phase):
     rng = np.random.default_rng(0)
     bits = {"group": 1 << rng.integers(0, 2, len(body)), "mask": rng.integers(1, 4, len(body))}
     mesh = bsc.CollisionMesh(all_faces, len(body), **bits)
-    plain, found = (bsc.CollisionDetector(mesh).detect(*all_x, arcs=a) for a in (None, arcs))
+    plain, found = (bsc.CollisionDetector(mesh).detect(*all_x, rigid_motion=a) for a in (None, arcs))
     cloth = plain.edge_edge[:, 1] < np.searchsorted(mesh.edges[:, 0], n)
     np.testing.assert_array_equal(found.edge_edge, plain.edge_edge[cloth])
     assert found.stats.filtered > 0
     one_body = bsc.RigidMotion(np.zeros(len(body), int), [[0.5, 0, 0]], [turn])
     turned = moved(all_x[0].astype(float), [0.5, 0, 0], turn)
-    assert bsc.CollisionDetector(mesh).detect(all_x[0].astype(float), turned, arcs=one_body).earliest_toi == 2.0
+    assert bsc.CollisionDetector(mesh).detect(all_x[0].astype(float), turned, rigid_motion=one_body).earliest_toi == 2.0
 
 
 def test_minimum_distances_radii_points_and_edges_turn_too(device, broad_phase):
@@ -282,17 +282,17 @@ def test_minimum_distances_radii_points_and_edges_turn_too(device, broad_phase):
         for radius in (0.0, 0.04):
             mesh = bsc.CollisionMesh([[4, 5, 6]], 7, edges=[[1, 2]], points=[0, 3], radius=radius)
             detector = bsc.CollisionDetector(mesh, min_distance=distance - 2 * radius)
-            found = detector.detect(x0, x1, arcs=arcs)
+            found = detector.detect(x0, x1, rigid_motion=arcs)
             assert {kind for kind in ("vertex_edge", "vertex_vertex") if len(getattr(found, kind))} == set(kinds)
     assert 0 < found.vertex_edge_toi[0] < 0.25 < found.vertex_vertex_toi[0] < 0.5
     for distance, hits in ((0.39, []), (0.41, [0])):
-        found = bsc.CollisionDetector(mesh, min_distance=distance - 0.08).detect(x0, x1, arcs=arcs)
+        found = bsc.CollisionDetector(mesh, min_distance=distance - 0.08).detect(x0, x1, rigid_motion=arcs)
         assert [row for row, (vertex, _face) in enumerate(found.vertex_face) if vertex == 0] == hits
     assert 0.6 < found.vertex_face_toi[0] < 0.75
     only = np.zeros(7, dtype=bool)
     only[3] = True
     detector = bsc.CollisionDetector(mesh, min_distance=0.33)
-    assert detector.detect(x0, x1, arcs=arcs, only=only).vertex_vertex.tolist() == [[0, 3]]
+    assert detector.detect(x0, x1, rigid_motion=arcs, vertices=only).vertex_vertex.tolist() == [[0, 3]]
 
 
 def test_a_strip_that_is_tied_to_a_body_is_found_on_its_own_arc(device):
@@ -303,7 +303,7 @@ def test_a_strip_that_is_tied_to_a_body_is_found_on_its_own_arc(device):
     mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)
     arcs = bsc.RigidMotion([0, 0, *[-1] * 4], [[0.0, 0, 0]], [np.pi * Z])
     detector = bsc.CollisionDetector(mesh)
-    found = detector.detect(x0, x1, arcs=arcs)
+    found = detector.detect(x0, x1, rigid_motion=arcs)
     assert detector.detect(x0, x1).earliest_toi == 2.0
     assert {(0, 1), (1, 1)} <= set(map(tuple, found.vertex_face.tolist()))
     times = found.vertex_face_toi[(found.vertex_face[:, 0] < 2)]
@@ -319,7 +319,7 @@ def test_a_body_collides_with_what_is_tied_to_it(device, broad_phase):
     x1 = x0.copy()
     x1[2:] = moved(x0[2:], 0.0, 0.5 * np.pi * Z)
     arcs = bsc.RigidMotion([-1, -1, 0, 0, 0, 0], [[0.0, 0, 0]], [0.5 * np.pi * Z])
-    found = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)).detect(x0, x1, arcs=arcs)
+    found = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6)).detect(x0, x1, rigid_motion=arcs)
     assert [3, 0] in found.vertex_face.tolist()
     assert found.vertex_face[:, 1].max() == 0
     np.testing.assert_allclose(found.vertex_face_toi, 0.5, atol=0.02)
@@ -334,7 +334,7 @@ def test_pairs_within_a_body_that_deforms_are_looked_at(angle, device):
     end = x0 + 2.0**-9.1 * rng.uniform(-1.0, 1.0, (len(x0), 1)) * Z  # as far as a body may deform, twice the distance
     mesh = bsc.CollisionMesh(np.arange(len(x0)).reshape(-1, 3), len(x0), device=device)
     arcs = bsc.RigidMotion([0] * len(x0), [[0.0, 0, 0]], [angle * Z], tolerance=1e-5)
-    found = bsc.CollisionDetector(mesh).detect(x0, moved(end, 0.0, angle * Z), arcs=arcs)
+    found = bsc.CollisionDetector(mesh).detect(x0, moved(end, 0.0, angle * Z), rigid_motion=arcs)
     assert found.certified
     for kind in KINDS:
         pairs, corners = pairs_of(mesh, kind)
@@ -363,7 +363,7 @@ def test_pairs_within_a_body_that_is_rigid_up_to_rounding_are_left_out(turns, de
     x1 = moved(x0.astype(float), 9.5, turn.astype(float), [3.0, 0, 0]).astype(np.float32)
     mesh = bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device)
     arcs = bsc.RigidMotion([0] * 6, np.full((1, 3), 9.5), turn[None])
-    found = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1, arcs=arcs)
+    found = bsc.CollisionDetector(mesh, method="exact").detect(x0, x1, rigid_motion=arcs)
     assert found.certified and found.earliest_toi == 2.0
 
 
@@ -378,9 +378,9 @@ def test_arcs_without_bodies_change_nothing(device):
     for centre, body in ((np.zeros((0, 3)), [-1] * 6), (np.zeros((2, 3)), np.full(6, -1))):
         arcs = bsc.RigidMotion(body, centre, centre)
         with wp.ScopedCapture(device) as capture:
-            captured = detector.capture(start, end, arcs=arcs)
+            captured = detector.capture(start, end, rigid_motion=arcs)
         wp.capture_launch(capture.graph)
-        for found in (detector.detect(x0, x1, arcs=arcs), captured.read()):
+        for found in (detector.detect(x0, x1, rigid_motion=arcs), captured.read()):
             assert found.edge_edge.tolist() == expected.edge_edge.tolist()
             assert found.vertex_face.tolist() == expected.vertex_face.tolist()
 
@@ -425,18 +425,20 @@ def test_what_does_not_fit_is_an_error(device):
     detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6))
     with pytest.raises(ValueError, match="read-only"):
         bsc.RigidMotion(body, [[0.0, 0, 0]], [Z]).turn[0] = 0.0
-    detector.detect(x0, x1 + [0, 0, 3.0] * (body >= 0)[:, None], arcs=bsc.RigidMotion(body, [[0.0, 0, 0]], [Z]))
+    detector.detect(x0, x1 + [0, 0, 3.0] * (body >= 0)[:, None], rigid_motion=bsc.RigidMotion(body, [[0.0, 0, 0]], [Z]))
     for error, end, arcs in (
         ("x1 must be where arcs take body 0", x1, bsc.RigidMotion(body, [[0.0, 0, 0]], [1.1 * Z])),
         ("x1 must be where arcs take body 0", x0, bsc.RigidMotion(body, [[0.0, 0, 0]], [Z])),
-        ("arcs must have a body for 6 vertices, not 5", x1, bsc.RigidMotion(body[:5], [[0.0, 0, 0]], [Z])),
+        ("rigid_motion must have a body for 6 vertices, not 5", x1, bsc.RigidMotion(body[:5], [[0.0, 0, 0]], [Z])),
         ("arcs.tolerance must be at least", x1, bsc.RigidMotion(body, [[0.0, 0, 0]], [Z], tolerance=1e-15)),
         ("x1 must have coordinates of at most 2", 1e200 * x1, bsc.RigidMotion(body, [[0.0, 0, 0]], [Z])),
     ):
         with pytest.raises(ValueError, match=error):
-            detector.detect(x0, end, arcs=arcs)
+            detector.detect(x0, end, rigid_motion=arcs)
     with pytest.raises(ValueError, match=r"x1\[4\] has a coordinate that is not finite"):
-        detector.detect(x0, np.where(np.arange(6)[:, None] == 4, np.nan, x1), arcs=bsc.RigidMotion(body, [X], [Z]))
+        detector.detect(
+            x0, np.where(np.arange(6)[:, None] == 4, np.nan, x1), rigid_motion=bsc.RigidMotion(body, [X], [Z])
+        )
 
 
 def blade_and_post():
@@ -464,10 +466,10 @@ def test_one_pass_finds_what_parts_of_the_step_do(device, monkeypatch):
         for i in range(3):
             x1[number == i] = moved(x0[number == i], motion.centre[i], turn[i])
         motion = bsc.RigidMotion(motion.body, motion.centre, turn, tolerance=1e-7)
-        found = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=motion)
+        found = bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=motion)
         with monkeypatch.context() as patch:
             patch.setattr(arc_pipeline.ArcPipeline, "is_for", staticmethod(lambda bounds: False))
-            expected = bsc.CollisionDetector(mesh).detect(x0, x1, arcs=motion)
+            expected = bsc.CollisionDetector(mesh).detect(x0, x1, rigid_motion=motion)
         for kind in KINDS:
             assert getattr(found, kind).tolist() == getattr(expected, kind).tolist()
             np.testing.assert_allclose(getattr(found, f"{kind}_toi"), getattr(expected, f"{kind}_toi"), atol=1e-3)
@@ -479,11 +481,11 @@ def test_a_graph_detects_on_arcs(device):
     mesh, x0, x1, arcs = blade_and_post()
     mesh = bsc.CollisionMesh(mesh.faces, 6, device=device)
     detector = bsc.CollisionDetector(mesh)
-    expected = detector.detect(x0, x1, arcs=arcs)
+    expected = detector.detect(x0, x1, rigid_motion=arcs)
     assert len(expected.vertex_face) + len(expected.edge_edge) > 0 == len(detector.detect(x0, x1).edge_edge)
     start, end = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
     with wp.ScopedCapture(device) as capture:
-        captured = detector.capture(start, end, arcs=arcs)
+        captured = detector.capture(start, end, rigid_motion=arcs)
     for offset in (3.0, 0.0):
         start.assign(np.where(np.arange(6)[:, None] < 3, x0, x0 + offset * Z))
         end.assign(np.where(np.arange(6)[:, None] < 3, x1, x1 + offset * Z))
@@ -501,10 +503,10 @@ def test_a_graph_in_which_a_body_deforms_finds_its_pairs_or_is_not_certified(dev
     x1, sinks = moved(x0, 0.0, 0.5 * Z), [[0.0] * 3] * 3 + [[0, 0, -0.0015]] * 3
     detector = bsc.CollisionDetector(bsc.CollisionMesh([[0, 1, 2], [3, 4, 5]], 6, device=device))
     arcs = bsc.RigidMotion([0] * 6, [[0.0] * 3], [0.5 * Z])
-    assert detector.detect(x0, x1, arcs=arcs).certified
+    assert detector.detect(x0, x1, rigid_motion=arcs).certified
     start, end = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
     with wp.ScopedCapture(device) as capture:
-        captured = detector.capture(start, end, arcs=arcs)
+        captured = detector.capture(start, end, rigid_motion=arcs)
     for off, sunk in ((0.0, False), (sinks, True)):
         end.assign(x1 + off)
         wp.capture_launch(capture.graph)
@@ -525,10 +527,10 @@ def test_what_a_graph_of_a_gpu_cannot_hold_is_an_error(device):
     x0, x1 = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
     wide = bsc.RigidMotion(arcs.body, arcs.centre, 2.0 * arcs.turn)
     for error, message, given, options in (
-        (RuntimeError, "detect with these arcs once before", arcs, {}),
+        (RuntimeError, "detect with this rigid_motion once before", arcs, {}),
         (NotImplementedError, "at most a quarter of a turn", wide, {}),
         (NotImplementedError, "none with min_distance", arcs, {"min_distance": 0.01}),
     ):
         detector = bsc.CollisionDetector(mesh, **options)
         with pytest.raises(error, match=message), wp.ScopedCapture(device):
-            detector.capture(x0, x1, arcs=given)
+            detector.capture(x0, x1, rigid_motion=given)

@@ -46,7 +46,7 @@ class ArcDetector:
             changed: Nonzero for each vertex of interest, Warp array of int; None for all.
         """
         if x0.requires_grad or x1.requires_grad:
-            raise ValueError("arcs: x0 and x1 must not require gradients")
+            raise ValueError("rigid_motion: x0 and x1 must not require gradients")
         mesh, method, body = self._straight.mesh, self._straight.method, arcs.body
         bounds = ArcBounds(arcs, mesh.device_vertices, x0, x1)
         if self._straight.radius is None and ArcPipeline.is_for(bounds):
@@ -84,15 +84,17 @@ class ArcDetector:
         Arguments are those of the last call of :meth:`find`, errors those of :meth:`.CollisionDetector.capture`.
         """
         if self._straight.radius is not None:
-            raise NotImplementedError("arcs: a graph holds none with min_distance or radius; detect outside the graph")
+            raise NotImplementedError(
+                "rigid_motion: a graph holds none with min_distance or radius; detect outside the graph"
+            )
         at_once = self.at_once
         if at_once is None or at_once.bounds.motion is not arcs:
             if (np.linalg.norm(arcs.turn, axis=1) > LARGEST_TURN).any():
                 raise NotImplementedError(
-                    "arcs: a graph holds turns of at most a quarter of a turn; detect outside the graph"
+                    "rigid_motion: a graph holds turns of at most a quarter of a turn; detect outside the graph"
                 )
-            raise RuntimeError("detect with these arcs once before capturing, which copies them to the device")
+            raise RuntimeError("detect with this rigid_motion once before capturing, which copies them to the device")
         if x0.requires_grad or x1.requires_grad:
-            raise ValueError("arcs: x0 and x1 must not require gradients")
+            raise ValueError("rigid_motion: x0 and x1 must not require gradients")
         at_once.bound(x0, x1)
         return at_once.finder.capture(x0, x1, at_once.certifies)

@@ -208,7 +208,7 @@ class Follower:
         end = self.mesh.device_positions(target, "target")
         found, touched = [], np.zeros(len(target), dtype=bool)
         for detector, gap in self._gaps.items():
-            contacts = as_contacts(detector.mesh, detector.detect(start, end, only=changed, arcs=arcs), gap)
+            contacts = as_contacts(detector.mesh, detector.detect(start, end, vertices=changed, rigid_motion=arcs), gap)
             contacts = contacts.rows(np.asarray(self._is_movable[contacts.vertices].any(axis=1)))
             touched[contacts.vertices] = True
             found.append(contacts.rows(contacts.toi > 0.0) if detector.min_distance else contacts)
