@@ -685,6 +685,7 @@ INTERNAL = {
     "CollisionFilter.bits_of_particles",
     "CollisionFilter.bits_of_shapes",
     "CollisionMesh.device_elements",
+    "CollisionMesh.elements",
     "FrameRange.bounds",
     "FrameRange.times",
     "FrictionTable.materials",
