@@ -59,8 +59,7 @@ class Segment:
         """
         self._usd_meshes = usd_meshes
         self.dtype = dtype
-        self.meshes, faces = [], []
-        edges, curves, points_alone, radius = [], [], [], []
+        self.meshes, faces, edges, curves, points_alone, radius = [], [], [], [], [], []
         vertex_count = face_count = 0
         compact = {}  # by identity of the triangles, which instances share: used points, corners, and the triangles
         for mesh in usd_meshes:

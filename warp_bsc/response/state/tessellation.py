@@ -3,10 +3,7 @@
 import numpy as np
 from newton import GeoType, Mesh
 
-__all__ = ["tessellate", "tessellation_key"]
-
-_BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}
-"""Options of a ``newton.Mesh`` whose triangles alone are used."""
+_BARE = {"compute_normals": False, "compute_uvs": False, "compute_inertia": False}  # triangles alone are used
 
 
 def tessellation_key(model, shape, shape_type, scale):
