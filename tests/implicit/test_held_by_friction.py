@@ -20,7 +20,7 @@ def last_steps(model, impulse, **options):
         states.reverse()
         assert solver.report.certified
         if step >= 60:
-            forces.append(getattr(solver.report, impulse).numpy()[:, :3].sum(axis=0) / DT)
+            forces.append(getattr(solver.report.forces, impulse).numpy()[:, :3].sum(axis=0) / DT)
             velocities = states[0].particle_qd if model.particle_count else states[0].body_qd
             speed = max(speed, np.abs(velocities.numpy()).max())
     return np.array(forces), speed

@@ -124,7 +124,7 @@ class SolverImplicit(SolverCCD):
         max_iterations: Newton steps of a step at most.
     """
 
-    _near = 0.0  # barriers do that
+    _near = 0.0  # no constraints for near pairs: barriers keep them apart
     _has_few_contacts = True
     report: ImplicitStepReport
     _report_type = ImplicitStepReport
@@ -160,7 +160,7 @@ class SolverImplicit(SolverCCD):
             inversions: What happens to tetrahedra that invert: ``"allowed"``, ``"reported"`` or ``"prevented"``.
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
                 hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
-                whether they sufficed. While something that a program moves is on its way, a step takes up to 16.
+                whether they sufficed. While something that a program moves is on its way, at least 16 are allowed.
             report_contacts: Whether ``report`` has the contacts of each step, with the impulses of barriers and
                 friction at its end; a number is that of the contacts that are listed at most.
             report_worlds: Whether ``report.worlds`` has results by world.
@@ -224,6 +224,11 @@ class SolverImplicit(SolverCCD):
         raise NotImplementedError("a step of SolverImplicit on a tape carries no gradients yet: step outside it")
 
     def _solve(self, step, end, recorder):
+        """Solves with contact from the inertial prediction, and detects what the solve left.
+
+        Worlds in which it left contacts end the step earlier on their way, where there are none; what still collides is
+        resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
+        """
         work = self._work
         begin(work)
         self._newton.solve(end, step.dt)

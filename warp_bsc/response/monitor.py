@@ -83,5 +83,5 @@ class CollisionMonitor(CollisionStage):
     @one_at_a_time
     def _inspect(self, step, end):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
-        with self._on_device(step, end):
+        with self._prepared(step, end):
             inspect(self._work)

@@ -5,11 +5,14 @@ The first detection tells slow worlds from fast ones::
 
                      slow contacts only              a fast, pushing or body contact
     n = 0            project, divide proximities     project
-    n = 1 .. 39      divide (recorded: project)      project, target widened 1.25 times each n, at most 5 times
-    n = 40 .. 71     divide                          divide (both recorded: truncate, n = 40 .. 47)
+    n = 1 .. 38      divide                          project, with separations times min(1.25^n, 5)
+    n = 39           divide                          project, then divide
+    n = 40 .. 71     divide                          divide
     then             freeze what still collides
 
-Where a contact has no dividing plane, its paths are truncated instead.
+A recorded step, one on a tape, projects slow contacts like fast ones up to n = 39, and truncates both for n = 40 .. 47.
+Where a contact has no dividing plane, its paths are truncated too. In the iteration that follows detection ``n``,
+``Loop.ITERATION`` is ``n`` + 1.
 
 When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
 more. It ends: vertices that stood apart at the start and stand still do not collide.
@@ -28,11 +31,11 @@ Where inversions are prevented, the resolved motion goes through the last two ro
 what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the
 vertices of both. This ends as well: what stands still does not invert.
 
-What is excluded? Contacts of elements that crossed or touched at the start, and vertices that were in the solid of a
-plane there. They are counted, but not resolved, and a step with them may be certified. The same holds for tetrahedra
-that were inverted at the start, for contacts of bodies that are left to the inner solver, see
-:class:`.contacts.rules.ContactClass`, and for pairs that filters leave out, see
-:class:`.state.collision_filter.CollisionFilter`.
+What is excluded, from resolution and from the certificate? Pairs of elements that crossed or touched at the start, and
+vertices that were in the solid of a plane there (``Result.EXCLUDED``). They are counted, and a step with them may be
+certified. So may one with tetrahedra that were inverted at the start (``INVERTED``), with contacts of bodies that are
+left to the inner solver (``BODY_CONTACTS``, see :class:`.contacts.rules.ContactClass`), and with pairs that filters
+leave out (``FILTERED``, see :class:`.state.collision_filter.CollisionFilter`).
 """
 
 import warp as wp

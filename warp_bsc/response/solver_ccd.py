@@ -326,7 +326,7 @@ class SolverCCD(CollisionStage):
             self._motion.friction.read()
         if self._forces is not None:
             self._forces.end(end, step.mask)
-        with self._on_device(step, end):
+        with self._prepared(step, end):
             self._solve(step, end, recorder)
             if step.is_first:
                 self.report.last_strain.zero_()

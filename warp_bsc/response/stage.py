@@ -119,6 +119,8 @@ class CollisionStage(CouplingHooks):
     ) -> None:
         """Steps the inner solver, and detects the collisions of its motion.
 
+        A step is taken as a whole unless ``substeps=`` of :class:`.solver_ccd.SolverCCD` divides it: each substep is
+        then solved, detected and resolved by itself, and the report has them together.
         :class:`.solver_ccd.SolverCCD` then changes positions and velocities of the particles and bodies that collide.
         What is said of tapes holds for it alone.
 
@@ -216,11 +218,16 @@ class CollisionStage(CouplingHooks):
         return WorldMask(self.solver, self._work, self._motion)
 
     def _resolve(self, step):
-        """Detects the collisions of a step after the inner solver, and resolves them if the stage does that."""
+        """Detects the collisions of a step after the inner solver, and resolves them if the stage does that.
+
+        Within :meth:`_prepared`, a :class:`.monitor.CollisionMonitor` inspects the motion. A
+        :class:`.solver_ccd.SolverCCD` solves it, by :func:`.step.resolve` or, with contact inside, by Newton's method
+        and then the same response; it measures the strain, and looks for inversions and arcs that collide.
+        """
         raise NotImplementedError
 
     @contextlib.contextmanager
-    def _on_device(self, step, end):
+    def _prepared(self, step, end):
         """Prepares the motion to the end that the inner solver predicted, in worlds that take part; counts the step."""
         with self._timed(step.number):
             self._motion.set_end(end, step.dt)

@@ -4,7 +4,7 @@ Read :func:`resolve` first. Conditions are on the device, so that a CUDA graph h
 ``wp.capture_while`` call a function if, or as long as, the only element of an array is not 0. What a world does in an
 iteration, when it freezes and what makes a step uncertified stands in :mod:`.schedule`.
 
-Each contact is moved apart at the end of the step, and the new motion is detected again, as far as it changed. Bodies
+The vertices of each contact are moved apart in their end positions, and the changed motion is detected again. Bodies
 that can be moved are projected with the particles, each by its pose, see :mod:`.solve.bodies`. Where the mesh has
 minimum distances, a contact is a pair that comes nearer than it may.
 """
