@@ -118,8 +118,8 @@ LIBRARIES = {
         "warp_bsc/bench/scenes/simulation.py",  # steps its solvers
         "warp_bsc/bench/scenes/contact.py",  # makes models
         "warp_bsc/bench/scenes/penetration.py",
-        "warp_bsc/bench/peers/newton.py",  # steps its solvers
-        "warp_bsc/bench/peers/mujoco.py",  # reads its models
+        "warp_bsc/bench/peers/newton_solvers.py",  # steps its solvers
+        "warp_bsc/bench/peers/mujoco_flex.py",  # reads its models
         "warp_bsc/bench/peers/states.py",
         "warp_bsc/bench/measure/judge.py",
         "torch",  # takes its solvers

@@ -13,7 +13,7 @@ from warp_bsc.bench.measure.penetration import FRAME_RATE, SCENES, SIMULATORS, m
 from warp_bsc.bench.peers import libuipc as penetration_libuipc
 from warp_bsc.bench.peers import mujoco as penetration_mujoco
 from warp_bsc.bench.peers import newton as penetration_newton
-from warp_bsc.bench.peers.newton import simulate_newton
+from warp_bsc.bench.peers.newton_solvers import simulate_newton
 from warp_bsc.bench.peers.states import find_bodies, held_positions
 from warp_bsc.bench.scenes.penetration import SCENES as BUILDERS
 from warp_bsc.bench.scenes.penetration import build_penetration_scene

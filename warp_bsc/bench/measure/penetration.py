@@ -309,13 +309,13 @@ def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], N
     """Runs a scene with a simulator, whose library is imported now; returns the device and the trajectory."""
     simulator = SIMULATORS[name]
     if simulator.solver:
-        from ..peers.newton import simulate_newton  # noqa: PLC0415
+        from ..peers.newton_solvers import simulate_newton  # noqa: PLC0415
 
         options = {"has_self_contact": simulator.has_self_contact, "has_stage": simulator.has_stage}
         device = str(built.scene.model.device)
         return device, simulate_newton(built, simulator.solver, simulator.rate, seconds, progress, **options)
     if name == "mujoco-ipc":
-        from ..peers.mujoco import simulate_mujoco  # noqa: PLC0415
+        from ..peers.mujoco_flex import simulate_mujoco  # noqa: PLC0415
 
         return "cpu", simulate_mujoco(built, simulator.rate, seconds, progress)
     from ..peers.libuipc import simulate_libuipc  # noqa: PLC0415
