@@ -11,8 +11,8 @@ from warp_bsc.bench.measure import penetration
 from warp_bsc.bench.measure.judge import Judge
 from warp_bsc.bench.measure.penetration import FRAME_RATE, SCENES, SIMULATORS, measure_penetration
 from warp_bsc.bench.peers import libuipc as penetration_libuipc
-from warp_bsc.bench.peers import mujoco as penetration_mujoco
-from warp_bsc.bench.peers import newton as penetration_newton
+from warp_bsc.bench.peers import mujoco_flex as penetration_mujoco
+from warp_bsc.bench.peers import newton_solvers as penetration_newton
 from warp_bsc.bench.peers.newton_solvers import simulate_newton
 from warp_bsc.bench.peers.states import find_bodies, held_positions
 from warp_bsc.bench.scenes.penetration import SCENES as BUILDERS
