@@ -59,7 +59,7 @@ _LARGEST_COUNT = wp.constant(wp.int64(2**31 - 1))
 
 
 @wp.func
-def is_dividing(status: SolveStatus, world: int, iteration: int) -> bool:
+def divides_after(status: SolveStatus, world: int, iteration: int) -> bool:
     """Returns whether contacts found after ``iteration`` iterations are divided, or truncated, and not projected."""
     if iteration >= status.max_iterations:
         return True
@@ -76,20 +76,20 @@ def divides_proximities(status: SolveStatus, world: int) -> bool:
 
 
 @wp.func
-def is_projecting(status: SolveStatus, world: int) -> bool:
+def projects_now(status: SolveStatus, world: int) -> bool:
     """Returns whether this iteration projects vertices of a world: one without contacts stays as it is."""
     iteration = status.loop[Loop.ITERATION]
-    return status.contact_iteration[world] == iteration - 1 and not is_dividing(status, world, iteration - 1)
+    return status.contact_iteration[world] == iteration - 1 and not divides_after(status, world, iteration - 1)
 
 
 @wp.func
-def is_divided(status: SolveStatus, world: int) -> bool:
+def divides_now(status: SolveStatus, world: int) -> bool:
     """Returns whether this iteration divides elements of a world, at first after its last projection.
 
     A world without contacts stays as it is.
     """
     iteration = status.loop[Loop.ITERATION]
-    return status.contact_iteration[world] == iteration - 1 and is_dividing(status, world, iteration)
+    return status.contact_iteration[world] == iteration - 1 and divides_after(status, world, iteration)
 
 
 @wp.func

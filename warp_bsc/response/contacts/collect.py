@@ -9,7 +9,7 @@ from ...kernels.closest import contact_weights
 from ...kernels.pipeline.queues import filled_entries, has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
-from ..schedule import count_contact, count_filtered, is_dividing, widened
+from ..schedule import count_contact, count_filtered, divides_after, widened
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
 from ..state.record import StepRecord, is_recording
 from ..state.status import Detection, Loop, Result, SolveStatus
@@ -171,7 +171,7 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         plane = planes.end[i]
         added = constraints.Constraint()
         added.normal = wp.vec3d(plane[0], plane[1], plane[2])
-        if is_dividing(status, world, status.loop[Loop.ITERATION]):
+        if divides_after(status, world, status.loop[Loop.ITERATION]):
             update_first_contact(vertices, vertex, time_of_entry(before, after), ContactKind.PLANE, i)
             if not dividing.first:
                 continue
@@ -256,7 +256,7 @@ def _collect_contact(
             moves = added.pace == Pace.FAST or rules.are_on_body(motion, corners)
             if moves or constraints.is_pushing(motion, corners, added.weights, added.normal, added.min_distance):
                 status.is_fast[world] = 1
-    if is_dividing(status, world, iteration):
+    if divides_after(status, world, iteration):
         if near:
             return
         for j in range(4):

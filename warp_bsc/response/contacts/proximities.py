@@ -8,7 +8,7 @@ from ...detection.run.launch import retry_until_fits
 from ...kernels.closest import weights_across
 from ...kernels.pipeline.queues import has_overflowed
 from ...kernels.polynomials import EDGE_EDGE
-from ..schedule import is_dividing, is_projecting
+from ..schedule import divides_after, projects_now
 from ..state.status import Loop, SolveStatus
 from ..state.structs import ContactKind, Pace, Step, constraint_count
 from ..state.vectors import ZERO, corners_of
@@ -45,7 +45,7 @@ def _add_proximity(
     if beyond > wp.max(path, REACH * separation):
         return
     world = motion.world[corners[0]]
-    if owner_of(motion, corners) != ContactClass.OURS or not is_projecting(status, world):
+    if owner_of(motion, corners) != ContactClass.OURS or not projects_now(status, world):
         return
     if constraints.pace_of(motion, corners, kind) == Pace.FAST:
         return
@@ -111,7 +111,7 @@ def _disable_if_behind(step: Step, nearest: wp.array2d[float], status: SolveStat
         return
     corners = added.vertices[i]
     world = step.motion.world[corners[0]]
-    if status.crossings[world] > 0 or not is_dividing(status, world, status.loop[Loop.ITERATION]):
+    if status.crossings[world] > 0 or not divides_after(status, world, status.loop[Loop.ITERATION]):
         return
     kind = constraints.kind_of_pair(added.kind[i])
     _weights, between = closest_vector(step.motion, corners, kind)

@@ -13,7 +13,7 @@ from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pa
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.planes_between import add_dividing_plane, has_planes
 from ..contacts.queue import PairQueue, queues_of, vertices_of
-from ..schedule import divides_proximities, is_divided, is_freezing
+from ..schedule import divides_now, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
 from ..state.record import NO_CONTACT, StepRecord, is_recording
 from ..state.status import Loop, Result, SolveStatus
@@ -195,7 +195,7 @@ def _keep_on_sides(step: Step, dividing: DividingPlanes, status: SolveStatus, ve
     vertices = step.vertices
     if dividing.first[vertex] < 0 or dividing.placed[vertex] == NOT_PLACED:
         return
-    if step.motion.inverse_mass[vertex] == 0.0 or not is_divided(status, step.motion.world[vertex]):
+    if step.motion.inverse_mass[vertex] == 0.0 or not divides_now(status, step.motion.world[vertex]):
         return
     x1 = vertices.x1[vertex]
     end = dividing.reached[vertex]

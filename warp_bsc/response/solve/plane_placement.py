@@ -13,7 +13,7 @@ import warp as wp
 
 from ..contacts.planes_between import FAR
 from ..contacts.rules import inverse_mass_of
-from ..schedule import is_divided
+from ..schedule import divides_now
 from ..state.status import Loop, SolveStatus
 from ..state.structs import CUT_SHORT, FROZEN, NO_NODE, NOT_PLACED, PLACED, DividingPlanes, Step
 from ..state.vectors import HALF, ZERO, to_double
@@ -147,7 +147,7 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
     """
     particle = wp.tid()
     world = step.motion.world[particle]
-    if planes.first[particle] < 0 or not is_divided(status, world):
+    if planes.first[particle] < 0 or not divides_now(status, world):
         return
     if step.motion.inverse_mass[particle] == 0.0 or step.vertices.outcome[particle] & FROZEN != 0:
         return

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..._profiling import phase
 from ..contacts.constraints import gap, min_distance_of, moves_body
-from ..schedule import is_dividing, is_projecting, is_reversible
+from ..schedule import divides_after, is_reversible, projects_now
 from ..state.cluster import BLOCK, wait_for_others
 from ..state.fixed_sum import with_delta
 from ..state.record import StepRecord
@@ -41,7 +41,7 @@ def _is_active(step: Step, status: SolveStatus, sweep: int, tolerance: wp.float6
     corners = constraints.vertices[i]
     world = motion.world[corners[0]]
     kind = constraints.kind[i]
-    if kind > ContactKind.PLANE and is_dividing(status, world, status.loop[Loop.ITERATION]):
+    if kind > ContactKind.PLANE and divides_after(status, world, status.loop[Loop.ITERATION]):
         if constraints.pace[i] != Pace.RESTING:
             return False
         if kind == ContactKind.EDGE_EDGE_PROXIMITY:
@@ -50,7 +50,7 @@ def _is_active(step: Step, status: SolveStatus, sweep: int, tolerance: wp.float6
             if start - kept >= CLOSE_EDGES * (constraints.separation[i] - kept):
                 return False
     past = sweep >= sweeps.max_position_sweeps(step, status, i)
-    if past or not is_projecting(status, world):
+    if past or not projects_now(status, world):
         return False
     normal = constraints.normal[i]
     separation = constraints.separation[i]
