@@ -5,8 +5,7 @@ The first detection tells slow worlds from fast ones::
 
                      slow contacts only              a fast, pushing or body contact
     n = 0            project, divide proximities     project
-    n = 1 .. 38      divide                          project, with separations times min(1.25^n, 5)
-    n = 39           divide                          project, then divide
+    n = 1 .. 39      divide                          project, with separations times min(1.25^n, 5)
     n = 40 .. 71     divide                          divide
     then             freeze what still collides
 
