@@ -15,7 +15,7 @@ def cpu_graph() -> Any:
     """Returns the :class:`warp.Graph` that the CPU captures.
 
     Contract: ``warp._src.context.runtime._apic_graph`` is the graph from ``capture_begin`` to ``capture_end``. Python
-    functions in a graph on the CPU, see :mod:`.detection.host_function`, live as long as it. Its attribute ``apic``
+    functions in a graph on the CPU, see :mod:`.run.host_function`, live as long as it. Its attribute ``apic``
     says whether the graph is to be saved.
 
     Raises:

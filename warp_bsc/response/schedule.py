@@ -24,7 +24,7 @@ once.
 
 What makes a step uncertified? Contacts that remain, a last detection that was incomplete, or start positions that are
 not finite, see :func:`decide`; predictions that are not finite; contacts on arcs; tetrahedra that still invert where
-that is prevented; and an end that a coupled solver has not shown yet: :mod:`.state.certificate` has it all.
+that is prevented; and an end that a coupled solver has not shown yet: ``state/certificate.py`` has it all.
 
 Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration divides
 what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the

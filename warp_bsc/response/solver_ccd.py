@@ -174,7 +174,7 @@ class SolverCCD(CollisionStage):
                 :class:`.forces.contact_report.ContactReport`. A number is that of the contacts that are listed at most;
                 True stands for 8 for each particle, and at least 4,096, in each substep. Sums have the contacts beyond
                 that too.
-            report_worlds: Whether ``report.worlds`` has results by world, :class:`.worlds.world_report.Worlds`.
+            report_worlds: Whether ``report.worlds`` has results by world, :class:`.report.worlds.Worlds`.
 
         Raises:
             TypeError: If an argument has another type.
@@ -271,7 +271,7 @@ class SolverCCD(CollisionStage):
             )
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
-        """Prepares for a coupled simulation, see :class:`.integration.coupling_interface.CouplingHooks`.
+        """Prepares for a coupled simulation, see :class:`.drive.coupling.CouplingHooks`.
 
         Raises:
             NotImplementedError: If a step has substeps: proxies would not follow them.

@@ -15,7 +15,7 @@ from newton_scenes import DT, SOLVERS, Rollout, add_patch, bullet
 from newton_versions import needs_attachments
 
 import warp_bsc as bsc
-from warp_bsc.response.drive import coupling as coupling_interface
+from warp_bsc.response.drive import coupling
 
 
 def ball_builder(mass):
@@ -250,13 +250,13 @@ def test_a_body_hangs_on_cloth_over_a_sphere(device):
     assert np.linalg.norm(q[corner] - pose[:3]) < 0.06 and pose[2] > 0.7 * free_fall
 
 
-@pytest.mark.parametrize("declares", sorted({False, coupling_interface.COUPLERS_DECLARE_RESTARTS}))
+@pytest.mark.parametrize("declares", sorted({False, coupling.COUPLERS_DECLARE_RESTARTS}))
 def test_particles_feel_the_impulses_of_a_pass_once(declares, device, monkeypatch):
     """A coupler in staggered mode rewinds no particles: what a contact has fed back is not fed back again.
 
     Couplers before Newton 1.8 do not declare whether they rewind.
     """
-    monkeypatch.setattr(coupling_interface, "COUPLERS_DECLARE_RESTARTS", declares)
+    monkeypatch.setattr(coupling, "COUPLERS_DECLARE_RESTARTS", declares)
     model = ModelView(bullet(30.0, device=device), "cloth")
     stage = bsc.SolverCCD(SOLVERS["vbd"](model))
     if declares:

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class _Arrays:
-    """The arrays of :class:`.world_report.Worlds` that a step writes."""
+    """The arrays of :class:`.worlds.Worlds` that a step writes."""
 
     certified: wp.array[wp.bool]
     truncated: wp.array[int]
@@ -34,7 +34,7 @@ class _Arrays:
 def _begin(status: SolveStatus, prevents_inversions: bool, first: bool, out: _Arrays):
     """Writes what follows from the contacts of each world, and clears the counts of vertices.
 
-    If it is not the ``first`` substep of a step, it adds to what the others did, as :func:`..write_back.merge_step`.
+    If it is not the ``first`` substep of a step, it adds to what the others did, as :func:`.count_steps.merge_step`.
     """
     world = wp.tid()
     found = status.of_worlds

@@ -47,7 +47,7 @@ class SolverReport:
 
     Attributes:
         step_results: What the last step did, on the device, which the other attributes read.
-        outcomes: What became of each vertex and body in it, read on the host, :class:`.outcomes.Outcomes`.
+        outcomes: What became of each vertex and body in it, read on the host.
         impulses_elsewhere: What resolves contacts before the stage in the last step, so that its impulses on them are
             small; None if nothing is known to.
     """

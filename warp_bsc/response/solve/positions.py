@@ -133,7 +133,7 @@ def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: 
 
 @functools.cache
 def _sweep(cluster: int) -> wp.Kernel:
-    """Returns the kernel that makes sweeps over each world by one cluster of blocks, see :mod:`.by_world`."""
+    """Returns the kernel that makes sweeps over each world by one cluster of blocks, see :mod:`.state.cluster`."""
 
     @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
     def sweep_positions(

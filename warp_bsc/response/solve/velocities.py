@@ -133,7 +133,7 @@ def _update_world(step: Step, particles: Incidence, world: int, last: bool, thre
 
 @functools.cache
 def _sweep(cluster: int) -> wp.Kernel:
-    """Returns the kernel that solves velocities of each world by one cluster of blocks, see :mod:`.by_world`."""
+    """Returns the kernel that solves velocities of each world by one cluster of blocks, see :mod:`.state.cluster`."""
 
     @wp.kernel(module="unique", enable_backward=False, cluster_dim=cluster, launch_bounds=BLOCK)
     def sweep_velocities(

@@ -391,7 +391,7 @@ class Workspace(Launches):
             self.recorder.reserve("truncations", self.particle_count + self.body_count)
 
     def sweep_by_world(self, kernel: Callable[[int], wp.Kernel], inputs: Sequence) -> None:
-        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.solve.by_world`.
+        """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.cluster`.
 
         Its first inputs are the step and the particles of worlds, its last one is the threads of a world.
         """

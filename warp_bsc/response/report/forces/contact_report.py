@@ -160,7 +160,7 @@ class ContactReport:
         """Impulse of contacts on one shape by another, in each world [N s], vec3, shape [world_count, n + 1, n + 1].
 
         Rows have the shapes that the impulse acts on, columns those that it is of. Shapes are numbered as in
-        :attr:`shapes_of_worlds`; the last row and column are of all particles of the world.
+        ``shapes_of_worlds``; the last row and column are of all particles of the world.
 
         Raises:
             RuntimeError: If there are more than 2^20 entries: sum up :attr:`contacts` instead.
