@@ -44,7 +44,6 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.queries.query_points import query_points
     from .detection.results.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.results.differentiable import DifferentiableContacts
-    from .implicit.solver import SolverImplicitAdjoint
     from .implicit.solver_implicit import SolverImplicit
     from .repairing.repair import repair
     from .repairing.results import RepairResult, UnresolvedContour
@@ -93,7 +92,6 @@ _MODULES = {
     "Selection": "usd.selection",
     "SolverCCD": "response.solver_ccd",
     "SolverImplicit": "implicit.solver_implicit",
-    "SolverImplicitAdjoint": "implicit.solver",
     "SolverReport": "response.report.report",
     "StateRepairResult": "repairing.state",
     "UnresolvedContour": "repairing.results",
@@ -136,7 +134,6 @@ __all__ = [
     "Selection",
     "SolverCCD",
     "SolverImplicit",
-    "SolverImplicitAdjoint",
     "SolverReport",
     "StateRepairResult",
     "UnresolvedContour",

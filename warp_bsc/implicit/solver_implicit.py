@@ -1,5 +1,7 @@
 """The solver with contact inside: inertia, elasticity, contact and friction in one solve of each step."""
 
+import weakref
+from collections.abc import Callable
 from typing import Literal
 
 import newton
@@ -11,6 +13,7 @@ from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
+from ..detection.run.host_function import run_on_host
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
@@ -23,6 +26,7 @@ from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.step_report import ImplicitStepReport, StepResults
+from .gradients.step_gradients import RecordedStep, StateGradients, StepGradients
 
 MAX_STEPS = 15
 """Newton steps of a step: after 48 steps, scenes of ``bench response`` are within 0.4 mm of where many more lead, in
@@ -192,7 +196,7 @@ class SolverImplicit(SolverCCD):
                     "or pass bodies='ignored' if something else writes its pose"
                 )
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
-        if model.particle_count and min_distance is None and particle_radius is None and not model.requires_grad:
+        if model.particle_count and min_distance is None and particle_radius is None:
             particle_radius = _radii_of_strands(model)
         super().__init__(
             _Inertia(model, moves_bodies=moves),
@@ -208,11 +212,16 @@ class SolverImplicit(SolverCCD):
             report_worlds=report_worlds,
         )
         self.max_iterations = max_steps
+        self._last_recorded: tuple = (lambda: None), (lambda: None)
         results, unconverged = self.report.results, self.report.unconverged
         self._newton = NewtonMethod(self._work, max_steps=max_steps, results=results, unconverged_steps=unconverged)
         self._newton.prepare(arrays_of(model))
         if self._forces is not None:
             self._newton.keeps_contacts, self._forces.more = True, self._newton.publish
+        self._gradients: StepGradients | None = None
+        if model.requires_grad:
+            self._newton.keeps_contacts = True
+            self._gradients = StepGradients(self._work, self._newton, results.converged)
         if report_worlds:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
 
@@ -221,7 +230,63 @@ class SolverImplicit(SolverCCD):
         raise TypeError("a SolverImplicit cannot be copied: make a new one of the same model")
 
     def _check_tape(self, state_in, state_out, mask):
-        raise NotImplementedError("a step of SolverImplicit on a tape carries no gradients yet: step outside it")
+        if self._motion.moves_bodies:
+            raise NotImplementedError(
+                "a step of SolverImplicit on a tape carries no gradients through bodies that it moves yet: step "
+                "outside the tape, or pass bodies='ignored'"
+            )
+        if mask is not None:
+            raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
+        if state_in is state_out:
+            raise ValueError("on a tape, state_out must not be state_in")
+
+    def _record(self, step, end):
+        """Solves a step; the tape records its adjoint."""
+        device, start = self.mesh.device, arrays_of(step.state_in)
+        given = [start.particle_q, start.particle_qd, step.state_in.particle_f, start.body_q]
+        ends = [end.particle_q, end.particle_qd, end.body_q]
+        recorded: RecordedStep | None = None
+        before: Callable[[], RecordedStep | None] = self._step_before(step.tape)
+
+        def forward():
+            nonlocal recorded
+            force = given[2]
+            v0, force = wp.clone(given[1]), None if force is None else wp.clone(force, requires_grad=False)
+            self._resolve_motion(step, end)
+            recorded = self._gradients.record(step.dt, v0, force, end)
+
+        def backward():
+            with self._lock:
+                of = [None if array is None else array.grad for array in (*given, *ends)]
+                self._gradients.backward(recorded, before(), StateGradients(*of))
+
+        run_on_host(forward, device)
+        self._last_recorded = weakref.ref(step.tape), lambda: recorded
+        arrays = [array for array in (*given, *ends) if array is not None and array.requires_grad]
+        step.tape.record_func(lambda: run_on_host(backward, device), arrays + self._read_arrays())
+
+    def _step_before(self, tape):
+        """Returns what returns the step of the same tape that was recorded last, None if there was none."""
+        last_tape, recorded = self._last_recorded
+        return recorded if last_tape() is tape else lambda: None
+
+    def _read_arrays(self):
+        """Returns the arrays that steps read beside those of states and get gradients, which a tape sets to zero."""
+        model, friction = self.model, self._motion.friction
+        names = ["particle_inv_mass", "gravity", *(f"tri_{name}" for name in ("poses", "areas", "materials"))]
+        names += ["tet_poses", "tet_materials"]
+        names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
+        names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]
+        arrays = [*friction.inputs, *(getattr(model, name) for name in names)]
+        attached = attachment_arrays(model)
+        if attached is not None:
+            arrays += [attached.body_point, attached.stiffness, attached.damping]
+        return [array for array in arrays if array is not None and len(array) and array.requires_grad]
+
+    def _resolve(self, step):
+        super()._resolve(step)
+        if self._gradients is not None:
+            self._gradients.finish(arrays_of(step.state_out))
 
     def _solve(self, step, end, recorder):
         """Solves with contact from the inertial prediction, and detects what the solve left.
@@ -230,6 +295,8 @@ class SolverImplicit(SolverCCD):
         resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
         """
         work = self._work
+        if self._gradients is not None:
+            self._gradients.begin()
         begin(work)
         self._newton.solve(end, step.dt)
         detect_contacts(work)

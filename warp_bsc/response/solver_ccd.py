@@ -228,7 +228,7 @@ class SolverCCD(CollisionStage):
             )
         if isinstance(self.solver, ContactLayer):
             self.report.layer_overflows, self.report.thickness = self.solver.skipped, self.solver.thickness_values
-        self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
+        self._watch_between_steps(bodies=True)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self._work)
         self._inner = self._choose_steps(integrator)

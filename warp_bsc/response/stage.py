@@ -61,10 +61,9 @@ class CollisionStage(CouplingHooks):
         motion.set_end(arrays_of(model), 1.0)
         prepare(self._work)
         self._recount_crossings()
-        if not model.requires_grad:
-            motion.remember(self._work.vertices.x1)
+        motion.remember(self._work.vertices.x1)
         self.report = self._report_type(self._work, responds=responds)
-        self._watches_bodies = motion.moves_bodies and not model.requires_grad
+        self._watches_bodies = motion.moves_bodies
         coupled: Any = innermost(self.solver)
         if isinstance(coupled, SolverCoupled):
             for stage in map(coupled.solver, coupled.entry_names()):

@@ -13,7 +13,6 @@ from ...response.state.motion import continues
 from ...response.state.poses import point_of
 from ...response.state.structs import Motion, Vertices
 from ...response.state.vectors import ZERO, to_double, to_single
-from ..attachments import check_attachments
 from .system import Unknowns
 
 wp.set_module_options({"enable_backward": False})
@@ -44,7 +43,7 @@ def attachments_of_model(model: newton.Model):
     Raises:
         NotImplementedError: If several attachments of infinite stiffness hold one particle.
     """
-    check_attachments(model)
+    _check_attachments(model)
     arrays = attachment_arrays(model)
     if arrays is None:
         return None
@@ -57,6 +56,20 @@ def attachments_of_model(model: newton.Model):
     attachments.items = wp.array(order, dtype=int, device=model.device)
     attachments.first = wp.array(first, dtype=int, device=model.device)
     return attachments
+
+
+def _check_attachments(model: newton.Model) -> None:
+    """Raises an error if several attachments hold one particle, reading them from the device.
+
+    Raises:
+        NotImplementedError: If they do.
+    """
+    found = attachment_arrays(model)
+    if found is None:
+        return
+    held = found.particle.numpy()[np.isinf(found.stiffness.numpy()) & found.enabled.numpy().astype(bool)]
+    if len(np.unique(held)) < len(held):
+        raise NotImplementedError("model: several attachments of infinite stiffness hold one particle")
 
 
 @wp.func

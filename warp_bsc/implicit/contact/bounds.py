@@ -216,7 +216,7 @@ def bound_by_planes(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        kept, _level, reach, floor = gap_at_plane(motion, planes, settings, i, vertex)
+        kept, _level, reach, floor = gap_at_plane(motion, planes, settings, i, vertex, to_double(motion.x0[vertex]))
         if reach == ZERO:
             continue
         before, _error = signed_distance(plane_at(planes, i, now), trial.x[vertex])

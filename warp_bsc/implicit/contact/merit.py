@@ -133,13 +133,13 @@ def add_plane_energies(
         i = planes.of_worlds[world, place]
         if i < 0:
             return
-        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
+        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex, to_double(motion.x0[vertex]))
         plane = plane_at(planes, i, now + (1.0 - now) * scale)
         distance, _error = signed_distance(plane, trial.moved[vertex])
         gap = distance - level
         if gap < reach:
             value = MEETS
             if gap > ZERO:
-                value = stiffness_at_plane(motion, settings, progress, world, vertex, reach)
+                value = stiffness_at_plane(motion, settings, progress.fall[world], vertex, reach)
                 value *= barrier.barrier_energy(gap, reach)
             add_energy(progress.trial, world, value, settings.units)

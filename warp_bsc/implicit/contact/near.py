@@ -206,7 +206,7 @@ def find_near_planes(
             return
         plane = plane_at(planes, i, plane_share[world])
         distance, _error = signed_distance(plane, trial.exact[vertex])
-        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex)
+        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex, to_double(motion.x0[vertex]))
         gap = distance - level
         if gap >= reach:
             continue
@@ -214,7 +214,7 @@ def find_near_planes(
             add_energy(progress.energy, world, MEETS, settings.units)
             continue
         normal = wp.vec3d(plane[0], plane[1], plane[2])
-        stiffness = stiffness_at_plane(motion, settings, progress, world, vertex, reach)
+        stiffness = stiffness_at_plane(motion, settings, progress.fall[world], vertex, reach)
         add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
         key = key_of_pair(1, 0, vertex, i)
         there, _error_there = signed_distance(planes.end[i], trial.exact[vertex])

@@ -82,7 +82,12 @@ class NewtonMethod:
     """Solves one step after the other, with the same buffers, on the device of the model.
 
     Attributes:
-        keeps_contacts: Whether a solve ends with the contacts at its end, to publish them.
+        mesh: The triangles that collide.
+        count, unknowns: Number of unknowns, and what they are.
+        contacts: Contacts of the last Newton step, or at the end.
+        settings, trial, progress: What barriers depend on, where vertices are, and how far each world is.
+        origin: Where vertices started the step, those that touched a shape a little beside it.
+        keeps_contacts: Whether a solve ends with the contacts at its end, to publish or to record them.
     """
 
     keeps_contacts = False
@@ -98,7 +103,7 @@ class NewtonMethod:
             unconverged_steps: Where they count steps in which a world did not converge.
         """
         self._work, self.max_steps = work, max_steps
-        mesh = self._mesh = work.mesh
+        mesh = self.mesh = work.mesh
         model, device = mesh.model, mesh.device
         particles, vertices = model.particle_count, mesh.vertex_count
         self._elements, of_elements = elements_of_model(model)
@@ -111,7 +116,7 @@ class NewtonMethod:
         def array(values):
             return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
 
-        unknowns = self._unknowns = Unknowns()
+        unknowns = self.unknowns = Unknowns()
         solved, body_of_vertex = self._bodies_in_solve(), mesh.shape_vertices.body
         body_world = np.zeros(0, dtype=int)
         if len(solved):
@@ -122,7 +127,7 @@ class NewtonMethod:
         number = np.argsort(order, kind="stable")
         unknown, of_bodies = number[:particles], np.full(model.body_count + 1, -1)
         of_bodies[solved] = number[particles::2]
-        self._count = len(order)
+        self.count = len(order)
         first = of_bodies[body_of_vertex]  # that of -1 is the last
         unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
         self._all_sought = array(np.append(np.ones(particles), np.where(first < 0, 0, 2 + body_of_vertex)))
@@ -131,8 +136,8 @@ class NewtonMethod:
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
         unknowns.of_worlds = array(of_worlds)
         unknowns.first_of_bodies = array(of_worlds[:-1] + np.bincount(world, minlength=work.worlds))
-        unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
-        unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
+        unknowns.is_free = wp.zeros(self.count, dtype=int, device=device)
+        unknowns.inertia = wp.zeros(self.count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
         largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
         self._team, self._threads, self._solve_worlds = make_team(largest, work.worlds, device)
@@ -145,14 +150,14 @@ class NewtonMethod:
             self._bodies.unknown, self._bodies.first_vertex = array(of_bodies[:-1]), array(first_vertex)
             held = np.flatnonzero(first >= 0)
             holder[particles + held] = first_vertex[body_of_vertex[held]]
-        self._rows = make_rows(of_elements, unknown, self._count, device)
-        row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
+        self._rows = make_rows(of_elements, unknown, self.count, device)
+        row_of_block = array(np.repeat(np.arange(self.count), np.diff(self._rows.first.numpy())))
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
-        self._vectors = allocate(Vectors, self._count, device)
+        self._vectors = allocate(Vectors, self.count, device)
         self.progress = allocate(Progress, work.worlds, device)
-        self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles))
-        self._trial.holder = array(holder)
-        self._origin, self._goal, self._lower, self._upper = (
+        self.trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles))
+        self.trial.holder = array(holder)
+        self.origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
         )
         limit = wp.full(vertices, 1.0, dtype=float, device=device)
@@ -163,22 +168,22 @@ class NewtonMethod:
         self._goes_back = wp.zeros(1, dtype=int, device=device)
         self._place = wp.zeros(work.worlds, dtype=int, device=device)
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
-        self._settings = BarrierSettings()
+        self.settings = BarrierSettings()
         self._metre = _metre_of(mesh)
         reach = self._reach(mesh)
-        self._settings.reach = wp.array(reach, dtype=float, device=device)
-        self._settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
+        self.settings.reach = wp.array(reach, dtype=float, device=device)
+        self.settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
         is_of_face = np.zeros(vertices)
         is_of_face[mesh.faces.ravel()] = 1
-        self._settings.is_of_face = array(is_of_face)
-        self._settings.load = wp.zeros(vertices, dtype=float, device=device)
+        self.settings.is_of_face = array(is_of_face)
+        self.settings.load = wp.zeros(vertices, dtype=float, device=device)
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)
         if len(solved):
             least = _of_worlds(np.min, reach[:particles], world, work.worlds, np.inf)[worlds]
             of_bodies = np.minimum(bodies.reach_between_bodies(mesh), least)
             of_bodies[:particles] = np.inf
-        self._settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
+        self.settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
         reach = np.minimum(reach, of_bodies)
         margin = np.where(np.isfinite(reach), reach, 0.0)
         margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
@@ -194,7 +199,7 @@ class NewtonMethod:
         if len(solved):
             heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * (_FAST * self._metre) ** 2, 1e-9))
-        self._settings.units = wp.array(units, dtype=wp.float64, device=device)
+        self.settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._attachments = attachments_of_model(model)
         self._poses = None if self._attachments is None else wp.clone(model.body_q)
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
@@ -210,11 +215,11 @@ class NewtonMethod:
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
         p.vectors, p.unknowns, p.bodies = self._vectors, unknowns, self._bodies
-        p.trial, p.progress, p.flow = self._trial, self.progress, self._flow
+        p.trial, p.progress, p.flow = self.trial, self.progress, self._flow
         p.goal, p.lower, p.upper, p.limit = self._goal, self._lower, self._upper, limit
         p.plane_share, p.whole, p.lacks = self._plane_share, whole, self._lacks
         p.leaves, p.any_leaves = self._leaves, self._any_leaves
-        p.first = wp.zeros(self._count, dtype=wp.vec3, device=device)
+        p.first = wp.zeros(self.count, dtype=wp.vec3, device=device)
         p.worlds = self._in_worlds(of_elements, unknowns)
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1
@@ -223,14 +228,14 @@ class NewtonMethod:
         self._captured, self._retired = False, []
         rooms = np.append(0, np.cumsum(np.where(order < particles, 1, _MORE_OF_BODIES)))
         self._rooms = rooms[of_worlds]  # of contacts, summed up by world
-        self._candidates, self._contacts = Candidates(), Contacts()
+        self._candidates, self.contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
         self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
 
     def _in_worlds(self, of_elements, unknowns) -> Worlds:
         """Returns what is in each world."""
         found, count, device = Worlds(), self._work.worlds, self._work.device
-        world = self._mesh.device_world.numpy()
+        world = self.mesh.device_world.numpy()
         is_given = (unknowns.of_vertex.numpy() == -1).astype(int)
         vertices, first = grouped_by_world(2 * world + is_given, 2 * count)
         arrays = {"vertices": vertices, "first_vertex": first[::2], "first_given": first[1::2]}
@@ -277,7 +282,7 @@ class NewtonMethod:
 
     def _bodies_in_solve(self) -> np.ndarray:
         """Returns the bodies whose vertices may be solved for."""
-        mesh, worlds = self._mesh, self._work.worlds
+        mesh, worlds = self.mesh, self._work.worlds
         if not self._work.motion.moves_bodies:
             return np.zeros(0, dtype=int)
         with_shapes = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
@@ -303,14 +308,14 @@ class NewtonMethod:
     def _go_back(self, end, detect, begins):
         work = self._work
         self._goes_back.zero_()
-        inputs = [self.progress, self._unknowns, work.status.contact_iteration, begins]
+        inputs = [self.progress, self.unknowns, work.status.contact_iteration, begins]
         outputs = [self._place, self._results[0].converged, self.progress.solving, self._goes_back]
         self._launch(decisions.go_back, work.worlds, inputs, outputs)
         wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
 
     def _move_back(self, end, detect):
-        inputs = [self._trial, self._unknowns, self._dt, self.progress.solving, self._place]
-        self._launch(steps.retreat, self._mesh.vertex_count, inputs, [self._work.step.motion, end])
+        inputs = [self.trial, self.unknowns, self._dt, self.progress.solving, self._place]
+        self._launch(steps.retreat, self.mesh.vertex_count, inputs, [self._work.step.motion, end])
         detect()
 
     def prepare(self, state: StateArrays) -> None:
@@ -326,8 +331,8 @@ class NewtonMethod:
 
     def read_materials(self) -> None:
         """Reads the stiffness of tetrahedra again; not in a CUDA graph. All else is read in each step."""
-        if self._mesh.model.tet_count and not self._work.device.is_capturing:
-            self._settings.elasticity.assign(self._elasticity(self._mesh))
+        if self.mesh.model.tet_count and not self._work.device.is_capturing:
+            self.settings.elasticity.assign(self._elasticity(self.mesh))
 
     @property
     def _least_speed(self):
@@ -337,35 +342,35 @@ class NewtonMethod:
     def _begin(self, end, dt):
         work, motion = self._work, self._work.step.motion
         self._dt = float(dt)
-        self._settings.dt = dt
-        self._settings.recovery = self._metre * _RECOVERY_SPEED * dt
-        self._settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
+        self.settings.dt = dt
+        self.settings.recovery = self._metre * _RECOVERY_SPEED * dt
+        self.settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
         p = self._problem
         p.least_change, p.far_change = self._least_speed * self._dt, self._metre * _FAR_SPEED * self._dt
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
-        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
+        self._launch(steps.begin_unknowns, self.count, [motion, wp.float64(dt)], [self.unknowns, self._goal])
         if self._attachments is not None:
-            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
+            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self.unknowns, self._goal]
             outputs = [work.vertices, end.particle_q, end.particle_qd]
-            self._launch(attach, self._mesh.model.particle_count, inputs, outputs)
+            self._launch(attach, self.mesh.model.particle_count, inputs, outputs)
             wp.copy(self._poses, end.body_q)
         self.progress.active.zero_()
         self.progress.given_moves.zero_()
         self._flow.arrived.zero_()
         wp.copy(self._sought, self._all_sought)
-        self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
-        inputs = [motion, self._margin, self._mesh.model.gravity, self._dt, self._unknowns, self._bodies]
-        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
+        self._launch_over_bodies(bodies.begin_bodies, [motion, self.unknowns, self.progress.active])
+        inputs = [motion, self._margin, self.mesh.model.gravity, self._dt, self.unknowns, self._bodies]
+        outputs = [self._goal, self._lower, self._upper, self.trial, self.progress, self._plane_share]
         self._lacks.zero_()
-        self._launch(steps.begin_step, max(self._mesh.vertex_count, work.worlds), inputs, outputs)
+        self._launch(steps.begin_step, max(self.mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
         self._leaves.zero_()
-        wp.copy(self._origin, motion.x0)
+        wp.copy(self.origin, motion.x0)
         self._touching.face.fill_(pairs.NO_FACE)
         self._touching.any.zero_()
 
     def _find_end(self, end):
-        work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
+        work, motion, vertices = self._work, self._work.step.motion, self.mesh.vertex_count
         self._find_candidates()
         wp.capture_if(self._touching.any, self._part_touching)
         self._flow.phase.fill_(int(Phase.BEGIN))
@@ -374,17 +379,17 @@ class NewtonMethod:
         if self.keeps_contacts:
             retry_until_fits(self._find_contacts_at_end, self, work.device)
         if len(self._bodies.unknown):
-            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
+            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self.unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
-        inputs = [self._trial, self._unknowns, self._dt]
+        inputs = [self.trial, self.unknowns, self._dt]
         self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end, self.progress])
         inputs = [self.progress, self._dt, self._least_speed, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
     def _renew_candidates(self):
-        inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
+        inputs = [self._work.step.motion, self.unknowns, self._margin, self.trial, self._leaves]
         inputs += [self.progress.active, int(self.keeps_contacts)]
-        self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
+        self._launch(steps.renew_boxes, self.mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
         self._leaves.zero_()
         self._any_leaves.zero_()
         self._find_candidates()
@@ -415,7 +420,7 @@ class NewtonMethod:
         candidates.used.zero_()
         for k in range(0, len(self._queues), 2):
             queues = self._queues[k : k + 2]
-            work.launch_over_entries(pairs.count_candidates, [self._mesh.device_world, *queues, candidates])
+            work.launch_over_entries(pairs.count_candidates, [self.mesh.device_world, *queues, candidates])
         self._launch(pairs.place_candidates, work.worlds, [candidates], [])
 
     def _prepare_candidates(self):
@@ -423,15 +428,15 @@ class NewtonMethod:
         self._candidates.far.zero_()
         self._candidates.listed_edges.fill_(-1)
         self._candidates.listed_others.zero_()
-        inputs = [self._work.step, self._settings, self._origin, self._work.status.crossings, self.progress]
+        inputs = [self._work.step, self.settings, self.origin, self._work.status.crossings, self.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
             outputs = [self._candidates, self._touching]
             self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, *outputs])
 
     def _part_touching(self):
-        inputs = [self._work.step, self._settings, self._touching]
-        self._launch(pairs.part_touching, self._mesh.model.particle_count, inputs, [self._trial, self._origin])
+        inputs = [self._work.step, self.settings, self._touching]
+        self._launch(pairs.part_touching, self.mesh.model.particle_count, inputs, [self.trial, self.origin])
         self._prepare_candidates()
 
     def _allocate_candidates(self, queues):
@@ -441,25 +446,25 @@ class NewtonMethod:
             ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
         )
         sizes["used"] = 1
-        sizes["kept"] = capacity if self._mesh.distances is not None else 0
+        sizes["kept"] = capacity if self.mesh.distances is not None else 0
         self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self._candidates.room.fill_(capacity)
 
     def _allocate_contacts(self, of_room):
         """Allocates contacts, so many for each particle of a world, and more for each body."""
-        self._retire(self._contacts)
+        self._retire(self.contacts)
         start, device = of_room * self._rooms, self._work.device
         capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
-        sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self._count)
+        sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self.count)
         parts = 1 if self._is_many else self._problem.parts
-        sizes["bucket"] = parts * self._mesh.vertex_count
+        sizes["bucket"] = parts * self.mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, of_each * capacity)
         sizes |= dict.fromkeys(("count", "listed", "coupled_first", "coupled_end"), self._work.worlds)
         contacts = allocate(Contacts, capacity, device, **sizes)
         contacts.parts, contacts.entries_of_each = parts, of_each
         contacts.start = wp.array(start.astype(np.int32), dtype=int, device=device)
         contacts.first_bucket = self._problem.worlds.first_vertex
-        self._contacts = self._problem.contacts = contacts
+        self.contacts = self._problem.contacts = contacts
 
     def _retire(self, buffers):
         if self._captured:
@@ -469,8 +474,8 @@ class NewtonMethod:
         """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
         if not self._problem.grows:
             return False
-        found, rooms = self._contacts.count.numpy(), np.diff(self._rooms)
-        if (found <= np.diff(self._contacts.start.numpy())).all():
+        found, rooms = self.contacts.count.numpy(), np.diff(self._rooms)
+        if (found <= np.diff(self.contacts.start.numpy())).all():
             return False
         needed = int(np.max(-(-found[rooms > 0] // rooms[rooms > 0])))
         capacity = capacity_for(needed * int(self._rooms[-1]), "contacts")
@@ -496,8 +501,8 @@ class NewtonMethod:
             team.arrived.zero_()
         inputs = [
             self._matrix,
-            self._contacts,
-            self._unknowns,
+            self.contacts,
+            self.unknowns,
             self.progress.solving,
             self._tolerance,
             _MAX_ITERATIONS,
@@ -515,7 +520,7 @@ class NewtonMethod:
     def _advance(self, resumes=False, of_all=False):
         work = self._work
         self._problem.grows = int(self._may_grow and not work.device.is_capturing)
-        inputs = [work.step.motion, work.motion.planes, self._settings, int(resumes)]
+        inputs = [work.step.motion, work.motion.planes, self.settings, int(resumes)]
         threads = self._block if work.device.is_cuda else 1
         inputs += [int(of_all or work.worlds == 1), self._problem, threads, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
@@ -525,7 +530,7 @@ class NewtonMethod:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
         work = self._work
         threads = max(1, _PUBLISHING // work.worlds) if work.device.is_cuda else 1
-        inputs = [self._contacts, self._settings, self._trial, self._goal]
+        inputs = [self.contacts, self.settings, self.trial, self._goal]
         inputs += [work.step, sides, centres, threads]
         self._launch(publish_contacts, (threads, work.worlds), inputs, [sums, rows])
 

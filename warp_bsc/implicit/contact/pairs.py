@@ -163,7 +163,8 @@ def moved(trial: Trial, scale: float, vertex: int) -> wp.vec3d:
 
 
 @wp.func
-def _reach_of(settings: BarrierSettings, corners: wp.vec4i) -> float:
+def reach_of(settings: BarrierSettings, corners: wp.vec4i) -> float:
+    """Returns the gap from which a pair pushes [m]."""
     reach, of_bodies = float(wp.inf), float(wp.inf)
     for j in range(4):
         reach = wp.min(reach, settings.reach[corners[j]])
@@ -182,23 +183,17 @@ def _compliance(motion: Motion, settings: BarrierSettings, layers: wp.float64, v
 
 
 @wp.func
-def _layers(progress: Progress, world: int, reach: wp.float64) -> wp.float64:
+def _layers(fall: float, reach: wp.float64) -> wp.float64:
     """Returns how many layers a barrier is made for: more than 1 where gravity alone would press one far into it."""
-    return wp.max(ONE, _LAYERS * wp.float64(progress.fall[world]) / reach)
+    return wp.max(ONE, _LAYERS * wp.float64(fall) / reach)
 
 
 @wp.func
-def _stiffness_by_mass(
-    motion: Motion,
-    settings: BarrierSettings,
-    progress: Progress,
-    world: int,
-    corners: wp.vec4i,
-    is_edges: bool,
-    reach: wp.float64,
+def stiffness_by_mass(
+    motion: Motion, settings: BarrierSettings, fall: float, corners: wp.vec4i, is_edges: bool, reach: wp.float64
 ) -> wp.float64:
-    """Returns the stiffness of a barrier as :class:`Candidates` has it."""
-    layers = _layers(progress, world, reach)
+    """Returns the stiffness of a barrier as :class:`Candidates` has it, given ``fall`` of :class:`.system.Progress`."""
+    layers = _layers(fall, reach)
     first = _compliance(motion, settings, layers, corners[0])
     second = _compliance(motion, settings, layers, corners[2]) + _compliance(motion, settings, layers, corners[3])
     if is_edges:
@@ -214,42 +209,59 @@ def _stiffness_by_mass(
 
 
 @wp.func
-def stiffness_of_pair(
-    by_mass: wp.float64, settings: BarrierSettings, trial: Trial, corners: wp.vec4i, reach: wp.float64
-) -> wp.float64:
-    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
+def carrying_stiffness(by_mass: wp.float64, settings: BarrierSettings, corners: wp.vec4i, reach: wp.float64):
+    """Returns the stiffness of a barrier that carries what presses the pair together [N/m].
 
-    It is more where elements, or many layers, push harder than that carries at the gap below which a pair hardly comes
-    nearer: what is taut, or under a pile, would otherwise be stuck there. It is less of edges of faces that are nearly
-    parallel where the Newton step begins, whose closest points jump from end to end: their ends are near these faces,
-    which push as well.
+    It is more than that by mass where elements, or many layers, push harder than that carries at the gap below which a
+    pair hardly comes nearer: what is taut, or under a pile, would otherwise be stuck there.
     """
     load = float(0.0)
     for j in range(4):
         load = wp.max(load, settings.load[corners[j]])
     needed = wp.float64(load) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
-    stiffness = wp.max(wp.abs(by_mass), needed)
+    return wp.max(wp.abs(by_mass), needed)
+
+
+@wp.func
+def share_of_parallel(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
+    """Returns the share of its stiffness that a barrier of two edges of faces has: less where they are nearly parallel.
+
+    Their closest points jump from end to end then; their ends are near these faces, which push as well.
+    """
+    u, v = b - a, d - c
+    scaled = wp.length_sq(wp.cross(u, v)) / (_PARALLEL * wp.length_sq(u) * wp.length_sq(v))
+    if scaled < ONE:
+        return scaled * (wp.float64(2.0) - scaled)
+    return ONE
+
+
+@wp.func
+def stiffness_of_pair(
+    by_mass: wp.float64, settings: BarrierSettings, trial: Trial, corners: wp.vec4i, reach: wp.float64
+) -> wp.float64:
+    """Returns the stiffness of a barrier [N/m]: at half of its reach, its curvature is that of what it pushes apart.
+
+    Edges are parallel or not where the Newton step begins.
+    """
+    stiffness = carrying_stiffness(by_mass, settings, corners, reach)
     if by_mass < ZERO:
         a, b, c, d = corners_of(trial.x, corners)
-        u, v = b - a, d - c
-        scaled = wp.length_sq(wp.cross(u, v)) / (_PARALLEL * wp.length_sq(u) * wp.length_sq(v))
-        if scaled < ONE:
-            stiffness *= scaled * (wp.float64(2.0) - scaled)
+        stiffness *= share_of_parallel(a, b, c, d)
     return stiffness
 
 
 @wp.func
 def stiffness_at_plane(
-    motion: Motion, settings: BarrierSettings, progress: Progress, world: int, vertex: int, reach: wp.float64
+    motion: Motion, settings: BarrierSettings, fall: float, vertex: int, reach: wp.float64
 ) -> wp.float64:
     """Returns the stiffness of a barrier between a vertex and a plane [N/m], as :func:`stiffness_of_pair`."""
     needed = wp.float64(settings.load[vertex]) / (reach * wp.float64(barrier.FORCE_AT_FLOOR))
-    compliance = _compliance(motion, settings, _layers(progress, world, reach), vertex)
+    compliance = _compliance(motion, settings, _layers(fall, reach), vertex)
     return wp.max(ONE / (compliance * wp.float64(barrier.CURVATURE_AT_HALF)), needed)
 
 
 @wp.func
-def _barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, reach: float):
+def barrier_of(settings: BarrierSettings, start: wp.float64, kept: wp.float64, reach: float):
     """Returns the level and the reach of the barrier of a pair, by its distance at the start and that to keep.
 
     The reach of what starts within it ends a little above its gap: a barrier otherwise throws apart, at up to its reach
@@ -390,7 +402,7 @@ def _prepare(
     a, b, c, d = corners_of(origin, corners)
     if not wp.isfinite(a + b + c + d):
         return
-    start, kept, whole = ZERO, ZERO, _reach_of(settings, corners)
+    start, kept, whole = ZERO, ZERO, reach_of(settings, corners)
     if motion.distances.radius:
         start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
@@ -407,7 +419,7 @@ def _prepare(
     if crossings[motion.world[corners[0]]] > 0:
         if crossed_at_start(step, queue.kind, queue.pairs[i]):
             return
-    level, reach = _barrier_of(settings, start, kept, whole)
+    level, reach = barrier_of(settings, start, kept, whole)
     pair = queue.pairs[i]
     slot = int(0)
     world, apart = motion.world[corners[0]], float((start - kept - reach) * wp.float64(ROUNDED_DOWN))
@@ -423,9 +435,8 @@ def _prepare(
         candidates.kept[slot] = kept
     candidates.level[slot] = level
     candidates.reach[slot] = float(reach)
-    candidates.stiffness[slot] = _stiffness_by_mass(
-        motion, settings, progress, world, corners, queue.kind == EDGE_EDGE, wp.float64(float(reach))
-    )
+    is_edges, fall = queue.kind == EDGE_EDGE, progress.fall[world]
+    candidates.stiffness[slot] = stiffness_by_mass(motion, settings, fall, corners, is_edges, wp.float64(float(reach)))
     candidates.floor[slot] = float(barrier.floor_gap(start - kept, reach))
     candidates.share[slot] = wp.where(is_far, FAR, 1.0)
     candidates.normal[slot] = 0
@@ -510,21 +521,21 @@ def part_touching(
 
 
 @wp.func
-def gap_at_plane(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int):
+def gap_at_plane(motion: Motion, planes: MovingPlanes, settings: BarrierSettings, i: int, vertex: int, x0: wp.vec3d):
     """Returns the distance that a vertex keeps from a plane, the level and the reach of its barrier, and its floor.
 
-    The reach is 0 if it is excluded.
+    The reach is 0 if it is excluded. The vertex starts the step at ``x0``.
     """
     if is_filtered_by_plane(motion, planes, i, vertex) or not is_stopped_by_plane(motion, planes, i, vertex):
         return ZERO, ZERO, ZERO, ZERO
-    start, error = signed_distance(planes.start[i], motion.x0[vertex])
+    start, error = signed_distance(planes.start[i], x0)
     if not start >= -error:
         return ZERO, ZERO, ZERO, ZERO
     kept = wp.min(start - error, ZERO)
     if motion.distances.radius and start > error:
         kept = wp.min(motion.distances.radius[vertex] + motion.distances.of_planes[i], KEPT * (start - error))
     whole = wp.where(body_of(motion, vertex) < 0, settings.reach[vertex], settings.reach_of_bodies[vertex])
-    level, reach = _barrier_of(settings, start, kept, whole)
+    level, reach = barrier_of(settings, start, kept, whole)
     return kept, level, reach, barrier.floor_gap(start - kept, reach)
 
 

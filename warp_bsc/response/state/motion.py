@@ -303,7 +303,7 @@ class ModelMotion:
             vertices.bodies = self._allocate_bodies()
             vertices.bodies.responds = int(responds_to_bodies)
         self.turns = BodyTurns(mesh) if watches_turns and (mesh.shape_vertices.body >= 0).any() else None
-        self.keeps_poses = moves_bodies or bool(model.requires_grad and model.body_count)
+        self.keeps_poses = moves_bodies
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
             add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
 

@@ -2,9 +2,8 @@
 
 import warp as wp
 
-from .contact.rows import Rows
+from ..contact.rows import Rows
 from .element_kernels import block
-from .kernels import FIXED
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,18 +12,18 @@ _ONE = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class ContactRows:
-    """Jacobians of the forces of contacts, by particle.
+    """Jacobians of the forces of contacts, by unknown.
 
     Attributes:
-        offsets: First entry of each particle, and the end of the last, int32, shape [particle_count + 1].
-        entries: Four times an element plus the place of the particle in it, int32.
-        vertices: Particles of elements, -1 for none, int32, shape [n, 4].
+        offsets: First entry of each unknown, and the end of the last, int32, shape [unknown_count + 1].
+        entries: Four times an element plus the place of the unknown in it, int32.
+        unknowns: Unknowns of elements, -1 for none, int32, shape [n, 4].
         jacobian: Minus blocks of the matrix, see :class:`.elements.Elements`.
     """
 
     offsets: wp.array[int]
     entries: wp.array[int]
-    vertices: wp.array2d[int]
+    unknowns: wp.array2d[int]
     jacobian: wp.array3d[wp.vec3d]
 
 
@@ -33,13 +32,13 @@ class Matrix:
     """The matrix A of a step, scaled: R^T A R, where R R^T are the inverted blocks of the diagonal.
 
     Attributes:
-        offsets: First block of each row, and the end of the last, int32, shape [particle_count + 1].
+        offsets: First block of each row, and the end of the last, int32, shape [unknown_count + 1].
         columns: Columns of blocks, int32, shape [n].
         values: Blocks of inertia and elastic forces, shape [n].
         contacts: Blocks of contacts.
-        roots: R by particle.
+        roots: R by unknown.
         eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R, float64,
-            shape [3 particle_count].
+            shape [3 unknown_count].
         unsymmetric: 1 for worlds with contacts, whose friction depends on their load, int32, shape [world_count].
     """
 
@@ -54,7 +53,7 @@ class Matrix:
 
 @wp.func
 def vector_at(x: wp.array[wp.float64], i: int) -> wp.vec3d:
-    """Returns the vector of particle i."""
+    """Returns the vector of unknown i."""
     return wp.vec3d(x[3 * i], x[3 * i + 1], x[3 * i + 2])
 
 
@@ -87,9 +86,9 @@ def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.float64], part: i
     for k in range(rows.offsets[i] + part, rows.offsets[i + 1], parts):
         e, row = rows.entries[k] // 4, 3 * (rows.entries[k] % 4)
         for j in range(4):
-            vertex = rows.vertices[e, j]
-            if vertex >= 0:
-                of = vector_at(x, vertex)
+            u = rows.unknowns[e, j] + int(0)
+            if u >= 0:
+                of = vector_at(x, u)
                 product += wp.vec3d(
                     wp.dot(rows.jacobian[e, row, j], of),
                     wp.dot(rows.jacobian[e, row + 1, j], of),
@@ -111,8 +110,7 @@ def row_product(matrix: Matrix, i: int, x: wp.array[wp.float64], part: int, part
 @wp.kernel
 def add_up_rows(
     # in
-    dt: wp.float64,
-    mass: wp.array[float],
+    inertia: wp.array[wp.float64],
     is_fixed: wp.array[int],
     rows: Rows,
     of_elements: wp.array[wp.mat33d],
@@ -120,15 +118,13 @@ def add_up_rows(
     # in and out
     diagonal: wp.array[wp.mat33d],
     # out
-    inertia: wp.array[wp.float64],
     values: wp.array[wp.mat33d],
 ):
-    """Adds up the blocks of elements, those of the diagonal, and inertia m / dt^2, 1 for particles that nothing moves.
+    """Adds up the blocks of elements, those of the diagonal, and inertia m / dt^2, 1 for what is fixed.
 
-    Blocks of fixed particles are 0 beside that. The blocks of the diagonal are returned as well.
+    Blocks of what is fixed are 0 beside that. The blocks of the diagonal are returned as well.
     """
     u = wp.tid()
-    inertia[u] = wp.where(is_fixed[u] != FIXED, wp.float64(mass[u]) / (dt * dt), _ONE)
     for k in range(rows.first[u], rows.first[u + 1]):
         total = wp.mat33d()
         if k == rows.first[u]:
@@ -187,15 +183,15 @@ def scale_rows(
 def scale_jacobians(
     # in
     transposed: int,
-    vertices: wp.array2d[int],
+    unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
     roots: wp.array[wp.mat33d],
     # in and out
     jacobian: wp.array3d[wp.vec3d],
 ):
-    """Multiplies the blocks of Jacobians, or of their transposes, by roots; those of fixed particles become 0."""
+    """Multiplies the blocks of Jacobians, or of their transposes, by roots; those of what is fixed become 0."""
     e, i, j = wp.tid()
-    v, w = vertices[e, i], vertices[e, j]
+    v, w = unknowns[e, i], unknowns[e, j]
     if i > j or v < 0 or w < 0:
         return
     upper, lower = wp.mat33d(), wp.mat33d()
@@ -212,16 +208,16 @@ def scale_jacobians(
 @wp.kernel
 def count_entries(
     # in
-    vertices: wp.array2d[int],
+    unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
     world: wp.array[int],
     # out
     counts: wp.array[int],
     unsymmetric: wp.array[int],
 ):
-    """Counts the elements of each free particle, and marks worlds that have some."""
+    """Counts the elements of each free unknown, and marks worlds that have some."""
     e, i = wp.tid()
-    v = vertices[e, i]
+    v = unknowns[e, i]
     if v >= 0:
         if is_fixed[v] == 0:
             wp.atomic_add(counts, v, 1)
@@ -231,16 +227,16 @@ def count_entries(
 @wp.kernel
 def list_entries(
     # in
-    vertices: wp.array2d[int],
+    unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
     # in and out
     ends: wp.array[int],
     # out
     entries: wp.array[int],
 ):
-    """Lists the elements of each free particle; ``ends`` are the ends of what is listed."""
+    """Lists the elements of each free unknown; ``ends`` are the ends of what is listed."""
     e, i = wp.tid()
-    v = vertices[e, i]
+    v = unknowns[e, i]
     if v >= 0:
         if is_fixed[v] == 0:
             entries[wp.atomic_add(ends, v, 1)] = 4 * e + i
@@ -258,18 +254,3 @@ def sum_scaled_squares(
     """Adds the squares of scaled forces to sums by world."""
     i = wp.tid()
     wp.atomic_add(sums, world[i], wp.length_sq(wp.transpose(roots[i]) * forces[i]))
-
-
-@wp.kernel
-def set_failed(
-    # in
-    world: wp.array[int],
-    failed: wp.array[int],
-    value: wp.float64,
-    # in and out
-    x: wp.array[wp.vec3d],
-):
-    """Sets a vector to a value in worlds that failed."""
-    i = wp.tid()
-    if failed[world[i]] != 0:
-        x[i] = wp.vec3d(value, value, value)

@@ -1,17 +1,17 @@
-"""Elastic forces of a step of VBD, their exact Hessians, and gradients with respect to all that they depend on."""
+"""Elastic forces of a step, their exact Hessians, and gradients with respect to all that they depend on."""
 
 import newton
 import numpy as np
 import warp as wp
 
-from .._private_names.of_warp import struct_fields
-from ..response.adjoint.arrays import launch_adjoint
+from ..._private_names.of_warp import struct_fields
+from ...response.adjoint.arrays import launch_adjoint
+from ..contact.rows import Rows, make_rows
+from ..elasticity.bending import bend, edge_corners
+from ..elasticity.derivatives import store_hessian
+from ..elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, has_energy, kind_of
+from ..elasticity.matrices import cross_matrix, identity, mat43d
 from . import energies
-from .contact.rows import Rows, make_rows
-from .elasticity.bending import bend, edge_corners
-from .elasticity.derivatives import store_hessian
-from .elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, has_energy, kind_of
-from .elasticity.matrices import cross_matrix, identity, mat43d
 from .element_kernels import gather
 
 wp.set_module_options({"enable_backward": False})
@@ -20,19 +20,19 @@ _TWO = wp.constant(wp.float64(2.0))
 
 
 class Elastic:
-    """The elements of a model that VBD gives energy to, in float64.
+    """The elements of a model, in float64.
 
     Attributes:
-        rows: Sparse rows of their Hessian, one for each particle.
+        rows: Sparse rows of their Hessian, one for each unknown.
         blocks: Hessians of elements but those of bending, as :attr:`.rows.Rows.source` counts them.
         bends: Those of bending, 16 for each element.
     """
 
-    def __init__(self, model: newton.Model):
-        """Allocates buffers."""
+    def __init__(self, model: newton.Model, unknown: np.ndarray, count: int):
+        """Allocates buffers; ``unknown`` is that of each particle, of so many."""
         self._elements, vertices = elements_of_model(model)
-        self.device, n = model.device, model.particle_count
-        self.rows = make_rows(vertices, np.arange(n), n, model.device)
+        self.device = model.device
+        self.rows = make_rows(vertices, unknown, count, model.device)
         self._count = sum(map(len, vertices))
         bends = 16 * len(vertices[ElementKind.BENDING])
         blocks = sum(v.size * size for v, size in zip(vertices, SIZES, strict=True)) - bends
@@ -41,12 +41,13 @@ class Elastic:
             return wp.zeros(count, dtype=dtype, device=model.device)
 
         corners = np.concatenate([v.ravel() for v in vertices])
+        corners = np.where(corners >= 0, unknown[np.maximum(corners, 0)], -1) if len(unknown) else corners
         self._corners = wp.array(corners.astype(np.int32).reshape(-1, 1), dtype=int, device=model.device)
         self._forces = zeros((len(corners), 1, 1), wp.vec3d)
         self.blocks, self.bends = zeros(blocks, wp.mat33d), zeros(bends, wp.mat33d)
 
     def add_forces(self, dt: float, x1: wp.array, x0: wp.array, forces: wp.array) -> None:
-        """Adds the forces on particles, vec3d, at positions at the end and at the start of a step, vec3d."""
+        """Adds the forces on unknowns, vec3d, at positions at the end and at the start of a step, vec3d."""
         inputs, outputs = [self._elements, wp.float64(dt), x1, x0], [self._forces.flatten()]
         wp.launch(energies.elastic_forces, self._count, inputs=inputs, outputs=outputs, device=self.device)
         inputs = [self.rows, *outputs]
@@ -58,7 +59,7 @@ class Elastic:
         wp.launch(_find_hessians, self._count, inputs=inputs, outputs=outputs, device=self.device)
 
     def add_gradients(self, dt: float, x1: wp.array, x0: wp.array, multipliers: wp.array) -> None:
-        """Adds to the gradients of positions and of parameters, given those with respect to the forces, vec3d."""
+        """Adds to the gradients of positions and parameters, given those with respect to forces on unknowns, vec3d."""
         elements = Elements()
         for name in struct_fields(Elements):  # with the gradients that arrays have now
             setattr(elements, name, getattr(self._elements, name))
@@ -76,7 +77,7 @@ def _add_corners(
     # in and out
     forces: wp.array[wp.vec3d],
 ):
-    """Adds the forces on corners of elements to those on their particles."""
+    """Adds the forces on corners of elements to those on their unknowns."""
     i = wp.tid()
     total = wp.vec3d()
     for n in range(rows.first_corner[i], rows.first_corner[i + 1]):

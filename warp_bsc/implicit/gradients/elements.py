@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from .._private_names.of_warp import empty_struct, struct_fields, struct_type
-from ..response.adjoint.arrays import launch_adjoint
+from ..._private_names.of_warp import empty_struct, struct_fields, struct_type
+from ...response.adjoint.arrays import launch_adjoint
 from . import element_kernels
 
 
@@ -21,21 +21,23 @@ class Elements:
     The buffers are made once, and hold what belongs to one step at a time.
 
     Attributes:
-        vertices: Particles of the elements, -1 for none, int32, shape [capacity, size].
+        vertices: Vertices of the elements, -1 for none, int32, shape [capacity, size].
+        rows: The unknown of each of these, -1 for none.
         count: Elements in use.
         jacobian: Derivatives of the forces with respect to positions at the end, float64, shape
             [capacity, 3 size, size] of vec3: row 3 i + j belongs to component j of the force on particle i.
     """
 
-    def __init__(self, kernel: wp.Kernel, vertices: wp.array, parameters: Sequence):
+    def __init__(self, kernel: wp.Kernel, vertices: wp.array, rows: wp.array, parameters: Sequence = ()):
         """Allocates buffers for forces on ``vertices``.
 
         Args:
             kernel: A kernel of the form above.
-            vertices: Particles of the elements, int32, shape [capacity, size].
+            vertices: Vertices of the elements, int32, shape [capacity, size].
+            rows: Their unknowns, likewise.
             parameters: What the kernel reads beside positions; arrays that require gradients get them.
         """
-        self.kernel, self.vertices, self.parameters = kernel, vertices, list(parameters)
+        self.kernel, self.vertices, self.rows, self.parameters = kernel, vertices, rows, list(parameters)
         self.device = device = vertices.device
         self.count, self._size = vertices.shape
         shape, rows = (self.count, 1, self._size), 3 * self._size
@@ -50,16 +52,16 @@ class Elements:
         self._launch(element_kernels.set_units, self._units.shape, [], [self._units])
 
     def load(self, x1: wp.array, x0: wp.array) -> None:
-        """Takes positions of particles at the end and at the start of a step, vec3d, shape [particle_count]."""
+        """Takes positions of vertices at the end and at the start of a step, vec3d."""
         shape = self.count, self._size
         self._launch(element_kernels.gather, shape, [self.vertices, x1], [self._x1])
         self._launch(element_kernels.gather, shape, [self.vertices, x0], [self._x0])
 
     def add_forces(self, dt: float, forces: wp.array) -> None:
-        """Adds the forces to those of particles, vec3d, shape [particle_count]."""
+        """Adds the forces to those on unknowns, vec3d."""
         inputs = [wp.float64(dt), self._x1, self._x0, *self.parameters]
         self._launch(self.kernel, (self.count, 1), inputs, [self._forces])
-        self._launch(element_kernels.scatter, (self.count, self._size), [self.vertices, self._forces], [forces])
+        self._launch(element_kernels.scatter, (self.count, self._size), [self.rows, self._forces], [forces])
 
     def differentiate(self, dt: float) -> None:
         """Computes the Jacobian."""
@@ -73,19 +75,19 @@ class Elements:
         wp.launch(self.kernel, shape[:2], inputs=inputs, outputs=[units], **options)
 
     def add_blocks(self, is_fixed: wp.array, blocks: wp.array) -> None:
-        """Subtracts the blocks of the Jacobian on the diagonal from those of particles, mat33d."""
-        inputs = [self.vertices, is_fixed, self.jacobian]
+        """Subtracts the blocks of the Jacobian on the diagonal from those of unknowns, mat33d."""
+        inputs = [self.rows, is_fixed, self.jacobian]
         self._launch(element_kernels.add_blocks, (self.count, self._size), inputs, [blocks])
 
     def add_gradients(self, dt: float, of_forces: wp.array, of_x1: wp.array, of_x0: wp.array) -> None:
-        """Adds gradients with respect to positions, given those with respect to the forces, vec3d, [particle_count].
+        """Adds gradients with respect to positions of vertices, given those with respect to forces on unknowns, vec3d.
 
         Parameters that require gradients get them as well.
         """
         shape = self.count, self._size
         for array in (self._of_x1, self._of_x0):
             array.zero_()
-        self._launch(element_kernels.gather, shape, [self.vertices, of_forces], [self._of_forces])
+        self._launch(element_kernels.gather, shape, [self.rows, of_forces], [self._of_forces])
         x1, x0 = with_gradient(self._x1, self._of_x1), with_gradient(self._x0, self._of_x0)
         inputs = [wp.float64(dt), x1, x0, *self.parameters]
         launch_adjoint(self.kernel, (self.count, 1), inputs, [self._of_forces], self.device)

@@ -1,0 +1,1 @@
+"""Gradients through the steps of the solver with contact inside."""

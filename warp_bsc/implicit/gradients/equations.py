@@ -1,0 +1,175 @@
+"""The equations that a converged step solves, and their derivatives.
+
+At the end x1 of a step the forces on each unknown balance: inertia, elasticity, attachments, barriers and friction. Let
+A = -d forces / d x1. By the implicit function theorem, a gradient g with respect to x1 becomes the gradient of
+l . forces with respect to everything that forces depend on, where A^T l = g. A is that of the forces as they are:
+elements are not made positive definite, closest points move, and friction follows its load, so that it is not
+symmetric.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import warp as wp
+
+from ..._private_names.of_newton import attachment_arrays
+from ...response.adjoint.arrays import launch_adjoint
+from ...response.state.planes import MovingPlanes
+from ...response.state.structs import Motion
+from ..contact.newton_method import NewtonMethod
+from ..contact.pairs import BarrierSettings
+from . import energies, kernels
+from .contact_forces import RecordedContacts, contact_forces
+from .elastic import Elastic
+from .elements import Elements, with_gradient
+from .matrix import StepMatrix
+from .matrix_kernels import Matrix
+
+
+class SolvedStep(NamedTuple):
+    """What a step began and ended with. Arrays of vertices are vec3d.
+
+    Attributes:
+        dt: Length of the step [s].
+        x0, x1: Positions of vertices at both ends [m].
+        v0: Velocities of particles at the start [m/s].
+        force: External forces [N], vec3, or None.
+        is_fixed: 1 for unknowns that are not solved for.
+        vertices, rows: Corners of contacts and their unknowns, -1 for none, int32, shape [n, 4].
+        contacts: The same contacts.
+        motion, planes, settings: What barriers and friction depend on; with the gradients that are wanted.
+        poses: Poses of bodies at the end and at the start, None without bodies.
+    """
+
+    dt: float
+    x0: wp.array
+    x1: wp.array
+    v0: wp.array
+    force: wp.array | None
+    is_fixed: wp.array
+    vertices: wp.array
+    rows: wp.array
+    contacts: RecordedContacts
+    motion: Motion
+    planes: MovingPlanes
+    settings: BarrierSettings
+    poses: tuple[wp.array | None, wp.array | None]
+
+
+class StepEquations:
+    """The forces on the unknowns of a solver, and their derivatives, for one step at a time.
+
+    Attributes:
+        count: Number of unknowns.
+        forces: Sum of the forces on each, 0 for those that are fixed [N], vec3d.
+        matrix: What :meth:`differentiate` computed.
+        attachments: Attachments of the model, None without any.
+    """
+
+    def __init__(self, newton: NewtonMethod):
+        """Allocates buffers for steps of a solver, whose unknowns they have."""
+        self._newton, model = newton, newton.mesh.model
+        self.model, self.device, self.count = model, model.device, newton.count
+        self._unknowns = unknowns = newton.unknowns
+        self.forces = wp.zeros(self.count, dtype=wp.vec3d, device=self.device)
+        self._inertia = wp.zeros(self.count, dtype=wp.float64, device=self.device)
+        unknown = unknowns.of_vertex.numpy()[: model.particle_count]
+        self.unknown = unknowns.of_vertex[: model.particle_count]
+        self._elastic = Elastic(model, unknown, self.count)
+        self.attachments = attachment_arrays(model)
+        self._springs: list[Elements] = []
+        if self.attachments is not None:
+            particles = self.attachments.particle
+            rows = wp.array(unknown[particles.numpy()].reshape(-1, 1), dtype=int, device=self.device)
+            self._springs = [Elements(energies.attachment_forces, particles.reshape((-1, 1)), rows)]
+        of_worlds = unknowns.of_worlds.numpy()
+        world = np.repeat(np.arange(len(of_worlds) - 1), np.diff(of_worlds))
+        self.world = wp.array(world.astype(np.int32), dtype=int, device=self.device)
+        self._is_fixed = wp.zeros(self.count, dtype=int, device=self.device)
+        self._matrix = StepMatrix(self._elastic, self._springs, self._is_fixed, self.world, len(of_worlds) - 1)
+        self._contacts: Elements | None = None
+        self._in_contact: list[Elements] = []
+        self._step: SolvedStep | None = None
+        self.matrix: Matrix | None = None
+
+    @property
+    def step(self) -> SolvedStep:
+        """The step that was loaded."""
+        assert self._step is not None
+        return self._step
+
+    def load(self, step: SolvedStep) -> None:
+        """Takes a step."""
+        self._step = step
+        wp.copy(self._is_fixed, step.is_fixed)
+        inputs = [wp.float64(step.dt), self.model.particle_inv_mass, self._unknowns.particle, step.is_fixed]
+        self._launch(kernels.inertia_of, inputs, [self._inertia])
+        for springs in self._springs:
+            attached = self.attachments
+            parameters = [attached.body, attached.body_point, attached.stiffness, attached.damping, attached.enabled]
+            springs.parameters = [*parameters, *step.poses]
+        self._in_contact = self._load_contacts(step)
+        for elements in self._elements():
+            elements.load(step.x1, step.x0)
+
+    def _load_contacts(self, step):
+        count, elements = len(step.vertices), self._contacts
+        if not count:
+            return []
+        if elements is None or len(elements.vertices) < count:
+            shape = (count + (count // 2 if self.device.is_cpu else 0), 4)  # elsewhere the number does not change
+            vertices, rows = (wp.full(shape, -1, dtype=int, device=self.device) for _ in range(2))
+            elements = self._contacts = Elements(contact_forces, vertices, rows)
+        elements.count = count
+        wp.copy(elements.vertices[:count], step.vertices)
+        wp.copy(elements.rows[:count], step.rows)
+        elements.parameters = [elements.vertices, step.contacts, step.motion, step.planes, step.settings]
+        return [elements]
+
+    def evaluate(self) -> wp.array:
+        """Returns the forces, which vanish where the step is solved."""
+        step = self.step
+        self._launch(energies.inertial_forces, self._inertial(step.x1, step.x0, step.v0), [self.forces])
+        self._elastic.add_forces(step.dt, step.x1, step.x0, self.forces)
+        for elements in self._elements():
+            elements.add_forces(step.dt, self.forces)
+        self._launch(kernels.clear_fixed, [step.is_fixed], [self.forces])
+        return self.forces
+
+    def differentiate(self, *, transposed: bool) -> Matrix:
+        """Returns the matrix A, the derivative of minus the forces, or A^T."""
+        step = self.step
+        self._elastic.differentiate(step.dt, step.x1, step.x0)
+        for elements in self._elements():
+            elements.differentiate(step.dt)
+        return self._matrix.assemble(self._inertia, self._in_contact, transposed=transposed)
+
+    def add_gradients(self, multipliers: wp.array, of_x1: wp.array, of_x0: wp.array, of_v0: wp.array, of_force) -> None:
+        """Adds the gradients with respect to all that forces depend on.
+
+        Args:
+            multipliers: Gradients with respect to the forces, l above, vec3d; 0 where these are fixed.
+            of_x1: The array to add to for positions of vertices at the end, vec3d.
+            of_x0: The same for those at the start.
+            of_v0: The same for velocities of particles at the start.
+            of_force: The same for external forces, vec3; None for none.
+        """
+        step = self.step
+        x1, x0, v0 = with_gradient(step.x1, of_x1), with_gradient(step.x0, of_x0), with_gradient(step.v0, of_v0)
+        inputs = self._inertial(x1, x0, v0, of_force)
+        launch_adjoint(energies.inertial_forces, self.count, inputs, [multipliers], self.device)
+        self._elastic.add_gradients(step.dt, x1, x0, multipliers)
+        for elements in self._elements():
+            elements.add_gradients(step.dt, multipliers, of_x1, of_x0)
+
+    def _elements(self):
+        return [*self._springs, *self._in_contact]
+
+    def _inertial(self, x1, x0, v0, of_force=None):
+        step, model = self.step, self.model
+        force = None if step.force is None else with_gradient(step.force, of_force)
+        inputs = [wp.float64(step.dt), x1, x0, v0, force, model.particle_inv_mass, model.gravity]
+        return [*inputs, model.particle_world, self._unknowns.particle, step.is_fixed]
+
+    def _launch(self, kernel, inputs, outputs):
+        wp.launch(kernel, self.count, inputs=inputs, outputs=outputs, device=self.device)

@@ -1,0 +1,308 @@
+"""Kernels of a step's gradients: what is fixed, gradients at its ends, contacts at its end, and where it failed."""
+
+import warp as wp
+
+from ...response.state.structs import Motion
+from ..contact.pairs import Trial
+from ..contact.system import Contacts, Unknowns, end_of_contacts, kind_of_key, second_of_key
+
+wp.set_module_options({"enable_backward": False})
+
+
+
+@wp.kernel
+def to_double(
+    # in
+    values: wp.array[wp.vec3],
+    # out
+    doubles: wp.array[wp.vec3d],
+):
+    """Converts vectors to float64."""
+    i = wp.tid()
+    doubles[i] = wp.vec3d(values[i])
+
+
+@wp.kernel
+def find_fixed(
+    # in
+    is_free: wp.array[int],
+    # out
+    is_fixed: wp.array[int],
+):
+    """Finds the unknowns that are not solved for."""
+    u = wp.tid()
+    is_fixed[u] = 1 - is_free[u]
+
+
+@wp.kernel
+def record_contacts(
+    # in
+    contacts: Contacts,
+    unknowns: Unknowns,
+    threads: int,
+    # in and out
+    count: wp.array[int],
+    # out
+    vertices: wp.array2d[int],
+    rows: wp.array2d[int],
+    kind: wp.array[int],
+    plane: wp.array[int],
+):
+    """Copies the contacts at the end of a step; so many threads share those of a world."""
+    thread, world = wp.tid()
+    for i in range(contacts.start[world] + thread, end_of_contacts(contacts, world), threads):
+        slot = wp.atomic_add(count, 0, 1)
+        key = contacts.key[i] + wp.int64(0)
+        kind[slot] = kind_of_key(key)
+        plane[slot] = second_of_key(key)
+        for j in range(4):
+            vertex = contacts.corners[i][j]
+            vertices[slot, j] = vertex
+            rows[slot, j] = wp.max(unknowns.of_vertex[vertex], -1)
+
+
+@wp.kernel
+def find_changed(
+    # in
+    trial: Trial,
+    unknowns: Unknowns,
+    end: wp.array[wp.vec3],
+    world: wp.array[int],
+    # in and out
+    changed: wp.array[int],
+):
+    """Marks worlds in which a step did not end where the solve did."""
+    p = wp.tid()
+    u = unknowns.of_vertex[p]
+    if unknowns.is_free[u] != 0 and wp.length_sq(end[p] - trial.x[p]) != 0.0:
+        changed[world[p]] = 1
+
+
+@wp.kernel
+def inertia_of(
+    # in
+    dt: wp.float64,
+    inverse_mass: wp.array[float],
+    particle: wp.array[int],
+    is_fixed: wp.array[int],
+    # out
+    inertia: wp.array[wp.float64],
+):
+    """Computes m / dt^2 of unknowns, 1 for what is fixed."""
+    u = wp.tid()
+    inertia[u] = wp.float64(1.0)
+    if is_fixed[u] == 0:
+        inertia[u] = wp.float64(1.0) / (wp.float64(inverse_mass[particle[u]]) * dt * dt)
+
+
+@wp.kernel
+def clear_fixed(
+    # in
+    is_fixed: wp.array[int],
+    # out
+    values: wp.array[wp.vec3d],
+):
+    """Sets the values of what is fixed to 0."""
+    u = wp.tid()
+    if is_fixed[u] != 0:
+        values[u] = wp.vec3d()
+
+
+@wp.kernel
+def of_end(
+    # in
+    dt: wp.float64,
+    of_positions: wp.array[wp.vec3],
+    of_velocities: wp.array[wp.vec3],
+    unknown: wp.array[int],
+    is_fixed: wp.array[int],
+    is_held: wp.array[int],
+    carried: wp.array[wp.vec3d],
+    # out
+    of_unknowns: wp.array[wp.vec3d],
+    of_x1: wp.array[wp.vec3d],
+):
+    """Sums the gradients by which the end of a step is felt: of what is solved for, and of particles that are given.
+
+    The velocity of what is solved for, or held, is (x1 - x0) / dt. ``carried`` are gradients that the next step has by
+    where given particles started it.
+    """
+    p = wp.tid()
+    gradient = carried[p] + wp.vec3d()
+    if of_positions:
+        gradient += wp.vec3d(of_positions[p])
+    u = unknown[p]
+    if of_velocities:
+        if is_fixed[u] == 0 or is_held[p] != 0:
+            gradient += wp.vec3d(of_velocities[p]) / dt
+    if is_fixed[u] == 0:
+        of_unknowns[u] = gradient
+    else:
+        of_unknowns[u] = wp.vec3d()
+        of_x1[p] = gradient
+
+
+@wp.kernel
+def finish_gradients(
+    # in
+    dt: wp.float64,
+    of_velocities: wp.array[wp.vec3],
+    unknown: wp.array[int],
+    is_fixed: wp.array[int],
+    is_held: wp.array[int],
+    continues: wp.array[int],
+    of_x1: wp.array[wp.vec3d],
+    of_x0: wp.array[wp.vec3d],
+    of_v0: wp.array[wp.vec3d],
+    # in and out
+    of_positions: wp.array[wp.vec3],
+    of_velocities_0: wp.array[wp.vec3],
+    # out
+    carried: wp.array[wp.vec3d],
+):
+    """Adds the gradients with respect to the state at the start of a step.
+
+    A given particle ends where that state has it. In worlds that continue it starts where the last step ended, to which
+    its gradient is ``carried``.
+    """
+    p = wp.tid()
+    gradient, of_velocity = of_x0[p] + wp.vec3d(), of_v0[p] + wp.vec3d()
+    carried[p] = wp.vec3d()
+    is_given = is_fixed[unknown[p]] != 0 and is_held[p] == 0
+    if is_given:
+        if continues[p] != 0:
+            carried[p] = gradient
+            gradient = wp.vec3d()
+        gradient += of_x1[p]
+    if of_velocities:
+        if is_given:
+            of_velocity += wp.vec3d(of_velocities[p])
+        else:
+            gradient -= wp.vec3d(of_velocities[p]) / dt
+    if of_positions:
+        of_positions[p] = of_positions[p] + wp.vec3(gradient)
+    if of_velocities_0:
+        of_velocities_0[p] = of_velocities_0[p] + wp.vec3(of_velocity)
+
+
+@wp.kernel
+def set_failed(
+    # in
+    world: wp.array[int],
+    failed: wp.array[int],
+    # in and out
+    x: wp.array[wp.vec3d],
+):
+    """Sets a vector to NaN in worlds that failed."""
+    u = wp.tid()
+    if failed[world[u]] != 0:
+        x[u] = wp.vec3d(wp.float64(wp.nan))
+
+
+@wp.kernel
+def find_continuing(
+    # in
+    world: wp.array[int],
+    interrupted: wp.array[int],
+    # out
+    continues: wp.array[int],
+):
+    """Marks what is in worlds in which a step begins where the last one ended; of world -1, what is in all of them."""
+    i = wp.tid()
+    last = interrupted.shape[0] - 1
+    continues[i] = 1 - interrupted[wp.where(world[i] < 0, last, world[i])]
+
+
+@wp.kernel
+def find_held(
+    # in
+    particle: wp.array[int],
+    stiffness: wp.array[float],
+    enabled: wp.array[wp.bool],
+    motion: Motion,
+    # out
+    is_held: wp.array[int],
+):
+    """Finds the particles that attachments hold."""
+    e = wp.tid()
+    if enabled[e] and wp.isinf(stiffness[e]) and motion.inverse_mass[particle[e]] > 0.0:
+        is_held[particle[e]] = 1
+
+
+@wp.kernel
+def begin_failed(
+    # in
+    converged: wp.array[wp.bool],
+    # out
+    failed: wp.array[int],
+):
+    """Marks worlds in which a solve did not converge."""
+    w = wp.tid()
+    failed[w] = int(not converged[w])
+
+
+@wp.kernel
+def start_poses(
+    # in
+    given: wp.array[wp.transform],
+    continues: wp.array[int],
+    # in and out
+    poses: wp.array[wp.transform],
+):
+    """Lets bodies start where they are given, in worlds in which a step does not begin where the last one ended."""
+    body = wp.tid()
+    if continues[body] == 0:
+        poses[body] = given[body]
+
+
+@wp.kernel
+def add_poses(
+    # in
+    of_poses: wp.array[wp.transform],
+    # in and out
+    sums: wp.array[wp.transform],
+):
+    """Adds gradients with respect to poses to others."""
+    body = wp.tid()
+    sums[body] = sums[body] + of_poses[body]
+
+
+@wp.kernel
+def finish_poses(
+    # in
+    continues: wp.array[int],
+    of_pose_1: wp.array[wp.transform],
+    of_pose_0: wp.array[wp.transform],
+    # in and out
+    of_given: wp.array[wp.transform],
+    # out
+    carried: wp.array[wp.transform],
+):
+    """Adds the gradients with respect to poses at both ends of a step to those of the poses that it was given.
+
+    Bodies start where the last step ended in worlds that continue, to which their gradient is ``carried``.
+    """
+    body = wp.tid()
+    gradient = of_pose_1[body]
+    carried[body] = wp.transform(wp.vec3(0.0), wp.quat(0.0, 0.0, 0.0, 0.0))
+    if continues[body] != 0:
+        carried[body] = of_pose_0[body]
+    else:
+        gradient = gradient + of_pose_0[body]
+    if of_given:
+        of_given[body] = of_given[body] + gradient
+
+
+@wp.kernel
+def add_inverse_masses(
+    # in
+    of_vertices: wp.array[float],
+    is_fixed: wp.array[int],
+    unknown: wp.array[int],
+    # in and out
+    of_particles: wp.array[float],
+):
+    """Adds gradients with respect to inverse masses of vertices to those of particles that are solved for."""
+    p = wp.tid()
+    if is_fixed[unknown[p]] == 0:
+        of_particles[p] = of_particles[p] + of_vertices[p]

@@ -1,0 +1,262 @@
+"""Gradients of :class:`warp.Tape` through the steps of the solver with contact inside.
+
+A step that a tape records keeps what it began and ended with, and the contacts at its end. Going back through it takes
+one linear solve, see :mod:`.equations`, whatever the Newton steps were.
+"""
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from ...response.adjoint.arrays import (
+    copied,
+    copied_materials,
+    launch_adjoint,
+    materials_with_gradients,
+    with_gradients,
+)
+from ...response.state.motion import StateArrays
+from ...response.state.workspace import Workspace
+from ..contact.newton_method import NewtonMethod
+from . import energies, kernels
+from .contact_forces import RecordedContacts
+from .equations import SolvedStep, StepEquations
+from .linear import LinearSolver
+
+_TOLERANCE, _MAX_ITERATIONS = 1e-6, 1000
+"""Residual at which a linear solve ends, relative to its right-hand side, and iterations after which it does."""
+_THREADS = 256
+"""Threads for each world that copy its contacts on a GPU."""
+
+
+@dataclass(eq=False)
+class StateGradients:
+    """Gradients with respect to the arrays of states at the start and at the end of a step; None where there is none."""
+
+    particle_q: wp.array | None
+    particle_qd: wp.array | None
+    particle_f: wp.array | None
+    body_q: wp.array | None
+    end_particle_q: wp.array | None
+    end_particle_qd: wp.array | None
+    end_body_q: wp.array | None
+
+
+@dataclass(eq=False)
+class RecordedStep:
+    """A step of a tape.
+
+    Attributes:
+        step: What it solved.
+        failed: 1 for worlds that it did not solve, int32, shape [worlds].
+        of_particles, of_bodies: 1 for what is in worlds in which it began where the last one ended, int32.
+        is_held: 1 for particles that attachments hold.
+        before: The step of the same tape before it, None if there is none.
+    """
+
+    step: SolvedStep
+    failed: wp.array
+    of_particles: wp.array
+    of_bodies: wp.array
+    is_held: wp.array
+    before: "RecordedStep | None" = None
+
+
+class StepGradients:
+    """Records steps, and goes back through them.
+
+    Attributes:
+        equations: Those of the step that was gone through last.
+    """
+
+    def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool]):
+        """Allocates buffers.
+
+        Args:
+            work: The workspace of the steps.
+            newton: The solver, which keeps contacts at the end of its steps.
+            converged: Whether it converged, by world.
+        """
+        self._work, self._newton, self._converged = work, newton, converged
+        self._model = model = work.mesh.model
+        self.equations = equations = StepEquations(newton)
+        self._linear = LinearSolver(
+            newton.unknowns.of_worlds, equations.world, tolerance=_TOLERANCE, max_iterations=_MAX_ITERATIONS
+        )
+        vertices, particles, device = work.mesh.vertex_count, model.particle_count, work.device
+
+        def zeros(n):
+            return wp.zeros(n, dtype=wp.vec3d, device=device)
+
+        self._of_x1, self._of_x0, self._of_v0 = zeros(vertices), zeros(vertices), zeros(particles)
+        self._of_unknowns, self._carried_x = zeros(equations.count), zeros(particles)
+        self._interrupted = wp.clone(work.motion.vertices.interrupted)
+        self._poses, self._carried_poses = None, None
+        if model.body_count:
+            self._poses, self._carried_poses = wp.clone(model.body_q), wp.zeros_like(model.body_q)
+        self._last: RecordedStep | None = None
+        self._carried_to: RecordedStep | None = None
+
+    def begin(self) -> None:
+        """Notes where a step begins, before it is solved."""
+        wp.copy(self._interrupted, self._work.motion.vertices.interrupted)
+
+    def record(self, dt: float, v0: wp.array, force: wp.array | None, end: StateArrays) -> RecordedStep:
+        """Returns a copy of the step that was taken last.
+
+        Args:
+            dt: Its length [s].
+            v0: Velocities of particles at its start, vec3.
+            force: External forces, vec3, or None; not copied.
+            end: The state at its end.
+        """
+        work, newton, model, device = self._work, self._newton, self._model, self._work.device
+        motion, particles = work.motion.vertices, model.particle_count
+        x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
+        self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
+        self._launch(kernels.to_double, particles, [v0], [velocity])
+        is_fixed = wp.zeros(self.equations.count, dtype=int, device=device)
+        self._launch(kernels.find_fixed, len(is_fixed), [newton.unknowns.is_free], [is_fixed])
+        is_held = wp.zeros(particles, dtype=int, device=device)
+        if self.equations.attachments is not None:
+            at = self.equations.attachments
+            inputs = [at.particle, at.stiffness, at.enabled, work.step.motion]
+            self._launch(kernels.find_held, len(at.particle), inputs, [is_held])
+        failed = wp.zeros(work.worlds, dtype=int, device=device)
+        self._launch(kernels.begin_failed, work.worlds, [self._converged], [failed])
+        inputs = [newton.trial, newton.unknowns, end.particle_q, work.mesh.device_world]
+        self._launch(kernels.find_changed, particles, inputs, [failed])
+        of_particles = wp.zeros(particles, dtype=int, device=device)
+        inputs = [work.mesh.device_world, self._interrupted]
+        self._launch(kernels.find_continuing, particles, inputs, [of_particles])
+        of_bodies, poses = wp.zeros(model.body_count, dtype=int, device=device), (None, None)
+        if model.body_count:
+            inputs = [model.body_world, self._interrupted]
+            self._launch(kernels.find_continuing, model.body_count, inputs, [of_bodies])
+            poses = wp.clone(end.body_q), wp.clone(self._poses)
+            self._launch(kernels.start_poses, model.body_count, [end.body_q, of_bodies], [poses[1]])
+        contacts = self._record_contacts()
+        of_motion = copied(motion, ["inverse_mass", "friction"])
+        of_motion.materials = copied_materials(motion.materials)
+        step = SolvedStep(
+            dt,
+            x0,
+            wp.clone(newton.trial.exact),
+            velocity,
+            force,
+            is_fixed,
+            *contacts,
+            of_motion,
+            copied(work.motion.planes, ["start", "end", "friction"]),
+            copied(newton.settings, ["load"]),
+            poses,
+        )
+        self._last = RecordedStep(step, failed, of_particles, of_bodies, is_held)
+        return self._last
+
+    def finish(self, end: StateArrays) -> None:
+        """Keeps where bodies ended a step, on a tape or not."""
+        if self._poses is not None:
+            wp.copy(self._poses, end.body_q)
+
+    def _record_contacts(self):
+        """Returns vertices, unknowns, and all else of the contacts at the end of a step."""
+        work, newton, device = self._work, self._newton, self._work.device
+        capacity = len(newton.contacts.corners)
+        vertices, rows = (wp.full((capacity, 4), -1, dtype=int, device=device) for _ in range(2))
+        kind, plane = wp.full(capacity, -1, dtype=int, device=device), wp.zeros(capacity, dtype=int, device=device)
+        count, threads = wp.zeros(1, dtype=int, device=device), _THREADS if device.is_cuda else 1
+        inputs = [newton.contacts, newton.unknowns, threads, count]
+        self._launch(kernels.record_contacts, (threads, work.worlds), inputs, [vertices, rows, kind, plane])
+        n = capacity if device.is_capturing or device.is_cuda else int(count.numpy()[0])
+        contacts = RecordedContacts()
+        contacts.kind, contacts.plane = _first(kind, n), _first(plane, n)
+        contacts.fall = wp.clone(newton.progress.fall)
+        return _first(vertices, n), _first(rows, n), contacts
+
+    def backward(self, recorded: RecordedStep, before: RecordedStep | None, of: StateGradients) -> None:
+        """Turns gradients with respect to the end of a step into those with respect to all that it depends on.
+
+        Args:
+            recorded: The step.
+            before: The step of the same tape that ended where it begins, None if there is none.
+            of: The gradients of states, which are changed.
+        """
+        step, equations, model = recorded.step, self.equations, self._model
+        particles, dt = model.particle_count, wp.float64(step.dt)
+        if self._carried_to is not recorded:
+            self._carried_x.zero_()
+            if self._carried_poses is not None:
+                self._carried_poses.zero_()
+        for array in (self._of_x1, self._of_x0, self._of_v0, self._of_unknowns):
+            array.zero_()
+        inputs = [dt, of.end_particle_q, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held]
+        outputs = [self._of_unknowns, self._of_x1]
+        self._launch(kernels.of_end, particles, [*inputs, self._carried_x], outputs)
+        motion, of_motion = with_gradients(step.motion, ["inverse_mass", "friction"])
+        table = self._work.motion.friction.materials.friction
+        motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
+        planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
+        poses, of_poses = step.poses, (None, None)
+        if model.body_count:
+            of_poses = tuple(wp.zeros_like(pose, requires_grad=False) for pose in poses)
+            wp.copy(of_poses[0], self._carried_poses)
+            if of.end_body_q is not None:
+                self._launch(kernels.add_poses, model.body_count, [of.end_body_q], [of_poses[0]])
+            poses = tuple(_with(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
+        step = step._replace(motion=motion, planes=planes, poses=poses)
+        equations.load(step)
+        multipliers = self._linear.solve(equations.differentiate(transposed=True), self._of_unknowns)
+        self._launch(kernels.set_failed, equations.count, [equations.world, recorded.failed], [multipliers])
+        equations.add_gradients(multipliers, self._of_x1, self._of_x0, self._of_v0, of.particle_f)
+        if model.body_count:
+            self._go_to_poses(poses, planes, of_planes)
+            inputs = [recorded.of_bodies, *of_poses]
+            self._launch(kernels.finish_poses, model.body_count, inputs, [of.body_q, self._carried_poses])
+        inputs = [dt, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held, recorded.of_particles]
+        inputs += [self._of_x1, self._of_x0, self._of_v0]
+        outputs = [of.particle_q, of.particle_qd, self._carried_x]
+        self._launch(kernels.finish_gradients, particles, inputs, outputs)
+        if model.particle_inv_mass.grad is not None:
+            inputs = [of_motion.inverse_mass, step.is_fixed, equations.unknown]
+            self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
+        self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
+        self._carried_to = before
+        for gradient in (of.end_particle_q, of.end_particle_qd, of.end_body_q):  # the step overwrote what they are of
+            if gradient is not None:
+                gradient.zero_()
+
+    def _go_to_poses(self, poses, planes, of_planes):
+        """Turns gradients with respect to what moves with bodies into those with respect to their poses."""
+        mesh, particles, at = self._work.mesh, self._model.particle_count, self.equations.attachments
+        shapes, infinite = mesh.device_shape_vertices, mesh.device_planes
+        if at is not None:
+            inputs = [at.particle.reshape((-1, 1)), at.body, at.body_point, at.stiffness, at.enabled, poses[0]]
+            self._adjoint(energies.place_held, len(at.particle), inputs, self._of_x1)
+        if len(shapes.body):
+            for pose, gradient in zip(poses, (self._of_x1, self._of_x0), strict=True):
+                inputs = [shapes.body, shapes.position, pose]
+                self._adjoint(energies.place_shapes, len(shapes.body), inputs, gradient[particles:])
+        if len(infinite.body):
+            for pose, gradient in zip(poses, (of_planes.end, of_planes.start), strict=True):
+                inputs = [infinite.body, infinite.point, infinite.normal, pose]
+                self._adjoint(energies.place_planes, len(infinite.body), inputs, gradient)
+
+    def _adjoint(self, kernel, size, inputs, gradient):
+        launch_adjoint(kernel, size, inputs, [gradient], self._work.device)
+
+    def _launch(self, kernel, size, inputs, outputs):
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
+
+
+def _first(array, n):
+    """Returns a copy of the first elements of an array; Warp makes no empty slices."""
+    if not n:
+        return wp.empty((0, *array.shape[1:]), dtype=array.dtype, device=array.device)
+    return array if n == len(array) else wp.clone(array[:n])
+
+
+def _with(values, gradient):
+    alias = values[:]
+    alias.grad, alias.retain_grad = gradient, True
+    return alias
