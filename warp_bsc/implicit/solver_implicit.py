@@ -13,6 +13,7 @@ from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
+from .._private_names.of_warp import paused_tape
 from ..detection.run.host_function import run_on_host
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
@@ -65,8 +66,12 @@ class _Inertia(SolverBase):
             self._bodies.inverse_mass = model.body_inv_mass
 
     def step(self, state_in, state_out, control, contacts, dt, *, observables=None):
-        """Writes the positions and velocities that inertia leads to."""
+        """Writes the positions and velocities that inertia leads to; no tape records that."""
         check_observables(self, observables, contacts)
+        with paused_tape():
+            self._step(state_in, state_out, dt)
+
+    def _step(self, state_in, state_out, dt):
         model = self.model
         if self._bodies is not None:
             inputs = [state_in.body_q, state_in.body_qd, state_in.body_f, model.body_flags, model.gravity]
@@ -126,6 +131,7 @@ class SolverImplicit(SolverCCD):
         report: What a step found and did, :class:`.contact.step_report.ImplicitStepReport`.
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         max_iterations: Newton steps of a step at most.
+        gradients: What carries gradients of tapes through steps, None unless the model requires gradients.
     """
 
     _near = 0.0  # no constraints for near pairs: barriers keep them apart
@@ -218,10 +224,10 @@ class SolverImplicit(SolverCCD):
         self._newton.prepare(arrays_of(model))
         if self._forces is not None:
             self._newton.keeps_contacts, self._forces.more = True, self._newton.publish
-        self._gradients: StepGradients | None = None
+        self.gradients: StepGradients | None = None
         if model.requires_grad:
             self._newton.keeps_contacts = True
-            self._gradients = StepGradients(self._work, self._newton, results.converged)
+            self.gradients = StepGradients(self._work, self._newton, results.converged)
         if report_worlds:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
 
@@ -253,12 +259,12 @@ class SolverImplicit(SolverCCD):
             force = given[2]
             v0, force = wp.clone(given[1]), None if force is None else wp.clone(force, requires_grad=False)
             self._resolve_motion(step, end)
-            recorded = self._gradients.record(step.dt, v0, force, end)
+            recorded = self.gradients.record(step.dt, v0, force, end)
 
         def backward():
             with self._lock:
                 of = [None if array is None else array.grad for array in (*given, *ends)]
-                self._gradients.backward(recorded, before(), StateGradients(*of))
+                self.gradients.backward(recorded, before(), StateGradients(*of))
 
         run_on_host(forward, device)
         self._last_recorded = weakref.ref(step.tape), lambda: recorded
@@ -285,8 +291,8 @@ class SolverImplicit(SolverCCD):
 
     def _resolve(self, step):
         super()._resolve(step)
-        if self._gradients is not None:
-            self._gradients.finish(arrays_of(step.state_out))
+        if self.gradients is not None:
+            self.gradients.finish(arrays_of(step.state_out))
 
     def _solve(self, step, end, recorder):
         """Solves with contact from the inertial prediction, and detects what the solve left.
@@ -295,8 +301,8 @@ class SolverImplicit(SolverCCD):
         resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
         """
         work = self._work
-        if self._gradients is not None:
-            self._gradients.begin()
+        if self.gradients is not None:
+            self.gradients.begin()
         begin(work)
         self._newton.solve(end, step.dt)
         detect_contacts(work)

@@ -84,6 +84,7 @@ class NewtonMethod:
     Attributes:
         mesh: The triangles that collide.
         count, unknowns: Number of unknowns, and what they are.
+        candidates: Pairs that may come near each other in the step.
         contacts: Contacts of the last Newton step, or at the end.
         settings, trial, progress: What barriers depend on, where vertices are, and how far each world is.
         origin: Where vertices started the step, those that touched a shape a little beside it.
@@ -228,7 +229,7 @@ class NewtonMethod:
         self._captured, self._retired = False, []
         rooms = np.append(0, np.cumsum(np.where(order < particles, 1, _MORE_OF_BODIES)))
         self._rooms = rooms[of_worlds]  # of contacts, summed up by world
-        self._candidates, self.contacts = Candidates(), Contacts()
+        self.candidates, self.contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
         self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
 
@@ -413,7 +414,7 @@ class NewtonMethod:
 
     def _place_candidates(self):
         """Gives each world its part of the candidates."""
-        work, candidates = self._work, self._candidates
+        work, candidates = self._work, self.candidates
         if work.worlds == 1:
             return
         candidates.room.zero_()
@@ -424,14 +425,14 @@ class NewtonMethod:
         self._launch(pairs.place_candidates, work.worlds, [candidates], [])
 
     def _prepare_candidates(self):
-        self._candidates.near.zero_()
-        self._candidates.far.zero_()
-        self._candidates.listed_edges.fill_(-1)
-        self._candidates.listed_others.zero_()
+        self.candidates.near.zero_()
+        self.candidates.far.zero_()
+        self.candidates.listed_edges.fill_(-1)
+        self.candidates.listed_others.zero_()
         inputs = [self._work.step, self.settings, self.origin, self._work.status.crossings, self.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
-            outputs = [self._candidates, self._touching]
+            outputs = [self.candidates, self._touching]
             self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, *outputs])
 
     def _part_touching(self):
@@ -441,14 +442,14 @@ class NewtonMethod:
 
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
-        self._retire(self._candidates)
+        self._retire(self.candidates)
         sizes: dict = dict.fromkeys(
             ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
         )
         sizes["used"] = 1
         sizes["kept"] = capacity if self.mesh.distances is not None else 0
-        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
-        self._candidates.room.fill_(capacity)
+        self.candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
+        self.candidates.room.fill_(capacity)
 
     def _allocate_contacts(self, of_room):
         """Allocates contacts, so many for each particle of a world, and more for each body."""

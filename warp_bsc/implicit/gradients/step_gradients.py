@@ -66,7 +66,8 @@ class StepGradients:
     """Records steps, and goes back through them.
 
     Attributes:
-        equations: Those of the step that was gone through last.
+        newton: The solver of the steps.
+        equations: Those of the step that was gone back through last.
     """
 
     def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool]):
@@ -77,7 +78,7 @@ class StepGradients:
             newton: The solver, which keeps contacts at the end of its steps.
             converged: Whether it converged, by world.
         """
-        self._work, self._newton, self._converged = work, newton, converged
+        self._work, self.newton, self._converged = work, newton, converged
         self._model = model = work.mesh.model
         self.equations = equations = StepEquations(newton)
         self._linear = LinearSolver(
@@ -110,7 +111,7 @@ class StepGradients:
             force: External forces, vec3, or None; not copied.
             end: The state at its end.
         """
-        work, newton, model, device = self._work, self._newton, self._model, self._work.device
+        work, newton, model, device = self._work, self.newton, self._model, self._work.device
         motion, particles = work.motion.vertices, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
         self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
@@ -161,7 +162,7 @@ class StepGradients:
 
     def _record_contacts(self):
         """Returns vertices, unknowns, and all else of the contacts at the end of a step."""
-        work, newton, device = self._work, self._newton, self._work.device
+        work, newton, device = self._work, self.newton, self._work.device
         capacity = len(newton.contacts.corners)
         vertices, rows = (wp.full((capacity, 4), -1, dtype=int, device=device) for _ in range(2))
         kind, plane = wp.full(capacity, -1, dtype=int, device=device), wp.zeros(capacity, dtype=int, device=device)

@@ -1,0 +1,165 @@
+"""Steps of the solver with contact inside in float64, solved until nothing is left: what gradients are judged by.
+
+Each step begins where :class:`warp_bsc.SolverImplicit` ends it, and goes on by Newton's method on the same equations,
+with the exact matrix, until the forces that remain are rounding. Positions and velocities stay in float64 from step to
+step. Where elements press harder than masses tell, barriers are stiffer: those forces are lagged in the solver, and
+are here those of the first run.
+"""
+
+import numpy as np
+import warp as wp
+
+from warp_bsc.implicit.contact.system import AT_PLANE
+from warp_bsc.implicit.gradients.contact_forces import RecordedContacts
+from warp_bsc.implicit.gradients.linear import LinearSolver
+from warp_bsc.implicit.gradients.step_gradients import StateGradients
+
+_NEWTON_STEPS = 40
+_SHARES = 0.5 ** np.arange(12)
+_LEAST_CHANGE = 1e-13
+"""Change of positions at which a step ends [m]."""
+
+
+class Unsolved(RuntimeError):
+    """A step whose forces do not balance in float64."""
+
+
+class ReferenceSteps:
+    """Steps a state in float64.
+
+    Attributes:
+        x, v: Positions and velocities of particles, float64, shape [particle_count, 3].
+        recorded: The steps so far.
+        residual: Largest force that remained in them, as a share of the weight of a particle.
+    """
+
+    def __init__(self, solver, dt, loads=None):
+        """Begins a run; ``loads`` are those of another run, which this one takes."""
+        self._solver, self._dt, self._given_loads = solver, dt, loads
+        gradients = self._gradients = solver.gradients
+        equations = gradients.equations
+        self._linear = LinearSolver(
+            gradients.newton.unknowns.of_worlds, equations.world, tolerance=1e-9, max_iterations=4000
+        )
+        self.recorded, self.loads, self.residual = [], [], 0.0
+
+    def begin(self, state):
+        """Starts in a state of Newton."""
+        self._solver.reset(state)
+        self._states = [state, self._solver.model.state()]
+        self.x, self.v = state.particle_q.numpy().astype(float), state.particle_qd.numpy().astype(float)
+        self.recorded, self.loads = [], []
+
+    def step(self, control=None):
+        """Takes a step; ``control`` may change the state before it."""
+        first, second = self._states
+        if control is not None:
+            control(first, len(self.recorded))
+        solver, dt = self._solver, self._dt
+        free = self._free()
+        # what a program has written stands; all else is as exact as it can be
+        given = first.particle_q.numpy().astype(float)
+        self.x = np.where(free[:, None], self.x, given)
+        solver.step(first, second, None, None, dt)
+        gradients = self._gradients
+        end = solver.arrays_of_step(second) if hasattr(solver, "arrays_of_step") else second
+        recorded = gradients.record(dt, first.particle_qd, first.particle_f, end)
+        step = recorded.step
+        n = len(self.x)
+        x0 = step.x0.numpy()
+        x0[:n][free] = self.x[free]
+        v0 = self.v.copy()
+        step.x0.assign(x0)
+        step.v0.assign(v0)
+        load = self._given_loads[len(self.recorded)] if self._given_loads else step.settings.load.numpy()
+        step.settings.load.assign(load)
+        self.loads.append(load)
+        step = self._with_candidates(step)
+        x1 = self._solve(step)
+        recorded.step, recorded.before = step, self.recorded[-1] if self.recorded else None
+        recorded.failed.zero_()
+        self.recorded.append(recorded)
+        new = x1[:n]
+        self.v = np.where(free[:, None], (new - self.x) / dt, self.v)
+        self.x = np.where(free[:, None], new, second.particle_q.numpy().astype(float))
+        second.particle_q.assign(self.x.astype(np.float32))
+        second.particle_qd.assign(self.v.astype(np.float32))
+        self._states = [second, first]
+
+    def _free(self):
+        return self._solver.mesh.inverse_masses.numpy()[: len(self.x)] > 0
+
+    def _with_candidates(self, step):
+        """Returns a step whose contacts are all pairs that may come near each other, and all particles at all planes.
+
+        Those beyond their reach have no force, so that forces are smooth in positions.
+        """
+        newton = self._gradients.newton
+        found, device = newton.candidates, step.x0.device
+        corners, keys, parts = found.corners.numpy(), found.key.numpy(), []
+        start, room, near, far = (getattr(found, name).numpy() for name in ("start", "room", "near", "far"))
+        for w in range(len(start)):
+            last = start[w] + room[w]
+            parts += [np.arange(start[w], start[w] + near[w]), np.arange(last - far[w], last)]
+        index = np.concatenate(parts)
+        vertices, kind = corners[index].astype(np.int32), (keys[index] >> 56).astype(np.int32)
+        particles, planes = np.flatnonzero(self._free()), np.arange(len(step.planes.friction))
+        at = np.stack(np.meshgrid(particles, planes, indexing="ij"), -1).reshape(-1, 2)
+        of_world, of_plane = newton.mesh.device_world.numpy()[at[:, 0]], step.planes.world.numpy()[at[:, 1]]
+        at = at[(of_plane < 0) | (of_plane == of_world)]
+        vertices = np.concatenate([vertices, np.repeat(at[:, :1], 4, axis=1).astype(np.int32)])
+        kind = np.concatenate([kind, np.full(len(at), int(AT_PLANE), dtype=np.int32)])
+        plane = np.concatenate([np.zeros(len(index), dtype=np.int32), at[:, 1].astype(np.int32)])
+        rows = np.maximum(newton.unknowns.of_vertex.numpy()[vertices], -1).astype(np.int32)
+        contacts = RecordedContacts()
+        contacts.kind, contacts.plane = wp.array(kind, device=device), wp.array(plane, device=device)
+        contacts.fall = step.contacts.fall
+        return step._replace(
+            vertices=wp.array(vertices, device=device), rows=wp.array(rows, device=device), contacts=contacts
+        )
+
+    def _solve(self, step):
+        equations = self._gradients.equations
+        weight = 9.81 / self._solver.mesh.inverse_masses.numpy()[: len(self.x)][self._free()].max()
+        unknown = equations.unknown.numpy()
+        x1 = step.x1.numpy()
+        equations.load(step)
+        forces = equations.evaluate().numpy()
+        size = np.abs(forces).max()
+        for _k in range(_NEWTON_STEPS):
+            change = self._linear.solve(equations.differentiate(transposed=False), equations.forces).numpy()[unknown]
+            if not np.isfinite(change).all():
+                raise Unsolved(f"the linear solve failed, with {size / weight:.1e} weights left")
+            for share in _SHARES:
+                moved = x1.copy()
+                moved[: len(self.x)] += share * change
+                step.x1.assign(moved)
+                equations.load(step)
+                tried = np.abs(equations.evaluate().numpy()).max()
+                if tried < size or share * np.abs(change).max() < _LEAST_CHANGE:
+                    break
+            else:
+                raise Unsolved(f"no share of a Newton step leaves less force than {size / weight:.1e} weights")
+            x1, size = moved, tried
+            if np.abs(change).max() < _LEAST_CHANGE * 1e3 and size < 1e-9 * weight:
+                break
+        self.residual = max(self.residual, size / weight)
+        return x1
+
+    def backward(self, of_x, of_v=None):
+        """Returns the gradients with respect to positions and velocities at the start, given those at the end."""
+        gradients, n, device = self._gradients, len(self.x), self._solver.model.device
+
+        def array(values=None):
+            zeros = wp.zeros(n, dtype=wp.vec3, device=device)
+            if values is not None:
+                zeros.assign(np.asarray(values, dtype=np.float32))
+            return zeros
+
+        end = array(of_x), array(of_v)
+        for recorded in reversed(self.recorded):
+            start = array(), array()
+            of = StateGradients(*start, None, None, *end, None)
+            gradients.backward(recorded, recorded.before, of)
+            end = start
+        return end[0].numpy(), end[1].numpy()
