@@ -212,6 +212,16 @@ def test_sheets_that_hit_each_other_where_single_vertices_are_cut_have_their_bar
     assert np.abs(states[0].particle_qd.numpy()).max() < 0.05
 
 
+@pytest.mark.parametrize(("gap", "speed"), [(0.006, 0.5), (0.006, 1.5), (0.008, 1.0), (0.008, 2.0), (0.01, 3.0)])
+def test_sheets_that_fall_together_do_not_meet_where_one_is_cut(gap, speed, device):
+    """Their ways are the same as long as all take the same part; one that takes less of its own is in the way."""
+    solver = bsc.SolverImplicit(sheets(device, 0.04, gap, speed))
+    states = [solver.model.state(), solver.model.state()]
+    for k in range(3):
+        solver.step(states[k % 2], states[1 - k % 2], None, None, DT)
+        assert solver.report.predicted_contacts == 0
+
+
 def test_boxes_of_candidates_take_a_part_of_a_displacement_of_metres(device):
     """Else all pairs are candidates, which do not fit into the buffers of a graph; the others take all of theirs."""
     solver = bsc.SolverImplicit(sheets(device, 0.04, 0.006, 1.0))
