@@ -286,8 +286,10 @@ def test_the_explicit_solver_takes_small_steps(device):
 
 
 def test_positions_that_are_not_finite(device, monkeypatch):
+    build = response_scenes.SCENES["box_edge"]
+
     def build_broken(builder):
-        scene = response_scenes._build_box_edge(builder)
+        scene = build(builder)
         scene.model.particle_qd.fill_(np.nan)
         return scene
 
