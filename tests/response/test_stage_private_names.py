@@ -199,5 +199,5 @@ class TestNewton16:
         "cut", [lambda state, contacts: (state.particle_q, contacts), lambda particle_q_out: (particle_q_out, None)]
     )
     def test_displacements_are_cut_in_either_form(self, cut):
-        solver = types.SimpleNamespace(**dict.fromkeys(of_newton._CUTS) | {"_penetration_free_truncation": cut})
+        solver = types.SimpleNamespace(**dict.fromkeys(of_newton.CUTS) | {"_penetration_free_truncation": cut})
         assert of_newton.displacements_since_detection(solver)[2](types.SimpleNamespace(particle_q=1)) == (1, None)
