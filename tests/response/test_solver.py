@@ -379,8 +379,8 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
 
 def leave_capacity_for_one_contact(detector):
     """Makes a detection whose buffers cannot grow overflow as soon as two vertex-face contacts are found."""
-    detector.vertex_face._allocate_contacts(1)
-    detector.capacities = detector._device_capacities()
+    detector.vertex_face.allocate_contacts(1)
+    detector.update_capacities()
 
 
 def test_a_graph_without_room_is_certified_too(device):
