@@ -226,7 +226,7 @@ class CapturedOnCpu(bsc.CapturedSteps):
     """Captures on the CPU as well."""
 
     def _capture(self):
-        self._graph = captured(self._steps)
+        self.graph = captured(self._steps)
 
 
 def test_a_replay_without_room_is_taken_back():

@@ -179,10 +179,11 @@ class TestNewton16:
 
     def test_models_without_attachments(self):
         assert of_newton.attachment_arrays(types.SimpleNamespace()) is None
-        arrays = {f"attachment_particle_body_{name}": name for name in of_newton.AttachmentArrays._fields}
+        names = of_newton.AttachmentArrays._fields
+        arrays = {f"attachment_particle_body_{name}": name for name in names}
         assert of_newton.attachment_arrays(types.SimpleNamespace(attachment_particle_body_count=0, **arrays)) is None
         found = of_newton.attachment_arrays(types.SimpleNamespace(attachment_particle_body_count=1, **arrays))
-        assert found == of_newton.AttachmentArrays._fields
+        assert found == names
 
     def test_switches_that_vbd_does_not_have_are_off(self):
         solver = types.SimpleNamespace(rigid_soft_enable_dat=True)
