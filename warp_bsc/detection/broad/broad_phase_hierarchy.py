@@ -151,9 +151,7 @@ class BroadPhaseHierarchy:
         inputs = [self.hierarchy, self._warps_of_cluster, arguments]
         launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
-    def pair_faces(
-        self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, keep_separated: bool = False
-    ) -> None:
+    def pair_faces(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, keep_separated=False) -> None:
         """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once."""
         self.fit(x0, x1, changed, keep_separated=keep_separated)
         queue = _FacePairs()

@@ -501,9 +501,8 @@ class NewtonMethod:
         inputs += [self._tolerance, _MAX_ITERATIONS, self._flow.solves, team]
         outputs = [self._vectors, self.iterations, self._flow.solves_next]
         options = {"device": work.device, "block_dim": self._threads}
-        wp.launch(
-            self._solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options
-        )
+        threads = work.worlds * team.blocks * self._threads
+        wp.launch(self._solve_worlds, threads, inputs=inputs, outputs=outputs, **options)
         self._advance()
 
     @phase("Newton step")
