@@ -122,8 +122,8 @@ class SolverImplicit(SolverCCD):
         report: What a step found and did, :class:`.contact.step_report.ImplicitStepReport`.
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         max_iterations: Newton steps of a step at most.
-        newton_method: How it solves a step, :class:`.contact.newton_method.NewtonMethod`.
-        work: The buffers of a step, :class:`.response.state.workspace.Workspace`.
+        newton_method: How it solves a step, ``contact.newton_method.NewtonMethod``.
+        work: The buffers of a step, ``response.state.workspace.Workspace``.
     """
 
     _near = 0.0  # no constraints for near pairs: barriers keep them apart

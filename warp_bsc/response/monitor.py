@@ -32,7 +32,7 @@ class CollisionMonitor(CollisionStage):
         solver: The inner solver.
         mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
         report: What the monitor found, :class:`.report.SolverReport`.
-        work: The buffers of a step, :class:`.state.workspace.Workspace`.
+        work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
     def __init__(

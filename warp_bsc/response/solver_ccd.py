@@ -98,7 +98,7 @@ class SolverCCD(CollisionStage):
         restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
         substeps: Steps of the inner solver in a step, each with its contacts.
         max_iterations: Iterations of detect and project.
-        work: The buffers of a step, :class:`.state.workspace.Workspace`.
+        work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
     _near = 1.0  # share of the separation within which pairs near their distance are moved apart like contacts
