@@ -423,13 +423,15 @@ def test_it_cannot_be_copied_taped_or_used_by_two_threads(device, monkeypatch):
             errors.append(str(error))
 
     def predict_meanwhile(*arguments, **options):
+        patch.undo()
         thread = threading.Thread(target=other)
         thread.start()
         thread.join()
         predict(*arguments, **options)
 
-    monkeypatch.setattr(solver.solver, "step", predict_meanwhile)
-    solver.step(state, end, None, None, DT)
+    with monkeypatch.context() as patch:
+        patch.setattr(solver.solver, "step", predict_meanwhile)
+        solver.step(state, end, None, None, DT)
     assert errors == ["another thread is using this SolverImplicit: use one for each thread"]
     builder = newton.ModelBuilder()
     add_patch(builder, 2, 0.1, (0.0, 0.0, 1.0))
