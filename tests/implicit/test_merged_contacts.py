@@ -48,7 +48,7 @@ def contacts_of_step(device, **options):
     model = builder.finalize(device=device)
     solver, state = bsc.SolverImplicit(model, friction=0.3, **options), model.state()
     solver.step(state, state, None, None, 1.0 / 240.0)
-    found = solver._newton._contacts
+    found = solver.newton_method.problem.contacts
     count = found.count.numpy()[0]
     order = np.argsort(found.key.numpy()[:count])
     names = "corners", "weights", "normal", "gradient", "hessian", "limit", "key", "couples"

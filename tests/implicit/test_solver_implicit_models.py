@@ -494,9 +494,9 @@ def test_no_candidates_are_sought_between_shapes_alone_or_within_a_body(speed, d
     builder.add_shape_sphere(body=body, radius=0.1)
     model = builder.finalize(device=device)
     solver, _ = run(model, 1, before=lambda state: speed and change(state.body_qd, (0, 0), speed))
-    newton_method, detector = solver._newton, solver._work.detector
-    newton_method._find_candidates()
-    found = newton_method._candidates
+    newton_method, detector = solver.newton_method, solver.work.detector
+    newton_method.find_candidates()
+    found = newton_method.problem.candidates
     counts = detector.counters.read()
     queued = counts.vertex_face.queued + counts.edge_edge.queued
     assert 0 < queued == found.near.numpy()[0] + found.far.numpy()[0]

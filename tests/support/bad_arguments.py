@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.cli.main import _build_parser
+from warp_bsc.cli.main import build_parser
 from warp_bsc.cli.options import natural, positive
 from warp_bsc.detection.at_rest.intersections import IntersectionFinder, find_intersections
 from warp_bsc.detection.at_rest.proximities import ProximityFinder
@@ -819,7 +819,7 @@ def option_rows() -> list[Row]:
         yield path, parser
 
     result = []
-    for path, parser in commands(_build_parser(), []):
+    for path, parser in commands(build_parser(), []):
         for action in parser._actions:
             option = next((text for text in action.option_strings if text.startswith("--")), None)
             if option is None or action.nargs == 0 or (action.choices is None and action.type is None):
@@ -832,7 +832,7 @@ def option_rows() -> list[Row]:
             positional = ["file"] * any(not a.option_strings and a.nargs in (None, "+") for a in parser._actions)
             for value in values:
                 line = [*path, *positional, f"{option}={value}"]
-                parse = functools.partial(_build_parser().parse_args, line)
+                parse = functools.partial(build_parser().parse_args, line)
                 result.append(ask(" ".join(path), option, repr(value), parse, "", option))
     return result
 

@@ -53,6 +53,7 @@ class Equations:
     Attributes:
         forces: Sum of the forces on each particle, 0 for fixed ones [N], vec3d, shape [particle_count].
         matrix: What :meth:`differentiate` computed.
+        elastic: The elastic forces.
         is_fixed: 1 for particles that VBD does not move, 2 for those that an attachment holds, int32; 0 for others.
     """
 
@@ -63,10 +64,10 @@ class Equations:
         self._x1, self._x0, self._of_x1, self._of_x0, self.forces = (self.zeros() for _ in range(5))
         self.is_fixed = wp.zeros(n, dtype=int, device=self.device)
         self._attachments = Attachments(model, self.is_fixed)
-        self._elastic = Elastic(model)
+        self.elastic = Elastic(model)
         self._contacts = ContactElements(solver)
         self._in_contact: list[Elements] = []
-        self._matrix = StepMatrix(self._elastic, self._attachments.springs, self.is_fixed, worlds)
+        self._matrix = StepMatrix(self.elastic, self._attachments.springs, self.is_fixed, worlds)
         self._step: Step | None = None
         self.matrix: Matrix | None = None
 
@@ -87,15 +88,15 @@ class Equations:
     def load_end(self, x1: wp.array) -> None:
         """Takes another end of the step."""
         self._launch(kernels.to_double, [x1], [self._x1])
-        for elements in [*self._elements(), *self._attachments.holds]:
+        for elements in [*self.elements(), *self._attachments.holds]:
             elements.load(self._x1, self._x0)
 
     def evaluate(self) -> wp.array:
         """Returns the forces, which vanish where the step is solved."""
         assert self._step is not None
         self._launch(energies.inertial_forces, self._inertial(self._x1, self._x0), [self.forces])
-        self._elastic.add_forces(self._step.dt, self._x1, self._x0, self.forces)
-        for elements in self._elements():
+        self.elastic.add_forces(self._step.dt, self._x1, self._x0, self.forces)
+        for elements in self.elements():
             elements.add_forces(self._step.dt, self.forces)
         self._launch(kernels.clear_fixed, [self.is_fixed], [self.forces])
         for elements in self._attachments.holds:
@@ -106,8 +107,8 @@ class Equations:
         """Computes the matrix A, the derivative of minus the forces, or A^T."""
         assert self._step is not None
         dt, mass = self._step.dt, self.model.particle_mass
-        self._elastic.differentiate(dt, self._x1, self._x0)
-        for elements in self._elements():
+        self.elastic.differentiate(dt, self._x1, self._x0)
+        for elements in self.elements():
             elements.differentiate(dt)
         assert mass is not None
         self.matrix = self._matrix.assemble(dt, mass, self._in_contact, transposed=transposed)
@@ -133,8 +134,8 @@ class Equations:
         x1, x0 = with_gradient(self._x1, self._of_x1), with_gradient(self._x0, self._of_x0)
         inputs = self._inertial(x1, x0, of_velocity, of_force)
         launch_adjoint(energies.inertial_forces, len(x1), inputs, [multipliers], self.device)
-        self._elastic.add_gradients(self._step.dt, x1, x0, multipliers)
-        for elements in self._elements():
+        self.elastic.add_gradients(self._step.dt, x1, x0, multipliers)
+        for elements in self.elements():
             elements.add_gradients(self._step.dt, multipliers, self._of_x1, self._of_x0)
         for elements in self._attachments.holds:
             inputs = [wp.float64(self._step.dt), self.model.particle_mass, self.is_fixed, of_end, self._of_x1]
@@ -142,7 +143,8 @@ class Equations:
             elements.add_gradients(self._step.dt, multipliers, self._of_x1, self._of_x0)
         return self._of_x1, self._of_x0
 
-    def _elements(self):
+    def elements(self) -> list[Elements]:
+        """Returns the springs of attachments, and all that is in contact in the step."""
         return [*self._attachments.springs, *self._in_contact]
 
     def _inertial(self, x1, x0, of_velocity=None, of_force=None):

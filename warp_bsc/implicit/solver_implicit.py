@@ -122,6 +122,8 @@ class SolverImplicit(SolverCCD):
         report: What a step found and did, :class:`.contact.step_report.ImplicitStepReport`.
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         max_iterations: Newton steps of a step at most.
+        newton_method: How it solves a step, ``contact.newton_method.NewtonMethod``.
+        work: The buffers of a step, ``response.state.workspace.Workspace``.
     """
 
     _near = 0.0  # no constraints for near pairs: barriers keep them apart
@@ -208,11 +210,11 @@ class SolverImplicit(SolverCCD):
             report_worlds=report_worlds,
         )
         self.max_iterations = max_steps
-        results, unconverged = self.report.results, self.report.unconverged
-        self._newton = NewtonMethod(self._work, max_steps=max_steps, results=results, unconverged_steps=unconverged)
-        self._newton.prepare(arrays_of(model))
+        counts = {"results": self.report.results, "unconverged_steps": self.report.unconverged}
+        method = self.newton_method = NewtonMethod(self.work, max_steps=max_steps, **counts)
+        method.prepare(arrays_of(model))
         if self._forces is not None:
-            self._newton.keeps_contacts, self._forces.more = True, self._newton.publish
+            method.keeps_contacts, self._forces.more = True, method.publish
         if report_worlds:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
 
@@ -229,19 +231,19 @@ class SolverImplicit(SolverCCD):
         Worlds in which it left contacts end the step earlier on their way, where there are none; what still collides is
         resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
         """
-        work = self._work
+        work = self.work
         begin(work)
-        self._newton.solve(end, step.dt)
+        self.newton_method.solve(end, step.dt)
         detect_contacts(work)
         wp.capture_if(work.loop[Loop.UNFINISHED], self._retreat, end=end)
         resolve_contacts(work, step.dt)
 
     def _retreat(self, end):
-        self._newton.retreat(end, self._detect)
+        self.newton_method.retreat(end, self._detect)
 
     def _detect(self):
-        begin(self._work)
-        detect_contacts(self._work)
+        begin(self.work)
+        detect_contacts(self.work)
 
     def _measure_strain(self):
         self._meter.measure_step(self._motion.vertices, self.report.last_strain)
@@ -256,4 +258,4 @@ class SolverImplicit(SolverCCD):
     def notify_model_changed(self, flags: int) -> None:
         """Reads masses, materials, gravity and shapes again, see :class:`warp_bsc.SolverCCD`."""
         super().notify_model_changed(flags)
-        self._newton.read_materials()
+        self.newton_method.read_materials()

@@ -32,6 +32,7 @@ class CollisionMonitor(CollisionStage):
         solver: The inner solver.
         mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
         report: What the monitor found, :class:`.report.SolverReport`.
+        work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
     def __init__(
@@ -84,4 +85,4 @@ class CollisionMonitor(CollisionStage):
     def _inspect(self, step, end):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._prepared(step, end):
-            inspect(self._work)
+            inspect(self.work)

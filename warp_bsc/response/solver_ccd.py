@@ -98,6 +98,7 @@ class SolverCCD(CollisionStage):
         restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
         substeps: Steps of the inner solver in a step, each with its contacts.
         max_iterations: Iterations of detect and project.
+        work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
     _near = 1.0  # share of the separation within which pairs near their distance are moved apart like contacts
@@ -215,7 +216,7 @@ class SolverCCD(CollisionStage):
         moving = {"moves_bodies": moves, "responds_to_bodies": separates, "watches_turns": True}
         motion = ModelMotion(mesh, coefficients, **moving)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
-        self._work.watch_inversions(options.inversions)
+        self.work.watch_inversions(options.inversions)
         if options.contact_layer and self.model.requires_grad and inner is solver:
             self.solver = ContactLayer(
                 solver,
@@ -230,11 +231,11 @@ class SolverCCD(CollisionStage):
             self.report.layer_overflows, self.report.thickness = self.solver.skipped, self.solver.thickness_values
         self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self._meter = StrainMeter(self._work)
+        self._meter = StrainMeter(self.work)
         self._inner = self._choose_steps(integrator)
         self._forces: ContactForces | None = None
         if options.report_contacts:
-            self._forces = ContactForces(self._work, options.report_contacts)
+            self._forces = ContactForces(self.work, options.report_contacts)
             forces = self._forces
             listed = forces.rows, forces.published, forces.shapes_of_worlds
             self.report.keep_forces(ContactReport(self.model, *listed))
@@ -247,7 +248,7 @@ class SolverCCD(CollisionStage):
         """Returns how the inner solver takes steps; with gradients Style3D has its own contacts."""
         steps: InnerSteps = WholeSteps(self)
         if isinstance(self.solver, SolverStyle3D) and not self.model.requires_grad:
-            steps = SpringSteps(self, self._work)
+            steps = SpringSteps(self, self.work)
         elif isinstance(self.solver, ContactLayer):
             steps.pushes_before = "the contact layer pushes before the stage"
         elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
@@ -260,12 +261,12 @@ class SolverCCD(CollisionStage):
         super()._check_tape(state_in, state_out, mask)
         if state_in is state_out:
             raise ValueError("on a tape, state_out must not be state_in")
-        if self._work.detector.points:
+        if self.work.detector.points:
             raise NotImplementedError(
                 "on a tape, particles without faces and springs that keep a distance carry no gradients: "
                 "omit min_distance and particle_radius"
             )
-        if self._work.ends is not None:
+        if self.work.ends is not None:
             raise NotImplementedError(
                 "inversions='prevented' has no gradients: on a tape, pass 'reported' or 'allowed'"
             )
@@ -307,9 +308,9 @@ class SolverCCD(CollisionStage):
             nonlocal recorded
             self._resolve_motion(step, end, self._recorder)
             recorded = None
-            if device.is_capturing or self._work.has_changed():
-                recorded = RecordedStep(self._work, step.dt)
-                self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
+            if device.is_capturing or self.work.has_changed():
+                recorded = RecordedStep(self.work, step.dt)
+                self.work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
         def backward():
             with self._lock:
@@ -331,25 +332,25 @@ class SolverCCD(CollisionStage):
             if step.is_first:
                 self.report.last_strain.zero_()
             self._measure_strain()
-            resolve_inversions(self._work, step.dt)
-            check_arcs(self._work)
+            resolve_inversions(self.work, step.dt)
+            check_arcs(self.work)
             self._write_end(step, end)
 
     def _solve(self, step, end, recorder):
         """Makes the motion free of its contacts, see :func:`.step.resolve`."""
-        resolve(self._work, step.dt, recorder)
+        resolve(self.work, step.dt, recorder)
 
     def _measure_strain(self):
         """Measures the strain by contacts of a whole step, for the report."""
         measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
-        wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
+        wp.capture_if(self.work.loop[Loop.UNFINISHED], measure)
 
     def _write_end(self, step, end):
         """Writes the resolved motion to the arrays of a state, and publishes the contacts."""
         size = max(self.mesh.vertex_count, self.model.body_count)
         poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
-        outputs = [end, poses, self._work.status]
-        self._work.launch(write_back, size, [self._work.vertices], outputs)
+        outputs = [end, poses, self.work.status]
+        self.work.launch(write_back, size, [self.work.vertices], outputs)
         if self._forces is not None:
             self._forces.publish(step.number, step.count)
 

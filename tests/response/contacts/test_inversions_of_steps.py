@@ -154,7 +154,7 @@ def test_cut_vertices_have_the_velocity_of_their_path(device):
     rollout.step()
     count = model.particle_count
     velocities = (rollout.positions - rollout.start[:count]) / DT
-    moved = solver._work.vertices.outcome.numpy()[:count] & int(UNCONSTRAINED) != 0
+    moved = solver.report.step_results.of_vertices.numpy()[:count] & int(UNCONSTRAINED) != 0
     assert 5 < np.count_nonzero(moved) < count
     np.testing.assert_allclose(rollout.velocities[moved], velocities[moved], rtol=1e-5, atol=1e-4)
     momentum = model.particle_mass.numpy()[:, None] * rollout.velocities
@@ -164,7 +164,7 @@ def test_cut_vertices_have_the_velocity_of_their_path(device):
 def test_where_cuts_do_not_suffice_vertices_are_frozen(device):
     model = shaken_model(device)
     solver = bsc.SolverCCD(Changed(model, shaken(0, 0.1)), inversions="prevented")
-    solver._work.status.max_truncations = 0  # so that no iteration cuts
+    solver.work.status.max_truncations = 0  # so that no iteration cuts
     rollout = Inverting(model, solver)
     rollout.step()
     report = solver.report

@@ -202,7 +202,7 @@ def test_random_bars_push_a_cloth_off_their_arcs(options, device):
         end_x[:count] = end.particle_q.numpy()
         place, quaternion = end.body_q.numpy()[0, :3], end.body_q.numpy()[0, 3:]
         end_x[count:] = Rotation.from_quat(quaternion).apply(x[count:]) + place
-        arcs = solver._work.arcs
+        arcs = solver.work.arcs
         motion = bsc.RigidMotion(arcs.body.numpy(), arcs.centre.numpy(), arcs.turn.numpy())
         np.testing.assert_allclose(motion.turn[0], Rotation.from_quat(quaternion).as_rotvec(), atol=1e-6)
         for time in np.linspace(0.0, 1.0, 17):

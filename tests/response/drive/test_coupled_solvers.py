@@ -427,7 +427,7 @@ def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch)
 
     captured = bsc.CapturedSteps(step, stage, [start])
     monkeypatch.setattr(wp, "capture_launch", spoil)
-    captured._graph = "a graph"
+    captured.graph = "a graph"
     captured()
     assert captured.retaken == 1 and model.body_count > stage.model.body_count
     for name, found in zip(names, runs[0], strict=True):

@@ -197,7 +197,7 @@ def test_nothing_is_found_in_a_world_that_takes_no_part(stage, device):
             state, end = end, state
         assert hits > 0
         solver.reset(state)
-        queued.append(solver._work.detector.counters.read().edge_edge.queued)
+        queued.append(solver.work.detector.counters.read().edge_edge.queued)
     assert queued[1] <= queued[0] // 3
 
 

@@ -120,7 +120,7 @@ def test_vertices_are_drawn_by_what_became_of_them(device):
         points = viewer.drawn[f"/ccd/{name}"]
         assert (0 if points is None else len(points)) == getattr(report, name)
     assert report.frozen + report.truncated > 0
-    x, uncertified = solver._work.vertices.x1.numpy(), report.uncertified_vertices
+    x, uncertified = solver.work.vertices.x1.numpy(), report.uncertified_vertices
     drawn = {tuple(point) for point in viewer.drawn["/ccd/uncertified"]}
     assert len(uncertified) and {tuple(x[i]) for i in uncertified} < drawn  # and vertices of the plates
 

@@ -83,10 +83,12 @@ class NewtonMethod:
 
     Attributes:
         keeps_contacts: Whether a solve ends with the contacts at its end, to publish them.
+        may_grow: Whether buffers of contacts grow between Newton steps, outside graphs.
+        problem: What Newton steps read and write.
     """
 
     keeps_contacts = False
-    _may_grow = True
+    may_grow = True
 
     def __init__(self, work: Workspace, *, max_steps: int, results: StepResults, unconverged_steps: wp.array[wp.int64]):
         """Allocates buffers.
@@ -206,7 +208,7 @@ class NewtonMethod:
         self._is_many = device.is_cuda and vertices > _MANY_VERTICES * processors
         self._block, blocks = BLOCKS[self._is_many]
         self._blocks = blocks * processors
-        p = self._problem = Problem()
+        p = self.problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
         p.vectors, p.unknowns, p.bodies = self._vectors, unknowns, self._bodies
@@ -225,7 +227,7 @@ class NewtonMethod:
         self._rooms = rooms[of_worlds]  # of contacts, summed up by world
         self._candidates, self._contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
-        self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
+        self.allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
 
     def _in_worlds(self, of_elements, unknowns) -> Worlds:
         """Returns what is in each world."""
@@ -340,7 +342,7 @@ class NewtonMethod:
         self._settings.dt = dt
         self._settings.recovery = self._metre * _RECOVERY_SPEED * dt
         self._settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
-        p = self._problem
+        p = self.problem
         p.least_change, p.far_change = self._least_speed * self._dt, self._metre * _FAR_SPEED * self._dt
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
         self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
@@ -366,7 +368,7 @@ class NewtonMethod:
 
     def _find_end(self, end):
         work, motion, vertices = self._work, self._work.step.motion, self._mesh.vertex_count
-        self._find_candidates()
+        self.find_candidates()
         wp.capture_if(self._touching.any, self._part_touching)
         self._flow.phase.fill_(int(Phase.BEGIN))
         self._flow.goes_on.fill_(1)
@@ -381,16 +383,17 @@ class NewtonMethod:
         inputs = [self.progress, self._dt, self._least_speed, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
-    def _renew_candidates(self):
+    def renew_candidates(self):
+        """Makes boxes anew in worlds in which a vertex leaves its own, and finds the candidates within them."""
         inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
         inputs += [self.progress.active, int(self.keeps_contacts)]
         self._launch(steps.renew_boxes, self._mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
         self._leaves.zero_()
         self._any_leaves.zero_()
-        self._find_candidates()
+        self.find_candidates()
 
     @phase("find candidates")
-    def _find_candidates(self):
+    def find_candidates(self):
         """Finds the pairs that may come near each other within the boxes."""
         work, detector = self._work, self._work.detector
 
@@ -442,24 +445,24 @@ class NewtonMethod:
         )
         sizes["used"] = 1
         sizes["kept"] = capacity if self._mesh.distances is not None else 0
-        self._candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
+        self._candidates = self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
         self._candidates.room.fill_(capacity)
 
-    def _allocate_contacts(self, of_room):
+    def allocate_contacts(self, of_room):
         """Allocates contacts, so many for each particle of a world, and more for each body."""
         self._retire(self._contacts)
         start, device = of_room * self._rooms, self._work.device
         capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
         sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self._count)
-        parts = 1 if self._is_many else self._problem.parts
+        parts = 1 if self._is_many else self.problem.parts
         sizes["bucket"] = parts * self._mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, of_each * capacity)
         sizes |= dict.fromkeys(("count", "listed", "coupled_first", "coupled_end"), self._work.worlds)
         contacts = allocate(Contacts, capacity, device, **sizes)
         contacts.parts, contacts.entries_of_each = parts, of_each
         contacts.start = wp.array(start.astype(np.int32), dtype=int, device=device)
-        contacts.first_bucket = self._problem.worlds.first_vertex
-        self._contacts = self._problem.contacts = contacts
+        contacts.first_bucket = self.problem.worlds.first_vertex
+        self._contacts = self.problem.contacts = contacts
 
     def _retire(self, buffers):
         if self._captured:
@@ -467,18 +470,18 @@ class NewtonMethod:
 
     def grow(self) -> bool:
         """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
-        if not self._problem.grows:
+        if not self.problem.grows:
             return False
         found, rooms = self._contacts.count.numpy(), np.diff(self._rooms)
         if (found <= np.diff(self._contacts.start.numpy())).all():
             return False
         needed = int(np.max(-(-found[rooms > 0] // rooms[rooms > 0])))
         capacity = capacity_for(needed * int(self._rooms[-1]), "contacts")
-        self._allocate_contacts(capacity // int(self._rooms[-1]))
+        self.allocate_contacts(capacity // int(self._rooms[-1]))
         return True
 
     def _take_newton_steps(self):
-        wp.capture_if(self._any_leaves, self._renew_candidates)
+        wp.capture_if(self._any_leaves, self.renew_candidates)
         self._flow.goes_on.zero_()
         self._advance(resumes=True, of_all=True)
         wp.capture_while(self._flow.solves_next, self._solve)
@@ -494,30 +497,21 @@ class NewtonMethod:
         work, team = self._work, self._team
         if team.blocks > 1:
             team.arrived.zero_()
-        inputs = [
-            self._matrix,
-            self._contacts,
-            self._unknowns,
-            self.progress.solving,
-            self._tolerance,
-            _MAX_ITERATIONS,
-            self._flow.solves,
-            team,
-        ]
+        inputs = [self._matrix, self._contacts, self._unknowns, self.progress.solving]
+        inputs += [self._tolerance, _MAX_ITERATIONS, self._flow.solves, team]
         outputs = [self._vectors, self.iterations, self._flow.solves_next]
         options = {"device": work.device, "block_dim": self._threads}
-        wp.launch(
-            self._solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options
-        )
+        threads = work.worlds * team.blocks * self._threads
+        wp.launch(self._solve_worlds, threads, inputs=inputs, outputs=outputs, **options)
         self._advance()
 
     @phase("Newton step")
     def _advance(self, resumes=False, of_all=False):
         work = self._work
-        self._problem.grows = int(self._may_grow and not work.device.is_capturing)
+        self.problem.grows = int(self.may_grow and not work.device.is_capturing)
         inputs = [work.step.motion, work.motion.planes, self._settings, int(resumes)]
         threads = self._block if work.device.is_cuda else 1
-        inputs += [int(of_all or work.worlds == 1), self._problem, threads, self._blocks]
+        inputs += [int(of_all or work.worlds == 1), self.problem, threads, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
         wp.launch(ADVANCE[self._is_many], self._blocks * threads, inputs=inputs, **options)
 
