@@ -292,7 +292,7 @@ class CollisionStage(CouplingHooks):
     def _follow_shapes(self):
         if self._coupled is not None:
             self._coupled.lose(None)
-        self._motion.follow_shapes(self._work.vertices, self.report.device_totals.shape_not_followed)
+        self._motion.follow_shapes(self.report.device_totals.shape_not_followed)
         if not self.mesh.device.is_capturing:
             self.report.copy_totals()
             self.report.warn()

@@ -6,7 +6,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from .mesh import ModelMesh, host_array
+from .mesh import ModelMesh
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,6 +65,7 @@ class LastStep:
         self.positions = wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=device)
         self.planes = wp.zeros(len(planes.world), dtype=wp.vec4d, device=device)
         self.poses = wp.zeros(model.body_count, dtype=wp.transform, device=device)
+        self.end(model.body_q)
         self.interrupted = wp.zeros(worlds + 1, dtype=int, device=device)
         self.arrays: list[wp.array] = [self.positions, self.planes, self.poses, self.interrupted]
         each = wp.array([*range(worlds), -1], dtype=int, device=device)
@@ -81,17 +82,15 @@ class LastStep:
         mesh, model = self._mesh, self._mesh.model
         if model.requires_grad:
             return
-        self.starts, misplaced, planes = self.positions, _find_misplaced_bodies(model), self.planes.numpy().copy()
-        if model.body_count:
-            poses = host_array(model.body_q).copy()
-            poses[misplaced] = np.nan
-            self.poses.assign(poses)
-        planes[np.isin(mesh.planes.body, misplaced)] = np.nan
+        self.starts, misplaced = self.positions, _find_misplaced_bodies(model)
+        poses, planes = self.poses.numpy().copy(), self.planes.numpy().copy()
+        poses[misplaced], planes[np.isin(mesh.planes.body, misplaced)] = np.nan, np.nan
+        self.poses.assign(poses)
         self.planes.assign(planes)
         mesh.positions(model.particle_q, self.poses, self.positions)
 
     def end(self, body_q: wp.array[wp.transform] | None) -> None:
-        """Copies the poses at the end of a step, after the response; all else is there."""
+        """Copies the poses at the end of a step, after the response, which has written all else."""
         if body_q is not None:
             wp.copy(self.poses, body_q)
 

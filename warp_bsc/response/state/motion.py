@@ -11,7 +11,7 @@ from .mesh import ModelMesh, Placement, members_of_worlds, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
 from .shapes import PlacedShapes
-from .structs import Bodies, Motion, MovedBodies, Vertices, add_zeros, body_of, can_move
+from .structs import Bodies, Motion, add_zeros, body_of, can_move
 from .turns import BodyTurns
 from .vectors import to_double
 
@@ -184,32 +184,20 @@ def _write_end(
 def _jump(
     # in
     placed: PlacedShapes,
-    motion: Motion,
-    moved: MovedBodies,
     poses: wp.array[wp.transform],
     particle_count: int,
     # out
     x1: wp.array[wp.vec3],
     planes: wp.array[wp.vec4d],
 ):
-    """Writes vertices and planes of shapes that jumped to where the last step left their bodies.
-
-    That is ``poses`` for those that the response cannot move, which has them if a body has vertices.
-    """
+    """Writes vertices and planes of shapes that jumped to where the last step left their bodies."""
     i = wp.tid()
     if i < planes.shape[0] and placed.jumped[placed.plane_shape[i]] == 1:
-        on = placed.plane_body[i]
-        if on < 0 or poses:
-            planes[i] = transformed_plane(placed.plane_point[i], placed.plane_normal[i], on, poses)
-        else:  # the next step starts it where its body is
-            planes[i] = wp.vec4d(wp.float64(wp.nan))
+        planes[i] = transformed_plane(placed.plane_point[i], placed.plane_normal[i], placed.plane_body[i], poses)
     if i < placed.position.shape[0] and placed.jumped[placed.shape[i]] == 1:
         x = placed.position[i]
-        body = placed.body[i]
-        if can_move(motion, body):
-            x = wp.transform_point(moved.pose[body], x)
-        elif body >= 0:
-            x = wp.transform_point(poses[body], x)
+        if placed.body[i] >= 0:
+            x = wp.transform_point(poses[placed.body[i]], x)
         x1[particle_count + i] = x
 
 
@@ -295,19 +283,15 @@ class ModelMotion:
         add_zeros(bodies, ("inverse_mass", "velocity"), model.body_count, device)
         return bodies
 
-    def follow_shapes(self, vertices: Vertices, not_followed: wp.array[wp.int64]) -> None:
-        """Moves shapes to where the model has them now, as ``ModelMesh.follow_shapes``.
+    def follow_shapes(self, not_followed: wp.array[wp.int64]) -> None:
+        """Moves shapes to where the model has them now, with the argument of ``ModelMesh.follow_shapes``.
 
         The last step is made to have ended there, so that nothing sweeps the way.
-
-        Args:
-            vertices: As the response left them in the last step.
-            not_followed: As there.
         """
         self.mesh.follow_shapes(not_followed)
-        poses = None if self.turns is None else self.last.poses
-        inputs = [self.mesh.placed_shapes, self.vertices, vertices.bodies, poses, self.mesh.model.particle_count]
-        wp.launch(_jump, self._size, inputs=inputs, outputs=[vertices.x1, self.planes.end], device=self.mesh.device)
+        inputs = [self.mesh.placed_shapes, self.last.poses, self.mesh.model.particle_count]
+        outputs = [self.last.positions, self.last.planes]
+        wp.launch(_jump, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def set_start(self, start: StateArrays) -> None:
         """Copies the positions at the start of a step, with errors as of :meth:`.state.mesh.ModelMesh.positions`."""
