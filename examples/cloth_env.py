@@ -178,7 +178,7 @@ class ClothEnv(gymnasium.vector.VectorEnv):
         builder.replicate(build_world(), num_envs)
         model = builder.finalize(device=device)
         self.solver, self.state, self.device = (
-            bsc.SolverImplicit(model, report_worlds=True),
+            bsc.SolverImplicit(model, report=["worlds"]),
             model.state(),
             model.device,
         )

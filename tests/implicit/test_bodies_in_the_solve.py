@@ -224,7 +224,7 @@ def coupled_press(device, mode, iterations):
     model, stages = builder.finalize(device=device), []
 
     def make(view):
-        stages.append(SolverImplicit(view, report_contacts=True))
+        stages.append(SolverImplicit(view, report=["contacts"]))
         return stages[-1]
 
     entries = [

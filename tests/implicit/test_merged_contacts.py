@@ -58,7 +58,7 @@ def contacts_of_step(device, **options):
 @pytest.fixture(scope="module")
 def contacts(device):
     """Those at the end of the step, which are reported: each pair's own."""
-    return contacts_of_step(device, report_contacts=True)
+    return contacts_of_step(device, report=["contacts"])
 
 
 def merged(contacts, device, order):

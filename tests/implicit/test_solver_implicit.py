@@ -65,7 +65,7 @@ def positions(state):
 @pytest.mark.parametrize("on_plane", [False, True])
 def test_a_scale_under_a_cloth_shows_its_weight(on_plane, device):
     model = ramp(device, on_plane=on_plane)
-    solver = bsc.SolverImplicit(model, report_contacts=True)
+    solver = bsc.SolverImplicit(model, report=["contacts"])
     force, weight = forces(solver, model.state(), model.state(), 12)[-1], weight_of(model)
     assert np.allclose(force, (0.0, 0.0, -weight), atol=1e-3 * weight)
     report = solver.report
@@ -82,7 +82,7 @@ def test_a_scale_under_a_cloth_shows_its_weight(on_plane, device):
 def test_friction_on_a_ramp_is_mu_times_the_normal_force(device):
     """Of a cloth that slides down; and it accelerates as that says."""
     model = ramp(device, 0.5, velocity=0.5, mu=0.2)
-    solver, state = bsc.SolverImplicit(model, friction=0.2, report_contacts=True), model.state()
+    solver, state = bsc.SolverImplicit(model, friction=0.2, report=["contacts"]), model.state()
     force, weight = -forces(solver, state, model.state(), 12)[-6:].mean(axis=0), weight_of(model)
     assert force[2] == pytest.approx(weight * np.cos(0.5), rel=0.01)
     assert force[0] == pytest.approx(-0.2 * force[2], rel=0.01)
@@ -96,7 +96,7 @@ def test_torques_on_a_moved_body_are_those_of_its_contacts(device):
     builder.add_shape_box(body, hx=0.5, hy=0.2, hz=0.1)
     add_patch(builder, 2, 0.05, (0.0, 0.0, 0.002))
     model = builder.finalize(device=device)
-    solver = bsc.SolverImplicit(model, report_contacts=True)
+    solver = bsc.SolverImplicit(model, report=["contacts"])
     step(solver, model.state(), model.state(), 12)
     wrench, weight = solver.report.forces.body_impulse.numpy()[body] / DT, weight_of(model)
     # the arm of the weight is 0.3 m to the left
@@ -257,7 +257,7 @@ def test_what_a_program_presses_into_a_wedge_has_not_arrived(device):
     builder.add_shape_box(plate, hx=0.2, hy=0.2, hz=0.1)
     add_patch(builder, 2, 0.05, (0.0, 0.0, 0.0025))
     model = builder.finalize(device=device)
-    solver, state, end = bsc.SolverImplicit(model, report_worlds=True), model.state(), model.state()
+    solver, state, end = bsc.SolverImplicit(model, report=["worlds"]), model.state(), model.state()
     for height, arrives in ((0.105, True), (0.09, False)):
         state.body_q.assign([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]])
         with pytest.warns(UserWarning, match="is not certified") if not arrives else pytest.MonkeyPatch.context():
@@ -297,7 +297,7 @@ def test_a_step_in_a_graph_is_the_step_without(device):
     ends = []
     for in_graph in (True, False):
         model = bullet(20.0, device=device)
-        solver = bsc.SolverImplicit(model, report_contacts=True)
+        solver = bsc.SolverImplicit(model, report=["contacts"])
         state, end = model.state(), model.state()
 
         def launch(solver=solver, state=state, end=end):
@@ -378,7 +378,7 @@ def test_solvers_of_one_model_do_not_disturb_each_other(device):
 
 def test_masses_gravity_and_flags_are_read_again(device):
     model = ramp(device)
-    solver, state, end = bsc.SolverImplicit(model, report_contacts=True), model.state(), model.state()
+    solver, state, end = bsc.SolverImplicit(model, report=["contacts"]), model.state(), model.state()
     weight = weight_of(model)
     for scale in ("particle_mass", "gravity"):
         forces(solver, state, end, 2)

@@ -288,7 +288,7 @@ def test_forces_of_contacts_of_newton_are_refused(device):
     contacts = newton.CollisionPipeline(model).contacts()
     solver.step(*states, None, contacts, DT, observables=None)
     assert states[1].particle_q.numpy()[:, 2].mean() < 0.02
-    with pytest.raises(NotImplementedError, match="report_contacts=True"):
+    with pytest.raises(NotImplementedError, match=r'report=\["contacts"\]'):
         solver.update_contacts(contacts, states[1])
     if HAS_OBSERVABLES:
         with pytest.raises(ValueError, match="contact_f"):
@@ -332,7 +332,7 @@ def test_a_world_with_input_that_is_not_finite_is_not_converged(name, mass, devi
         builder.add_particle(wp.vec3(float(world), 0.0, 0.0), wp.vec3(), of_particle)
         builder.end_world()
     model = builder.finalize(device=device)
-    solver, _ = run(model, 1, before=lambda state: change(getattr(state, name), 1, np.nan), report_worlds=True)
+    solver, _ = run(model, 1, before=lambda state: change(getattr(state, name), 1, np.nan), report=["worlds"])
     is_used = mass > 0.0 or name != "particle_f"
     assert solver.report.worlds.converged.numpy().tolist() == [True, not is_used]
     assert solver.report.converged != is_used and solver.report.unconverged_steps == is_used

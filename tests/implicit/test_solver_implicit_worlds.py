@@ -55,7 +55,7 @@ class Run:
 
     def __init__(self, seeds, device):
         self.model, self.count = finalize(seeds, device), len(seeds)
-        self.solver = bsc.SolverImplicit(self.model, friction=0.3, report_contacts=True, report_worlds=True)
+        self.solver = bsc.SolverImplicit(self.model, friction=0.3, report=["contacts", "worlds"])
         self.states = [self.model.state(), self.model.state()]
         self.clock = wp.zeros(self.count, dtype=int, device=device)
         self.ends = [[] for _ in seeds]

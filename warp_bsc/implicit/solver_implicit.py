@@ -1,5 +1,6 @@
 """The solver with contact inside: inertia, elasticity, contact and friction in one solve of each step."""
 
+from collections.abc import Collection, Mapping
 from typing import Literal
 
 import newton
@@ -11,6 +12,7 @@ from newton.solvers.experimental.coupled import ModelView
 
 from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
+from ..response.options import Inversions, Reported
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
@@ -140,10 +142,9 @@ class SolverImplicit(SolverCCD):
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
-        inversions: Literal["allowed", "reported", "prevented"] = "allowed",
+        inversions: Inversions = "allowed",
         max_iterations: int = MAX_STEPS,
-        report_contacts: bool | int = False,
-        report_worlds: bool = False,
+        report: Collection[Reported] | Mapping[Reported, int] = (),
     ):
         """Prepares steps of a model.
 
@@ -163,9 +164,8 @@ class SolverImplicit(SolverCCD):
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
                 hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
                 whether they sufficed. While something that a program moves is on its way, at least 16 are allowed.
-            report_contacts: Whether ``report`` has the contacts of each step, with the impulses of barriers and
-                friction at its end; a number is that of the contacts that are listed at most.
-            report_worlds: Whether ``report.worlds`` has results by world.
+            report: What the report of a step has beside its results; impulses of ``"contacts"`` are those of barriers
+                and friction at its end.
 
         Raises:
             TypeError: If an argument has another type.
@@ -206,8 +206,7 @@ class SolverImplicit(SolverCCD):
             particle_radius=particle_radius,
             collision_filter=collision_filter,
             inversions=inversions,
-            report_contacts=report_contacts,
-            report_worlds=report_worlds,
+            report=report,
         )
         self.max_iterations = max_steps
         counts = {"results": self.report.results, "unconverged_steps": self.report.unconverged}
@@ -215,7 +214,7 @@ class SolverImplicit(SolverCCD):
         method.prepare(arrays_of(model))
         if self._forces is not None:
             method.keeps_contacts, self._forces.more = True, method.publish
-        if report_worlds:
+        if self._counter is not None:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
 
     def __deepcopy__(self, memo):
@@ -251,7 +250,7 @@ class SolverImplicit(SolverCCD):
     def update_contacts(self, contacts, state=None):
         """Raises NotImplementedError: the contacts of the solve are no contacts of Newton's pipeline."""
         raise NotImplementedError(
-            "SolverImplicit does not use Newton's contacts, and has no forces of them: pass report_contacts=True, and "
+            'SolverImplicit does not use contacts of Newton, and has no forces of them: pass report=["contacts"], and '
             "read report.forces.contacts and the impulses beside it"
         )
 

@@ -61,8 +61,7 @@ class CollisionStage(CouplingHooks):
         motion.set_end(arrays_of(model), 1.0)
         prepare(self.work)
         self._recount_crossings()
-        if not model.requires_grad:
-            motion.remember(self.work.vertices.x1)
+        motion.last.begin()
         self.report = self._report_type(self.work, responds=responds)
         self._watches_bodies = motion.moves_bodies and not model.requires_grad
         coupled: Any = innermost(self.solver)
@@ -192,7 +191,7 @@ class CollisionStage(CouplingHooks):
             yield
         with paused_tape():
             if self._coupled is not None:
-                self._coupled.finish(step.state_out, self._motion.vertices, self.work.vertices)
+                self._coupled.finish()
                 self.report.copy_totals()
 
     def _leave_out(self, step):
@@ -233,6 +232,7 @@ class CollisionStage(CouplingHooks):
             self._motion.set_end(end, step.dt)
             with contextlib.nullcontext() if step.mask is None else self._world_mask.applied(step.mask):
                 yield
+                self._motion.last.end(end.body_q)
                 self._count_step(step)
 
     def _count_step(self, step):
@@ -292,7 +292,7 @@ class CollisionStage(CouplingHooks):
     def _follow_shapes(self):
         if self._coupled is not None:
             self._coupled.lose(None)
-        self._motion.follow_shapes(self.work.vertices, self.report.device_totals.shape_not_followed)
+        self._motion.follow_shapes(self.report.device_totals.shape_not_followed)
         if not self.mesh.device.is_capturing:
             self.report.copy_totals()
             self.report.warn()
@@ -301,7 +301,7 @@ class CollisionStage(CouplingHooks):
     def reset(self, state, world_mask=None, flags=None):
         """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
         super().reset(state, world_mask, flags)
-        self._motion.interrupt(world_mask)
+        self._motion.last.interrupt(world_mask)
         self.work.forget_crossings(world_mask)
         if self._coupled is not None:
             self._coupled.lose(world_mask)
