@@ -18,7 +18,7 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.nodes import make_refnode
 
 import warp_bsc
-from warp_bsc.cli.main import _build_parser
+from warp_bsc.cli.main import build_parser
 
 gc.disable()  # a build makes trees that stay, and takes a quarter longer if they are looked at again and again
 
@@ -148,7 +148,7 @@ class CommandHelp(SphinxDirective):
     def run(self):
         """Returns the text as a block of code."""
         os.environ["COLUMNS"] = "80"
-        parser = _build_parser()
+        parser = build_parser()
         for name in " ".join(self.arguments).split():
             parser = parser._subparsers._group_actions[0].choices[name]
         text = parser.format_help()

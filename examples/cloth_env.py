@@ -163,6 +163,7 @@ class ClothEnv(gymnasium.vector.VectorEnv):
         actions: The tensor that a step reads, float32, shape [num_envs, 3]. A step that is given another copies it.
         solver: Steps all worlds.
         state: Their present state.
+        worlds: What kernels read and write of each world, and what the tensors view.
     """
 
     def __init__(self, num_envs=16, device=None):
@@ -177,11 +178,11 @@ class ClothEnv(gymnasium.vector.VectorEnv):
         builder.replicate(build_world(), num_envs)
         model = builder.finalize(device=device)
         self.solver, self.state, self.device = (
-            bsc.SolverImplicit(model, report_worlds=True),
+            bsc.SolverImplicit(model, report=["worlds"]),
             model.state(),
             model.device,
         )
-        self._worlds = worlds = Worlds()
+        self.worlds = worlds = Worlds()
         with wp.ScopedDevice(self.device):
             worlds.seed = wp.zeros(1, dtype=int)
             worlds.episode, worlds.time = (wp.zeros(num_envs, dtype=int) for _ in range(2))
@@ -207,10 +208,10 @@ class ClothEnv(gymnasium.vector.VectorEnv):
         with self._on_stream_of_torch():
             if seed is not None or self._np_random is None:
                 self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed)
-                self._worlds.seed.fill_(int(self.np_random.integers(2**31)))
-                self._worlds.episode.zero_()
-            wp.to_torch(self._worlds.resets)[:-1].copy_(mask)
-            self._worlds.active.zero_()
+                self.worlds.seed.fill_(int(self.np_random.integers(2**31)))
+                self.worlds.episode.zero_()
+            wp.to_torch(self.worlds.resets)[:-1].copy_(mask)
+            self.worlds.active.zero_()
             self._begin()
             self._observe()
         return self._tensors[0], self._info
@@ -242,21 +243,21 @@ class ClothEnv(gymnasium.vector.VectorEnv):
         return *self._tensors, self._info
 
     def _simulate(self):
-        self._worlds.active.fill_(True)
-        self._launch(choose, self.num_envs, [], [self._worlds])
+        self.worlds.active.fill_(True)
+        self._launch(choose, self.num_envs, [], [self.worlds])
         self._begin()
-        self.solver.step(self.state, self.state, None, None, DT, world_mask=self._worlds.active)
+        self.solver.step(self.state, self.state, None, None, DT, world_mask=self.worlds.active)
         self._observe()
 
     def _begin(self):
-        inputs = [self._actions, self.solver.model.particle_q, self._worlds]
+        inputs = [self._actions, self.solver.model.particle_q, self.worlds]
         outputs = [self.state.particle_q, self.state.particle_qd]
         self._launch(move, self.solver.model.particle_count, inputs, outputs)
-        self.solver.reset(self.state, self._worlds.resets, newton.StateFlags.NONE)
+        self.solver.reset(self.state, self.worlds.resets, newton.StateFlags.NONE)
 
     def _observe(self):
         inputs = [self._actions, self.state.particle_q, self.solver.report.worlds.certified]
-        self._launch(observe, self.num_envs, inputs, [self._worlds])
+        self._launch(observe, self.num_envs, inputs, [self.worlds])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)

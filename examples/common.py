@@ -52,7 +52,7 @@ class ExampleBase:
         """
         self.model = model
         if self.draws_contacts:
-            options["report_contacts"] = True
+            options["report"] = ["contacts"]
         self.solver = bsc.SolverCCD(solver, **options) if self.ccd and not isinstance(solver, bsc.SolverCCD) else solver
         self.state_0, self.state_1 = model.state(), model.state()
         self.control = model.control()

@@ -72,20 +72,20 @@ def test_lattice(kind, data, exponent):
 @pytest.mark.parametrize("name", ["integer_lattice", "collapsing", "coplanar", "grazing"])
 def test_distance_of_zero_is_contact_in_its_own_polynomials_too(kind, name):
     points = GENERATORS[name](np.random.default_rng(3), 40, kind, np.float64)
-    shapes = list(queries._polygons(points, queries._POLYGONS[kind], np.zeros(len(points))))
+    shapes = list(queries.polygons(points, queries.POLYGONS[kind], np.zeros(len(points))))
     collides = queries.collides(shapes, np.zeros(len(points), dtype=bool))
     assert collides.sum() > 0
     assert np.array_equal(collides, COLLIDES[kind](points))
-    toi = queries._earliest(shapes, np.full((len(points), 2), np.nan))
+    toi = queries.earliest(shapes, np.full((len(points), 2), np.nan))
     assert np.array_equal(toi, TOI[kind](points), equal_nan=True)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_filter_agrees_with_exact_arithmetic(kind):
     points, distance = distances.adversarial(np.random.default_rng(4), 120, kind)
-    shapes = queries._polygons(points, queries._POLYGONS[kind], distance)
+    shapes = queries.polygons(points, queries.POLYGONS[kind], distance)
     exact = queries.collides(shapes, np.zeros(len(points), dtype=bool))
-    near, hit = polygons_near(points, queries._POLYGONS[kind], distance)
+    near, hit = polygons_near(points, queries.POLYGONS[kind], distance)
     assert exact[hit].all()
     assert not exact[~near].any()
     assert (hit | ~near).mean() > 0.6

@@ -19,10 +19,10 @@ def installed(monkeypatch):
     def set_version(package, version):
         monkeypatch.setattr(importlib.import_module(package), "__version__", version)
 
-    for cached in (versions.warn_if_untested, of_warp._warn_of_one_thread):
+    for cached in (versions.warn_if_untested, of_warp.warn_of_one_thread):
         cached.cache_clear()
     yield set_version
-    for cached in (versions.warn_if_untested, of_warp._warn_of_one_thread):
+    for cached in (versions.warn_if_untested, of_warp.warn_of_one_thread):
         cached.cache_clear()
 
 
@@ -63,7 +63,7 @@ def test_without_the_graph_of_the_cpu_a_capture_is_refused(monkeypatch):
 
 def test_functions_on_the_host_need_the_graph(monkeypatch):
     with wp.ScopedCapture("cpu"), monkeypatch.context() as patch:
-        patch.setattr(of_warp.wp._src.context, "runtime", types.SimpleNamespace())
+        patch.setattr(wp._src.context, "runtime", types.SimpleNamespace())
         with pytest.raises(RuntimeError, match="run this outside graphs"):
             run_on_host(lambda: None, types.SimpleNamespace(is_cpu=True, is_capturing=True))
 

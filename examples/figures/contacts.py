@@ -36,7 +36,7 @@ def drape():
     builder.color()
     model = builder.finalize()
     inner = newton.solvers.SolverVBD(model, iterations=10)
-    solver = bsc.SolverCCD(inner, min_distance=0.03, friction=0.6, report_contacts=True)
+    solver = bsc.SolverCCD(inner, min_distance=0.03, friction=0.6, report=["contacts"])
     states = [model.state(), model.state()]
     for _ in range(70):
         states[0].clear_forces()
@@ -57,7 +57,7 @@ def press():
     add_cloth(builder, 24, 0.5, (0.0, 0.0, 0.005), 0.3)
     builder.color()
     model = builder.finalize()
-    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), report_contacts=True)
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), report=["contacts"])
     states = [model.state(), model.state()]
     for height in np.append(np.full(15, 0.08), np.linspace(0.08, 0.03, 25)):
         pose = np.array([[0.0, 0.0, height, 0.0, 0.0, 0.0, 1.0]])

@@ -143,7 +143,7 @@ def test_usd_scene_has_intervals(request):
 
 def test_worst_query_is_one_of_those_asked():
     intervals = load_intervals("crash:1000", most=1)
-    queries, _ = bench_paper._gather(intervals, wp.get_device("cpu"), 2000)
+    queries, _ = bench_paper.gather_queries(intervals, wp.get_device("cpu"), 2000)
     with cores(1):
         worst = find_worst(queries[PairKind.EDGE_EDGE], wp.get_device("cpu"), repeat=1)
     assert list(worst) == list(METHODS)

@@ -129,8 +129,8 @@ def test_a_step_that_meets_something_says_nothing_of_free_flight():
     """The block meets the sheet 10 ms after the start."""
     built = build_penetration_scene("soft", "vbd", 60)
     start = positions(built.scene.model)
-    assert penetration._speed_kept(built, [start, start], 60) is None
-    assert penetration._speed_kept(built, [start, start], 120) == 0.0
+    assert penetration.find_speed_kept(built, [start, start], 60) is None
+    assert penetration.find_speed_kept(built, [start, start], 120) == 0.0
 
 
 def test_what_a_solver_cannot_run_is_a_reason():

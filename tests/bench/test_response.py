@@ -250,7 +250,7 @@ def test_worlds_are_reset(device):
         scene = replace(build_scene("worlds", "vbd"), resets={0.05: (2, 5)})
         simulation = Simulation(scene, "vbd", 60, stage_options={})
         assert simulation.run(0.1, lambda *_: None) == 6
-    speed = -simulation._states[0].particle_qd.numpy()[:, 2].reshape(8, -1).mean(axis=1)
+    speed = -simulation.states[0].particle_qd.numpy()[:, 2].reshape(8, -1).mean(axis=1)
     assert speed[[2, 5]] == pytest.approx(2 * 9.81 / 60, rel=1e-2)
     assert speed[[3, 4, 6, 7]] == pytest.approx(6 * 9.81 / 60, rel=1e-2)
     samples = simulation.samples
@@ -286,8 +286,10 @@ def test_the_explicit_solver_takes_small_steps(device):
 
 
 def test_positions_that_are_not_finite(device, monkeypatch):
+    build = response_scenes.SCENES["box_edge"]
+
     def build_broken(builder):
-        scene = response_scenes._build_box_edge(builder)
+        scene = build(builder)
         scene.model.particle_qd.fill_(np.nan)
         return scene
 

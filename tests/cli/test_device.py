@@ -4,8 +4,8 @@ import pytest
 import warp as wp
 
 from warp_bsc.cli import device
-from warp_bsc.detection.pipeline import _add_deviations
 from warp_bsc.detection.run import compilation
+from warp_bsc.response.write_back import write_back
 
 
 @pytest.fixture
@@ -14,20 +14,20 @@ def load(monkeypatch, tmp_path):
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
 
     def load_anew():
-        _add_deviations.module.unload()
-        wp.load_module(_add_deviations.module, "cpu")
+        write_back.module.unload()
+        wp.load_module(write_back.module, "cpu")
 
     yield load_anew
-    _add_deviations.module.unload()
+    write_back.module.unload()
 
 
 @pytest.mark.parametrize("log_level", [wp.LOG_INFO, wp.LOG_WARNING])
 def test_one_line_says_that_kernels_are_compiled(log_level, load, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(wp.config, "log_level", log_level)
-    compilation._say.cache_clear()
+    compilation.say_compiling.cache_clear()
     load()
     load()  # from the cache
-    compilation._report(is_cpu=True)  # of another module
+    compilation.report_compilation(is_cpu=True)  # of another module
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warp-bsc: ")]
     expected = "warp-bsc: compiling kernels for the CPU, once for each version: about half a minute of processor time. "
     assert said == [f"{expected}They are kept in {tmp_path}"] * (log_level == wp.LOG_INFO)
@@ -46,10 +46,10 @@ def test_long_compilations_show_their_progress(monkeypatch, capsys):
     monkeypatch.setattr(device.time, "monotonic", lambda: next(times))
     with device.loading_kernels("cpu"):
         for _ in range(6):
-            compilation._report(is_cpu=True)
+            compilation.report_compilation(is_cpu=True)
     assert capsys.readouterr().err.splitlines() == [
         "Compiling kernels for cpu, once for each version: about half a minute of processor time.",
         "Compiling kernels: 4 modules in 14 s.",
     ]
-    compilation._report(is_cpu=True)
+    compilation.report_compilation(is_cpu=True)
     assert not capsys.readouterr().err

@@ -142,26 +142,26 @@ def test_signal(tmp_path, monkeypatch, capsys, scene, number):
 
 
 def test_signals_that_follow_disturb_nothing(tmp_path, monkeypatch, scene):
-    finish = replay_run._finish
+    finish = replay_run.finish_outputs
 
     def disturbed(*arguments):
         os.kill(os.getpid(), signal.SIGHUP)
         return finish(*arguments)
 
-    monkeypatch.setattr(replay_run, "_finish", disturbed)
+    monkeypatch.setattr(replay_run, "finish_outputs", disturbed)
     status = replay_with(monkeypatch, scene, tmp_path, lambda: os.kill(os.getpid(), signal.SIGTERM))
     assert status == 128 + signal.SIGTERM
     assert read_left(tmp_path, "interrupted by SIGTERM") == [3] * len(OUTPUTS)
 
 
 def test_signal_while_the_files_are_finished(tmp_path, monkeypatch, capsys, scene):
-    finish = replay_run._finish
+    finish = replay_run.finish_outputs
 
     def disturbed(*arguments):
         os.kill(os.getpid(), signal.SIGTERM)
         return finish(*arguments)
 
-    monkeypatch.setattr(replay_run, "_finish", disturbed)
+    monkeypatch.setattr(replay_run, "finish_outputs", disturbed)
     write_old(tmp_path)
     assert main(["replay", scene, *options(tmp_path)]) == 128 + signal.SIGTERM
     assert read_left(tmp_path, "") == [FRAMES - 1] * len(OUTPUTS)

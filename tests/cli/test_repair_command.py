@@ -219,9 +219,9 @@ def test_a_repair_that_compiles_says_so(tmp_path, capsys, monkeypatch, options):
     whole = run.repair_shot
 
     def compiled(*arguments, **named):
-        compilation._report(is_cpu=True)
+        compilation.report_compilation(is_cpu=True)
         time.sleep(0.1)
-        compilation._report(is_cpu=True)
+        compilation.report_compilation(is_cpu=True)
         yield from whole(*arguments, **named)
 
     path = crossing_twice(tmp_path)

@@ -9,6 +9,8 @@ from collision_results import assert_same
 from sheets import crumpled
 
 import warp_bsc as bsc
+from warp_bsc.detection.pipeline import DetectionPipeline
+from warp_bsc.detection.results.collision_finder import CollisionFinder
 
 
 @pytest.fixture
@@ -51,19 +53,22 @@ def test_looking_for_intersections_leaves_the_results_of_a_graph_alone(captured)
 @pytest.mark.gpu
 def test_a_graph_says_that_a_queue_was_too_small(captured):
     detector, _, start, end, _ = captured
-    detector._pipeline.edge_edge._allocate_contacts(1)
+    pipeline = DetectionPipeline(detector.mesh, only_used_vertices=True)
+    finder = CollisionFinder(pipeline, pipeline.broad_phase.lock)
+    assert finder.find(start, end).certified
+    pipeline.edge_edge.allocate_contacts(1)
     with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.capture(start, end)
+        c = finder.capture(start, end)
     wp.capture_launch(capture.graph)
     assert c.read().overflowed and not c.read().certified
     (overflow,) = c.read().overflows
     assert re.fullmatch("edge_edge contacts: [0-9]+ do not fit in the capacity 1", overflow)
-    assert detector.detect(start, end).certified  # grows
+    assert finder.find(start, end).certified  # grows
     wp.capture_launch(capture.graph)  # writes to the queues that it was captured with
     with pytest.raises(RuntimeError, match="capture again"):
         c.read()
     with wp.ScopedCapture(device="cuda:0") as capture:
-        c = detector.capture(start, end)
+        c = finder.capture(start, end)
     wp.capture_launch(capture.graph)
     assert c.read().certified and not c.read().overflowed
 

@@ -13,6 +13,7 @@ from warp_bsc import checker
 from warp_bsc.detection.at_rest.intersections import find_intersections
 from warp_bsc.detection.broad.broad_phase_hierarchy import BroadPhaseHierarchy
 from warp_bsc.detection.pipeline import DetectionPipeline
+from warp_bsc.detection.results.collision_finder import CollisionFinder
 from warp_bsc.detection.run.launch import retry_until_fits
 from warp_bsc.detection.run.settings import Count
 from warp_bsc.kernels.signs import FREE
@@ -247,16 +248,16 @@ def test_queues_with_room_for_one_entry_grow(broad_phase):
     mesh = bsc.CollisionMesh(faces, len(x0))
     expected = bsc.CollisionDetector(mesh).detect(x0, x1)
     assert len(expected.vertex_face) > 20 and len(expected.edge_edge) > 20
-    detector = bsc.CollisionDetector(mesh)
-    pipeline = detector._pipeline
-    assert bool(pipeline._broad_phase.buffers) == (broad_phase is BroadPhaseHierarchy)
+    pipeline = DetectionPipeline(mesh, only_used_vertices=True)
+    assert bool(pipeline.broad_phase.buffers) == (broad_phase is BroadPhaseHierarchy)
     if broad_phase is BroadPhaseHierarchy:
-        pipeline._broad_phase._face_pairs = wp.empty(1, dtype=wp.vec2i)
+        pipeline.broad_phase.face_pairs = wp.empty(1, dtype=wp.vec2i)
     for narrow_phase in pipeline.narrow_phases:
         narrow_phase.queue = wp.empty(1, dtype=wp.vec2i)
-        narrow_phase._allocate_survivors(1)
-        narrow_phase._allocate_contacts(1)
-    c = detector.detect(x0, x1)
+        narrow_phase.allocate_survivors(1)
+        narrow_phase.allocate_contacts(1)
+    finder = CollisionFinder(pipeline, pipeline.broad_phase.lock)
+    c = finder.find(*(wp.array(x, dtype=wp.vec3, device=mesh.device) for x in (x0, x1)))
     assert_same(c, expected)
     assert c.certified and not c.overflowed
 
@@ -272,8 +273,8 @@ def test_capacities_for_a_number_of_pairs_a_face(n):
         capacities = narrow_phase.capacities
         assert capacities.queued == expected
         assert capacities.survivors >= expected // 2 and capacities.contacts >= expected // 8
-    assert pipeline.capacities.numpy()[1] == pipeline._broad_phase.capacity
-    assert mesh.device.is_cpu or pipeline._broad_phase.capacity == max(2**17, 256 * len(faces))
+    assert pipeline.capacities.numpy()[1] == pipeline.broad_phase.capacity
+    assert mesh.device.is_cpu or pipeline.broad_phase.capacity == max(2**17, 256 * len(faces))
     positions = [wp.array(x, dtype=wp.vec3, device=mesh.device) for x in (x0, x1)]
     for p in (pipeline, other):
         retry_until_fits(lambda p=p: p.find_contacts(*positions), p, mesh.device)

@@ -8,6 +8,7 @@ from sheets import crumpled, grid
 
 import warp_bsc as bsc
 from warp_bsc.detection import detector as detector_module
+from warp_bsc.detection.results.collision_finder import CollisionFinder
 
 KINDS = ("vertex_face", "edge_edge")
 FALLING = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [1, 1, 1], [2, 1, 2], [1, 2, 2]], dtype=float)
@@ -120,15 +121,15 @@ def test_an_early_collision_takes_less_work_than_all(device, monkeypatch):
     x0, x1, faces = crumpled(1, n=40)
     x1 = x0 + 20.0 * (x1 - x0)
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0), device=device))
-    work, run = [], detector._finder.find
+    work, run = [], CollisionFinder.find
 
-    def counted(*arguments, **options):
-        found = run(*arguments, **options)
+    def counted(self, *arguments, **options):
+        found = run(self, *arguments, **options)
         stats = found.stats
         work.append(np.array([stats.vertex_face.candidates + stats.edge_edge.candidates, len(found)]))
         return found
 
-    monkeypatch.setattr(detector._finder, "find", counted)
+    monkeypatch.setattr(CollisionFinder, "find", counted)
     assert detector.collision_free_step(x0, x1).certified
     candidates, contacts = sum(work)
     detector.detect(x0, x1)

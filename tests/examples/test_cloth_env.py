@@ -76,7 +76,7 @@ def test_spaces_seeds_and_tensors(env):
             run += [observations.clone(), rewards.clone()]
         runs.append(run)
     assert len(pointers) == 1
-    worlds = env.unwrapped._worlds
+    worlds = env.unwrapped.worlds
     assert next(iter(pointers))[:3] == (worlds.observations.ptr, worlds.rewards.ptr, worlds.terminated.ptr)
     assert all(torch.equal(one, other) for one, other in zip(*runs[:2], strict=True))
     assert not torch.equal(runs[0][0], runs[2][0]) and not torch.equal(runs[0][0][0], runs[0][0][1])

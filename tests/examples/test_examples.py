@@ -324,7 +324,7 @@ def test_frame_that_does_not_fit_into_a_graph_is_repeated(monkeypatch, capsys):
         example.solver.time.zero_()
 
     monkeypatch.setattr(wp, "capture_launch", spoil)
-    example.run_frame._graph = "a graph"
+    example.run_frame.graph = "a graph"
     example.step()
     assert (expected.positions() == example.positions()).all()
     assert (example.solver.time.numpy() == expected.solver.time.numpy()).all()
@@ -345,7 +345,7 @@ def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypat
             array.grad.fill_(wp.nan)
 
     monkeypatch.setattr(wp, "capture_launch", spoil)
-    example.run_frame._graph = "a graph"
+    example.run_frame.graph = "a graph"
     example.step()
     assert example.run_frame.retaken == 1
     assert example.solver.report.gradient_counts.lost_steps == 0

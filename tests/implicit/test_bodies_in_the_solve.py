@@ -133,7 +133,7 @@ def test_a_body_and_a_free_sheet_keep_their_momentum(shape, device):
     for _ in range(8):
         rollout.step(0.5 * DT)
         assert rollout.solver.report.certified
-        certified = rollout.solver._work.vertices.x1.numpy()
+        certified = rollout.solver.work.vertices.x1.numpy()
         assert certified.tobytes() == rollout.vertices(rollout.states[0]).tobytes()
     assert rollout.collisions == 0
     assert rollout.states[0].particle_qd.numpy()[:, 2].min() < -1.0
@@ -224,7 +224,7 @@ def coupled_press(device, mode, iterations):
     model, stages = builder.finalize(device=device), []
 
     def make(view):
-        stages.append(SolverImplicit(view, report_contacts=True))
+        stages.append(SolverImplicit(view, report=["contacts"]))
         return stages[-1]
 
     entries = [

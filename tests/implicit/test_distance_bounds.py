@@ -33,18 +33,27 @@ def _bound(
     values[i, 1] = wp.float64(distance_bounds.distance_along(kind, kept, u, v, w) - rounding)
     values[i, 2] = wp.float64(distance_bounds.distance_along(kind, other, u, v, w) - rounding)
     values[i, 3] = wp.float64(distance_bounds.distance_of_boxes(kind, u, v, w) - rounding)
-    # the least of the distances on the ways of the points
-    least = distance
+    # the least of the distances on the ways of the points, and where each takes a part of its own
+    least, apart = distance, distance
     for k in range(1, 17):
         t = wp.float64(k) / wp.float64(16.0)
         e, f = a + t * ways[corners[0]], b + t * ways[corners[1]]
         g, h = c + t * ways[corners[2]], d + t * ways[corners[3]]
         _weights, then = barrier.closest_weights_and_gap(kind, e, f, g, h)
         least = wp.min(least, then)
+        bits = int(k)
+        e, f = a + wp.float64(bits & 1) * ways[corners[0]], b + wp.float64((bits >> 1) & 1) * ways[corners[1]]
+        g, h = c + wp.float64((bits >> 2) & 1) * ways[corners[2]], d + wp.float64((bits >> 3) & 1) * ways[corners[3]]
+        _weights_apart, then_apart = barrier.closest_weights_and_gap(kind, e, f, g, h)
+        apart = wp.min(apart, then_apart)
     values[i, 4] = least
     rounding += distance_bounds.rounding_of(p, q, r)
-    values[i, 5] = wp.float64(distance_bounds.distance_of_ways(kind, u, v, w, p, q, r) - rounding)
+    values[i, 5] = wp.float64(distance_bounds.distance_of_ways(kind, u, v, w, p, q, r, wp.vec3()) - rounding)
     values[i, 6] = distance - wp.float64(distance_bounds.way_together(kind, p, q, r))
+    s = wp.vec3(ways[corners[3]])
+    rounding += distance_bounds.rounding_of(s, s, s)
+    values[i, 7] = apart
+    values[i, 8] = wp.float64(distance_bounds.distance_of_ways(kind, u, v, w, p + s, q + s, r + s, s) - rounding)
 
 
 @wp.kernel(enable_backward=False)
@@ -53,10 +62,10 @@ def _of_bits(bits: int, direction: wp.array[wp.vec3]):
 
 
 def _found(device, kind, points, ways, others):
-    """Returns the directions and values of pairs, shapes [n, 2, 3] and [n, 7]."""
+    """Returns the directions and values of pairs, shapes [n, 2, 3] and [n, 9]."""
     count = len(points)
     directions = wp.zeros((count, 2), dtype=wp.vec3d, device=device)
-    values = wp.zeros((count, 7), dtype=wp.float64, device=device)
+    values = wp.zeros((count, 9), dtype=wp.float64, device=device)
     inputs = [wp.array(v.reshape(-1, 3), dtype=wp.vec3d, device=device) for v in (points, ways, others)]
     wp.launch(_bound, count, inputs=[int(kind), *inputs], outputs=[directions, values], device=device)
     return directions.numpy(), values.numpy()
@@ -83,18 +92,19 @@ def test_bounds_of_distances(device):
         others[::3] = np.eye(3)[random.integers(0, 3, len(others[::3]))]
         others /= np.linalg.norm(others, axis=1, keepdims=True)
         directions, values = _found(device, kind, points, ways, others)
-        distance, along, other, of_boxes, least, of_ways, left = values.T
+        distance, along, other, of_boxes, least, of_ways, left, apart, of_any_parts = values.T
         exact, kept = directions.transpose(1, 0, 2)
         extent = np.ptp(points, axis=1).max(axis=1)
         is_direction = distance > 1e-12 * extent
         assert (np.linalg.norm(kept, axis=1) <= 1.0).all()
         assert np.abs(kept - exact)[is_direction].max() <= 0.005
         assert (along <= distance).all() and (other <= distance).all() and (of_boxes <= distance).all()
-        assert (of_ways <= least).all() and (left <= least).all()
+        assert (of_ways <= least).all() and (left <= least).all() and (of_any_parts <= apart).all()
         usual = extent > 1e-15
         assert (along >= distance - 0.02 * extent)[is_direction & usual].all()
         assert (other < 0.9 * distance).any() and (of_boxes > 0.5 * distance)[usual].any()
         assert (of_ways > 0.5 * least)[usual].any() and (left > 0.5 * least)[usual].any()
+        assert (of_any_parts > 0.5 * apart)[usual].any()
 
 
 def test_no_direction(device):

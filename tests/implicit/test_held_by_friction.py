@@ -13,7 +13,7 @@ GRAVITY = 9.81
 
 def last_steps(model, impulse, **options):
     """Impulses by DT, and the largest velocity, in the last 20 of 80 steps."""
-    solver, states, forces = SolverImplicit(model, report_contacts=True, **options), [model.state(), model.state()], []
+    solver, states, forces = SolverImplicit(model, report=["contacts"], **options), [model.state(), model.state()], []
     speed = 0.0
     for step in range(80):
         solver.step(*states, None, None, DT)

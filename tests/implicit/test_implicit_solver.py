@@ -420,7 +420,7 @@ def test_the_stage_sees_vbd_through_its_adjoint(device):
     model = builder.finalize(device=device)
     vbd = newton.solvers.SolverVBD(model, particle_enable_self_contact=True)
     stage = bsc.SolverCCD(bsc.SolverImplicitAdjoint(vbd))
-    assert stage._motion.moves_bodies
+    assert stage.work.motion.moves_bodies
 
 
 def test_gradients_go_through_the_stage_and_vbd(device):

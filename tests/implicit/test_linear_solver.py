@@ -61,8 +61,8 @@ class System:
         matrix = np.zeros((n, 3, n, 3))
         matrix[np.arange(n), :, np.arange(n), :] = np.where(fixed, 1.0, mass / DT**2)[:, None, None] * np.eye(3)
         equations.differentiate(transposed=False)
-        terms = list(exact_hessians(equations._elastic, equations.model))
-        for elements in equations._elements():
+        terms = list(exact_hessians(equations.elastic, equations.model))
+        for elements in equations.elements():
             elements.differentiate(DT)  # unscaled
             jacobian, size = elements.jacobian.numpy()[: elements.count], elements.vertices.shape[1]
             vertices = elements.vertices.numpy()[: elements.count]

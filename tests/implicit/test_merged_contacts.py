@@ -48,7 +48,7 @@ def contacts_of_step(device, **options):
     model = builder.finalize(device=device)
     solver, state = bsc.SolverImplicit(model, friction=0.3, **options), model.state()
     solver.step(state, state, None, None, 1.0 / 240.0)
-    found = solver._newton._contacts
+    found = solver.newton_method.problem.contacts
     count = found.count.numpy()[0]
     order = np.argsort(found.key.numpy()[:count])
     names = "corners", "weights", "normal", "gradient", "hessian", "limit", "key", "couples"
@@ -58,7 +58,7 @@ def contacts_of_step(device, **options):
 @pytest.fixture(scope="module")
 def contacts(device):
     """Those at the end of the step, which are reported: each pair's own."""
-    return contacts_of_step(device, report_contacts=True)
+    return contacts_of_step(device, report=["contacts"])
 
 
 def merged(contacts, device, order):

@@ -55,7 +55,7 @@ class Run:
 
     def __init__(self, seeds, device):
         self.model, self.count = finalize(seeds, device), len(seeds)
-        self.solver = bsc.SolverImplicit(self.model, friction=0.3, report_contacts=True, report_worlds=True)
+        self.solver = bsc.SolverImplicit(self.model, friction=0.3, report=["contacts", "worlds"])
         self.states = [self.model.state(), self.model.state()]
         self.clock = wp.zeros(self.count, dtype=int, device=device)
         self.ends = [[] for _ in seeds]
@@ -101,17 +101,17 @@ def together(device):
 def test_buffers_of_contacts_that_grow_change_no_bit(together):
     """Also where a world waits for larger ones while another one needs new candidates."""
     run, waits = Run(range(6), together.model.device), set()
-    newton_method = run.solver._newton
+    newton_method = run.solver.newton_method
     newton_method.keeps_contacts = False  # pairs of worlds that have ended are not sought again
-    renew = newton_method._renew_candidates
+    renew = newton_method.renew_candidates
 
     def renew_candidates():
-        waits.update(newton_method._flow.phase.numpy().tolist())
+        waits.update(newton_method.problem.flow.phase.numpy().tolist())
         renew()
 
-    newton_method._renew_candidates = renew_candidates
+    newton_method.renew_candidates = renew_candidates
     for _ in range(STEPS):
-        newton_method._allocate_contacts(1)
+        newton_method.allocate_contacts(1)
         run.step()
     assert waits == {Phase.SEARCH_CANDIDATES, Phase.GROW, Phase.END}
     moved, expected = ([[end[: len(ARRAYS)] for end in ends] for ends in r.ends] for r in (run, together))

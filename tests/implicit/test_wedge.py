@@ -69,7 +69,7 @@ def vertices_inside(state, plates):
 @pytest.mark.parametrize("angle", [0.0, np.radians(35.0)], ids=["parallel", "wedge"])
 def test_what_is_squeezed_is_named_and_does_not_explode(angle, device):
     model = build(angle, device)
-    solver, energy = bsc.SolverImplicit(model, report_worlds=True), ElasticEnergy(model)
+    solver, energy = bsc.SolverImplicit(model, report=["worlds"]), ElasticEnergy(model)
     state, end = model.state(), model.state()
     world, mass = model.particle_world.numpy(), model.particle_mass.numpy()
     box_mass, box_inertia = model.body_mass.numpy()[6], model.body_inertia.numpy()[6]

@@ -283,7 +283,7 @@ def test_worlds_do_not_notice_each_other(trouble, device):
             rollout.states = end, start
             bits.append(np.delete(np.concatenate([rollout.positions, rollout.velocities], axis=1), middle, axis=0))
             hits += rollout.solver.report.predicted_contacts
-            outcome = rollout.solver._work.vertices.outcome.numpy()
+            outcome = rollout.solver.report.step_results.of_vertices.numpy()
             assert not (np.delete(outcome, middle) & ~int(PROJECTED)).any()
             troubled |= {
                 "crossing": rollout.solver.report.crossings > 0 and rollout.solver.report.excluded > 0,

@@ -47,7 +47,7 @@ class Scene:
     """The scene, its solver and sensors."""
 
     def __init__(self, device):
-        self.solver = bsc.SolverImplicit(build(device), report_contacts=True)
+        self.solver = bsc.SolverImplicit(build(device), report=["contacts"])
         self.sensor = bsc.ContactSensor(
             self.solver,
             ["box", "tab*", "particles"],
@@ -136,7 +136,7 @@ def test_times_in_air_and_in_contact(device):
 
 
 def test_too_many_contacts_are_flagged(device):
-    solver = bsc.SolverImplicit(build(device), report_contacts=4)
+    solver = bsc.SolverImplicit(build(device), report={"contacts": 4})
     sensor, state = bsc.ContactSensor(solver, ["box"]), solver.model.state()
     assert sensor.data.force_matrix_w is None
     flags = []
@@ -166,7 +166,7 @@ def test_a_stage_behind_a_solver_and_a_ground_in_all_worlds(device):
     )
     builder.replicate(world, 2)
     builder.color()
-    solver = bsc.SolverCCD(newton.solvers.SolverVBD(builder.finalize(device=device)), report_contacts=True)
+    solver = bsc.SolverCCD(newton.solvers.SolverVBD(builder.finalize(device=device)), report=["contacts"])
     sensor, state = bsc.ContactSensor(solver, ["ground"], ["particles"]), solver.model.state()
     forces = []
     for _ in range(48):
@@ -214,7 +214,7 @@ def test_other_arguments_that_are_wrong_are_refused(rested, device):
         bsc.ContactSensor(rested.solver, "box")
     with pytest.raises(TypeError, match="solver must be a SolverCCD or a SolverImplicit"):
         bsc.ContactSensor(newton.solvers.SolverXPBD(rested.solver.model), ["box"])
-    with pytest.raises(RuntimeError, match="report_contacts"):
+    with pytest.raises(RuntimeError, match=r'report=\["contacts"\]'):
         bsc.ContactSensor(bsc.SolverImplicit(rested.solver.model), ["box"])
     with pytest.raises(ValueError, match="dt must be"):
         rested.sensor.update(0.0)

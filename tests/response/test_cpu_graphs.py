@@ -62,7 +62,7 @@ def test_functions_go_with_their_graph():
         def call(self):
             pass
 
-    before = len(host_function._functions)
+    before = len(host_function.functions_of_graphs)
     owner = Owner()
     graph = captured(functools.partial(run_on_host, owner.call, CPU))
     reference = weakref.ref(owner)
@@ -71,7 +71,7 @@ def test_functions_go_with_their_graph():
     del graph
     gc.collect()
     assert reference() is None
-    assert len(host_function._functions) == before
+    assert len(host_function.functions_of_graphs) == before
 
 
 def test_an_error_is_raised_where_the_graph_is_launched(capsys):
@@ -226,7 +226,7 @@ class CapturedOnCpu(bsc.CapturedSteps):
     """Captures on the CPU as well."""
 
     def _capture(self):
-        self._graph = captured(self._steps)
+        self.graph = captured(self._steps)
 
 
 def test_a_replay_without_room_is_taken_back():

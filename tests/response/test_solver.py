@@ -132,7 +132,7 @@ def test_proximities_are_of_neighbours_in_a_pile(device):
     model = builder.finalize(device=device)
     rollout = Rollout(model, bsc.SolverCCD(newton.solvers.SolverXPBD(model, iterations=0)))
     rollout.step()
-    constraints = rollout.solver._work.constraints
+    constraints = rollout.solver.work.constraints
     kinds, corners = (
         array.numpy()[: constraints.count.numpy()[0]] for array in (constraints.kind, constraints.vertices)
     )
@@ -379,8 +379,8 @@ def test_a_frame_in_a_graph_is_the_frame_without(device):
 
 def leave_capacity_for_one_contact(detector):
     """Makes a detection whose buffers cannot grow overflow as soon as two vertex-face contacts are found."""
-    detector.vertex_face._allocate_contacts(1)
-    detector.capacities = detector._device_capacities()
+    detector.vertex_face.allocate_contacts(1)
+    detector.update_capacities()
 
 
 def test_a_graph_without_room_is_certified_too(device):
@@ -389,7 +389,7 @@ def test_a_graph_without_room_is_certified_too(device):
         pytest.skip("needs a GPU with conditional nodes")
     model = bullet(60.0, device=device)
     rollout = Rollout(model, bsc.SolverCCD(SOLVERS["vbd"](model)))
-    leave_capacity_for_one_contact(rollout.solver._work.detector)
+    leave_capacity_for_one_contact(rollout.solver.work.detector)
     start, end = rollout.states
     with wp.ScopedCapture(device) as capture:
         start.clear_forces()
@@ -421,8 +421,10 @@ def test_captured_steps_retake_nothing_that_a_graph_completes(device):
 
     steps = bsc.CapturedSteps(frame, rollout.solver, [rollout.states[0]])
     steps()
-    leave_capacity_for_one_contact(rollout.solver._work.detector)
-    steps._capture()
+    leave_capacity_for_one_contact(rollout.solver.work.detector)
+    with wp.ScopedCapture(device) as capture:
+        frame()
+    steps.graph = capture.graph
     for _ in range(5):
         steps()
         assert len(rollout.detector.find_intersections(rollout.positions)) == 0

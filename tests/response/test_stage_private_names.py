@@ -179,10 +179,11 @@ class TestNewton16:
 
     def test_models_without_attachments(self):
         assert of_newton.attachment_arrays(types.SimpleNamespace()) is None
-        arrays = {f"attachment_particle_body_{name}": name for name in of_newton.AttachmentArrays._fields}
+        names = of_newton.AttachmentArrays._fields
+        arrays = {f"attachment_particle_body_{name}": name for name in names}
         assert of_newton.attachment_arrays(types.SimpleNamespace(attachment_particle_body_count=0, **arrays)) is None
         found = of_newton.attachment_arrays(types.SimpleNamespace(attachment_particle_body_count=1, **arrays))
-        assert found == of_newton.AttachmentArrays._fields
+        assert found == names
 
     def test_switches_that_vbd_does_not_have_are_off(self):
         solver = types.SimpleNamespace(rigid_soft_enable_dat=True)
@@ -199,5 +200,5 @@ class TestNewton16:
         "cut", [lambda state, contacts: (state.particle_q, contacts), lambda particle_q_out: (particle_q_out, None)]
     )
     def test_displacements_are_cut_in_either_form(self, cut):
-        solver = types.SimpleNamespace(**dict.fromkeys(of_newton._CUTS) | {"_penetration_free_truncation": cut})
+        solver = types.SimpleNamespace(**dict.fromkeys(of_newton.CUTS) | {"_penetration_free_truncation": cut})
         assert of_newton.displacements_since_detection(solver)[2](types.SimpleNamespace(particle_q=1)) == (1, None)

@@ -159,8 +159,8 @@ def test_what_is_inside_duplicates_is_inside_each(tmp_path):
 def test_many_duplicates_cost_what_one_does(tmp_path, monkeypatch):
     """Pairs of bounding boxes that are compared are those of one of the boxes and what is in it."""
     compared = []
-    enclosing = containment._enclosing
-    monkeypatch.setattr(containment, "_enclosing", lambda *args: compared.append(enclosing(*args)) or compared[-1])
+    enclosing = containment.enclosing_boxes
+    monkeypatch.setattr(containment, "enclosing_boxes", lambda *args: compared.append(enclosing(*args)) or compared[-1])
     numbers = []
     for count in (1, 12):
         stage = new_stage(tmp_path / f"scene{count}.usda")

@@ -183,11 +183,11 @@ def test_a_worker_that_is_killed(waves):
 def test_a_call_that_kills_every_worker(tmp_path):
     """The error names it, and the calls before it are answered."""
     calls = deque(
-        workers._Call(f"checked interval {number}", function, arguments)
+        workers.WorkerCall(f"checked interval {number}", function, arguments)
         for number, (function, arguments) in enumerate([(abs, (-1,)), (abs, (-2,)), (os._exit, (1,)), (abs, (-3,))])
     )
     with closing(workers.LocalWorkers(2)) as processes:
-        answers = workers._in_order(processes, calls)
+        answers = workers.results_in_order(processes, calls)
         assert [next(answers), next(answers)] == [1, 2]
         with pytest.raises(ChildProcessError, match=r"^worker after worker died while it checked interval 2"):
             next(answers)

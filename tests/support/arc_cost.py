@@ -101,7 +101,7 @@ def tumbling_boxes(cells, device):
 def steps(model, turn, count, on_arcs):
     """Median time of a step and results: with bodies on arcs, or on chords as if none turned."""
     device = model.device
-    chords = contextlib.nullcontext() if on_arcs else mock.patch.object(motion, "BodyTurns", lambda mesh: None)
+    chords = contextlib.nullcontext() if on_arcs else mock.patch.object(motion, "BodyTurns", lambda *_: None)
     with chords:
         solver = bsc.SolverCCD(SOLVERS["vbd"](model))
     states, number = [model.state(), model.state()], wp.zeros(1, dtype=int, device=device)

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import warp_bsc as bsc
-from warp_bsc.cli.main import _build_parser
+from warp_bsc.cli.main import build_parser
 from warp_bsc.cli.options import natural, positive
 from warp_bsc.detection.at_rest.intersections import IntersectionFinder, find_intersections
 from warp_bsc.detection.at_rest.proximities import ProximityFinder
@@ -499,8 +499,10 @@ def calls_of_solvers() -> dict[str, Call]:
     }
     materials = without(bad_bits(count), "rows") | {"too large": 1, "two-dimensional": np.zeros((2, 2), dtype=int)}
     bits = without(bad_bits(count), "rows") | {"two-dimensional": np.ones((2, 2), dtype=int)}
-    reporting = bsc.SolverCCD(inner, report_contacts=True)
+    reporting = bsc.SolverCCD(inner, report=["contacts"])
     patterns = {"None": None, "number": 3, "string": "particles", "numbers": [3], "unknown": ["nothing"]}
+    counts = {name: {"contacts": value} for name, value in (without(NOT_COUNT, "bool") | {"zero": 0}).items()}
+    reported = patterns | counts | {f"worlds {name}": {"worlds": value} for name, value in FLAGS.items()}
     found = {
         "CollisionFilter": Call(
             bsc.CollisionFilter,
@@ -531,8 +533,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
                 "inversions": {"unknown": "counted", "flag": True, "None": None},
                 "max_iterations": NOT_COUNT | {"too many": 41},
-                "report_contacts": without(NOT_COUNT, "bool") | {"zero": 0},
-                "report_worlds": FLAGS,
+                "report": reported,
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
                 "collision_filter": filters,
@@ -548,7 +549,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
                 "collision_filter": filters,
-                "report_worlds": FLAGS,
+                "report": reported,
             },
             raises=bsc.CollisionMonitor.__init__,
         ),
@@ -579,8 +580,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
                 "inversions": {"unknown": "counted", "flag": True, "None": None},
                 "max_iterations": NOT_COUNT | {"zero": 0},
-                "report_contacts": without(NOT_COUNT, "bool") | {"zero": 0},
-                "report_worlds": FLAGS,
+                "report": reported,
             },
             raises=bsc.SolverImplicit.__init__,
         ),
@@ -819,7 +819,7 @@ def option_rows() -> list[Row]:
         yield path, parser
 
     result = []
-    for path, parser in commands(_build_parser(), []):
+    for path, parser in commands(build_parser(), []):
         for action in parser._actions:
             option = next((text for text in action.option_strings if text.startswith("--")), None)
             if option is None or action.nargs == 0 or (action.choices is None and action.type is None):
@@ -832,7 +832,7 @@ def option_rows() -> list[Row]:
             positional = ["file"] * any(not a.option_strings and a.nargs in (None, "+") for a in parser._actions)
             for value in values:
                 line = [*path, *positional, f"{option}={value}"]
-                parse = functools.partial(_build_parser().parse_args, line)
+                parse = functools.partial(build_parser().parse_args, line)
                 result.append(ask(" ".join(path), option, repr(value), parse, "", option))
     return result
 

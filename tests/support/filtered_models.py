@@ -73,7 +73,7 @@ def judge(seed, stage=bsc.SolverCCD, **options):
     result = Judged()
     predicted = []
     inner = Changed(model, lambda state: predicted.append(state.particle_q.numpy().copy()))
-    solver = stage(inner, collision_filter=collision_filter, report_contacts=True, **options)
+    solver = stage(inner, collision_filter=collision_filter, report=["contacts"], **options)
     mesh, count = solver.mesh, model.particle_count
     of_both = zip(collision_filter.bits_of_particles(model), collision_filter.bits_of_shapes(model), strict=True)
     group, mask = (np.concatenate([one, other[mesh.shape_vertices.shape]]) for one, other in of_both)

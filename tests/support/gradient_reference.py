@@ -39,7 +39,7 @@ class ReferenceSteps:
         gradients = self._gradients = solver.gradients
         equations = gradients.equations
         self._linear = LinearSolver(
-            gradients.newton.unknowns.of_worlds, equations.world, tolerance=1e-9, max_iterations=4000
+            gradients.newton.problem.unknowns.of_worlds, equations.world, tolerance=1e-9, max_iterations=4000
         )
         self.recorded, self.loads, self.residual = [], [], 0.0
 
@@ -95,7 +95,7 @@ class ReferenceSteps:
         Those beyond their reach have no force, so that forces are smooth in positions.
         """
         newton = self._gradients.newton
-        found, device = newton.candidates, step.x0.device
+        found, device = newton.problem.candidates, step.x0.device
         corners, keys, parts = found.corners.numpy(), found.key.numpy(), []
         start, room, near, far = (getattr(found, name).numpy() for name in ("start", "room", "near", "far"))
         for w in range(len(start)):
@@ -110,7 +110,7 @@ class ReferenceSteps:
         vertices = np.concatenate([vertices, np.repeat(at[:, :1], 4, axis=1).astype(np.int32)])
         kind = np.concatenate([kind, np.full(len(at), int(AT_PLANE), dtype=np.int32)])
         plane = np.concatenate([np.zeros(len(index), dtype=np.int32), at[:, 1].astype(np.int32)])
-        rows = np.maximum(newton.unknowns.of_vertex.numpy()[vertices], -1).astype(np.int32)
+        rows = np.maximum(newton.problem.unknowns.of_vertex.numpy()[vertices], -1).astype(np.int32)
         contacts = RecordedContacts()
         contacts.kind, contacts.plane = wp.array(kind, device=device), wp.array(plane, device=device)
         contacts.fall = step.contacts.fall

@@ -71,7 +71,7 @@ def run_scene_of_bench(name, mode, steps):
     """Takes steps of a scene of the bench, and returns its solver."""
     scene = build_scene(name, "vbd")
     simulation = Simulation(scene, "vbd", 60, has_contacts=mode == "plain", stage_options=stage_options(mode))
-    solver = simulation._solver = Counted(simulation._solver, scene.model)
+    solver = simulation.solver = Counted(simulation.solver, scene.model)
     simulation.run(steps / 60, lambda step, steps: None)
     return solver
 

@@ -22,8 +22,8 @@ def stage(model, monkeypatch, *, tiny, inner="vbd", make=bsc.SolverCCD, **option
         patch.setattr(pipeline, "make_broad_phase", _make_hierarchy)
         solver = make(SOLVERS[inner](model) if isinstance(inner, str) else inner, **options)
     if tiny:
-        detector = solver._work.detector
-        detector.broad_phase._face_pairs = wp.empty(CAPACITY, dtype=wp.vec2i, device=detector.mesh.device)
-        detector.capacities = detector._device_capacities()
+        detector = solver.work.detector
+        detector.broad_phase.face_pairs = wp.empty(CAPACITY, dtype=wp.vec2i, device=detector.mesh.device)
+        detector.update_capacities()
         detector.grow = lambda: False
     return solver

@@ -13,7 +13,8 @@ from newton.solvers.experimental.coupled import CouplingInterface
 
 from .versions import missing, version_of, warn_if_untested
 
-_CUTS = "pos_prev_collision_detection", "particle_displacements", "_penetration_free_truncation"
+CUTS = "pos_prev_collision_detection", "particle_displacements", "_penetration_free_truncation"
+"""Names of VBD that :func:`displacements_since_detection` needs."""
 
 COUPLERS_DECLARE_RESTARTS = hasattr(CouplingInterface, "coupling_notify_iteration_restarts")
 """Whether couplers say, once and before any other hook, whether they restart steps; Newton before 1.8 does not."""
@@ -103,10 +104,10 @@ def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array
     Raises:
         RuntimeError: If VBD has not all of them: polish could move particles through each other.
     """
-    for name in _CUTS:
+    for name in CUTS:
         if not hasattr(solver, name):
             raise missing("newton", f"SolverVBD.{name}", "polish has no use with self-contact")
-    start, displacements, cut = (getattr(solver, name) for name in _CUTS)
+    start, displacements, cut = (getattr(solver, name) for name in CUTS)
     takes_array = "particle_q_out" in inspect.signature(cut).parameters
     return start, displacements, lambda state: cut(state.particle_q) if takes_array else cut(state, None)
 

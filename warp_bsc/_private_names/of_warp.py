@@ -49,7 +49,7 @@ def may_run_in_threads(kernel: wp.Kernel) -> bool:
         mode, level = options["mode"] or wp.config.mode, options["optimization_level"]
         level = wp.config.optimization_level if level is None else level
     except (AttributeError, KeyError):
-        _warn_of_one_thread()
+        warn_of_one_thread()
         return False
     return mode == "release" and level != 0
 
@@ -76,7 +76,7 @@ def on_compilation(report: Callable[[bool], None]) -> None:
 
 
 @functools.cache
-def _warn_of_one_thread() -> None:
+def warn_of_one_thread() -> None:
     warn_caller(
         f"Warp {wp.__version__} does not say how kernels were compiled: warp-bsc runs them on one core of the CPU"
     )

@@ -12,10 +12,13 @@ from .filters import polygons_near, triangles_may_touch
 from .roots import doubles_around
 
 __all__ = [
+    "POLYGONS",
     "VERTEX_FACE",
     "collides",
+    "earliest",
     "edge_edge",
     "edge_edge_toi",
+    "polygons",
     "undecided_triangles",
     "vertex_edge",
     "vertex_edge_toi",
@@ -30,7 +33,7 @@ VERTEX_FACE = np.array([[(1, 0), (2, 0), (3, 0)]])
 _EDGE_EDGE = np.array([[(0, 2), (1, 2), (1, 3)], [(0, 2), (1, 3), (0, 3)]])
 
 # The polygon of a query, its corners in order around it, each a difference of two of its points.
-_POLYGONS = {
+POLYGONS = {
     "vertex_vertex": np.array([(0, 1)]),
     "vertex_edge": np.array([(0, 1), (0, 2)]),
     "vertex_face": np.array([(0, 1), (0, 2), (0, 3)]),
@@ -121,7 +124,7 @@ def vertex_face_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndar
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _decide(_earliest, "vertex_face", points, min_distance)
+    return _decide(earliest, "vertex_face", points, min_distance)
 
 
 def edge_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -137,7 +140,7 @@ def edge_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarra
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _decide(_earliest, "edge_edge", points, min_distance)
+    return _decide(earliest, "edge_edge", points, min_distance)
 
 
 def vertex_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -153,7 +156,7 @@ def vertex_edge_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndar
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _decide(_earliest, "vertex_edge", points, min_distance)
+    return _decide(earliest, "vertex_edge", points, min_distance)
 
 
 def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.ndarray:
@@ -169,14 +172,14 @@ def vertex_vertex_toi(points: ArrayLike, min_distance: ArrayLike = 0.0) -> np.nd
     Raises:
         ValueError: As in :func:`vertex_face`.
     """
-    return _decide(_earliest, "vertex_vertex", points, min_distance)
+    return _decide(earliest, "vertex_vertex", points, min_distance)
 
 
 def _decide(
     decide: Callable[[Iterable, np.ndarray], np.ndarray], kind: str, points: ArrayLike, min_distance: ArrayLike
 ) -> np.ndarray:
-    """Returns the results of :func:`collides` or :func:`_earliest` for queries; errors as :func:`vertex_face`."""
-    points = checked_coordinates(points, (2 * (_POLYGONS[kind].max() + 1), 3), "points")
+    """Returns the results of :func:`collides` or :func:`earliest` for queries; errors as :func:`vertex_face`."""
+    points = checked_coordinates(points, (2 * (POLYGONS[kind].max() + 1), 3), "points")
     distance = np.broadcast_to(checked_distances(min_distance, "min_distance", len(points)), len(points))
     result = np.zeros(len(points), dtype=bool) if decide is collides else np.full((len(points), 2), np.nan)
     triangles = {"vertex_face": VERTEX_FACE, "edge_edge": _EDGE_EDGE}.get(kind)
@@ -184,12 +187,12 @@ def _decide(
     if touching.any():
         result[touching] = decide(undecided_triangles(points[touching], triangles), result[touching])
     which = np.flatnonzero(~touching)
-    near, hit = polygons_near(points[which], _POLYGONS[kind], distance[which])
+    near, hit = polygons_near(points[which], POLYGONS[kind], distance[which])
     if decide is collides:
         result[which[hit]] = True
         near &= ~hit
     which = which[near]
-    result[which] = decide(_polygons(points[which], _POLYGONS[kind], distance[which]), result[which])
+    result[which] = decide(polygons(points[which], POLYGONS[kind], distance[which]), result[which])
     return result
 
 
@@ -200,7 +203,7 @@ def collides(undecided, hit):
     return hit
 
 
-def _earliest(undecided, toi):
+def earliest(undecided, toi):
     """Returns the doubles around each query's earliest contact, float64 (n, 2), NaN as in ``toi`` where none is."""
     for query, shape in undecided:
         for contact in contacts(shape):
@@ -219,7 +222,7 @@ def undecided_triangles(points, pairs):
             yield start + query, Triangle(*([[a, b - a] for a, b in corner] for corner in (x, y, z)))
 
 
-def _polygons(points, pairs, distance):
+def polygons(points, pairs, distance):
     """Yields (query, Polygon) for every query."""
     # the distance as one more coordinate, scaled with the others
     integers = scale_to_integers(*decompose_with_distance(points, distance))

@@ -9,7 +9,7 @@ from .._version import __version__
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
 
-__all__ = ["main", "run"]
+__all__ = ["build_parser", "main", "run"]
 
 _EPILOG = f"""\
 examples:
@@ -49,12 +49,12 @@ def main(argv: list[str] | None = None) -> int:
 def run(argv: list[str]) -> int:
     """Runs the command line as :func:`main` does, but raises every error."""
     argv = _with_joined_frames(_with_benchmark(argv))
-    arguments = _build_parser(argv).parse_args(argv)
+    arguments = build_parser(argv).parse_args(argv)
     arguments.command_line = ["warp-bsc", *argv]
     return arguments.run(arguments) or ExitStatus.DONE
 
 
-def _build_parser(argv: list[str] | None = None) -> argparse.ArgumentParser:
+def build_parser(argv: list[str] | None = None) -> argparse.ArgumentParser:
     """Returns the parser, with the options of the command that the arguments name; without any, of all commands."""
     parser = _Parser(
         prog="warp-bsc",

@@ -29,7 +29,7 @@ from .replay_options import command_of, repair_command_of
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
-__all__ = ["ReplayRun"]
+__all__ = ["ReplayRun", "finish_outputs"]
 
 
 class ReplayRun(contextlib.ExitStack):
@@ -179,10 +179,10 @@ class ReplayRun(contextlib.ExitStack):
         if self._earlier and len(self._intervals) < self._earlier.count:  # or than a shorter one, to resume
             finished = [output for output in finished if not isinstance(output, HitsJson)]
         # Signals do not interrupt the files. They do interrupt streams, whose reader may not read to the end.
-        self.problems += _finish([output for output in finished if not output.file.is_stream], summary)
+        self.problems += finish_outputs([output for output in finished if not output.file.is_stream], summary)
         try:
             with INTERRUPTS.raised():
-                self.problems += _finish([output for output in finished if output.file.is_stream], summary)
+                self.problems += finish_outputs([output for output in finished if output.file.is_stream], summary)
         except BrokenPipeError:
             if not self.problems:
                 raise
@@ -227,7 +227,7 @@ class ReplayRun(contextlib.ExitStack):
         return describe(error) if isinstance(error, OSError | ValueError) else f"{self._scene.path}: {describe(error)}"
 
 
-def _finish(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
+def finish_outputs(outputs: list[ReplayOutput], summary: Summary) -> list[str]:
     """Finishes files, without their last intervals if the disk is full; returns messages on missing parts.
 
     On a full disk all files shrink down to half of their intervals. After that only the file that does not fit

@@ -115,6 +115,7 @@ class DetectionPipeline:
         counts: The same on the host, as the last :meth:`grow` has read them.
         capacities: Capacities for the counts, in the order of the counters, and 0 for positions that are not finite,
             Warp array of int64: where a count is larger, contacts are missing.
+        broad_phase: The broad phase, whose boxes are those of the last run.
         vertex_face: The narrow phase of vertex-face pairs.
         edge_edge: The narrow phase of edge-edge pairs.
         points: The narrow phases of pairs of a point and an edge, and of two points; none without a minimum distance
@@ -204,7 +205,7 @@ class DetectionPipeline:
             # of layers that lie on each other, three of four pairs are of edges, and most pairs of faces have none
             sizes = [min(max(n * pairs // 4, MIN_CAPACITY), 2**31 - 1) for n in (1, 3, 8)]
             vertex_face, edge_edge, face_pairs = sizes
-        self._broad_phase = make_broad_phase(
+        self.broad_phase: BroadPhase = make_broad_phase(
             mesh,
             self.counters.face_pairs,
             capacity=face_pairs,
@@ -224,7 +225,7 @@ class DetectionPipeline:
                     DistanceKind.VERTEX_VERTEX, self.counters.vertex_vertex, edge_edge, elements=(vertices, vertices)
                 ),
             )
-        self.capacities = self._device_capacities()
+        self.update_capacities()
 
     def count_filtered_by_world(self, counts: wp.array) -> None:
         """Makes each run write how many pairs groups and masks leave out in each world, beside those of all.
@@ -233,7 +234,7 @@ class DetectionPipeline:
             counts: Pairs by world, Warp array of int64, shape [number of worlds].
         """
         self._filtered_of_worlds = counts
-        self._broad_phase.count_filtered_by_world(counts)
+        self.broad_phase.count_filtered_by_world(counts)
 
     def set_bodies(self, body: np.ndarray) -> None:
         """Sets the body of each vertex for the next runs of a pipeline that has some."""
@@ -327,11 +328,6 @@ class DetectionPipeline:
         device = self.mesh.device
         launch(_add_deviations, len(self._padding), inputs=inputs, outputs=outputs, device=device, record_tape=False)
 
-    @property
-    def broad_phase(self) -> BroadPhase:
-        """The broad phase, whose boxes are those of the last run."""
-        return self._broad_phase
-
     def find_candidates(
         self, x0: wp.array, x1: wp.array, *, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
@@ -346,9 +342,9 @@ class DetectionPipeline:
         self._pad_arcs()
         self.counters.array.zero_()
         options = {"changed": changed, "keep_separated": keep_separated}
-        self._broad_phase.pair_elements(x0, x1, *_queues(self.vertex_face, self.edge_edge), **options)
+        self.broad_phase.pair_elements(x0, x1, *_queues(self.vertex_face, self.edge_edge), **options)
         if self.points:
-            self._broad_phase.pair_points(x0, x1, *_queues(*self.points), **options)
+            self.broad_phase.pair_points(x0, x1, *_queues(*self.points), **options)
         if self.mesh.device.is_cpu:
             self._launch_count_not_finite(x0, x1)
 
@@ -362,7 +358,7 @@ class DetectionPipeline:
         self._pad_arcs()
         self.counters.array.zero_()
         queues = _queues(self.vertex_face, self.edge_edge)
-        self._broad_phase.pair_elements(x0, x1, *queues, keep_separated=True)
+        self.broad_phase.pair_elements(x0, x1, *queues, keep_separated=True)
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small in the last run; synchronizes with the device.
@@ -378,13 +374,13 @@ class DetectionPipeline:
             return False
         self.generation += 1
         if self._captured:
-            self._retired += [*self._broad_phase.buffers, self.capacities]
+            self._retired += [*self.broad_phase.buffers, self.capacities]
             for narrow_phase in self.narrow_phases:
                 self._retired += narrow_phase.buffers
-        self._broad_phase.grow(counts.face_pairs)
+        self.broad_phase.grow(counts.face_pairs)
         for narrow_phase in self.narrow_phases:
             narrow_phase.grow(counts.pairs[DistanceKind(narrow_phase.kind)])
-        self.capacities = self._device_capacities()
+        self.update_capacities()
         return True
 
     def overflows(self, counts: Counts) -> list[str]:
@@ -393,10 +389,11 @@ class DetectionPipeline:
 
     def _host_capacities(self) -> Counts:
         pairs = {phase.kind.label: phase.capacities for phase in self.narrow_phases}
-        return Counts(0, self._broad_phase.capacity, **pairs)
+        return Counts(0, self.broad_phase.capacity, **pairs)
 
-    def _device_capacities(self) -> wp.array:
-        return wp.array(self._host_capacities().values(), dtype=wp.int64, device=self.mesh.device)
+    def update_capacities(self) -> None:
+        """Makes ``capacities`` anew, after a buffer was replaced."""
+        self.capacities = wp.array(self._host_capacities().values(), dtype=wp.int64, device=self.mesh.device)
 
     def _launch_count_not_finite(self, x0: wp.array, x1: wp.array) -> None:
         """Launches the count on the CPU; the broad phase of a GPU counts while it boxes the elements."""

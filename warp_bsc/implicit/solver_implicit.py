@@ -1,7 +1,7 @@
 """The solver with contact inside: inertia, elasticity, contact and friction in one solve of each step."""
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from typing import Literal
 
 import newton
@@ -15,6 +15,7 @@ from .._arguments import check_instance, checked_choice, checked_integer
 from .._private_names.of_newton import attachment_arrays, check_observables
 from .._private_names.of_warp import paused_tape
 from ..detection.run.host_function import run_on_host
+from ..response.options import Inversions, Reported
 from ..response.solver_ccd import SolverCCD
 from ..response.state.collision_filter import CollisionFilter
 from ..response.state.friction_table import FrictionTable
@@ -132,6 +133,8 @@ class SolverImplicit(SolverCCD):
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         max_iterations: Newton steps of a step at most.
         gradients: What carries gradients of tapes through steps, None unless the model requires gradients.
+        newton_method: How it solves a step, ``contact.newton_method.NewtonMethod``.
+        work: The buffers of a step, ``response.state.workspace.Workspace``.
     """
 
     _near = 0.0  # no constraints for near pairs: barriers keep them apart
@@ -148,10 +151,9 @@ class SolverImplicit(SolverCCD):
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
-        inversions: Literal["allowed", "reported", "prevented"] = "allowed",
+        inversions: Inversions = "allowed",
         max_iterations: int = MAX_STEPS,
-        report_contacts: bool | int = False,
-        report_worlds: bool = False,
+        report: Collection[Reported] | Mapping[Reported, int] = (),
     ):
         """Prepares steps of a model.
 
@@ -171,9 +173,8 @@ class SolverImplicit(SolverCCD):
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
                 hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
                 whether they sufficed. While something that a program moves is on its way, at least 16 are allowed.
-            report_contacts: Whether ``report`` has the contacts of each step, with the impulses of barriers and
-                friction at its end; a number is that of the contacts that are listed at most.
-            report_worlds: Whether ``report.worlds`` has results by world.
+            report: What the report of a step has beside its results; impulses of ``"contacts"`` are those of barriers
+                and friction at its end.
 
         Raises:
             TypeError: If an argument has another type.
@@ -214,21 +215,20 @@ class SolverImplicit(SolverCCD):
             particle_radius=particle_radius,
             collision_filter=collision_filter,
             inversions=inversions,
-            report_contacts=report_contacts,
-            report_worlds=report_worlds,
+            report=report,
         )
         self.max_iterations = max_steps
         self._last_recorded: tuple = (lambda: None), (lambda: None)
-        results, unconverged = self.report.results, self.report.unconverged
-        self._newton = NewtonMethod(self._work, max_steps=max_steps, results=results, unconverged_steps=unconverged)
-        self._newton.prepare(arrays_of(model))
+        counts = {"results": self.report.results, "unconverged_steps": self.report.unconverged}
+        method = self.newton_method = NewtonMethod(self.work, max_steps=max_steps, **counts)
+        method.prepare(arrays_of(model))
         if self._forces is not None:
-            self._newton.keeps_contacts, self._forces.more = True, self._newton.publish
+            method.keeps_contacts, self._forces.more = True, method.publish
         self.gradients: StepGradients | None = None
         if model.requires_grad:
-            self._newton.keeps_contacts = True
-            self.gradients = StepGradients(self._work, self._newton, results.converged)
-        if report_worlds:
+            method.keeps_contacts = True
+            self.gradients = StepGradients(self.work, method, self.report.results.converged)
+        if self._counter is not None:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
 
     def __deepcopy__(self, memo):
@@ -300,21 +300,21 @@ class SolverImplicit(SolverCCD):
         Worlds in which it left contacts end the step earlier on their way, where there are none; what still collides is
         resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
         """
-        work = self._work
+        work = self.work
         if self.gradients is not None:
             self.gradients.begin()
         begin(work)
-        self._newton.solve(end, step.dt)
+        self.newton_method.solve(end, step.dt)
         detect_contacts(work)
         wp.capture_if(work.loop[Loop.UNFINISHED], self._retreat, end=end)
         resolve_contacts(work, step.dt)
 
     def _retreat(self, end):
-        self._newton.retreat(end, self._detect)
+        self.newton_method.retreat(end, self._detect)
 
     def _detect(self):
-        begin(self._work)
-        detect_contacts(self._work)
+        begin(self.work)
+        detect_contacts(self.work)
 
     def _measure_strain(self):
         self._meter.measure_step(self._motion.vertices, self.report.last_strain)
@@ -322,11 +322,11 @@ class SolverImplicit(SolverCCD):
     def update_contacts(self, contacts, state=None):
         """Raises NotImplementedError: the contacts of the solve are no contacts of Newton's pipeline."""
         raise NotImplementedError(
-            "SolverImplicit does not use Newton's contacts, and has no forces of them: pass report_contacts=True, and "
+            'SolverImplicit does not use contacts of Newton, and has no forces of them: pass report=["contacts"], and '
             "read report.forces.contacts and the impulses beside it"
         )
 
     def notify_model_changed(self, flags: int) -> None:
         """Reads masses, materials, gravity and shapes again, see :class:`warp_bsc.SolverCCD`."""
         super().notify_model_changed(flags)
-        self._newton.read_materials()
+        self.newton_method.read_materials()

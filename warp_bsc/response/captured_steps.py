@@ -37,6 +37,7 @@ class CapturedSteps:
             frame()
 
     Attributes:
+        graph: The CUDA graph of the last capture; None before, and on the CPU.
         retaken: Runs so far that were taken back.
     """
 
@@ -70,7 +71,7 @@ class CapturedSteps:
         if self._layer is not None:
             restored.append(self._layer.skipped)
         self._before = Snapshot(restored)
-        self._graph = None
+        self.graph = None
         self.retaken = 0
 
     @one_at_a_time
@@ -81,22 +82,22 @@ class CapturedSteps:
             RuntimeError: If another thread is running them; if CUDA makes no graph of them, for example because they
                 write to memory of a tape that is gone.
         """
-        if self._graph is None or not self._launch():
+        if self.graph is None or not self._launch():
             self._steps()
             self._capture()
 
     def _capture(self):
-        self._graph = None
+        self.graph = None
         if self._device.is_cuda:
             with wp.ScopedCapture(self._device) as capture:
                 self._steps()
-            self._graph = capture.graph
+            self.graph = capture.graph
 
     def _launch(self):
         """Launches the graph; if its buffers were too small, restores the state and returns False."""
         self._before.save()
         lost = self._count_lost()
-        wp.capture_launch(self._graph)
+        wp.capture_launch(self.graph)
         if self._count_lost() == lost:
             if self._report is not None:
                 self._report.warn()

@@ -58,7 +58,7 @@ class ContactSensorData:
         current_contact_time: Time in contact so far, 0 without [s].
         last_contact_time: Length of the last time in contact [s].
         complete: Whether the forces of the last update have all contacts of the step, bool, shape [1]: false if there
-            were more than ``report_contacts`` of the solver has room for.
+            were more than ``report=`` of the solver allows.
     """
 
     net_forces_w: wp.array
@@ -198,7 +198,8 @@ class ContactSensor:
         """Finds what the patterns name.
 
         Args:
-            solver: A :class:`warp_bsc.SolverCCD` or :class:`warp_bsc.SolverImplicit` with ``report_contacts``.
+            solver: A :class:`warp_bsc.SolverCCD` or :class:`warp_bsc.SolverImplicit` with
+                ``report=["contacts"]``.
             sensors: Patterns of what has a sensor each, in this order, and in that of the model.
             filters: Patterns; each is of all that it names in a world, and has a column of the force matrix.
             history_length: Updates that the history has, at least 1.

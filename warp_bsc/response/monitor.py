@@ -1,17 +1,17 @@
 """The stage that only watches: it reports the collisions of another solver's steps, and changes nothing."""
 
+from collections.abc import Collection
 from typing import Literal
 
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase
 
-from .._arguments import checked_flag
 from .._one_thread import one_at_a_time
 from ..detection.run.host_function import run_on_host
 from .contacts.detect import inspect
 from .drive.inner_steps import WholeSteps
-from .options import default_separation, friction_of
+from .options import checked_report, default_separation, friction_of
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter, checked_filter
 from .state.kept_distances import KeptDistances
@@ -32,6 +32,7 @@ class CollisionMonitor(CollisionStage):
         solver: The inner solver.
         mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
         report: What the monitor found, :class:`.report.SolverReport`.
+        work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
     def __init__(
@@ -41,7 +42,7 @@ class CollisionMonitor(CollisionStage):
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
-        report_worlds: bool = False,
+        report: Collection[Literal["worlds"]] = (),
     ):
         """Puts the monitor behind a solver.
 
@@ -51,7 +52,7 @@ class CollisionMonitor(CollisionStage):
             particle_radius: Radius of each particle [m], as for :class:`.solver_ccd.SolverCCD`.
             collision_filter: Groups and masks of particles and shapes: pairs that they leave out are not watched,
                 :class:`.state.collision_filter.CollisionFilter`.
-            report_worlds: Whether ``report.worlds`` has results by world, as for :class:`.solver_ccd.SolverCCD`.
+            report: ``["worlds"]`` makes ``report.worlds`` have results by world, as for :class:`.solver_ccd.SolverCCD`.
 
         Raises:
             TypeError: If an argument has another type.
@@ -59,7 +60,7 @@ class CollisionMonitor(CollisionStage):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
-        report_worlds = checked_flag(report_worlds, "report_worlds")
+        _, counts_worlds = checked_report(report, self.model, choices=["worlds"])
         distances = KeptDistances.of(self.model, min_distance, particle_radius)
         collision_filter = checked_filter(collision_filter, self.model)
         of_mesh = {"collision_filter": collision_filter, "uses_margins": isinstance(min_distance, str)}
@@ -71,7 +72,7 @@ class CollisionMonitor(CollisionStage):
         friction = friction_of(mesh, nothing[:1], nothing)
         motion = ModelMotion(mesh, friction, watches_turns=True)
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
-        if report_worlds:
+        if counts_worlds:
             self._count_worlds()
         self._inner = WholeSteps(self)
         self._prepare_entry()
@@ -84,4 +85,4 @@ class CollisionMonitor(CollisionStage):
     def _inspect(self, step, end):
         """Detects the collisions of the motion from the start of the step to its end, and counts the step."""
         with self._prepared(step, end):
-            inspect(self._work)
+            inspect(self.work)

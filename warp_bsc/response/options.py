@@ -1,7 +1,10 @@
-"""The arguments of the collision stage as one frozen dataclass, with their checks."""
+"""Checks of the arguments of the collision stage, and defaults that follow from the model or its mesh.
 
-from dataclasses import dataclass
-from typing import Literal, cast, get_args
+Each function has the errors that :class:`.solver_ccd.SolverCCD` has; arguments and defaults stand in its signature.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
 
 import newton
 import numpy as np
@@ -15,100 +18,34 @@ from .._arguments import (
     checked_flag,
     checked_integer,
     checked_number,
+    checked_strings,
 )
 from .._private_names.of_newton import has_external_rigid_solver
-from .state.collision_filter import CollisionFilter, checked_filter
 from .state.friction import Friction
 from .state.friction_table import FrictionTable, checked_table
-from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
-from .tuning import CONTACTS_PER_PARTICLE, MAX_ITERATIONS, MIN_CONTACTS, SEPARATION
+from .tuning import CONTACTS_PER_PARTICLE, MIN_CONTACTS, SEPARATION
 
 MAX_SUBSTEPS, MAX_CONTACTS = 1024, 2**28
 MAX_FLOAT = float(np.finfo(np.float32).max)
 Bodies = Literal["pushed", "separated", "ignored"]
 Inversions = Literal["allowed", "reported", "prevented"]
+Reported = Literal["contacts", "worlds"]
 
 
-@dataclass(frozen=True, eq=False)
-class StageOptions:
-    """The arguments of :class:`.solver_ccd.SolverCCD`, checked, with defaults that follow from the model.
-
-    Coefficients are arrays; ``reads_friction`` says whether each step reads those of friction again. The default of
-    ``separation`` follows from the mesh, and is None here. ``report_contacts`` is the number of contacts that are
-    listed at most, 0 for none.
-    """
-
-    separation: float | None
-    friction: wp.array
-    friction_table: FrictionTable | None
-    reads_friction: bool
-    restitution: wp.array
-    substeps: int
-    bodies: Bodies
-    distances: KeptDistances
-    collision_filter: CollisionFilter | None
-    inversions: Inversions
-    contact_layer: bool
-    max_iterations: int
-    report_contacts: int
-    report_worlds: bool
-
-    @classmethod
-    def of(
-        cls,
-        model: newton.Model,
-        *,
-        separation=None,
-        friction=None,
-        restitution=None,
-        substeps=1,
-        bodies="pushed",
-        min_distance=None,
-        particle_radius=None,
-        collision_filter=None,
-        inversions="allowed",
-        contact_layer=True,
-        max_iterations=MAX_ITERATIONS,
-        report_contacts: bool | int = False,
-        report_worlds=False,
-    ) -> "StageOptions":
-        """Returns the options, with arguments and errors as of :class:`.solver_ccd.SolverCCD`."""
-        if separation is not None:
-            separation = checked_distance(separation, "separation", zero=False)
-            checked_number(separation, "separation", 0.0, MAX_FLOAT)
-        table, friction = checked_table(friction, model)
-        substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)
-        return cls(
-            separation=separation,
-            friction=checked_friction(friction, model),
-            friction_table=table,
-            reads_friction=model.requires_grad or isinstance(friction, wp.array),
-            restitution=checked_restitution(restitution, model),
-            substeps=substeps,
-            bodies=cast(Bodies, checked_choice(bodies, "bodies", get_args(Bodies))),
-            distances=KeptDistances.of(model, min_distance, particle_radius),
-            collision_filter=checked_filter(collision_filter, model),
-            inversions=cast(Inversions, checked_choice(inversions, "inversions", get_args(Inversions))),
-            contact_layer=checked_flag(contact_layer, "contact_layer"),
-            max_iterations=checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS),
-            report_contacts=checked_capacity(report_contacts, model, substeps),
-            report_worlds=checked_flag(report_worlds, "report_worlds"),
-        )
-
-    def moves_bodies(self, mesh: ModelMesh, solver: SolverBase) -> bool:
-        """Returns whether the response can move bodies behind a solver."""
-        model = mesh.model
-        if self.bodies == "ignored" or not model.body_count:
+def moves_bodies(bodies: Bodies, mesh: ModelMesh, solver: SolverBase) -> bool:
+    """Returns whether the response can move bodies of a mesh behind a solver that integrates."""
+    model = mesh.model
+    if bodies == "ignored" or not model.body_count:
+        return False
+    if bodies == "pushed":
+        integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
+        if not integrates or has_external_rigid_solver(solver):
             return False
-        if self.bodies == "pushed":
-            integrates = isinstance(solver, SolverXPBD | SolverSemiImplicit | SolverVBD)
-            if not integrates or has_external_rigid_solver(solver):
-                return False
-        shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
-        assert model.body_flags is not None and model.body_inv_mass is not None
-        kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
-        return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
+    shaped = np.unique(mesh.shape_vertices.body[mesh.shape_vertices.body >= 0])
+    assert model.body_flags is not None and model.body_inv_mass is not None
+    kinematic = (model.body_flags.numpy() & BodyFlags.KINEMATIC) != 0
+    return bool(((model.body_inv_mass.numpy() > 0.0) & ~kinematic)[shaped].any())
 
 
 def default_separation(mesh: ModelMesh) -> float:
@@ -137,19 +74,45 @@ def particle_edge_lengths(mesh: ModelMesh) -> np.ndarray:
     return np.linalg.norm(rest[edges[:, 1]] - rest[edges[:, 0]], axis=1)
 
 
-def checked_capacity(report_contacts, model: newton.Model, substeps: int) -> int:
-    """Returns the argument ``report_contacts`` as a number of contacts, 0 for none."""
-    if report_contacts is True or report_contacts is False:
-        capacity = substeps * max(MIN_CONTACTS, CONTACTS_PER_PARTICLE * model.particle_count)
-        return min(capacity, MAX_CONTACTS) if report_contacts else 0
-    return checked_integer(report_contacts, "report_contacts", 1, MAX_CONTACTS)
+def checked_bodies(bodies: str) -> Bodies:
+    """Returns the argument ``bodies``."""
+    return checked_choice(bodies, "bodies", get_args(Bodies))
 
 
-def checked_friction(friction, model: newton.Model) -> wp.array:
-    """Returns the argument ``friction``; by default the model's ``particle_mu``."""
+def checked_separation(separation: float | None) -> float | None:
+    """Returns the argument ``separation``; None if it follows from the mesh, see :func:`default_separation`."""
+    if separation is None:
+        return None
+    distance = checked_distance(separation, "separation", zero=False)
+    return checked_number(distance, "separation", 0.0, MAX_FLOAT)
+
+
+def checked_report(
+    report: Any, model: newton.Model, substeps: int = 1, *, choices: Sequence[str] = get_args(Reported)
+) -> tuple[int, bool]:
+    """Returns the argument ``report``: contacts to list at most, 0 for none, and whether to count by world."""
+    names = [checked_choice(name, "report", choices) for name in checked_strings(report, "report")]
+    values = dict(report) if isinstance(report, Mapping) else dict.fromkeys(names, True)
+    contacts, worlds = values.get("contacts", False), values.get("worlds", False)
+    if contacts is True or contacts is False:
+        most = min(substeps * max(MIN_CONTACTS, CONTACTS_PER_PARTICLE * model.particle_count), MAX_CONTACTS)
+        contacts = most if contacts else 0
+    else:
+        contacts = checked_integer(contacts, "report['contacts']", 1, MAX_CONTACTS)
+    return contacts, checked_flag(worlds, "report['worlds']")
+
+
+def checked_friction(friction: Any, model: newton.Model) -> tuple[wp.array, FrictionTable | None, bool]:
+    """Returns the argument ``friction``: coefficients of particles, those of pairs, and whether each step reads them.
+
+    By default the coefficient is the model's ``particle_mu``.
+    """
+    table, friction = checked_table(friction, model)
+    reads = model.requires_grad or isinstance(friction, wp.array)
     friction = model.particle_mu if friction is None else friction
     limits = "at least 0, and finite in single precision"
-    return _checked_coefficients(friction, "friction", (1, model.particle_count), MAX_FLOAT, limits, model)
+    lengths = 1, model.particle_count
+    return _checked_coefficients(friction, "friction", lengths, MAX_FLOAT, limits, model), table, reads
 
 
 def checked_restitution(restitution, model: newton.Model) -> wp.array:

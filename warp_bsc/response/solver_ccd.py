@@ -1,14 +1,16 @@
 """The collision stage for Newton: a solver that wraps another one, and makes its motion free of collisions."""
 
 import functools
-from typing import Literal
+from collections.abc import Collection, Mapping
+from typing import Literal, get_args
 
 import numpy as np
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
+from .._arguments import checked_choice, checked_flag, checked_integer
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver
+from .._private_names.of_newton import body_q_prev
 from ..detection.run.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
@@ -16,14 +18,28 @@ from .drive.inner_steps import InnerSteps, WholeSteps
 from .drive.style3d_springs import SpringSteps
 from .drive.substeps import Substeps
 from .layer.contact_layer import ContactLayer
-from .options import StageOptions, default_separation, friction_of
+from .options import (
+    MAX_SUBSTEPS,
+    Bodies,
+    Inversions,
+    Reported,
+    checked_bodies,
+    checked_friction,
+    checked_report,
+    checked_restitution,
+    checked_separation,
+    default_separation,
+    friction_of,
+    moves_bodies,
+)
 from .report.count_steps import count_record
 from .report.forces.contact_forces import ContactForces
 from .report.forces.contact_report import ContactReport
 from .report.strain import StrainMeter
 from .stage import CollisionStage
-from .state.collision_filter import CollisionFilter
+from .state.collision_filter import CollisionFilter, checked_filter
 from .state.friction_table import FrictionTable
+from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
 from .state.record import StepRecorder
@@ -98,6 +114,7 @@ class SolverCCD(CollisionStage):
         restitution: Share of the approaching velocity that comes back, Warp array of float, shape [1].
         substeps: Steps of the inner solver in a step, each with its contacts.
         max_iterations: Iterations of detect and project.
+        work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
     _near = 1.0  # share of the separation within which pairs near their distance are moved apart like contacts
@@ -110,15 +127,14 @@ class SolverCCD(CollisionStage):
         friction: float | wp.array[float] | FrictionTable | None = None,
         restitution: float | wp.array[float] | None = None,
         substeps: int = 1,
-        bodies: Literal["pushed", "separated", "ignored"] = "pushed",
+        bodies: Bodies = "pushed",
         min_distance: float | Literal["model"] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
-        inversions: Literal["allowed", "reported", "prevented"] = "allowed",
+        inversions: Inversions = "allowed",
         contact_layer: bool = True,
         max_iterations: int = MAX_ITERATIONS,
-        report_contacts: bool | int = False,
-        report_worlds: bool = False,
+        report: Collection[Reported] | Mapping[Reported, int] = (),
     ):
         """Puts the stage behind a solver.
 
@@ -170,11 +186,11 @@ class SolverCCD(CollisionStage):
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.
             max_iterations: Iterations of detect and project, 0 to 40; what still collides then is divided, see
                 :mod:`.schedule`. Fewer bound the time of a step, and leave more vertices with cut paths.
-            report_contacts: Whether ``report`` has the contacts of each step and their impulses, see
-                :class:`.forces.contact_report.ContactReport`. A number is that of the contacts that are listed at most;
-                True stands for 8 for each particle, and at least 4,096, in each substep. Sums have the contacts beyond
-                that too.
-            report_worlds: Whether ``report.worlds`` has results by world, :class:`.report.worlds.Worlds`.
+            report: What the report of a step has beside its results. ``"contacts"``: contacts and their impulses, see
+                :class:`.forces.contact_report.ContactReport`. ``"worlds"``: results by world, see
+                :class:`.report.worlds.Worlds`. At most 8 contacts for each particle, or 4,096 if that is more, are
+                listed in each substep; a mapping gives another number for the step: ``{"contacts": 20_000,
+                "worlds": True}``. Sums have the contacts beyond that too.
 
         Raises:
             TypeError: If an argument has another type.
@@ -182,64 +198,50 @@ class SolverCCD(CollisionStage):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
-        options = StageOptions.of(
-            self.model,
-            separation=separation,
-            friction=friction,
-            restitution=restitution,
-            substeps=substeps,
-            bodies=bodies,
-            min_distance=min_distance,
-            particle_radius=particle_radius,
-            collision_filter=collision_filter,
-            inversions=inversions,
-            contact_layer=contact_layer,
-            max_iterations=max_iterations,
-            report_contacts=report_contacts,
-            report_worlds=report_worlds,
-        )
-        self._reads_friction = options.reads_friction
-        self.friction, self.restitution = options.friction, options.restitution
-        self.substeps, self.max_iterations = options.substeps, options.max_iterations
-        separates, keeps_distances = options.bodies == "separated", options.distances.any
-        of_mesh = {"separates_bodies": separates, "uses_margins": isinstance(min_distance, str)}
-        mesh = ModelMesh(self.model, strands=keeps_distances, collision_filter=collision_filter, **of_mesh)
-        self._warn_of_unseen(mesh, options.distances)
-        self.separation = default_separation(mesh) if options.separation is None else options.separation
-        if keeps_distances:
-            mesh.distances = mesh.min_distances(options.distances, reach=self._near * self.separation)
-        inner = solver.solver if isinstance(solver, ContactLayer) else solver
+        separation, bodies = checked_separation(separation), checked_bodies(bodies)
+        self.friction, table, self._reads_friction = checked_friction(friction, self.model)
+        self.restitution = checked_restitution(restitution, self.model)
+        self.substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)
+        self.max_iterations = checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS)
+        inversions = checked_choice(inversions, "inversions", get_args(Inversions))
+        contact_layer = checked_flag(contact_layer, "contact_layer")
+        distances = KeptDistances.of(self.model, min_distance, particle_radius)
+        collision_filter = checked_filter(collision_filter, self.model)
+        listed_contacts, counts_worlds = checked_report(report, self.model, self.substeps)
+        of_mesh = {"separates_bodies": bodies == "separated", "uses_margins": isinstance(min_distance, str)}
+        mesh = ModelMesh(self.model, strands=distances.any, collision_filter=collision_filter, **of_mesh)
+        self._warn_of_unseen(mesh, distances)
+        self.separation = default_separation(mesh) if separation is None else separation
+        if distances.any:
+            mesh.distances = mesh.min_distances(distances, reach=self._near * self.separation)
         integrator = innermost(solver)
-        moves = options.moves_bodies(mesh, integrator)
-        coefficients = friction_of(mesh, self.friction, table=options.friction_table)
-        moving = {"moves_bodies": moves, "responds_to_bodies": separates, "watches_turns": True}
-        motion = ModelMotion(mesh, coefficients, **moving)
+        moves, responds = moves_bodies(bodies, mesh, integrator), bodies == "separated"
+        coefficients = friction_of(mesh, self.friction, table=table)
+        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=responds, watches_turns=True)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
-        self._work.watch_inversions(options.inversions)
-        if options.contact_layer and self.model.requires_grad and inner is solver:
+        self.work.watch_inversions(inversions)
+        if contact_layer and self.model.requires_grad and not isinstance(solver, ContactLayer):
             self.solver = ContactLayer(
                 solver,
-                friction=friction if options.friction_table is not None else self.friction,
+                friction=self.friction if table is None else friction,
                 restitution=self.restitution,
                 min_distance=min_distance,
                 particle_radius=particle_radius,
                 collision_filter=collision_filter,
-                bodies=options.bodies,
+                bodies=bodies,
             )
         if isinstance(self.solver, ContactLayer):
             self.report.layer_overflows, self.report.thickness = self.solver.skipped, self.solver.thickness_values
         self._watch_between_steps(bodies=True)
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
-        self._meter = StrainMeter(self._work)
+        self._meter = StrainMeter(self.work)
         self._inner = self._choose_steps(integrator)
         self._forces: ContactForces | None = None
-        if options.report_contacts:
-            self._forces = ContactForces(self._work, options.report_contacts)
-            forces = self._forces
-            listed = forces.rows, forces.published, forces.shapes_of_worlds
-            self.report.keep_forces(ContactReport(self.model, *listed))
+        if listed_contacts:
+            self._forces = forces = ContactForces(self.work, listed_contacts)
+            self.report.keep_forces(ContactReport(self.model, forces.rows, forces.published, forces.shapes_of_worlds))
         self.report.impulses_elsewhere = self._inner.pushes_before
-        if options.report_worlds:
+        if counts_worlds:
             self._count_worlds(None if self._forces is None else self._forces.published.max_impulse)
         self._prepare_entry()
 
@@ -247,7 +249,7 @@ class SolverCCD(CollisionStage):
         """Returns how the inner solver takes steps; with gradients Style3D has its own contacts."""
         steps: InnerSteps = WholeSteps(self)
         if isinstance(self.solver, SolverStyle3D) and not self.model.requires_grad:
-            steps = SpringSteps(self, self._work)
+            steps = SpringSteps(self, self.work)
         elif isinstance(self.solver, ContactLayer):
             steps.pushes_before = "the contact layer pushes before the stage"
         elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
@@ -260,12 +262,12 @@ class SolverCCD(CollisionStage):
         super()._check_tape(state_in, state_out, mask)
         if state_in is state_out:
             raise ValueError("on a tape, state_out must not be state_in")
-        if self._work.detector.points:
+        if self.work.detector.points:
             raise NotImplementedError(
                 "on a tape, particles without faces and springs that keep a distance carry no gradients: "
                 "omit min_distance and particle_radius"
             )
-        if self._work.ends is not None:
+        if self.work.ends is not None:
             raise NotImplementedError(
                 "inversions='prevented' has no gradients: on a tape, pass 'reported' or 'allowed'"
             )
@@ -307,9 +309,9 @@ class SolverCCD(CollisionStage):
             nonlocal recorded
             self._resolve_motion(step, end, self._recorder)
             recorded = None
-            if device.is_capturing or self._work.has_changed():
-                recorded = RecordedStep(self._work, step.dt)
-                self._work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
+            if device.is_capturing or self.work.has_changed():
+                recorded = RecordedStep(self.work, step.dt)
+                self.work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
 
         def backward():
             with self._lock:
@@ -331,25 +333,25 @@ class SolverCCD(CollisionStage):
             if step.is_first:
                 self.report.last_strain.zero_()
             self._measure_strain()
-            resolve_inversions(self._work, step.dt)
-            check_arcs(self._work)
+            resolve_inversions(self.work, step.dt)
+            check_arcs(self.work)
             self._write_end(step, end)
 
     def _solve(self, step, end, recorder):
         """Makes the motion free of its contacts, see :func:`.step.resolve`."""
-        resolve(self._work, step.dt, recorder)
+        resolve(self.work, step.dt, recorder)
 
     def _measure_strain(self):
         """Measures the strain by contacts of a whole step, for the report."""
         measure = functools.partial(self._meter.measure, self._motion.vertices, self.report.last_strain)
-        wp.capture_if(self._work.loop[Loop.UNFINISHED], measure)
+        wp.capture_if(self.work.loop[Loop.UNFINISHED], measure)
 
     def _write_end(self, step, end):
         """Writes the resolved motion to the arrays of a state, and publishes the contacts."""
         size = max(self.mesh.vertex_count, self.model.body_count)
         poses = body_q_prev(self.solver) if self._motion.moves_bodies else None
-        outputs = [end, poses, self._work.status]
-        self._work.launch(write_back, size, [self._work.vertices], outputs)
+        outputs = [end, poses, self.work.status]
+        self.work.launch(write_back, size, [self.work.vertices], outputs)
         if self._forces is not None:
             self._forces.publish(step.number, step.count)
 

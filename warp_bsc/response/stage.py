@@ -56,13 +56,13 @@ class CollisionStage(CouplingHooks):
         """Allocates the workspace of steps, and makes the report."""
         self.mesh, self._motion, self._responds, model = motion.mesh, motion, responds, self.model
         options = {"max_iterations": max_iterations, "responds": responds, "has_few_contacts": self._has_few_contacts}
-        self._work = Workspace(motion, separation=separation, restitution=restitution, **options)
+        self.work = Workspace(motion, separation=separation, restitution=restitution, **options)
         motion.set_start(arrays_of(model))
         motion.set_end(arrays_of(model), 1.0)
-        prepare(self._work)
+        prepare(self.work)
         self._recount_crossings()
-        motion.remember(self._work.vertices.x1)
-        self.report = self._report_type(self._work, responds=responds)
+        motion.last.begin()
+        self.report = self._report_type(self.work, responds=responds)
         self._watches_bodies = motion.moves_bodies
         coupled: Any = innermost(self.solver)
         if isinstance(coupled, SolverCoupled):
@@ -94,14 +94,14 @@ class CollisionStage(CouplingHooks):
             return None
         worlds = None if self._counter is None else self._counter.worlds.certified
         results = self.report.step_results.results
-        self.report.coupled = CoupledCheck(self._work, results, self.report.device_totals, worlds)
+        self.report.coupled = CoupledCheck(self.work, results, self.report.device_totals, worlds)
         return self.report.coupled
 
     def _count_worlds(self, max_impulse: wp.array | None = None):
         """Makes the report have results by world."""
         find_inside = self.report.find_inside_by_world()
         published = {"strain": self.report.last_strain, "find_inside": find_inside, "max_impulse": max_impulse}
-        self._counter = WorldCounter(self._work, self.report.step_results, **published)
+        self._counter = WorldCounter(self.work, self.report.step_results, **published)
         self.report.keep_worlds(self._counter.worlds)
 
     @one_at_a_time
@@ -191,7 +191,7 @@ class CollisionStage(CouplingHooks):
             yield
         with paused_tape():
             if self._coupled is not None:
-                self._coupled.finish(step.state_out, self._motion.vertices, self._work.vertices)
+                self._coupled.finish()
                 self.report.copy_totals()
 
     def _leave_out(self, step):
@@ -201,7 +201,7 @@ class CollisionStage(CouplingHooks):
 
     def _find_set_bodies(self, start):
         """Counts dynamic bodies whose pose a program writes between steps, which the stage takes to be there."""
-        work, report = self._work, self.report
+        work, report = self.work, self.report
         inputs = [self._motion.vertices, start.body_q, work.vertices.bodies.pose]
         work.launch(find_set_bodies, work.body_count, inputs, [report.set_steps, report.device_totals.set_bodies])
 
@@ -214,7 +214,7 @@ class CollisionStage(CouplingHooks):
         """
         if self.mesh.device.is_capturing:
             raise RuntimeError("world_mask needs memory: step once with one before capturing")
-        return WorldMask(self.solver, self._work, self._motion)
+        return WorldMask(self.solver, self.work, self._motion)
 
     def _resolve(self, step):
         """Detects the collisions of a step after the inner solver, and resolves them if the stage does that.
@@ -232,11 +232,12 @@ class CollisionStage(CouplingHooks):
             self._motion.set_end(end, step.dt)
             with contextlib.nullcontext() if step.mask is None else self._world_mask.applied(step.mask):
                 yield
+                self._motion.last.end(end.body_q)
                 self._count_step(step)
 
     def _count_step(self, step):
         """Adds a substep to the results of its step, which the last one adds to the totals."""
-        work, report, first = self._work, self.report, step.is_first
+        work, report, first = self.work, self.report, step.is_first
         found = report.step_results
         size = max(self.mesh.vertex_count, work.body_count, len(found.results))
         inputs = [work.step, work.status, work.particle_count, self._responds, first]
@@ -253,7 +254,7 @@ class CollisionStage(CouplingHooks):
 
     def _recount_crossings(self):
         """Makes the next step count the crossings at its start, even if it begins where the last one ended."""
-        self._work.loop[Loop.RECOUNT].fill_(1)
+        self.work.loop[Loop.RECOUNT].fill_(1)
 
     @contextlib.contextmanager
     def _timed(self, substep):
@@ -291,7 +292,7 @@ class CollisionStage(CouplingHooks):
     def _follow_shapes(self):
         if self._coupled is not None:
             self._coupled.lose(None)
-        self._motion.follow_shapes(self._work.vertices, self.report.device_totals.shape_not_followed)
+        self._motion.follow_shapes(self.report.device_totals.shape_not_followed)
         if not self.mesh.device.is_capturing:
             self.report.copy_totals()
             self.report.warn()
@@ -300,7 +301,7 @@ class CollisionStage(CouplingHooks):
     def reset(self, state, world_mask=None, flags=None):
         """Resets the inner solver, and lets the next step of the worlds begin where its state is."""
         super().reset(state, world_mask, flags)
-        self._motion.interrupt(world_mask)
-        self._work.forget_crossings(world_mask)
+        self._motion.last.interrupt(world_mask)
+        self.work.forget_crossings(world_mask)
         if self._coupled is not None:
             self._coupled.lose(world_mask)

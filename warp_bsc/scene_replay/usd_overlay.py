@@ -71,10 +71,7 @@ _ELEMENTS = {
 }
 _CONTACTS = _MARKERS | {"primvars:toi": "float[]"} | _ELEMENTS
 _PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
-    "Polygons": (
-        "Mesh",
-        _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"},
-    ),
+    "Polygons": ("Mesh", _EXTENT | {"faceVertexCounts": "int[]", "faceVertexIndices": "int[]", "points": "point3f[]"}),
     "VertexFace": ("PointInstancer", _CONTACTS),
     "EdgeEdge": ("PointInstancer", _CONTACTS),
     "VertexEdge": ("PointInstancer", _CONTACTS),

@@ -34,10 +34,12 @@ from .worker import check_chunk, find_selection_without_initial, name_device, pa
 __all__ = [
     "Cluster",
     "LocalWorkers",
+    "WorkerCall",
     "Workers",
     "check_in_workers",
     "checked_address",
     "device_of_cluster",
+    "results_in_order",
     "selection_without_initial_in_workers",
 ]
 
@@ -217,8 +219,8 @@ def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: 
 
     Arguments and errors are those of :func:`check_in_workers`.
     """
-    call = _Call("checked the first time", find_selection_without_initial, (pack(scene, checks),))
-    (selection,) = _in_order(workers, deque([call]))
+    call = WorkerCall("checked the first time", find_selection_without_initial, (pack(scene, checks),))
+    (selection,) = results_in_order(workers, deque([call]))
     return selection
 
 
@@ -237,10 +239,10 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
     """
     job = pack(scene, checks)
     calls = deque(
-        _Call(_name_chunk(scene, start, stop), check_chunk, (job, start, stop))
+        WorkerCall(_name_chunk(scene, start, stop), check_chunk, (job, start, stop))
         for start, stop in _cut(scene, first, workers.count)
     )
-    for found in _in_order(workers, calls):
+    for found in results_in_order(workers, calls):
         left_out = len(scene.left_out)
         for result in unpack(scene, found):
             yield result
@@ -251,7 +253,7 @@ def check_in_workers(scene: Scene, checks: Checks, workers: Workers, first: int 
                 call.withdraw()
                 call.arguments = (job, *call.arguments[1:])
         if first < (stop := calls[0].arguments[1] if calls else len(scene)):  # the chunk has ended early
-            calls.appendleft(_Call(_name_chunk(scene, first, stop), check_chunk, (job, first, stop)))
+            calls.appendleft(WorkerCall(_name_chunk(scene, first, stop), check_chunk, (job, first, stop)))
 
 
 def checked_address(address: str) -> str:
@@ -286,7 +288,7 @@ def device_of_cluster(address: str, name: str | None) -> str:
 
 
 @dataclass
-class _Call:
+class WorkerCall:
     """A call of a function in a worker.
 
     Attributes:
@@ -310,7 +312,7 @@ class _Call:
             self.future = None
 
 
-def _in_order(workers: Workers, calls: deque[_Call]) -> Iterator[Any]:
+def results_in_order(workers: Workers, calls: deque[WorkerCall]) -> Iterator[Any]:
     """Makes calls in workers and yields their results in order. A call whose worker dies is made again.
 
     Args:

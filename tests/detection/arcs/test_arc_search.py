@@ -11,6 +11,7 @@ from sheets import crumpled
 
 import warp_bsc as bsc
 from warp_bsc.detection.arcs import arc_pipeline
+from warp_bsc.detection.arcs.rigid_motion import ArcBounds
 
 KINDS = ("vertex_face", "edge_edge")
 X, Y, Z = np.eye(3)
@@ -514,7 +515,8 @@ def test_a_graph_in_which_a_body_deforms_finds_its_pairs_or_is_not_certified(dev
         assert found.certified == (device.is_cpu or not sunk)
         assert found.vertex_face.tolist() == ([[3, 0]] if device.is_cpu and sunk else [])
     # what a GPU measures in the graph
-    bounds = detector._arcs.at_once.bounds
+    ends = (wp.array(x, dtype=wp.vec3d, device=device) for x in (x0, x1))
+    bounds = ArcBounds(arcs, detector.mesh.device_vertices, *ends)
     for off, rigid in ((0.0, True), (sinks, False)):
         bounds.measure(start, wp.array(x1 + off, dtype=wp.vec3d, device=device))
         assert bounds.are_rigid().tolist() == [rigid]

@@ -109,10 +109,12 @@ def test_rays_through_edges_and_corners():
 
 def test_bodies_in_one_place_take_the_square_of_their_number(monkeypatch):
     """As many as there are pairs of bodies, whose vertices are all on each other; a smaller one is in all of them."""
-    enclosing, numbers = containment._enclosing, []
+    enclosing, numbers = containment.enclosing_boxes, []
     for count in (4, 8):
         compared = []
-        monkeypatch.setattr(containment, "_enclosing", lambda *args, to=compared: to.append(enclosing(*args)) or to[-1])
+        monkeypatch.setattr(
+            containment, "enclosing_boxes", lambda *args, to=compared: to.append(enclosing(*args)) or to[-1]
+        )
         solids = [box((0, 0, 0), (3, 3, 3))] * count + [box((1, 1, 1), (2, 2, 2))]
         assert find(solids)[0] == [(count, body) for body in range(count)]
         numbers.append(sum(map(len, compared)))

@@ -130,8 +130,8 @@ def face_pairs(mesh, x0, x1, changed=None, keep_separated=False):
     finder = BroadPhaseHierarchy(mesh, count, capacity=4_000_000)
     positions = [wp.array(x, dtype=wp.vec3, device=device) for x in (x0, x1)]
     changed = None if changed is None else wp.array(changed, dtype=int, device=device)
-    finder._pair_faces(*positions, changed, keep_separated)
-    pairs = mesh.face_order[finder._face_pairs.numpy()[: count.numpy()[0]]]
+    finder.pair_faces(*positions, changed, keep_separated)
+    pairs = mesh.face_order[finder.face_pairs.numpy()[: count.numpy()[0]]]
     return in_order(pairs, len(mesh.faces))
 
 

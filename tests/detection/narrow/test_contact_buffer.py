@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import weakref
 
 import numpy as np
 import pytest
@@ -24,10 +25,14 @@ def test_results_that_someone_holds_outlive_the_next_detection():
     assert_same(held[0], held[2])
 
 
+def buffers_of(c):
+    """The buffers that a result owns, one for each kind of pair."""
+    return [rows.buffer for rows in c._rows.values()]
+
+
 def buffer_addresses(c):
     """Addresses of all arrays that a result owns on the device."""
-    buffers = [rows.buffer for rows in c._rows.values()]
-    return {getattr(buffer, name).ptr for buffer in buffers for name in ContactBuffer.vars}
+    return {getattr(buffer, name).ptr for buffer in buffers_of(c) for name in ContactBuffer.vars}
 
 
 @pytest.mark.parametrize("keep", [lambda c: c, copy.copy, lambda c: [c, c.vertex_face]], ids=["kept", "copied", "read"])
@@ -80,12 +85,12 @@ def test_many_results_dropped_at_once_leave_few_buffers():
     detector = bsc.CollisionDetector(bsc.CollisionMesh(faces, len(x0)))
     results = [detector.detect(x0, x1) for _ in range(8)]
     addresses = [buffer_addresses(c) for c in results]
+    pairs = [weakref.ref(buffer.pairs) for c in results for buffer in buffers_of(c)]
     results.clear()
+    assert sum(array() is not None for array in pairs) <= 4
     again = [detector.detect(x0, x1) for _ in range(8)]
     reused = set.union(*addresses) & set.union(*(buffer_addresses(c) for c in again))
     assert len(reused) >= 2 * len(addresses[0])
-    buffers = detector._finder._buffers
-    assert len(buffers._free) + len(buffers._returned) <= 4
 
 
 def test_buffers_of_differentiable_results_stay_theirs(device):

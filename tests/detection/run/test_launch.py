@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_bsc.detection.run.launch import _pool, cores, launch_over
+from warp_bsc.detection.run.launch import cores, launch_over, thread_pool
 
 
 @wp.kernel
@@ -28,7 +28,7 @@ def test_a_launch_does_not_wait_for_threads_that_are_busy():
     free = threading.Event()
     waiting = threading.Timer(20.0, free.set)
     waiting.start()
-    busy = [_pool(2).submit(free.wait) for _ in range(2)]
+    busy = [thread_pool(2).submit(free.wait) for _ in range(2)]
     values = wp.zeros(10_000, dtype=int, device="cpu")
     with cores(2):
         launch_over(add_one, len(values), inputs=[], outputs=[values], device=values.device, chunk=64)

@@ -99,7 +99,7 @@ class Step:
         options = {"friction": self.friction, "restitution": self.restitution, "bodies": "separated"}
         inner = Still(model) if layer is None else bsc.ContactLayer(Still(model), thickness=layer, **options)
         self.solver = bsc.SolverCCD(inner, contact_layer=False, max_iterations=projections, **options)
-        self.solver._work.status.max_truncations = truncations
+        self.solver.work.status.max_truncations = truncations
         self.states = start, end = model.state(), model.state()
         self.arrays = {
             "start_q": start.particle_q,
@@ -230,7 +230,7 @@ def test_an_incomplete_record_gives_nan(device):
     scene.end(scene.values)
     with wp.Tape():
         scene.solver.step(*scene.states, None, None, DT)
-    work = scene.solver._work
+    work = scene.solver.work
     recorded = RecordedStep(work, DT)
     arrays = [scene.arrays[name] for name in list(scene.arrays)[:6]]
     for complete in (1, 0):

@@ -385,7 +385,7 @@ def test_an_incomplete_record_gives_nan(device):
     scene.backward()
     table.grad.zero_()
     solver = scene.solver
-    work = solver._work
+    work = solver.work
     recorded = RecordedStep(work, DT)
     arrays = [wp.zeros(scene.model.particle_count, dtype=wp.vec3, device=device) for _ in range(3)]
     StepAdjoint(recorded).backward(*arrays)

@@ -78,7 +78,7 @@ def test_random_steps_are_counted_and_made_free_of_inversions(size, held, device
     model = shaken_model(device, held=held)
     for seed in range(2):
         solver = bsc.SolverCCD(
-            Changed(model, shaken(seed, size, 9 * held)), inversions="prevented", report_contacts=True
+            Changed(model, shaken(seed, size, 9 * held)), inversions="prevented", report=["contacts"]
         )
         rollout, cut = Inverting(model, solver), 0
         for _ in range(2):
@@ -149,12 +149,12 @@ def test_a_block_that_is_thrown_or_pressed_inverts_nowhere(scene, substeps, devi
 def test_cut_vertices_have_the_velocity_of_their_path(device):
     """The impulses that the report has are the change of momentum that follows."""
     model = shaken_model(device)
-    solver = bsc.SolverCCD(Changed(model, shaken(0, 0.03)), inversions="prevented", report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model, shaken(0, 0.03)), inversions="prevented", report=["contacts"])
     rollout = Inverting(model, solver)
     rollout.step()
     count = model.particle_count
     velocities = (rollout.positions - rollout.start[:count]) / DT
-    moved = solver._work.vertices.outcome.numpy()[:count] & int(UNCONSTRAINED) != 0
+    moved = solver.report.step_results.of_vertices.numpy()[:count] & int(UNCONSTRAINED) != 0
     assert 5 < np.count_nonzero(moved) < count
     np.testing.assert_allclose(rollout.velocities[moved], velocities[moved], rtol=1e-5, atol=1e-4)
     momentum = model.particle_mass.numpy()[:, None] * rollout.velocities
@@ -164,7 +164,7 @@ def test_cut_vertices_have_the_velocity_of_their_path(device):
 def test_where_cuts_do_not_suffice_vertices_are_frozen(device):
     model = shaken_model(device)
     solver = bsc.SolverCCD(Changed(model, shaken(0, 0.1)), inversions="prevented")
-    solver._work.status.max_truncations = 0  # so that no iteration cuts
+    solver.work.status.max_truncations = 0  # so that no iteration cuts
     rollout = Inverting(model, solver)
     rollout.step()
     report = solver.report
@@ -254,7 +254,7 @@ def test_worlds_are_alone_and_may_take_no_part(device):
             by = np.concatenate([shakes[world][step] for world in of_worlds])
             state.particle_q.assign((state.particle_q.numpy() + by).astype(np.float32))
 
-        options = {"inversions": "prevented", "report_worlds": True, "separation": 2e-4}
+        options = {"inversions": "prevented", "report": ["worlds"], "separation": 2e-4}
         solver = bsc.SolverCCD(Changed(model, change), **options)
         start, end, ends = model.state(), model.state(), []
         for mask in masks:
@@ -287,7 +287,7 @@ def test_worlds_report_their_inversions(device):
         x[54 + 13] += np.float32([0.06, 0.0, 0.0])  # in the second world
         state.particle_q.assign(x)
 
-    solver = bsc.SolverCCD(Changed(model, change), inversions="reported", report_worlds=True)
+    solver = bsc.SolverCCD(Changed(model, change), inversions="reported", report=["worlds"])
     rollout = Inverting(model, solver)
     rollout.step()
     assert solver.report.worlds.inverting.numpy().tolist() == [0, rollout.inverting]

@@ -27,7 +27,7 @@ def test_static_faces_have_little_room_in_queues(device):
     )
     builder.add_shape_box(-1, hx=0.1, hy=0.1, hz=0.1)
     builder.add_shape_box(builder.add_body(is_kinematic=True), hx=0.1, hy=0.1, hz=0.1)
-    work = bsc.SolverImplicit(builder.finalize(device=device))._work
+    work = bsc.SolverImplicit(builder.finalize(device=device)).work
     assert pairs_of(work.mesh, work.can_move.numpy()) == 96 * (8 + 12) + 2 * 12
 
 
@@ -80,7 +80,7 @@ def test_contacts_are_those_of_a_detection_with_queues(seed, device, monkeypatch
     found = []
     for tiny in (False, True):
         solver = stage(model, monkeypatch, tiny=tiny, max_iterations=0)  # so that first contacts are found at once
-        work, motion = solver._work, solver._motion
+        work, motion = solver.work, solver.work.motion
         arrays = arrays_of(model)
         motion.set_start(arrays)
         arrays.particle_q = wp.array(end, dtype=wp.vec3, device=device)

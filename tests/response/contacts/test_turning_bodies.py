@@ -93,6 +93,16 @@ def test_a_blade_meets_what_its_chords_miss(make, options, device):
         assert crossings_on_arcs(solver.mesh, *ends, 0.5 * np.pi) == 0
 
 
+def test_a_blade_turns_from_where_its_world_last_took_part(device):
+    """A program turns it before a step in which its world takes no part."""
+    model = blade_and_strip(device)
+    solver, (start, end, last) = bsc.SolverCCD(Changed(model)), [model.state() for _ in range(3)]
+    turned(0.5 * np.pi)(start)
+    solver.step(start, end, None, None, DT, world_mask=wp.zeros(2, dtype=bool, device=device))
+    solver.step(end, last, None, None, DT)
+    assert solver.report.predicted_contacts > 20 and solver.report.certified
+
+
 @pytest.mark.parametrize("options", [{}, {"min_distance": 0.002}], ids=["touch", "distance"])
 @pytest.mark.parametrize("broad_phase", ["simd", "hierarchy"])
 def test_boxes_reach_as_far_as_arcs(broad_phase, options, device, monkeypatch):
@@ -202,7 +212,7 @@ def test_random_bars_push_a_cloth_off_their_arcs(options, device):
         end_x[:count] = end.particle_q.numpy()
         place, quaternion = end.body_q.numpy()[0, :3], end.body_q.numpy()[0, 3:]
         end_x[count:] = Rotation.from_quat(quaternion).apply(x[count:]) + place
-        arcs = solver._work.arcs
+        arcs = solver.work.arcs
         motion = bsc.RigidMotion(arcs.body.numpy(), arcs.centre.numpy(), arcs.turn.numpy())
         np.testing.assert_allclose(motion.turn[0], Rotation.from_quat(quaternion).as_rotvec(), atol=1e-6)
         for time in np.linspace(0.0, 1.0, 17):
@@ -252,7 +262,7 @@ def test_bodies_that_do_not_turn_give_the_same_bits(device, monkeypatch):
     ends = []
     for watches in (True, False):
         if not watches:
-            monkeypatch.setattr(motion_module, "BodyTurns", lambda mesh: None)
+            monkeypatch.setattr(motion_module, "BodyTurns", lambda *_: None)
         for kinematic in (True, False):
             for options in ({}, {"min_distance": 0.002}):
                 model = blade_and_strip(device, kinematic=kinematic)
@@ -279,7 +289,7 @@ def test_a_disc_that_spins_on_a_sheet_is_at_rest_as_by_its_chords(distance, devi
     ends = []
     for watches in (True, False):
         if not watches:
-            monkeypatch.setattr(motion_module, "BodyTurns", lambda mesh: None)
+            monkeypatch.setattr(motion_module, "BodyTurns", lambda *_: None)
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
         add_patch(builder, 4, 0.1, (0.0, 0.0, 0.0), fixed=True)
         place = [0.01, 0.02, 0.02 + distance + 2e-6]

@@ -59,12 +59,12 @@ def entries(model, rigid, cloth):
     ]
 
 
-def with_proxy(model, inner="vbd", iterations=1, bodies=(0,), report_worlds=False, **options):
+def with_proxy(model, inner="vbd", iterations=1, bodies=(0,), report=(), **options):
     """A coupled solver in which the first bodies are proxies in the entry of the cloth, and the stage in that entry."""
     stages = []
 
     def make(view):
-        stages.append(bsc.SolverCCD(SOLVERS[inner](view), report_worlds=report_worlds))
+        stages.append(bsc.SolverCCD(SOLVERS[inner](view), report=report))
         return stages[-1]
 
     proxies = [SolverCoupledProxy.Proxy(source="rigid", destination="cloth", bodies=bodies, **options)]
@@ -184,7 +184,7 @@ def test_worlds_and_resets_of_a_program_are_told_apart(device):
     builder.replicate(world, 2)
     builder.color()
     model = builder.finalize(device=device)
-    solver, stage = with_proxy(model, bodies=[0, 1], report_worlds=True, mode="staggered")
+    solver, stage = with_proxy(model, bodies=[0, 1], report=["worlds"], mode="staggered")
     states, report = [model.state(), model.state()], stage.report
     states[0].body_qd.assign(np.float32([[0.0, 0.0, -1.0, 0.0, 0.0, 0.0], 6 * [0.0]]))
 
@@ -427,7 +427,7 @@ def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch)
 
     captured = bsc.CapturedSteps(step, stage, [start])
     monkeypatch.setattr(wp, "capture_launch", spoil)
-    captured._graph = "a graph"
+    captured.graph = "a graph"
     captured()
     assert captured.retaken == 1 and model.body_count > stage.model.body_count
     for name, found in zip(names, runs[0], strict=True):

@@ -181,13 +181,12 @@ class TestInIsaacLab:
                 cloth.update(1.0 / 60.0)
                 return cloth.data.nodal_pos_w.torch[..., 2].numpy().copy()
 
-            assert type(manager._solver) is SOLVERS[kind] and manager._solver.friction.numpy().tolist() == [
-                np.float32(0.4)
-            ]
+            solver = manager._solver
+            assert type(solver) is SOLVERS[kind] and solver.friction.numpy().tolist() == [np.float32(0.4)]
             start = heights()
             for _ in range(30):
                 simulation.step(render=False)
-            report, fallen = manager._solver.report, heights()
+            report, fallen = solver.report, heights()
             assert report.totals.steps == 30 and report.totals.uncertified_steps == 0 and not report.penetrated
             distances = np.linalg.norm(cloth.data.nodal_pos_w.torch.numpy() - [[[0, 0, 0.3]], [[1, 0, 0.3]]], axis=2)
             assert distances.min() > 0.095 and (fallen.min(axis=1) < 0.35).all()  # it hangs over the ball

@@ -10,7 +10,7 @@ from style3d_scenes import add_sheet, drape
 
 import warp_bsc as bsc
 from warp_bsc.response.drive.inner_steps import WholeSteps
-from warp_bsc.response.drive.style3d_springs import SpringSteps
+from warp_bsc.response.drive.style3d_springs import SpringSteps, Style3DContacts
 
 RATE = 60.0
 
@@ -55,8 +55,8 @@ def test_equal_runs_are_equal_bit_for_bit(device):
             solver.step(*states, model.control(), None, 1.0 / RATE)
             states.reverse()
         ends.append([states[0].particle_q.numpy(), states[0].particle_qd.numpy()])
-    work = solver._work
-    solver._inner._contacts.find(states[0], 1.0 / RATE)
+    work = solver.work
+    Style3DContacts(work).find(states[0], 1.0 / RATE)
     of_second = work.constraints.vertices.numpy()[: work.constraints.count.numpy()[0]] >= model.particle_count // 2
     of_cloth = work.constraints.vertices.numpy()[: len(of_second)] < model.particle_count
     pairs = (of_second & of_cloth).any(axis=1) & (~of_second).any(axis=1)

@@ -18,7 +18,7 @@ class Pair:
     """Steps of a stage in substeps, and as many steps of another stage that are as long as those."""
 
     def __init__(self, make, **options):
-        options |= {"report_contacts": True, "report_worlds": True}
+        options |= {"report": ["contacts", "worlds"]}
         self.together, self.apart = (bsc.SolverCCD(make(), **options, **more) for more in ({"substeps": NUMBER}, {}))
         self.model = self.together.model
         self.states, self.others = ([self.model.state() for _ in range(2)] for _ in range(2))
@@ -249,7 +249,7 @@ def test_substeps_in_a_graph_are_those_without(device):
         pytest.skip("needs conditional nodes")
     model, ends = bullet(30.0, device=device), []
     for in_graph in (True, False):
-        solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3, report_worlds=True, report_contacts=True)
+        solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=3, report=["contacts", "worlds"])
         states = model.state(), model.state()
 
         def frame(solver=solver, states=states):

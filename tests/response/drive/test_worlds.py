@@ -47,7 +47,7 @@ def finalize(seeds, device):
 def new_stage(model, inner, **options):
     """Returns a stage with everything reported, and a separation that is no median over worlds."""
     solver = SOLVERS[inner](model)
-    return bsc.SolverCCD(solver, separation=2e-4, friction=0.3, report_contacts=True, report_worlds=True, **options)
+    return bsc.SolverCCD(solver, separation=2e-4, friction=0.3, report=["contacts", "worlds"], **options)
 
 
 def move_plates(state, heights):
@@ -182,7 +182,7 @@ def test_resets_of_single_worlds_touch_no_other_world(device):
 @pytest.mark.parametrize("stage", [bsc.SolverCCD, bsc.CollisionMonitor])
 def test_nothing_is_found_in_a_world_that_takes_no_part(stage, device):
     model = bullet(100, device=device, worlds=3)
-    solver = stage(Changed(model), report_worlds=True)
+    solver = stage(Changed(model), report=["worlds"])
     mask = wp.array([False, True, False, True], dtype=bool, device=device)
     queued = []
     for masked in (None, mask):
@@ -197,7 +197,7 @@ def test_nothing_is_found_in_a_world_that_takes_no_part(stage, device):
             state, end = end, state
         assert hits > 0
         solver.reset(state)
-        queued.append(solver._work.detector.counters.read().edge_edge.queued)
+        queued.append(solver.work.detector.counters.read().edge_edge.queued)
     assert queued[1] <= queued[0] // 3
 
 
@@ -208,7 +208,7 @@ def test_crossings_of_worlds_that_take_no_part_are_known_when_they_go_on(device)
     builder.replicate(world, 2)
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), report_worlds=True)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), report=["worlds"])
     state, end = model.state(), model.state()
     for active in ((True, False), (False, True), (True, True)):
         mask = wp.array([*active, True], dtype=bool, device=device)
@@ -221,15 +221,15 @@ def test_crossings_of_worlds_that_take_no_part_are_known_when_they_go_on(device)
 @pytest.mark.parametrize("stage", [bsc.SolverCCD, bsc.CollisionMonitor])
 def test_a_stage_that_is_not_asked_has_no_results_by_world(stage, device):
     model = bullet(1, device=device)
-    with pytest.raises(RuntimeError, match="report_worlds=True"):
+    with pytest.raises(RuntimeError, match=r'report=\["worlds"\]'):
         stage(Changed(model)).report.worlds  # noqa: B018
-    with pytest.raises(RuntimeError, match="report_contacts=True"):
-        stage(Changed(model), report_worlds=True).report.worlds.max_impulse  # noqa: B018
+    with pytest.raises(RuntimeError, match=r'report=\["contacts"\]'):
+        stage(Changed(model), report=["worlds"]).report.worlds.max_impulse  # noqa: B018
 
 
 def test_a_world_with_a_position_that_is_not_finite_is_not_certified(device):
     model = bullet(1, device=device, worlds=2)
-    solver = bsc.SolverCCD(Changed(model), report_worlds=True)
+    solver = bsc.SolverCCD(Changed(model), report=["worlds"])
     state = model.state()
     positions = state.particle_q.numpy().copy()
     positions[-1] = np.nan
@@ -251,7 +251,7 @@ def test_a_velocity_that_is_not_finite_leaves_its_world_alone_uncertified(option
         velocity[particle] = np.nan
         state.particle_qd.assign(velocity)
 
-    solver = bsc.SolverCCD(Changed(model, lose), report_worlds=True, **options)
+    solver = bsc.SolverCCD(Changed(model, lose), report=["worlds"], **options)
     state, end = model.state(), model.state()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -280,7 +280,7 @@ def test_a_velocity_that_is_not_finite_in_one_substep_is_seen(device):
             velocity[-1] = np.inf
             state.particle_qd.assign(velocity)
 
-    solver = bsc.SolverCCD(Changed(model, lose), substeps=8, report_worlds=True)
+    solver = bsc.SolverCCD(Changed(model, lose), substeps=8, report=["worlds"])
     state, end = model.state(), model.state()
     solver.step(state, end, model.control(), None, DT)
     assert len(calls) == 8 and not solver.report.certified and solver.report.not_finite == 1
@@ -304,7 +304,7 @@ def test_strain_and_what_is_inside_by_world(device):
     for i in range(count, 2 * count):
         builder.particle_q[i] = wp.vec3(*builder.particle_q[i]) - wp.vec3(0.0, 0.0, 0.1)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), report_worlds=True)
+    solver = bsc.SolverCCD(Changed(model), report=["worlds"])
     with pytest.warns(UserWarning, match="edges pass through faces at the start"):
         solver.step(model.state(), model.state(), model.control(), None, DT)
         assert solver.report.crossings > 0
@@ -324,7 +324,7 @@ def test_frozen_and_truncated_vertices_are_counted_by_world(device):
     for i in range(world.particle_count, builder.particle_count):
         builder.particle_qd[i] = wp.vec3(0.0, 0.0, 3.0 * (-1.0) ** i)
     model = builder.finalize(device=device)
-    options = {"max_iterations": 0, "report_worlds": True, "report_contacts": True}
+    options = {"max_iterations": 0, "report": ["contacts", "worlds"]}
     solver = bsc.SolverCCD(Changed(model), **options)
     state, end, cut = model.state(), model.state(), 0
     for i in range(6):
@@ -388,7 +388,7 @@ def test_filtered_pairs_by_world_are_those_of_each_world_alone(tree, options, mo
 
     def filtered(seeds):
         model, collision_filter = filtered_worlds(seeds, device)
-        given = {"collision_filter": collision_filter, "min_distance": 0.002, "report_worlds": True}
+        given = {"collision_filter": collision_filter, "min_distance": 0.002, "report": ["worlds"]}
         make = bsc.CollisionMonitor
         if options is not None:
             make, given = bsc.SolverCCD, given | {"bodies": "separated", **options}

@@ -349,8 +349,9 @@ def test_a_layer_without_room_for_its_pairs_pushes_nothing(device):
         model = colliding_patches(**SOFT).finalize(device=device)
         solver = layered(semi_implicit(model), layer)
         if layer is not None:
-            solver.solver._detector.capacities.zero_()
-            solver.solver._detector.grow = lambda: False
+            detector = solver.solver._detector
+            detector.capacities.zero_()
+            detector.grow = lambda: False
         rollout = Rollout(model, solver)
         for _ in range(12):
             rollout.step(DT)

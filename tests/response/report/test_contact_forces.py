@@ -53,7 +53,7 @@ def step_forces(model, solver, dt, steps):
 def test_a_scale_under_a_cloth_shows_its_weight(inner, substeps, rate, device):
     """The mean force of the last tenth of a second is the weight within 1%, and has no other part."""
     model = ramp(device, 0.0)
-    solver = bsc.SolverCCD(SOLVERS[inner](model), friction=0.3, substeps=substeps, report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS[inner](model), friction=0.3, substeps=substeps, report=["contacts"])
     forces = step_forces(model, solver, 1.0 / rate, int(0.35 * rate))
     weight = GRAVITY * float(model.particle_mass.numpy().sum())
     assert np.allclose(forces[-rate // 10 :].mean(axis=0), (0.0, 0.0, -weight), atol=0.01 * weight)
@@ -67,7 +67,7 @@ def test_a_scale_under_a_cloth_shows_its_weight(inner, substeps, rate, device):
 def test_friction_on_a_ramp_is_mu_times_the_normal_force(device):
     """Of a cloth that slides down."""
     model = ramp(device, 0.5, velocity=0.5, mu=0.2)
-    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.2, report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS["vbd"](model), friction=0.2, report=["contacts"])
     force = -step_forces(model, solver, DT, 60)[-30:].mean(axis=0)
     weight = GRAVITY * float(model.particle_mass.numpy().sum())
     assert force[2] == pytest.approx(weight * np.cos(0.5), rel=0.02)
@@ -88,7 +88,7 @@ def test_pads_feel_the_weight_of_what_they_grip_and_its_velocity_is_its_motion(d
         builder.add_shape_box(-1, xform=pad, hx=0.01, hy=0.005, hz=0.01, cfg=cfg)
     builder.color()
     model = builder.finalize(device=device)
-    options = {"report_contacts": True, "min_distance": 0.002, "friction": 1.0}
+    options = {"report": ["contacts"], "min_distance": 0.002, "friction": 1.0}
     solver = bsc.SolverCCD(newton.solvers.SolverVBD(model, iterations=10), **options)
     mass, dt, (state, end), rows = model.particle_mass.numpy(), 1.0 / 240.0, (model.state() for _ in range(2)), []
     for _ in range(80):
@@ -112,7 +112,7 @@ def test_the_impulse_of_a_bounce_is_the_change_of_momentum(device):
     builder.add_particle(wp.vec3(9.0, 0.0, 9.0), wp.vec3(), 1.0)
     model = builder.finalize(device=device)
     inner = newton.solvers.SolverSemiImplicit(model, angular_damping=0.0)
-    options = {"bodies": "separated", "restitution": 0.5, "friction": 0.0, "report_contacts": True}
+    options = {"bodies": "separated", "restitution": 0.5, "friction": 0.0, "report": ["contacts"]}
     solver = bsc.SolverCCD(inner, **options)
     state, end, mass = model.state(), model.state(), float(model.body_mass.numpy()[0])
     solver.step(state, end, model.control(), None, DT)
@@ -193,7 +193,7 @@ def check_bodies(model, report, change, speed):
 def test_sums_are_the_changes_of_momentum_of_cloth(speed, substeps, device):
     """Of a patch shot at a sheet, where nothing is cut: only the turn of a world is of no pair."""
     model = bullet(speed, device=device)
-    solver = bsc.SolverCCD(Changed(model), substeps=substeps, report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), substeps=substeps, report=["contacts"])
     with pytest.warns(UserWarning, match="a step strained") if speed == 60 else pytest.warns():
         largest, unpaired = check_momentum(model, solver, 8)
     assert largest > 1e-4 * speed and unpaired < 1e-3 * largest
@@ -210,7 +210,7 @@ def test_sums_are_the_changes_of_momentum_of_cloth_and_bodies(substeps, device):
     add_patch(builder, 8, 0.05, (0.0, 0.0, 0.1), velocity=(0.0, 0.0, 1.0))
     model = builder.finalize(device=device)
     inner = newton.solvers.SolverXPBD(model, iterations=0)
-    solver = bsc.SolverCCD(inner, substeps=substeps, friction=0.3, report_contacts=True)
+    solver = bsc.SolverCCD(inner, substeps=substeps, friction=0.3, report=["contacts"])
     largest, _ = check_momentum(model, solver, 4)
     assert largest > 1e-3
 
@@ -222,7 +222,7 @@ def test_velocities_that_paths_gave_are_of_no_pair(device):
     for i in range(builder.particle_count):
         builder.particle_qd[i] = wp.vec3(0.0, 0.0, 3.0 * (-1.0) ** i)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), max_iterations=0, report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), max_iterations=0, report=["contacts"])
     largest, unpaired = check_momentum(model, solver, 6, lambda state, i: place_plates(state, 0.05 - 0.01 * i))
     totals = solver.report.totals
     assert totals.truncated_steps > 0 and totals.frozen_steps > 0
@@ -239,7 +239,7 @@ def test_matrices_of_pairs_add_up(device):
     builder.add_ground_plane()
     builder.replicate(world, 2)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=2, report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), substeps=2, report=["contacts"])
     state, end, report = model.state(), model.state(), solver.report
     for _ in range(20):
         solver.step(state, end, model.control(), None, DT)
@@ -269,7 +269,7 @@ def test_matrices_of_pairs_add_up(device):
 def test_matrices_that_are_too_large_are_an_error(device, monkeypatch):
     monkeypatch.setattr(contact_forces, "MAX_PAIRS", 0)
     model = bullet(60, device=device)
-    solver = bsc.SolverCCD(Changed(model), report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), report=["contacts"])
     solver.step(model.state(), model.state(), model.control(), None, DT)
     with pytest.raises(RuntimeError, match="1 entries: sum up contacts"):
         solver.report.forces.shape_pair_impulse  # noqa: B018
@@ -301,7 +301,9 @@ def test_members_of_worlds():
 @pytest.mark.filterwarnings("ignore:a step strained")
 def test_contacts_beyond_the_capacity_are_counted_and_summed_up(device):
     model = bullet(60, device=device)
-    few, all_listed = (bsc.SolverCCD(Changed(model), report_contacts=n) for n in (5, True))
+    few, all_listed = (
+        bsc.SolverCCD(Changed(model), report=report) for report in ({"contacts": 5, "worlds": True}, ["contacts"])
+    )
     state, control = model.state(), model.control()
     state.particle_q.assign(
         state.particle_q.numpy() - np.float32((0.0, 0.0, 0.09)) * (np.arange(model.particle_count) > 288)[:, None]
@@ -311,7 +313,7 @@ def test_contacts_beyond_the_capacity_are_counted_and_summed_up(device):
     assert not few.report.forces.contacts.complete and all_listed.report.forces.contacts.complete
     assert few.report.forces.contacts.count.numpy()[0] == all_listed.report.forces.contacts.count.numpy()[0] > 5
     assert len(few.report.forces.contacts.numpy()["toi"]) == few.report.forces.contacts.capacity == 5
-    assert few.report.forces.complete
+    assert few.report.forces.complete and len(few.report.worlds.certified) == 1
     assert np.array_equal(few.report.forces.particle_impulse.numpy(), all_listed.report.forces.particle_impulse.numpy())
 
 
@@ -320,7 +322,7 @@ def test_impulses_that_are_too_large_for_a_sum_are_flagged(mass, complete, devic
     model = ramp(device, 0.0)
     model.particle_mass.fill_(mass)
     model.particle_inv_mass.fill_(1.0 / mass)
-    solver = bsc.SolverCCD(SOLVERS["semi_implicit"](model), report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS["semi_implicit"](model), report=["contacts"])
     step_forces(model, solver, 1.0 / 100.0, 3)
     assert len(solver.report.forces.contacts.numpy()["toi"])
     assert solver.report.forces.complete == solver.report.forces.contacts.complete == complete
@@ -330,15 +332,15 @@ def test_a_stage_that_is_not_asked_has_no_contacts(device):
     """And takes the same steps, bit by bit."""
     model = bullet(60, device=device)
     ends = []
-    for asked in (False, True):
-        solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=2, report_contacts=asked)
+    for asked in ([], ["contacts"]):
+        solver = bsc.SolverCCD(SOLVERS["vbd"](model), substeps=2, report=asked)
         state, end = model.state(), model.state()
         for _ in range(6):
             solver.step(state, end, model.control(), None, DT)
             state, end = end, state
         ends.append(np.concatenate([state.particle_q.numpy(), state.particle_qd.numpy()]))
         if not asked:
-            with pytest.raises(RuntimeError, match="report_contacts=True"):
+            with pytest.raises(RuntimeError, match=r'report=\["contacts"\]'):
                 _ = solver.report.forces
     assert np.array_equal(*ends)
 
@@ -347,5 +349,5 @@ def test_a_stage_that_is_not_asked_has_no_contacts(device):
     "value, error", [(0, ValueError), (-1, ValueError), ("yes", TypeError), (2.5, TypeError), (None, TypeError)]
 )
 def test_bad_capacities_are_errors(value, error, device):
-    with pytest.raises(error, match="report_contacts"):
-        bsc.SolverCCD(Changed(bullet(1, device=device)), report_contacts=value)
+    with pytest.raises(error, match=r"report\['contacts'\]"):
+        bsc.SolverCCD(Changed(bullet(1, device=device)), report={"contacts": value})

@@ -48,7 +48,7 @@ def shot(device, **options):
 
 
 def test_contacts_are_drawn_where_they_are(device):
-    solver, state = shot(device, report_contacts=True)
+    solver, state = shot(device, report=["contacts"])
     report, viewer = solver.report, Recorder(solver.model)
     report.draw(viewer)
     contacts = report.forces.contacts.numpy()
@@ -78,7 +78,7 @@ def test_minimum_distances_are_shells(device):
     builder.add_particle(wp.vec3(0.0, 0.0, 1.0), wp.vec3(), 0.01)
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), min_distance=0.01, particle_radius=0.002, report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), min_distance=0.01, particle_radius=0.002, report=["contacts"])
     viewer = Recorder(model)
     solver.report.draw(viewer)
     points, faces, opacity = viewer.drawn["/ccd/shells"]
@@ -98,7 +98,7 @@ def squeezed(device, times=1):
     for i in range(builder.particle_count):
         builder.particle_qd[i] = wp.vec3(0.0, 0.0, 3.0 * (-1.0) ** i)
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(Changed(model), max_iterations=0, report_contacts=True)
+    solver = bsc.SolverCCD(Changed(model), max_iterations=0, report=["contacts"])
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for _ in range(times):
@@ -120,7 +120,7 @@ def test_vertices_are_drawn_by_what_became_of_them(device):
         points = viewer.drawn[f"/ccd/{name}"]
         assert (0 if points is None else len(points)) == getattr(report, name)
     assert report.frozen + report.truncated > 0
-    x, uncertified = solver._work.vertices.x1.numpy(), report.uncertified_vertices
+    x, uncertified = solver.work.vertices.x1.numpy(), report.uncertified_vertices
     drawn = {tuple(point) for point in viewer.drawn["/ccd/uncertified"]}
     assert len(uncertified) and {tuple(x[i]) for i in uncertified} < drawn  # and vertices of the plates
 
@@ -141,9 +141,9 @@ def test_a_certified_step_warns_of_nothing(device):
 
 def test_a_stage_that_keeps_no_contacts_says_so_where_it_is_drawn(device):
     solver, _ = shot(device)
-    with pytest.warns(UserWarning, match="report_contacts=True"):
+    with pytest.warns(UserWarning, match=r'report=\["contacts"\]'):
         solver.report.draw(Recorder(solver.model))
-    with pytest.raises(RuntimeError, match="report_contacts=True"):
+    with pytest.raises(RuntimeError, match=r'report=\["contacts"\]'):
         solver.report.forces.table()
     monitor = bsc.CollisionMonitor(Changed(solver.model))
     with warnings.catch_warnings():
@@ -160,7 +160,7 @@ def test_table_by_shape(device):
         add_patch(builder, 4, 0.05, (x, 0.0, 0.001))
     builder.color()
     model = builder.finalize(device=device)
-    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), report_contacts=True)
+    solver = bsc.SolverCCD(SOLVERS["xpbd"](model), report=["contacts"])
     state, end = model.state(), model.state()
     solver.step(state, end, None, None, 1e-6)
     assert solver.report.forces.table().splitlines()[1] == "no contact had an impulse"
@@ -184,7 +184,7 @@ def test_table_by_shape(device):
 
 def test_usd_has_what_is_drawn(device, tmp_path):
     """A layer of Newton's viewer: impulses in the frame in which there are some, and none in the next."""
-    solver, state = shot(device, report_contacts=True, min_distance=1e-3)
+    solver, state = shot(device, report=["contacts"], min_distance=1e-3)
     path = tmp_path / "contacts.usda"
     viewer = ViewerUSD(str(path), fps=60, num_frames=2)
     viewer.set_model(solver.model)

@@ -48,7 +48,7 @@ def momenta(model, state):
 
 def check_vertices(rollout):
     """Asserts that the certified vertices are those of the poses of the state, bit by bit."""
-    certified = rollout.solver._work.vertices.x1.numpy()
+    certified = rollout.solver.work.vertices.x1.numpy()
     assert certified.tobytes() == rollout.vertices(rollout.states[0]).tobytes()
 
 
@@ -174,14 +174,13 @@ def test_a_body_that_projection_does_not_stop_is_put_back_as_one(freezes, device
     """Its pose goes back along its path until its vertices are on their sides, or to its start."""
     model = ball_and_sheet(device, fixed=True, n=8)
     rollout = Rollout(model, bsc.SolverCCD(free(model), max_iterations=0))
-    work = rollout.solver._work
     if freezes:
-        work.status.max_truncations = 0
+        rollout.solver.work.status.max_truncations = 0
     outcomes = []
     for _ in range(4):
         before = rollout.states[0].body_q.numpy()[0]
         rollout.step()
-        outcomes.append(int(work.vertices.bodies.outcome.numpy()[0]))
+        outcomes.append(int(rollout.solver.report.step_results.of_bodies.numpy()[0]))
         assert rollout.solver.report.certified
         check_vertices(rollout)
         after = rollout.states[0].body_q.numpy()[0]

@@ -91,7 +91,7 @@ def test_linear_momentum_is_kept(iterations, device):
     before, velocities, divided = rollout.momenta()[0], rollout.velocities, 0
     for _ in range(6):
         rollout.step()
-        divided += np.count_nonzero(rollout.solver._work.vertices.outcome.numpy() & int(DIVIDED))
+        divided += np.count_nonzero(rollout.solver.report.step_results.of_vertices.numpy() & int(DIVIDED))
         assert rollout.solver.report.truncated == rollout.solver.report.frozen == 0
     assert np.linalg.norm(rollout.momenta()[0] - before) < 1e-5 * np.linalg.norm(before)
     assert rollout.collisions == 0 and np.abs(rollout.velocities - velocities).max() > 1.0

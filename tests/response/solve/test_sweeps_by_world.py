@@ -23,7 +23,7 @@ def run(speeds, device, options):
     count = model.particle_count // len(speeds)
     velocity = model.particle_qd.numpy() * np.repeat(speeds, count)[:, None]
     model.particle_qd.assign(velocity)
-    solver = bsc.SolverCCD(Changed(model), friction=0.3, report_worlds=True, **options)
+    solver = bsc.SolverCCD(Changed(model), friction=0.3, report=["worlds"], **options)
     states, ends, hits = [model.state(), model.state()], [], 0
     for step in range(8):
         mask = wp.array([speed != SPEEDS[1] or step != 2 for speed in speeds] + [True], dtype=bool, device=device)

@@ -38,6 +38,7 @@ __all__ = [
     "benchmark_scene",
     "find_adversarial_worst",
     "find_places",
+    "gather_queries",
     "to_dict",
 ]
 
@@ -246,7 +247,7 @@ def benchmark_scene(
         ValueError: If no swept boxes overlap.
     """
     progress("candidate pairs")
-    queries, overlapping = _gather(intervals, places[-1].device, effort.queries)
+    queries, overlapping = gather_queries(intervals, places[-1].device, effort.queries)
     if not overlapping:
         raise ValueError(f"{name}: no pairs: no swept boxes overlap in the intervals measured")
 
@@ -291,7 +292,7 @@ def benchmark_scene(
     )
 
 
-def _gather(
+def gather_queries(
     intervals: list[tuple[int, BenchmarkScene]], device: wp.Device, max_queries: int
 ) -> tuple[dict[PairKind, Queries], int]:
     """Returns the overlapping pairs of some intervals by kind, or a random part of them; and their number."""

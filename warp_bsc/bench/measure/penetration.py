@@ -27,6 +27,7 @@ __all__ = [
     "PenetrationMeasurement",
     "PenetrationRun",
     "Simulator",
+    "find_speed_kept",
     "measure_penetration",
     "show",
     "to_dict",
@@ -298,7 +299,7 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
         collisions=sum(judgement.collisions),
         colliding_steps=sum(found > 0 for found in judgement.collisions),
         inverted=judgement.inverted,
-        speed_kept=_speed_kept(built, states, simulator.rate),
+        speed_kept=find_speed_kept(built, states, simulator.rate),
         stretch=judgement.stretch,
         uncertified_steps=trajectory.uncertified_steps,
         milliseconds=(float(np.median(timed)), float(np.mean(timed))),
@@ -323,7 +324,7 @@ def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], N
     return "cuda", simulate_libuipc(built, simulator.rate, seconds, progress)
 
 
-def _speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
+def find_speed_kept(built, states: list[np.ndarray], rate: int) -> float | None:
     """Returns the way of the centre of what flies freely, as a share of that of a free fall at its first velocity.
 
     None without it, and where the first step goes as far as what it meets.

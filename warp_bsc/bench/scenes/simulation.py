@@ -127,6 +127,8 @@ class Simulation:
 
     Attributes:
         stage: The stage, which :class:`.SolverImplicit` is itself; None without one.
+        solver: What is stepped: the stage, or the solver without one.
+        states: The state at the start of the next pair of steps, and the one between them.
         samples: What was measured of each state.
         milliseconds: Time of each step [ms]; two steps are timed together.
         collisions: Pairs that meet on straight ways in each step, see :class:`..crossings.CrossingCounter`; empty if
@@ -182,13 +184,13 @@ class Simulation:
             if isinstance(inner, newton.solvers.SolverStyle3D) and not has_contacts:
                 inner.collision = None  # its own contacts, which need those of Newton
             self.stage = None if stage_options is None else SolverCCD(inner, **scene.stage_options, **stage_options)
-        self._solver: Any = inner if self.stage is None else self.stage
+        self.solver: Any = inner if self.stage is None else self.stage
         self._pipeline = newton.CollisionPipeline(model) if has_contacts else None
         self._contacts = self._pipeline.contacts() if self._pipeline else None
-        self._states, self._control = (model.state(), model.state()), model.control()
+        self.states, self._control = (model.state(), model.state()), model.control()
         # VBD that does not move bodies reads their poses at the start and at the end; the others copy them
         self._poses_in_both = solver != "vbd"
-        self._ends = [model.state() for _ in self._states]  # copies of both ends of a pair
+        self._ends = [model.state() for _ in self.states]  # copies of both ends of a pair
         self._graph: wp.Graph | None = None
         self.samples, self.milliseconds = samples or Samples(model, early_steps), []
         self._counts_collisions, self.collisions = counts_collisions, []
@@ -203,16 +205,16 @@ class Simulation:
         steps = 2 * max(2, math.ceil(round(seconds * self._rate, 6) / 2))
         self._mover = _Mover(scene, self._rate, steps, self._offset, poses_in_both=self._poses_in_both)
         resets = {2 * round(0.5 * t * self._rate): worlds for t, worlds in scene.resets.items()}
-        samples.add(self._states[0])
+        samples.add(self.states[0])
         if self._counts_collisions:
-            self._counter.begin(self._states[0])
+            self._counter.begin(self.states[0])
         for step in range(0, steps, 2):
             progress(step, steps)
             if step in resets:
                 self._reset(resets[step])
-                samples.restart(self._states[0], resets[step])
+                samples.restart(self.states[0], resets[step])
                 if self._counts_collisions:
-                    self._counter.begin(self._states[0])
+                    self._counter.begin(self.states[0])
             self.milliseconds += [0.5 * self._take_pair()] * 2
             for i, state in enumerate(self._ends):
                 if not samples.add(state):
@@ -228,7 +230,7 @@ class Simulation:
 
     def count_crossings(self) -> int:
         """Returns the number of crossings now, see :class:`..crossings.CrossingCounter`."""
-        return self._counter.count(self._states[0])
+        return self._counter.count(self.states[0])
 
     def _take_pair(self) -> float:
         """Takes two steps, and returns their time [ms]."""
@@ -253,27 +255,27 @@ class Simulation:
 
     def _step_twice(self):
         """Takes two steps, and copies the state at the end of each: some solvers overwrite that at their start."""
-        first, second = self._states
+        first, second = self.states
         for start, end, copy in zip((first, second), (second, first), self._ends, strict=True):
             self._mover.move(start, end)
             start.clear_forces()
             if self._pipeline and self._contacts:
                 self._pipeline.collide(start, self._contacts)
-            self._solver.step(start, end, self._control, self._contacts, 1.0 / self._rate)
+            self.solver.step(start, end, self._control, self._contacts, 1.0 / self._rate)
             for name in ("particle_q", "particle_qd", "body_q", "body_qd"):
                 if getattr(end, name) is not None:
                     wp.copy(getattr(copy, name), getattr(end, name))
 
     def _reset(self, worlds: Sequence[int]):
         """Puts the particles of worlds where the model has them, as a trainer does."""
-        model, state = self._model, self._states[0]
+        model, state = self._model, self.states[0]
         mask = np.zeros(model.world_count + 1, dtype=bool)
         mask[list(worlds)] = True
         is_reset = mask[host_array(model.particle_world)][:, None]
         for name in ("particle_q", "particle_qd"):
             array = getattr(state, name)
             array.assign(np.where(is_reset, host_array(getattr(model, name)), array.numpy()))
-        self._solver.reset(state, world_mask=wp.array(mask, dtype=bool))
+        self.solver.reset(state, world_mask=wp.array(mask, dtype=bool))
 
 
 class Samples:

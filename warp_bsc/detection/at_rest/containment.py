@@ -14,7 +14,7 @@ from ..mesh import CollisionMesh
 from .body_parts import BodyParts, pair_keys
 from .intersections import Intersections, points_on_faces
 
-__all__ = ["Containment", "ContainmentFinder"]
+__all__ = ["Containment", "ContainmentFinder", "enclosing_boxes"]
 
 _CHUNK = 1 << 20  # pairs in memory at a time
 
@@ -90,7 +90,7 @@ class ContainmentFinder:
         parts = self._parts
         low, high = parts.boxes(x)
         (outer,) = np.nonzero(parts.closed)
-        pairs = _enclosing(low, high, low[outer], high[outer], 3)
+        pairs = enclosing_boxes(low, high, low[outer], high[outer], 3)
         pairs[:, 1] = outer[pairs[:, 1]]
         pairs = pairs[parts.body[pairs[:, 0]] != parts.body[pairs[:, 1]]]
         pairs = pairs[is_sought(parts.body[pairs])]
@@ -127,7 +127,7 @@ class ContainmentFinder:
         parts = self._parts
         low, high = parts.boxes(x)
         (closed,) = np.nonzero(parts.closed)
-        pairs = _enclosing(points, points, low[closed], high[closed], 3)
+        pairs = enclosing_boxes(points, points, low[closed], high[closed], 3)
         pairs[:, 1] = closed[pairs[:, 1]]
         of_body = np.stack([pairs[:, 0], parts.body[pairs[:, 1]]], axis=1)
         kept = is_sought(of_body)
@@ -212,7 +212,7 @@ class ContainmentFinder:
             query, in two arrays.
             """
             turned = [1, 2, 0]
-            found = _enclosing(points[:, turned], points[:, turned], box_low[:, turned], high[:, turned], axes)
+            found = enclosing_boxes(points[:, turned], points[:, turned], box_low[:, turned], high[:, turned], axes)
             keys = found[:, 0] * len(parts.body) + parts.of_face[faces[found[:, 1]]]
             bounds = np.searchsorted(keys_compared, keys), np.searchsorted(keys_compared, keys, side="right")
             pairs, at = expand_ranges(*bounds)
@@ -276,7 +276,7 @@ class ContainmentFinder:
         return np.flatnonzero((part >= 0) & is_compared[part] & (a & b & c == 0))
 
 
-def _enclosing(
+def enclosing_boxes(
     low: np.ndarray, high: np.ndarray, outer_low: np.ndarray, outer_high: np.ndarray, axes: int
 ) -> np.ndarray:
     """Returns the pairs of an inner box and an outer one that contains it, borders included.

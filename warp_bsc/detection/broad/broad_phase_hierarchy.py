@@ -44,6 +44,7 @@ class BroadPhaseHierarchy:
 
     Attributes:
         hierarchy: The hierarchy on the device; a run fits its boxes.
+        face_pairs: The queue of the pairs of faces that a run finds, by place, array of vec2i.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class BroadPhaseHierarchy:
             warps = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
             self._warps_of_cluster = max(1, min(_MAX_WARPS_OF_CLUSTER, warps))
         capacity = 8 * len(mesh.cells) if capacity is None else capacity
-        self._face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
+        self.face_pairs = wp.empty(capacity, dtype=wp.vec2i, device=device)
 
     @property
     def is_padded(self) -> bool:
@@ -92,17 +93,17 @@ class BroadPhaseHierarchy:
     @property
     def buffers(self) -> list[wp.array]:
         """The queue for pairs of faces."""
-        return [self._face_pairs]
+        return [self.face_pairs]
 
     @property
     def capacity(self) -> int:
         """Capacity for pairs of faces."""
-        return len(self._face_pairs)
+        return len(self.face_pairs)
 
     def grow(self, count: int) -> None:
         """Enlarges the queue if it is too small for the count."""
         if count > self.capacity:
-            self._face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
+            self.face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
 
     def count_filtered_by_world(self, counts: wp.array) -> None:
         """Makes runs count the pairs that groups and masks leave out by world as well."""
@@ -112,7 +113,7 @@ class BroadPhaseHierarchy:
         self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
         """Enqueues the candidates."""
-        self._pair_faces(x0, x1, changed, keep_separated)
+        self.pair_faces(x0, x1, changed, keep_separated)
         self._launch_over_pairs(pair_elements_kernel, *out)
 
     def pair_points(
@@ -123,7 +124,7 @@ class BroadPhaseHierarchy:
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
         """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
-        self._pair_faces(x, x)
+        self.pair_faces(x, x)
         self._launch_over_pairs(pair_edges_with_faces_kernel, counts, pairs)
 
     def fit(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, *, keep_separated: bool = False) -> None:
@@ -150,14 +151,14 @@ class BroadPhaseHierarchy:
         inputs = [self.hierarchy, self._warps_of_cluster, arguments]
         launch(kernel, threads, inputs=inputs, device=self._device, block_dim=_TRAVERSAL_BLOCK, record_tape=False)
 
-    def _pair_faces(self, x0, x1, changed=None, keep_separated=False):
+    def pair_faces(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, keep_separated=False) -> None:
         """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once."""
         self.fit(x0, x1, changed, keep_separated=keep_separated)
         queue = _FacePairs()
-        queue.pairs, queue.count = self._face_pairs, self._count
+        queue.pairs, queue.count = self.face_pairs, self._count
         self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
 
     def _launch_over_pairs(self, make_kernel, *arguments):
         threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
-        inputs = [self.hierarchy, self._face_pairs, self._count, *arguments, threads]
+        inputs = [self.hierarchy, self.face_pairs, self._count, *arguments, threads]
         launch(make_kernel(self.is_padded, self._swept), threads, inputs=inputs, device=self._device, record_tape=False)

@@ -46,13 +46,15 @@ class NarrowPhase:
         self._bits = [max(1, int(count - 1).bit_length()) for count in elements]
         self.counts = counts
         self.queue = wp.empty(capacity, dtype=wp.vec2i, device=counts.device)
-        self._allocate_survivors(capacity // 2 + 64)
-        self._allocate_contacts(capacity // 8 + 64)
+        self.allocate_survivors(capacity // 2 + 64)
+        self.allocate_contacts(capacity // 8 + 64)
 
-    def _allocate_survivors(self, capacity: int) -> None:
+    def allocate_survivors(self, capacity: int) -> None:
+        """Replaces the queue of pairs that no cull decides."""
         self._survivors = wp.empty(capacity, dtype=wp.vec2i, device=self.counts.device)
 
-    def _allocate_contacts(self, capacity: int) -> None:
+    def allocate_contacts(self, capacity: int) -> None:
+        """Replaces the contacts, and the buffers of their order and of the exact stage."""
         device = self.counts.device
         self.contacts = make_contact_buffer(capacity, device)
         self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
@@ -61,8 +63,8 @@ class NarrowPhase:
 
     def fit_all(self) -> None:
         """Enlarges the buffers so that no run overflows them: all queued pairs may survive and be contacts."""
-        self._allocate_survivors(len(self.queue))
-        self._allocate_contacts(len(self.queue))
+        self.allocate_survivors(len(self.queue))
+        self.allocate_contacts(len(self.queue))
 
     @property
     def buffers(self) -> list:
@@ -95,9 +97,9 @@ class NarrowPhase:
             capacity = capacity_for(counts.queued, f"{label} queued")
             self.queue = wp.empty(capacity, dtype=wp.vec2i, device=self.counts.device)
         if counts.survivors > len(self._survivors):
-            self._allocate_survivors(capacity_for(counts.survivors, f"{label} survivors"))
+            self.allocate_survivors(capacity_for(counts.survivors, f"{label} survivors"))
         if counts.contacts > len(self.contacts.pairs):
-            self._allocate_contacts(capacity_for(counts.contacts, f"{label} contacts"))
+            self.allocate_contacts(capacity_for(counts.contacts, f"{label} contacts"))
         return overflowed
 
     def stages(self, elements: wp.array) -> PairStages:

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..._private_names.of_warp import on_compilation
 
-__all__ = ["duration", "reported_to"]
+__all__ = ["duration", "report_compilation", "reported_to", "say_compiling"]
 
 _listeners: list[Callable[[], None]] = []
 
@@ -29,7 +29,8 @@ def duration(is_cpu: bool) -> str:
 
 
 @functools.cache
-def _say(is_cpu: bool) -> None:
+def say_compiling(is_cpu: bool) -> None:
+    """Prints, once for each kind of device, that kernels are compiled, how long it takes, and where they are kept."""
     device = "the CPU" if is_cpu else "the GPU"
     print(
         f"warp-bsc: compiling kernels for {device}, once for each version: {duration(is_cpu)}. "
@@ -37,12 +38,12 @@ def _say(is_cpu: bool) -> None:
     )
 
 
-def _report(is_cpu: bool) -> None:
+def report_compilation(is_cpu: bool) -> None:
     """Prints one line in each process, where Warp prints one for each module that it loads, and tells listeners."""
     if wp.config.log_level <= wp.LOG_INFO:
-        _say(is_cpu)
+        say_compiling(is_cpu)
     for listener in _listeners:
         listener()
 
 
-on_compilation(_report)
+on_compilation(report_compilation)

@@ -20,7 +20,7 @@ import warp as wp
 from ..._private_names.of_warp import cpu_graph
 from .launch import launch
 
-__all__ = ["run_on_host"]
+__all__ = ["functions_of_graphs", "run_on_host"]
 
 
 @dataclass(eq=False)
@@ -36,7 +36,7 @@ class _Failure:
     raise_error: object = None
 
 
-_functions: dict[int, tuple[Callable[[], object], _Failure]] = {}
+functions_of_graphs: dict[int, tuple[Callable[[], object], _Failure]] = {}
 """By number, each function in a graph that exists, with the failure of its graph."""
 
 _numbers = itertools.count()
@@ -51,7 +51,7 @@ def _call(number: int) -> int | None:
     ctypes would print an error that is raised here, and go on. The C function, which the kernel calls, sets an
     exception that Python raises once the launch of the graph has returned to it.
     """
-    function, failure = _functions[number]
+    function, failure = functions_of_graphs[number]
     try:
         function()
     except BaseException as error:  # Ctrl-C as well
@@ -119,7 +119,7 @@ def run_on_host(function: Callable[[], object], device: wp.Device) -> None:
         _failures[graph].flag.zero_()  # at the start of each replay
     failure = _failures[graph]
     number = next(_numbers)
-    _functions[number] = function, failure
-    weakref.finalize(graph, _functions.pop, number)
+    functions_of_graphs[number] = function, failure
+    weakref.finalize(graph, functions_of_graphs.pop, number)
     call = ctypes.cast(_call, ctypes.c_void_p).value
     launch(_call_kernel, 1, inputs=[call, number, failure.flag], device=device, record_tape=False)

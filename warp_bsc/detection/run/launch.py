@@ -30,6 +30,7 @@ __all__ = [
     "made_once",
     "max_blocks",
     "retry_until_fits",
+    "thread_pool",
 ]
 
 _THREADS = os.cpu_count() or 1
@@ -138,7 +139,7 @@ def cores(count: int) -> Iterator[None]:
 
 
 @functools.cache
-def _pool(threads: int) -> ThreadPoolExecutor:
+def thread_pool(threads: int) -> ThreadPoolExecutor:
     """Returns threads for the CPU: Warp runs a kernel on one, and other threads run at the same time."""
     return ThreadPoolExecutor(threads)
 
@@ -221,7 +222,7 @@ def _run(commands: list[wp.Launch], threads: int) -> None:
         for command in waiting:
             command.launch()
 
-    others = [_pool(threads).submit(work) for _ in range(min(threads, len(commands)) - 1)]
+    others = [thread_pool(threads).submit(work) for _ in range(min(threads, len(commands)) - 1)]
     try:
         work()
     finally:

@@ -108,21 +108,25 @@ def list_pair(
     left = ROUNDED_DOWN * now - way
     if is_shorter or before != FAR_TOGETHER or left < within:  # positions are read where displacements do not tell
         a, b, c = seen_from_last(trial.x, corners)
-        rounding = rounding_of(a, b, c) + rounding_of(p, q, r)
         if before >= FAR:
             now = distance_bound(candidates, i, kind, a, b, c)
         left = 0.0
-        if now >= within and not is_shorter:
+        if now >= within and is_shorter:  # its vertices may take different parts
+            s = trial.displaced[corners[3]] + wp.vec3()
+            rounding = rounding_of(a, b, c) + rounding_of(p + s, q + s, r + s) + rounding_of(s, s, s)
+            if distance_of_ways(kind, a, b, c, p + s, q + s, r + s, s) - rounding >= within:
+                return False
+        elif now >= within:
             # what moves together is as far from each other along a vector as at the start or the end, or farther
+            rounding = rounding_of(a, b, c) + rounding_of(p, q, r)
             n = direction_of_bits(candidates.normal[i])
             at_start = distance_along(kind, n, a, b, c)
             at_end = distance_along(kind, n, a + p, b + q, c + r)
-            left = wp.max(ROUNDED_DOWN * now - way, wp.min(at_start, at_end) - rounding)
+            left = wp.max(wp.min(at_start, at_end), distance_of_ways(kind, a, b, c, p, q, r, wp.vec3())) - rounding
+            left = wp.max(ROUNDED_DOWN * now - way, left)
     if left >= within:
         candidates.share[i] = FAR_TOGETHER
         candidates.now[i] = ROUNDED_DOWN * left - bend
-        return False
-    if now >= within and distance_of_ways(kind, a, b, c, p, q, r) - rounding >= within:
         return False
     candidates.now[i] = now
     candidates.share[i] = 1.0
@@ -160,7 +164,7 @@ def bound_by_pair(
     # the closest points are found for what comes near
     if way <= ROUNDED_DOWN * (gap - barrier.least_gap(gap, reach, floor)):
         return
-    apart = distance_of_ways(kind, a, b, c, p - s, q - s, r - s) - rounding_of(a, b, c) - rounding
+    apart = distance_of_ways(kind, a, b, c, p - s, q - s, r - s, wp.vec3()) - rounding_of(a, b, c) - rounding
     if apart >= ROUNDED_UP * (float(kept) + bends[0] + barrier.MOST_LEFT * reach):
         return
     e, f, g, h = corners_of(trial.x, corners)

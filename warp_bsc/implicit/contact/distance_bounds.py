@@ -71,14 +71,16 @@ def distance_of_ways(
     p: wp.vec3,
     q: wp.vec3,
     r: wp.vec3,
+    s: wp.vec3,
 ) -> float:
     """Returns the distance of the boxes around the ways of two elements, at most that of the elements on them.
 
-    But for its rounding, and ways are seen from the fourth point as well.
+    But for its rounding. Where the points take the same part of their ways, these may be seen from the fourth one as
+    well, whose own is 0 then; otherwise they may take any parts.
     """
     low, high = wp.min(b, b + q), wp.max(b, b + q)
     first, last = wp.min(a, a + p), wp.max(a, a + p)
-    lower, upper = wp.min(wp.min(c, c + r), wp.vec3()), wp.max(wp.max(c, c + r), wp.vec3())
+    lower, upper = wp.min(wp.min(c, c + r), wp.min(wp.vec3(), s)), wp.max(wp.max(c, c + r), wp.max(wp.vec3(), s))
     if kind == EDGE_EDGE:
         first, last = wp.min(first, low), wp.max(last, high)
     else:

@@ -83,16 +83,15 @@ class NewtonMethod:
 
     Attributes:
         mesh: The triangles that collide.
-        count, unknowns: Number of unknowns, and what they are.
-        candidates: Pairs that may come near each other in the step.
-        contacts: Contacts of the last Newton step, or at the end.
-        settings, trial, progress: What barriers depend on, where vertices are, and how far each world is.
-        origin: Where vertices started the step, those that touched a shape a little beside it.
         keeps_contacts: Whether a solve ends with the contacts at its end, to publish or to record them.
+        may_grow: Whether buffers of contacts grow between Newton steps, outside graphs.
+        problem: What Newton steps read and write.
+        settings: What barriers and friction depend on.
+        origin: Where vertices started the step, those that touched a shape a little beside it.
     """
 
     keeps_contacts = False
-    _may_grow = True
+    may_grow = True
 
     def __init__(self, work: Workspace, *, max_steps: int, results: StepResults, unconverged_steps: wp.array[wp.int64]):
         """Allocates buffers.
@@ -117,7 +116,7 @@ class NewtonMethod:
         def array(values):
             return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
 
-        unknowns = self.unknowns = Unknowns()
+        unknowns = self._unknowns = Unknowns()
         solved, body_of_vertex = self._bodies_in_solve(), mesh.shape_vertices.body
         body_world = np.zeros(0, dtype=int)
         if len(solved):
@@ -128,7 +127,7 @@ class NewtonMethod:
         number = np.argsort(order, kind="stable")
         unknown, of_bodies = number[:particles], np.full(model.body_count + 1, -1)
         of_bodies[solved] = number[particles::2]
-        self.count = len(order)
+        self._count = len(order)
         first = of_bodies[body_of_vertex]  # that of -1 is the last
         unknowns.of_vertex = array(np.append(unknown, np.where(first < 0, -1, -2 - first)))
         self._all_sought = array(np.append(np.ones(particles), np.where(first < 0, 0, 2 + body_of_vertex)))
@@ -137,8 +136,8 @@ class NewtonMethod:
         unknowns.body = array(np.append(np.full(particles, -1), np.repeat(solved, 2))[order])
         unknowns.of_worlds = array(of_worlds)
         unknowns.first_of_bodies = array(of_worlds[:-1] + np.bincount(world, minlength=work.worlds))
-        unknowns.is_free = wp.zeros(self.count, dtype=int, device=device)
-        unknowns.inertia = wp.zeros(self.count, dtype=wp.float64, device=device)
+        unknowns.is_free = wp.zeros(self._count, dtype=int, device=device)
+        unknowns.inertia = wp.zeros(self._count, dtype=wp.float64, device=device)
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
         largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
         self._team, self._threads, self._solve_worlds = make_team(largest, work.worlds, device)
@@ -151,13 +150,13 @@ class NewtonMethod:
             self._bodies.unknown, self._bodies.first_vertex = array(of_bodies[:-1]), array(first_vertex)
             held = np.flatnonzero(first >= 0)
             holder[particles + held] = first_vertex[body_of_vertex[held]]
-        self._rows = make_rows(of_elements, unknown, self.count, device)
-        row_of_block = array(np.repeat(np.arange(self.count), np.diff(self._rows.first.numpy())))
+        self._rows = make_rows(of_elements, unknown, self._count, device)
+        row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
         self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
-        self._vectors = allocate(Vectors, self.count, device)
+        self._vectors = allocate(Vectors, self._count, device)
         self.progress = allocate(Progress, work.worlds, device)
-        self.trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles))
-        self.trial.holder = array(holder)
+        self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles))
+        self._trial.holder = array(holder)
         self.origin, self._goal, self._lower, self._upper = (
             wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
         )
@@ -212,15 +211,15 @@ class NewtonMethod:
         self._is_many = device.is_cuda and vertices > _MANY_VERTICES * processors
         self._block, blocks = BLOCKS[self._is_many]
         self._blocks = blocks * processors
-        p = self._problem = Problem()
+        p = self.problem = Problem()
         p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
         p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
         p.vectors, p.unknowns, p.bodies = self._vectors, unknowns, self._bodies
-        p.trial, p.progress, p.flow = self.trial, self.progress, self._flow
+        p.trial, p.progress, p.flow = self._trial, self.progress, self._flow
         p.goal, p.lower, p.upper, p.limit = self._goal, self._lower, self._upper, limit
         p.plane_share, p.whole, p.lacks = self._plane_share, whole, self._lacks
         p.leaves, p.any_leaves = self._leaves, self._any_leaves
-        p.first = wp.zeros(self.count, dtype=wp.vec3, device=device)
+        p.first = wp.zeros(self._count, dtype=wp.vec3, device=device)
         p.worlds = self._in_worlds(of_elements, unknowns)
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1
@@ -229,9 +228,9 @@ class NewtonMethod:
         self._captured, self._retired = False, []
         rooms = np.append(0, np.cumsum(np.where(order < particles, 1, _MORE_OF_BODIES)))
         self._rooms = rooms[of_worlds]  # of contacts, summed up by world
-        self.candidates, self.contacts = Candidates(), Contacts()
+        self._candidates, self._contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
-        self._allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
+        self.allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
 
     def _in_worlds(self, of_elements, unknowns) -> Worlds:
         """Returns what is in each world."""
@@ -309,13 +308,13 @@ class NewtonMethod:
     def _go_back(self, end, detect, begins):
         work = self._work
         self._goes_back.zero_()
-        inputs = [self.progress, self.unknowns, work.status.contact_iteration, begins]
+        inputs = [self.progress, self._unknowns, work.status.contact_iteration, begins]
         outputs = [self._place, self._results[0].converged, self.progress.solving, self._goes_back]
         self._launch(decisions.go_back, work.worlds, inputs, outputs)
         wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
 
     def _move_back(self, end, detect):
-        inputs = [self.trial, self.unknowns, self._dt, self.progress.solving, self._place]
+        inputs = [self._trial, self._unknowns, self._dt, self.progress.solving, self._place]
         self._launch(steps.retreat, self.mesh.vertex_count, inputs, [self._work.step.motion, end])
         detect()
 
@@ -346,12 +345,12 @@ class NewtonMethod:
         self.settings.dt = dt
         self.settings.recovery = self._metre * _RECOVERY_SPEED * dt
         self.settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
-        p = self._problem
+        p = self.problem
         p.least_change, p.far_change = self._least_speed * self._dt, self._metre * _FAR_SPEED * self._dt
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
-        self._launch(steps.begin_unknowns, self.count, [motion, wp.float64(dt)], [self.unknowns, self._goal])
+        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
         if self._attachments is not None:
-            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self.unknowns, self._goal]
+            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
             outputs = [work.vertices, end.particle_q, end.particle_qd]
             self._launch(attach, self.mesh.model.particle_count, inputs, outputs)
             wp.copy(self._poses, end.body_q)
@@ -359,9 +358,9 @@ class NewtonMethod:
         self.progress.given_moves.zero_()
         self._flow.arrived.zero_()
         wp.copy(self._sought, self._all_sought)
-        self._launch_over_bodies(bodies.begin_bodies, [motion, self.unknowns, self.progress.active])
-        inputs = [motion, self._margin, self.mesh.model.gravity, self._dt, self.unknowns, self._bodies]
-        outputs = [self._goal, self._lower, self._upper, self.trial, self.progress, self._plane_share]
+        self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
+        inputs = [motion, self._margin, self.mesh.model.gravity, self._dt, self._unknowns, self._bodies]
+        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
         self._lacks.zero_()
         self._launch(steps.begin_step, max(self.mesh.vertex_count, work.worlds), inputs, outputs)
         self.iterations.zero_()
@@ -372,7 +371,7 @@ class NewtonMethod:
 
     def _find_end(self, end):
         work, motion, vertices = self._work, self._work.step.motion, self.mesh.vertex_count
-        self._find_candidates()
+        self.find_candidates()
         wp.capture_if(self._touching.any, self._part_touching)
         self._flow.phase.fill_(int(Phase.BEGIN))
         self._flow.goes_on.fill_(1)
@@ -380,23 +379,24 @@ class NewtonMethod:
         if self.keeps_contacts:
             retry_until_fits(self._find_contacts_at_end, self, work.device)
         if len(self._bodies.unknown):
-            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self.unknowns, self._dt], [motion, end])
+            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
-        inputs = [self.trial, self.unknowns, self._dt]
+        inputs = [self._trial, self._unknowns, self._dt]
         self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end, self.progress])
         inputs = [self.progress, self._dt, self._least_speed, self._lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
-    def _renew_candidates(self):
-        inputs = [self._work.step.motion, self.unknowns, self._margin, self.trial, self._leaves]
+    def renew_candidates(self):
+        """Makes boxes anew in worlds in which a vertex leaves its own, and finds the candidates within them."""
+        inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
         inputs += [self.progress.active, int(self.keeps_contacts)]
         self._launch(steps.renew_boxes, self.mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
         self._leaves.zero_()
         self._any_leaves.zero_()
-        self._find_candidates()
+        self.find_candidates()
 
     @phase("find candidates")
-    def _find_candidates(self):
+    def find_candidates(self):
         """Finds the pairs that may come near each other within the boxes."""
         work, detector = self._work, self._work.detector
 
@@ -414,7 +414,7 @@ class NewtonMethod:
 
     def _place_candidates(self):
         """Gives each world its part of the candidates."""
-        work, candidates = self._work, self.candidates
+        work, candidates = self._work, self._candidates
         if work.worlds == 1:
             return
         candidates.room.zero_()
@@ -425,47 +425,47 @@ class NewtonMethod:
         self._launch(pairs.place_candidates, work.worlds, [candidates], [])
 
     def _prepare_candidates(self):
-        self.candidates.near.zero_()
-        self.candidates.far.zero_()
-        self.candidates.listed_edges.fill_(-1)
-        self.candidates.listed_others.zero_()
+        self._candidates.near.zero_()
+        self._candidates.far.zero_()
+        self._candidates.listed_edges.fill_(-1)
+        self._candidates.listed_others.zero_()
         inputs = [self._work.step, self.settings, self.origin, self._work.status.crossings, self.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
-            outputs = [self.candidates, self._touching]
+            outputs = [self._candidates, self._touching]
             self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, *outputs])
 
     def _part_touching(self):
         inputs = [self._work.step, self.settings, self._touching]
-        self._launch(pairs.part_touching, self.mesh.model.particle_count, inputs, [self.trial, self.origin])
+        self._launch(pairs.part_touching, self.mesh.model.particle_count, inputs, [self._trial, self.origin])
         self._prepare_candidates()
 
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
-        self._retire(self.candidates)
+        self._retire(self._candidates)
         sizes: dict = dict.fromkeys(
             ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
         )
         sizes["used"] = 1
         sizes["kept"] = capacity if self.mesh.distances is not None else 0
-        self.candidates = self._problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
-        self.candidates.room.fill_(capacity)
+        self._candidates = self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
+        self._candidates.room.fill_(capacity)
 
-    def _allocate_contacts(self, of_room):
+    def allocate_contacts(self, of_room):
         """Allocates contacts, so many for each particle of a world, and more for each body."""
-        self._retire(self.contacts)
+        self._retire(self._contacts)
         start, device = of_room * self._rooms, self._work.device
         capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
-        sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self.count)
-        parts = 1 if self._is_many else self._problem.parts
+        sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self._count)
+        parts = 1 if self._is_many else self.problem.parts
         sizes["bucket"] = parts * self.mesh.vertex_count
         sizes |= dict.fromkeys(_OF_ENTRIES, of_each * capacity)
         sizes |= dict.fromkeys(("count", "listed", "coupled_first", "coupled_end"), self._work.worlds)
         contacts = allocate(Contacts, capacity, device, **sizes)
         contacts.parts, contacts.entries_of_each = parts, of_each
         contacts.start = wp.array(start.astype(np.int32), dtype=int, device=device)
-        contacts.first_bucket = self._problem.worlds.first_vertex
-        self.contacts = self._problem.contacts = contacts
+        contacts.first_bucket = self.problem.worlds.first_vertex
+        self._contacts = self.problem.contacts = contacts
 
     def _retire(self, buffers):
         if self._captured:
@@ -473,18 +473,18 @@ class NewtonMethod:
 
     def grow(self) -> bool:
         """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
-        if not self._problem.grows:
+        if not self.problem.grows:
             return False
-        found, rooms = self.contacts.count.numpy(), np.diff(self._rooms)
-        if (found <= np.diff(self.contacts.start.numpy())).all():
+        found, rooms = self._contacts.count.numpy(), np.diff(self._rooms)
+        if (found <= np.diff(self._contacts.start.numpy())).all():
             return False
         needed = int(np.max(-(-found[rooms > 0] // rooms[rooms > 0])))
         capacity = capacity_for(needed * int(self._rooms[-1]), "contacts")
-        self._allocate_contacts(capacity // int(self._rooms[-1]))
+        self.allocate_contacts(capacity // int(self._rooms[-1]))
         return True
 
     def _take_newton_steps(self):
-        wp.capture_if(self._any_leaves, self._renew_candidates)
+        wp.capture_if(self._any_leaves, self.renew_candidates)
         self._flow.goes_on.zero_()
         self._advance(resumes=True, of_all=True)
         wp.capture_while(self._flow.solves_next, self._solve)
@@ -500,30 +500,21 @@ class NewtonMethod:
         work, team = self._work, self._team
         if team.blocks > 1:
             team.arrived.zero_()
-        inputs = [
-            self._matrix,
-            self.contacts,
-            self.unknowns,
-            self.progress.solving,
-            self._tolerance,
-            _MAX_ITERATIONS,
-            self._flow.solves,
-            team,
-        ]
+        inputs = [self._matrix, self._contacts, self._unknowns, self.progress.solving]
+        inputs += [self._tolerance, _MAX_ITERATIONS, self._flow.solves, team]
         outputs = [self._vectors, self.iterations, self._flow.solves_next]
         options = {"device": work.device, "block_dim": self._threads}
-        wp.launch(
-            self._solve_worlds, work.worlds * team.blocks * self._threads, inputs=inputs, outputs=outputs, **options
-        )
+        threads = work.worlds * team.blocks * self._threads
+        wp.launch(self._solve_worlds, threads, inputs=inputs, outputs=outputs, **options)
         self._advance()
 
     @phase("Newton step")
     def _advance(self, resumes=False, of_all=False):
         work = self._work
-        self._problem.grows = int(self._may_grow and not work.device.is_capturing)
+        self.problem.grows = int(self.may_grow and not work.device.is_capturing)
         inputs = [work.step.motion, work.motion.planes, self.settings, int(resumes)]
         threads = self._block if work.device.is_cuda else 1
-        inputs += [int(of_all or work.worlds == 1), self._problem, threads, self._blocks]
+        inputs += [int(of_all or work.worlds == 1), self.problem, threads, self._blocks]
         options = {"device": work.device, "block_dim": self._block}
         wp.launch(ADVANCE[self._is_many], self._blocks * threads, inputs=inputs, **options)
 
@@ -531,7 +522,7 @@ class NewtonMethod:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
         work = self._work
         threads = max(1, _PUBLISHING // work.worlds) if work.device.is_cuda else 1
-        inputs = [self.contacts, self.settings, self.trial, self._goal]
+        inputs = [self._contacts, self.settings, self._trial, self._goal]
         inputs += [work.step, sides, centres, threads]
         self._launch(publish_contacts, (threads, work.worlds), inputs, [sums, rows])
 

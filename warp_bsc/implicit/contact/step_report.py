@@ -61,8 +61,8 @@ class ImplicitStepReport(SolverReport):
 
     ``hits`` are contacts that the solve left, and that the response behind it resolved; ``strain`` is that of a step
     from its start to its end. Impulses of barriers and friction are those at the end of the solve: with those of the
-    response they are the change of momentum, as far as the step :attr:`converged`. With ``report_worlds``, ``worlds``
-    has :attr:`newton_steps`, :attr:`last_change`, :attr:`converged` and :attr:`arrived` by world as well.
+    response they are the change of momentum, as far as the step :attr:`converged`. With ``report=["worlds"]`` also
+    ``worlds`` has :attr:`newton_steps`, :attr:`last_change`, :attr:`converged` and :attr:`arrived`.
     """
 
     strain_cause = ""

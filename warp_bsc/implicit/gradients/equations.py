@@ -69,8 +69,8 @@ class StepEquations:
     def __init__(self, newton: NewtonMethod):
         """Allocates buffers for steps of a solver, whose unknowns they have."""
         self._newton, model = newton, newton.mesh.model
-        self.model, self.device, self.count = model, model.device, newton.count
-        self._unknowns = unknowns = newton.unknowns
+        self.model, self.device, self.count = model, model.device, len(newton.problem.unknowns.particle)
+        self._unknowns = unknowns = newton.problem.unknowns
         self.forces = wp.zeros(self.count, dtype=wp.vec3d, device=self.device)
         self._inertia = wp.zeros(self.count, dtype=wp.float64, device=self.device)
         unknown = unknowns.of_vertex.numpy()[: model.particle_count]

@@ -9,7 +9,6 @@ from ..contact.system import Contacts, Unknowns, end_of_contacts, kind_of_key, s
 wp.set_module_options({"enable_backward": False})
 
 
-
 @wp.kernel
 def to_double(
     # in

@@ -31,7 +31,7 @@ _THREADS = 256
 
 @dataclass(eq=False)
 class StateGradients:
-    """Gradients with respect to the arrays of states at the start and at the end of a step; None where there is none."""
+    """Gradients with respect to the arrays of the states at both ends of a step; None where there are none."""
 
     particle_q: wp.array | None
     particle_qd: wp.array | None
@@ -82,7 +82,7 @@ class StepGradients:
         self._model = model = work.mesh.model
         self.equations = equations = StepEquations(newton)
         self._linear = LinearSolver(
-            newton.unknowns.of_worlds, equations.world, tolerance=_TOLERANCE, max_iterations=_MAX_ITERATIONS
+            newton.problem.unknowns.of_worlds, equations.world, tolerance=_TOLERANCE, max_iterations=_MAX_ITERATIONS
         )
         vertices, particles, device = work.mesh.vertex_count, model.particle_count, work.device
 
@@ -117,7 +117,7 @@ class StepGradients:
         self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
         self._launch(kernels.to_double, particles, [v0], [velocity])
         is_fixed = wp.zeros(self.equations.count, dtype=int, device=device)
-        self._launch(kernels.find_fixed, len(is_fixed), [newton.unknowns.is_free], [is_fixed])
+        self._launch(kernels.find_fixed, len(is_fixed), [newton.problem.unknowns.is_free], [is_fixed])
         is_held = wp.zeros(particles, dtype=int, device=device)
         if self.equations.attachments is not None:
             at = self.equations.attachments
@@ -125,7 +125,7 @@ class StepGradients:
             self._launch(kernels.find_held, len(at.particle), inputs, [is_held])
         failed = wp.zeros(work.worlds, dtype=int, device=device)
         self._launch(kernels.begin_failed, work.worlds, [self._converged], [failed])
-        inputs = [newton.trial, newton.unknowns, end.particle_q, work.mesh.device_world]
+        inputs = [newton.problem.trial, newton.problem.unknowns, end.particle_q, work.mesh.device_world]
         self._launch(kernels.find_changed, particles, inputs, [failed])
         of_particles = wp.zeros(particles, dtype=int, device=device)
         inputs = [work.mesh.device_world, self._interrupted]
@@ -142,7 +142,7 @@ class StepGradients:
         step = SolvedStep(
             dt,
             x0,
-            wp.clone(newton.trial.exact),
+            wp.clone(newton.problem.trial.exact),
             velocity,
             force,
             is_fixed,
@@ -163,16 +163,16 @@ class StepGradients:
     def _record_contacts(self):
         """Returns vertices, unknowns, and all else of the contacts at the end of a step."""
         work, newton, device = self._work, self.newton, self._work.device
-        capacity = len(newton.contacts.corners)
+        capacity = len(newton.problem.contacts.corners)
         vertices, rows = (wp.full((capacity, 4), -1, dtype=int, device=device) for _ in range(2))
         kind, plane = wp.full(capacity, -1, dtype=int, device=device), wp.zeros(capacity, dtype=int, device=device)
         count, threads = wp.zeros(1, dtype=int, device=device), _THREADS if device.is_cuda else 1
-        inputs = [newton.contacts, newton.unknowns, threads, count]
+        inputs = [newton.problem.contacts, newton.problem.unknowns, threads, count]
         self._launch(kernels.record_contacts, (threads, work.worlds), inputs, [vertices, rows, kind, plane])
         n = capacity if device.is_capturing or device.is_cuda else int(count.numpy()[0])
         contacts = RecordedContacts()
         contacts.kind, contacts.plane = _first(kind, n), _first(plane, n)
-        contacts.fall = wp.clone(newton.progress.fall)
+        contacts.fall = wp.clone(newton.problem.progress.fall)
         return _first(vertices, n), _first(rows, n), contacts
 
     def backward(self, recorded: RecordedStep, before: RecordedStep | None, of: StateGradients) -> None:

@@ -15,8 +15,9 @@ from ...detection.at_rest.intersections import find_intersections
 from ..contacts.detect import inspect
 from ..report.totals import StepTotals
 from ..state.certificate import certify, is_certified, revoke
+from ..state.last_step import interrupt_worlds
 from ..state.mesh import ModelMesh
-from ..state.motion import ModelMotion, StateArrays, arrays_of, interrupt_worlds
+from ..state.motion import ModelMotion, StateArrays, arrays_of
 from ..state.status import Loop, Result, SolveStatus
 from ..state.structs import add_zeros
 from ..state.workspace import Workspace
@@ -168,7 +169,7 @@ class CoupledCheck:
         self._step, self._others = step, others = _Step(), _Others()
         add_zeros(step, ("awaits", "certified"), 1, device)
         add_zeros(step, ["certified_worlds"], 0 if worlds is None else len(worlds), device)
-        add_zeros(step, ["lost"], len(motion.vertices.interrupted), device)
+        add_zeros(step, ["lost"], len(motion.last.interrupted), device)
         others.particle_flags, others.particle_world = model.particle_flags, self.mesh.device_world
         self.bodies = bodies_of_other_entries(model)
         others.bodies = wp.array(np.isin(np.arange(model.body_count), self.bodies), dtype=int, device=device)
@@ -176,8 +177,7 @@ class CoupledCheck:
         self._start, self._end = model.state(), model.state()
         motion.set_start(arrays_of(self._start))
         self._inspect()
-        if work.motion.last is not None:
-            motion.remember(self._work.vertices.x1)
+        motion.last.begin()
         step.lost.fill_(1)
 
     @property
@@ -186,7 +186,7 @@ class CoupledCheck:
         return int(self._work.results[Result.CROSSINGS].numpy()[0])
 
     def lose(self, world_mask: wp.array[wp.bool] | None = None) -> None:
-        """Gives up the end of the step in worlds that are reset, with a mask as of :meth:`.ModelMotion.interrupt`."""
+        """Gives up the end of the step in worlds that are reset, with a mask as of :meth:`.LastStep.interrupt`."""
         interrupt_worlds(self._step.lost, world_mask)
 
     def end(self) -> None:
@@ -204,7 +204,7 @@ class CoupledCheck:
         """
         wp.capture_if(self._step.awaits, self._see, given=given, own=own)
         if begins:
-            wp.copy(self._motion.vertices.interrupted, self._step.lost)
+            wp.copy(self._motion.last.interrupted, self._step.lost)
             self._step.lost.zero_()
             self._motion.set_start(given)
             for name in ("particle_q", "body_q"):

@@ -9,10 +9,11 @@ from newton.solvers.experimental.coupled import CouplingInterface, ModelView
 from ..._private_names.of_newton import COUPLERS_DECLARE_RESTARTS
 from ..._private_names.of_warp import paused_tape
 from ...detection.run.host_function import run_on_host
-from ..state.motion import ModelMotion, arrays_of, continues
+from ..state.motion import StateArrays, arrays_of, continues
 from ..state.poses import in_world
 from ..state.structs import Motion, Vertices
 from ..state.vectors import to_double, to_single
+from ..state.workspace import Workspace
 from ..wrapped_solver import WrappedSolver
 from .snapshot import Snapshot
 
@@ -121,7 +122,7 @@ class CouplingHooks(WrappedSolver):
         ``SolverVBD`` itself: behind a stage it raises, and warns of soft ones, which VBD applies all the same.
     """
 
-    _motion: ModelMotion
+    _work: Workspace
     _coupled: "_Coupled | None" = None  # None outside coupled simulations
 
     def _prepare_entry(self) -> None:
@@ -136,8 +137,8 @@ class CouplingHooks(WrappedSolver):
         """
         if COUPLERS_DECLARE_RESTARTS:
             self._hook("coupling_notify_iteration_restarts")(enabled)
-        self._motion.interrupt()
-        self._coupled = _Coupled(self.model, self._motion, self._make_check(), restarts=enabled)
+        self.work.motion.last.interrupt()
+        self._coupled = _Coupled(self.work, self._make_check(), restarts=enabled)
 
     def _make_check(self) -> Any:
         """Returns the :class:`.coupled_check.CoupledCheck` of the steps; None if the entry sees nothing of others."""
@@ -177,16 +178,16 @@ class CouplingHooks(WrappedSolver):
 
 
 class _Coupled:
-    """State of a stage in a coupled simulation: where steps started and ended, and the impulses of the response."""
+    """State of a stage in a coupled simulation: where a step starts, and the impulses of the response."""
 
-    def __init__(self, model, motion, check, *, restarts):
-        self._model, self._motion, self.check, device = model, motion, check, model.device
+    def __init__(self, work: Workspace, check, *, restarts):
+        self._model, self.work, self.check, self._last = work.mesh.model, work, check, work.motion.last
+        model, device = self._model, work.device
         kinds = (StateFlags.PARTICLE_Q, model.particle_count), (StateFlags.BODY_Q, model.body_count)
         self._all_positions = sum(int(flag) for flag, count in kinds if count)
-        self._last, self._first, self._start = model.state(), model.state(), model.state()
+        self._start, self._before = model.state(), Snapshot(self._last.arrays if restarts else [])
         self._continues = False
         self.has_stepped = False  # since the last reset
-        self._starts = Snapshot(motion.starts() if restarts else [])
         self.body_impulses = wp.zeros(model.body_count, dtype=wp.spatial_vector, device=device)
         self.particle_impulses = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
 
@@ -197,7 +198,8 @@ class _Coupled:
         """
         if self.check is None or self._continues or flags & self._all_positions != self._all_positions:
             return
-        given, own, begins = arrays_of(state), arrays_of(self._last), dt > 0.0
+        given, own, begins = arrays_of(state), StateArrays(), dt > 0.0
+        own.particle_q, own.body_q = self._last.positions, self._last.poses
         with paused_tape():
             run_on_host(lambda: self.check.see(given, own, begins=begins), self._model.device)
 
@@ -209,16 +211,15 @@ class _Coupled:
         if dt <= 0.0:  # ``reset`` interrupts the motion
             return
         if iteration_restart:
-            self._starts.restore()
+            self._before.restore()
         elif not self._continues:
-            _copy_positions(self._first, self._last)
-            self._starts.save()
+            self._before.save()
         self._continues = True
         self.body_impulses.zero_()  # those of an earlier pass
         self.particle_impulses.zero_()
 
     def lose(self, world_mask):
-        """Takes into account that worlds were reset, ``world_mask`` as of :meth:`.ModelMotion.interrupt`."""
+        """Takes into account that worlds were reset, ``world_mask`` as of :meth:`.LastStep.interrupt`."""
         self.has_stepped = False
         if self.check is not None:
             self.check.lose(world_mask)
@@ -228,29 +229,22 @@ class _Coupled:
         if not self._continues:
             return state
         self._continues = False
-        model, device = self._model, self._model.device
-        for kernel, name, proxy in (
-            (_find_starts_of_bodies, "body", BodyFlags.PROXY),
-            (_find_starts_of_particles, "particle", ParticleFlags.PROXY),
+        for kernel, kind, ends, proxy in (
+            (_find_starts_of_bodies, "body", self._last.poses, BodyFlags.PROXY),
+            (_find_starts_of_particles, "particle", self._last.positions, ParticleFlags.PROXY),
         ):
-            ends, given, starts = (getattr(x, f"{name}_q") for x in (self._first, state, self._start))
+            given, starts = (getattr(x, f"{kind}_q") for x in (state, self._start))
             if starts is not None:
-                inputs = [self._motion.vertices, ends, getattr(model, f"{name}_world"), getattr(model, f"{name}_flags")]
-                wp.launch(kernel, len(starts), inputs=[*inputs, int(proxy), given], outputs=[starts], device=device)
+                of_model = [getattr(self._model, f"{kind}_{name}") for name in ("world", "flags")]
+                inputs = [self.work.step.motion, ends, *of_model, int(proxy), given]
+                self.work.launch(kernel, len(starts), inputs, [starts])
         return self._start
 
-    def finish(self, state, motion, vertices):
-        """Keeps the positions at the end of a step, and adds the impulses of the response."""
+    def finish(self):
+        """Adds the impulses of the response in a step."""
         self.has_stepped = True
-        _copy_positions(self._last, state)
         outputs = [self.particle_impulses, self.body_impulses]
-        inputs, size = [motion, vertices, self._model.particle_mass], max(map(len, outputs))
-        wp.launch(_add_impulses, size, inputs=inputs, outputs=outputs, device=self._model.device)
+        inputs = [self.work.step.motion, self.work.vertices, self._model.particle_mass]
+        self.work.launch(_add_impulses, max(map(len, outputs)), inputs, outputs)
         if self.check is not None:
             self.check.end()
-
-
-def _copy_positions(to, state):
-    for name in ("particle_q", "body_q"):
-        if getattr(to, name) is not None:
-            wp.copy(getattr(to, name), getattr(state, name))

@@ -1,4 +1,4 @@
-"""Copies of arrays and states, to which they can be set back."""
+"""Copies of arrays and states, to which they can be set back, all of them or in some worlds."""
 
 import copy
 from collections.abc import Sequence
@@ -6,6 +6,8 @@ from typing import Any
 
 import newton
 import warp as wp
+
+from ..state.motion import takes_part
 
 
 def _clone(x: Any) -> Any:
@@ -19,19 +21,51 @@ def _clone(x: Any) -> Any:
     return copied
 
 
-class Snapshot:
-    """Keeps what arrays and states hold at one time."""
+def _restoring(dtype: type) -> wp.Kernel:
+    """Returns the kernel below for arrays of a type: a graph on the CPU runs wrong overloads of generic ones."""
 
-    def __init__(self, kept: Sequence[newton.State | wp.array]):
-        """Copies arrays and states, as they are now; :meth:`save` copies them again, and allocates nothing."""
-        self._kept = [(x, _clone(x)) for x in kept]
+    @wp.kernel(enable_backward=False, module="unique")
+    def restore(saved: wp.array[dtype], world: wp.array[int], mask: wp.array[wp.bool], values: wp.array[dtype]):
+        """Restores what belongs to worlds that take no part in a step."""
+        i = wp.tid()
+        if not takes_part(mask, world[i]):
+            values[i] = saved[i]
+
+    return restore
+
+
+_TYPES = wp.vec3, wp.vec4d, wp.transform, wp.spatial_vector, wp.float32, wp.int32
+_RESTORE = {dtype: _restoring(dtype) for dtype in _TYPES}
+
+
+def restore_worlds(saved: Any, worlds: wp.array[int], mask: wp.array[wp.bool], array: Any) -> None:
+    """Restores the elements of an array in worlds that take no part in a step, given the world of each element."""
+    wp.launch(_RESTORE[array.dtype], len(worlds), inputs=[saved, worlds, mask], outputs=[array], device=array.device)
+
+
+class Snapshot:
+    """Keeps what arrays and states hold at one time.
+
+    Attributes:
+        saved: The copies, in the order of what is kept.
+    """
+
+    def __init__(self, kept: Sequence[newton.State | wp.array], worlds: Sequence[wp.array[int]] = ()):
+        """Copies arrays and states, as they are now; :meth:`save` copies them again, and allocates nothing.
+
+        ``worlds`` has the worlds of the elements of each array, if it is ever to be restored by a mask.
+        """
+        self._kept, self._worlds, self.saved = kept, worlds, [_clone(x) for x in kept]
 
     def save(self) -> None:
         """Copies what they hold."""
-        for x, saved in self._kept:
+        for x, saved in zip(self._kept, self.saved, strict=True):
             saved.assign(x)
 
-    def restore(self) -> None:
-        """Makes them hold what they held when it was copied."""
-        for x, saved in self._kept:
-            x.assign(saved)
+    def restore(self, mask: wp.array[wp.bool] | None = None) -> None:
+        """Makes them hold what they held when it was copied; with a mask, in worlds that take no part in a step."""
+        for i, (x, saved) in enumerate(zip(self._kept, self.saved, strict=True)):
+            if mask is None:
+                x.assign(saved)
+            else:
+                restore_worlds(saved, self._worlds[i], mask, x)

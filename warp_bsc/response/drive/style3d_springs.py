@@ -217,8 +217,7 @@ class Style3DContacts:
         model = mesh.model
         self._work, self._model = work, model
         self._flight = ModelMotion(mesh, work.motion.friction)
-        self._last = wp.clone(work.vertices.x1)
-        self._flight.remember(self._last)
+        self._flight.last.begin()
         self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
         self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
         self._keys: wp.array[wp.uint64] | None = None
@@ -227,9 +226,9 @@ class Style3DContacts:
     def find(self, state: newton.State, dt: float) -> None:
         """Finds the contacts of particles that fly on from a state for a step of length ``dt`` [s]."""
         work, flight, model, start = self._work, self._flight, self._model, arrays_of(state)
-        motion, work.motion = work.motion, flight
+        motion, work.motion, last = work.motion, flight, flight.last.positions
         try:
-            wp.copy(self._last, work.vertices.x1)
+            wp.copy(last, work.vertices.x1)
             flight.set_start(start)
             flight.set_end(start, dt)
             inputs = [start, state.particle_f, model.particle_world, model.gravity, dt]
@@ -237,7 +236,7 @@ class Style3DContacts:
             find_contacts(work)
             add_proximities(work)
             self._sort()
-            wp.copy(work.vertices.x1, self._last)  # where the step before ended
+            wp.copy(work.vertices.x1, last)  # where the step before ended
         finally:
             work.motion = motion
 

@@ -16,7 +16,7 @@ from newton.solvers import SolverBase, SolverStyle3D
 from ..._private_names.of_newton import has_external_rigid_solver
 from ..._private_names.of_warp import paused_tape
 from ..state.mesh import host_array
-from ..state.motion import ModelMotion, StateArrays, arrays_of, continues, find_misplaced_bodies, takes_part
+from ..state.motion import ModelMotion, StateArrays, arrays_of, continues, takes_part
 from ..state.structs import Motion
 from .inner_steps import InnerSteps, StepCall
 
@@ -100,22 +100,6 @@ def _go_on(motion: Motion, way: _Way, i: int, number: int, start: StateArrays, e
                 end.body_q[k] = pose
 
 
-@wp.kernel
-def _remember_poses(
-    # in
-    motion: Motion,
-    body_world: wp.array[int],
-    mask: wp.array[wp.bool],
-    end: StateArrays,
-    # out
-    last_body_q: wp.array[wp.transform],
-):
-    """Keeps where bodies end a step, of worlds that take part in it."""
-    body = wp.tid()
-    if body < last_body_q.shape[0] and (not mask or takes_part(mask, body_world[body])):
-        last_body_q[body] = end.body_q[body]
-
-
 class Substeps:
     """Divides steps into a number of smaller ones.
 
@@ -143,15 +127,10 @@ class Substeps:
         self._forces = {n: wp.clone(array, requires_grad=False) for n, array in _forces_of(self._states[0]).items()}
         self._way, particles, bodies = _Way(), model.particle_count, model.body_count
         self._way.x0, self._way.x1 = (wp.zeros(particles, dtype=wp.vec3, device=device) for _ in range(2))
-        self._way.pose0, self._way.pose1, self._last_body_q = (
-            wp.zeros(bodies, dtype=wp.transform, device=device) for _ in range(3)
-        )
+        self._way.pose0, self._way.pose1 = (wp.zeros(bodies, dtype=wp.transform, device=device) for _ in range(2))
         moved = np.zeros(0, dtype=bool)
         if bodies:
             kinematic = (host_array(model.body_flags) & BodyFlags.KINEMATIC) != 0
-            poses = host_array(model.body_q).copy()
-            poses[find_misplaced_bodies(model)] = np.nan  # which start the first step where its state has them
-            self._last_body_q.assign(poses)
             moved = kinematic | (host_array(model.body_inv_mass) == 0.0) | leaves_bodies
         self._way.is_moved = wp.array(moved, dtype=bool, device=device)
         self._way.ends_in_out = leaves_bodies
@@ -188,9 +167,6 @@ class Substeps:
                 for name, array in forces.items():  # the inner solver adds its own to those of the start
                     wp.copy(getattr(end, name), array)
             start = end
-        if not on_tape:
-            inputs = [self._model.body_world, call.mask, arrays_of(call.state_out)]
-            self._launch(_remember_poses, inputs, [self._last_body_q])
 
     def _begin(self, state_in, state_out, start, mask):
         """Copies the state at the start, and finds the way of what a program has moved."""
@@ -198,7 +174,7 @@ class Substeps:
         with paused_tape():
             start.assign(state_in)
             motion.set_start(arrays_of(state_in))  # which finds worlds that a program set to another state
-        inputs = [motion.last, self._last_body_q, self._model.body_world, mask, arrays_of(state_in)]
+        inputs = [motion.last.starts, motion.last.poses, self._model.body_world, mask, arrays_of(state_in)]
         self._launch(_find_way, [*inputs, arrays_of(state_out)], [self._way])
 
     def _launch(self, kernel, inputs, outputs):

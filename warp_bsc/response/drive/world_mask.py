@@ -14,24 +14,9 @@ from ..state.mesh import host_array
 from ..state.motion import ModelMotion, continues, takes_part
 from ..state.structs import Motion
 from ..state.workspace import Workspace
+from .snapshot import Snapshot, restore_worlds
 
 wp.set_module_options({"enable_backward": False})
-
-
-def _restoring(dtype: type) -> wp.Kernel:
-    """Returns the kernel below for arrays of a type: a graph on the CPU runs wrong overloads of generic ones."""
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def restore(saved: wp.array[dtype], world: wp.array[int], mask: wp.array[wp.bool], values: wp.array[dtype]):
-        """Restores what belongs to worlds that take no part in a step."""
-        i = wp.tid()
-        if not takes_part(mask, world[i]):
-            values[i] = saved[i]
-
-    return restore
-
-
-_RESTORE = {dtype: _restoring(dtype) for dtype in (wp.vec3, wp.transform, wp.spatial_vector, wp.float32)}
 
 
 @wp.kernel
@@ -57,7 +42,6 @@ class _Held:
 
     last: wp.array[wp.vec3]  # where vertices ended the last step
     planes: wp.array[wp.vec4d]
-    interrupted: wp.array[int]
     inverse_mass: wp.array[float]  # 0 in these worlds
     body_inverse_mass: wp.array[float]
     active: wp.array[int]  # 1 of vertices in other worlds that can move
@@ -78,8 +62,6 @@ def _hold(
 ):
     """Lets vertices and planes of worlds that take no part stand where the last step left them, without mass."""
     i = wp.tid()
-    if i < motion.interrupted.shape[0]:
-        held.interrupted[i] = motion.interrupted[i]
     if i < plane_start.shape[0] and not takes_part(mask, plane_world[i]):
         plane_start[i] = held.planes[i]
         plane_end[i] = held.planes[i]
@@ -100,25 +82,6 @@ def _hold(
             motion.is_not_finite[i] = 0
 
 
-@wp.kernel
-def _release(
-    # in
-    mask: wp.array[wp.bool],
-    world: wp.array[int],
-    held: _Held,
-    # out
-    last: wp.array[wp.vec3],
-    interrupted: wp.array[int],
-):
-    """Restores what the next step of worlds that took no part begins with."""
-    i = wp.tid()
-    if i < interrupted.shape[0]:
-        if not takes_part(mask, wp.where(i == interrupted.shape[0] - 1, -1, i)):
-            interrupted[i] = held.interrupted[i]
-    if last and i < last.shape[0] and not takes_part(mask, world[i]):
-        last[i] = held.last[i]
-
-
 class WorldMask:
     """Lets worlds take no part in a step of a stage.
 
@@ -130,12 +93,12 @@ class WorldMask:
         """Allocates buffers for the inner solver, the workspace of steps, and their motion."""
         self._solver, self._work, self._motion = solver, work, motion
         model, device = motion.mesh.model, work.device
-        self._last = motion.last
-        self._held = held = _Held()
-        of_vertices = motion.vertices
-        if self._last is not None:
-            held.last = wp.empty_like(self._last)
-        held.planes, held.interrupted = wp.empty_like(motion.planes.end), wp.empty_like(of_vertices.interrupted)
+        self._last = Snapshot(motion.last.arrays, motion.last.worlds)
+        self._held, of_vertices = _Held(), motion.vertices
+        held = self._held
+        last, held.planes, *_ = self._last.saved
+        if motion.last.starts is not None:
+            held.last = last
         held.inverse_mass = wp.empty_like(of_vertices.inverse_mass)
         held.active = wp.zeros(len(held.inverse_mass), dtype=int, device=device)
         if motion.moves_bodies:
@@ -166,15 +129,12 @@ class WorldMask:
             wp.copy(self._saved[name], array, count=len(self._saved[name]))
         if self._last_poses is not None:
             wp.copy(self._last_poses, body_q_prev(self._solver))
-        if self._last is not None:
-            wp.copy(self._held.last, self._last)
-        wp.copy(self._held.planes, self._motion.planes.end)
+        self._last.save()
 
     def restore(self, mask: wp.array[wp.bool], state: newton.State) -> None:
         """Puts back the state at the start, in worlds that take no part."""
         for name, array, world in self._arrays(state):
-            inputs = [self._saved[name], world, mask]
-            wp.launch(_RESTORE[array.dtype], len(world), inputs=inputs, outputs=[array], device=self._work.device)
+            restore_worlds(self._saved[name], world, mask, array)
         if self._last_poses is not None:
             poses, world = body_q_prev(self._solver), self._worlds["body"]
             inputs = [self._last_poses, self._saved["body_q"], world, mask, self._motion.vertices]
@@ -184,9 +144,9 @@ class WorldMask:
     def applied(self, mask: wp.array[wp.bool]) -> Iterator[None]:
         """Lets the stage look at the worlds alone that take part; the predicted motion is complete before."""
         work, motion, held = self._work, self._motion, self._held
-        vertices, planes, world = motion.vertices, motion.planes, motion.vertices.world
+        vertices, planes = motion.vertices, motion.planes
         masses, body_masses = vertices.inverse_mass, vertices.bodies.inverse_mass
-        size = max(len(vertices.x0), len(planes.start), len(vertices.interrupted), motion.mesh.model.body_count)
+        size = max(len(vertices.x0), len(planes.start), motion.mesh.model.body_count)
         outputs = [vertices, planes.start, planes.end, held]
         work.launch(_hold, size, [mask, masses, planes.world, work.can_move], outputs)
         vertices.inverse_mass = held.inverse_mass
@@ -198,8 +158,7 @@ class WorldMask:
         finally:
             vertices.inverse_mass, vertices.bodies.inverse_mass = masses, body_masses
             work.motion, work.active, work.unmasked = motion, work.can_move, None
-        outputs = [self._last, vertices.interrupted]
-        work.launch(_release, max(len(world), len(vertices.interrupted)), [mask, world, held], outputs)
+        self._last.restore(mask)
 
 
 def checked_mask(world_mask, model: newton.Model) -> wp.array | None:

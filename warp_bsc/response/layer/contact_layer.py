@@ -35,9 +35,19 @@ from ..adjoint.arrays import filled
 from ..adjoint.pose_kernels import set_centres
 from ..adjoint.structs import StateGradients
 from ..contacts.queue import queues_of
-from ..options import Bodies, StageOptions, friction_of, in_eight_bits, particle_edge_lengths
-from ..state.collision_filter import CollisionFilter
+from ..options import (
+    Bodies,
+    checked_bodies,
+    checked_friction,
+    checked_restitution,
+    friction_of,
+    in_eight_bits,
+    moves_bodies,
+    particle_edge_lengths,
+)
+from ..state.collision_filter import CollisionFilter, checked_filter
 from ..state.friction_table import FrictionTable
+from ..state.kept_distances import KeptDistances
 from ..state.mesh import ModelMesh
 from ..state.motion import ModelMotion, arrays_of
 from ..state.structs import add_zeros
@@ -117,31 +127,22 @@ class ContactLayer(WrappedSolver):
             NotImplementedError: If the model has shapes that are not supported, see :class:`.state.mesh.ModelMesh`.
         """
         super().__init__(solver)
-        options = StageOptions.of(
-            self.model,
-            friction=friction,
-            restitution=restitution,
-            min_distance=min_distance,
-            particle_radius=particle_radius,
-            collision_filter=collision_filter,
-            bodies=bodies,
-        )
-        strands = options.distances.any
-        self.mesh = mesh = ModelMesh(self.model, strands=strands, collision_filter=options.collision_filter)
-        self.friction, self.restitution = options.friction, options.restitution
-        self._reads_friction = options.reads_friction
-        thin, thick = default_thicknesses(mesh, options.distances.largest)
+        self.friction, table, self._reads_friction = checked_friction(friction, self.model)
+        self.restitution = checked_restitution(restitution, self.model)
+        distances, bodies = KeptDistances.of(self.model, min_distance, particle_radius), checked_bodies(bodies)
+        collision_filter = checked_filter(collision_filter, self.model)
+        self.mesh = mesh = ModelMesh(self.model, strands=distances.any, collision_filter=collision_filter)
+        thin, thick = default_thicknesses(mesh, distances.largest)
         if thickness is not None:
             thin = thick = checked_distance(thickness, "thickness", zero=False)
-        moves_bodies = options.moves_bodies(mesh, innermost(solver))
-        coefficients = friction_of(mesh, self.friction, table=options.friction_table)
-        self._motion = ModelMotion(mesh, coefficients, moves_bodies=moves_bodies)
+        moves = moves_bodies(bodies, mesh, innermost(solver))
+        self._motion = ModelMotion(mesh, friction_of(mesh, self.friction, table=table), moves_bodies=moves)
         layer, device = Layer(), mesh.device
-        n, body_count = mesh.vertex_count, self.model.body_count if moves_bodies else 0
+        n, body_count = mesh.vertex_count, self.model.body_count if moves else 0
         layer.thickness = self.thickness_values = wp.full(1, thin, dtype=wp.float64, device=device)
         layer.restitution = self.restitution
         layer.motion, layer.planes = self._motion.vertices, self._motion.planes
-        layer.distances = mesh.min_distances(options.distances, reach=thick)
+        layer.distances = mesh.min_distances(distances, reach=thick)
         self._rule = rule = ThicknessRule()
         rule.thin, rule.thick = thin, thick
         add_zeros(rule, ["is_chosen"], 1, device)

@@ -24,10 +24,10 @@ from .text import line_of
 from .totals import GradientTotals, Penetrated, StepTotals, Totals
 from .worlds import Worlds
 
-_NOT_DRAWN = "report.draw draws contacts only if a stage keeps them: SolverCCD(solver, report_contacts=True)"
-_INCOMPLETE = "report.draw lacks contacts: raise the number that report_contacts= allows"
-_NO_CONTACTS = "a stage keeps contacts only if it is asked to: SolverCCD(solver, report_contacts=True)"
-_NO_WORLDS = "a stage counts worlds only if it is asked to: pass report_worlds=True"
+_NOT_DRAWN = 'report.draw draws contacts only if a stage keeps them: SolverCCD(solver, report=["contacts"])'
+_INCOMPLETE = 'report.draw lacks contacts: allow more of them than now, report={"contacts": number}'
+_NO_CONTACTS = 'a stage keeps contacts only if it is asked to: SolverCCD(solver, report=["contacts"])'
+_NO_WORLDS = 'a stage counts worlds only if it is asked to: pass report=["worlds"]'
 _NOT_WATCHED = "a stage counts inversions only if it is asked to: pass inversions='reported' or 'prevented'"
 
 

@@ -52,7 +52,7 @@ def table_by_shape(model: newton.Model, contacts: dict[str, np.ndarray], dt: flo
     if len(rows) > _MOST_ROWS:
         lines.append(f"and {len(rows) - _MOST_ROWS} shapes with less")
     if not complete:
-        lines.append("contacts are missing: raise the number that report_contacts= allows")
+        lines.append('contacts are missing: allow more of them than now, report={"contacts": number}')
     return "\n".join(lines)
 
 

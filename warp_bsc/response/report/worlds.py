@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-_NO_IMPULSES = "a stage keeps impulses only if it is asked to: SolverCCD(solver, report_contacts=True)"
+_NO_IMPULSES = 'a stage keeps impulses only if it is asked to: SolverCCD(solver, report=["contacts"])'
 
 
 @dataclass(eq=False)

@@ -6,16 +6,15 @@ import warp as wp
 from newton import BodyFlags
 
 from .friction import Friction
+from .last_step import SAME_POSE, LastStep
 from .mesh import ModelMesh, Placement, members_of_worlds, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
 from .shapes import PlacedShapes
-from .structs import Bodies, Motion, MovedBodies, Vertices, add_zeros, body_of, can_move
+from .structs import Bodies, Motion, add_zeros, body_of, can_move
 from .turns import BodyTurns
 from .vectors import to_double
 
-_SAME_POSE = wp.constant(1e-5)
-"""Largest difference of two poses of a body that are the same but for rounding [m], and of their quaternions."""
 SET_STEPS = wp.constant(4)
 """Steps in a row that a dynamic body does not start where it ended the last one, after which a program moves it."""
 
@@ -79,24 +78,6 @@ def takes_part(mask: wp.array[wp.bool], world: int) -> bool:
 
 
 @wp.kernel(enable_backward=False)
-def _interrupt(world_mask: wp.array[wp.bool], interrupted: wp.array[int]):
-    """Marks worlds as interrupted, and as the last entry everything that is in all worlds, if any world is."""
-    i = wp.tid()
-    last = world_mask.shape[0] - 1
-    if world_mask[wp.min(i, last)] or world_mask[last]:
-        interrupted[i] = 1
-        interrupted[interrupted.shape[0] - 1] = 1
-
-
-def interrupt_worlds(interrupted: wp.array[int], world_mask: wp.array[wp.bool] | None) -> None:
-    """Marks worlds as interrupted, with a mask as of :meth:`ModelMotion.interrupt`."""
-    if world_mask is None:
-        interrupted.fill_(1)
-    else:
-        wp.launch(_interrupt, len(interrupted), inputs=[world_mask, interrupted], device=interrupted.device)
-
-
-@wp.kernel(enable_backward=False)
 def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
@@ -133,7 +114,7 @@ def find_set_bodies(
     q, last_q = wp.transform_get_rotation(start), wp.transform_get_rotation(end)
     turned = wp.min(wp.length(q - last_q), wp.length(q + last_q))
     shifted = wp.length(wp.transform_get_translation(start) - wp.transform_get_translation(end))
-    is_set = wp.max(turned, shifted) > _SAME_POSE and can_move(motion, body)
+    is_set = wp.max(turned, shifted) > SAME_POSE and can_move(motion, body)
     steps[body] = wp.where(is_set and continues(motion, motion.bodies.world[body]), steps[body] + 1, 0)
     if steps[body] == SET_STEPS:
         wp.atomic_add(count, 0, wp.int64(1))
@@ -203,46 +184,21 @@ def _write_end(
 def _jump(
     # in
     placed: PlacedShapes,
-    motion: Motion,
-    moved: MovedBodies,
     poses: wp.array[wp.transform],
     particle_count: int,
     # out
     x1: wp.array[wp.vec3],
     planes: wp.array[wp.vec4d],
 ):
-    """Writes vertices and planes of shapes that jumped to where the last step left their bodies.
-
-    That is ``poses`` for those that the response cannot move, which has them if a body has vertices.
-    """
+    """Writes vertices and planes of shapes that jumped to where the last step left their bodies."""
     i = wp.tid()
     if i < planes.shape[0] and placed.jumped[placed.plane_shape[i]] == 1:
-        on = placed.plane_body[i]
-        if on < 0 or poses:
-            planes[i] = transformed_plane(placed.plane_point[i], placed.plane_normal[i], on, poses)
-        else:  # the next step starts it where its body is
-            planes[i] = wp.vec4d(wp.float64(wp.nan))
+        planes[i] = transformed_plane(placed.plane_point[i], placed.plane_normal[i], placed.plane_body[i], poses)
     if i < placed.position.shape[0] and placed.jumped[placed.shape[i]] == 1:
         x = placed.position[i]
-        body = placed.body[i]
-        if can_move(motion, body):
-            x = wp.transform_point(moved.pose[body], x)
-        elif body >= 0:
-            x = wp.transform_point(poses[body], x)
+        if placed.body[i] >= 0:
+            x = wp.transform_point(poses[placed.body[i]], x)
         x1[particle_count + i] = x
-
-
-def find_misplaced_bodies(model: newton.Model) -> np.ndarray:
-    """Returns the bodies that joint coordinates of a model put elsewhere than ``body_q``, which a model may not set."""
-    if model.joint_type is None or (model.joint_type.numpy() == newton.JointType.FREE).all():
-        return np.empty(0, dtype=int)
-    state = model.state()
-    assert model.joint_q is not None and model.joint_qd is not None and model.body_q is not None
-    assert state.body_q is not None
-    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
-    placed, given = state.body_q.numpy(), model.body_q.numpy().copy()  # of the CPU, it is the model's own memory
-    given[(placed[:, 3:] * given[:, 3:]).sum(axis=1) < 0.0, 3:] *= -1.0  # the same rotation
-    return np.flatnonzero(np.abs(placed - given).max(axis=1) > _SAME_POSE)
 
 
 class ModelMotion:
@@ -254,6 +210,7 @@ class ModelMotion:
         vertices: The vertices, :class:`.state.structs.Motion`.
         planes: The infinite planes, :class:`.state.planes.MovingPlanes`.
         mesh: The mesh.
+        last: Where the last step ended.
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.
         turns: How bodies turn, None if nothing asks for it or no body has a shape.
@@ -283,8 +240,8 @@ class ModelMotion:
         device, model = mesh.device, mesh.model
         self.vertices = vertices = Motion()
         add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
-        add_zeros(vertices, ["interrupted"], max(1, model.world_count) + 1, device)
-        self._last: wp.array[wp.vec3] | None = None
+        self.last = last = LastStep(mesh)
+        vertices.interrupted = last.interrupted
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction, vertices.materials = friction.vertices, friction.materials
         vertices.pair_filter = mesh.pair_filter
@@ -296,13 +253,14 @@ class ModelMotion:
         planes.shape, planes.body, planes.shape_filter = of_planes.shape, of_planes.body, mesh.shape_filter
         of_worlds = members_of_worlds(mesh.planes.world, max(1, model.world_count))
         planes.of_worlds = wp.array(of_worlds, dtype=int, device=device)
-        add_zeros(planes, ("start", "end"), len(friction.planes), device)
+        planes.start, planes.end = wp.zeros_like(last.planes), last.planes
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies
         if moves_bodies:
             vertices.bodies = self._allocate_bodies()
             vertices.bodies.responds = int(responds_to_bodies)
-        self.turns = BodyTurns(mesh) if watches_turns and (mesh.shape_vertices.body >= 0).any() else None
+        has_turns = watches_turns and (mesh.shape_vertices.body >= 0).any()
+        self.turns = BodyTurns(mesh, last.poses) if has_turns else None
         self.keeps_poses = moves_bodies
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
             add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
@@ -325,66 +283,19 @@ class ModelMotion:
         add_zeros(bodies, ("inverse_mass", "velocity"), model.body_count, device)
         return bodies
 
-    def remember(self, last: wp.array[wp.vec3]) -> None:
-        """Makes vertices and planes that the response cannot move start each step where they ended the last one.
-
-        Worlds in which a movable particle is elsewhere than at that end were set to another state, and start there. The
-        first step starts where the model puts vertices and planes, as set by :meth:`set_start` and :meth:`set_end`;
-        those of bodies that joint coordinates of the model put elsewhere start where the state of the step has them,
-        since a program that evaluates the joints does not move them.
-
-        Args:
-            last: Positions of the vertices at the end of the last step, which the response keeps.
-        """
-        self._last = last
-        positions, planes = self.vertices.x0.numpy().copy(), self.planes.end.numpy().copy()
-        misplaced = find_misplaced_bodies(self.mesh.model)
-        first = self.mesh.model.particle_count
-        positions[first:][np.isin(self.mesh.shape_vertices.body, misplaced)] = np.nan
-        planes[np.isin(self.mesh.planes.body, misplaced)] = np.nan
-        if self.turns is not None:
-            self.turns.remember(misplaced)
-        last.assign(positions)
-        self.planes.end.assign(planes)
-
-    @property
-    def last(self) -> wp.array[wp.vec3] | None:
-        """Positions of the vertices at the end of the last step, None if steps do not start there."""
-        return self._last
-
-    def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
-        """Makes the next step begin where its state is.
-
-        Args:
-            world_mask: Which worlds, and as the last entry whether also everything that is in all worlds, shape
-                [world_count + 1]; None for everything.
-        """
-        interrupt_worlds(self.vertices.interrupted, world_mask)
-
-    def follow_shapes(self, vertices: Vertices, not_followed: wp.array[wp.int64]) -> None:
-        """Moves shapes to where the model has them now, as ``ModelMesh.follow_shapes``.
+    def follow_shapes(self, not_followed: wp.array[wp.int64]) -> None:
+        """Moves shapes to where the model has them now, with the argument of ``ModelMesh.follow_shapes``.
 
         The last step is made to have ended there, so that nothing sweeps the way.
-
-        Args:
-            vertices: As the response left them in the last step.
-            not_followed: As there.
         """
         self.mesh.follow_shapes(not_followed)
-        poses = None if self.turns is None else self.turns.turns.end
-        inputs = [self.mesh.placed_shapes, self.vertices, vertices.bodies, poses, self.mesh.model.particle_count]
-        wp.launch(_jump, self._size, inputs=inputs, outputs=[vertices.x1, self.planes.end], device=self.mesh.device)
-
-    def starts(self) -> list[wp.array]:
-        """Returns the arrays that say where the next step begins; to restore them lets a program repeat a step."""
-        arrays: list[wp.array] = [self.vertices.interrupted]
-        if self.turns is not None:
-            arrays.append(self.turns.turns.end)
-        return arrays if self._last is None else [*arrays, self._last, self.planes.end]
+        inputs = [self.mesh.placed_shapes, self.last.poses, self.mesh.model.particle_count]
+        outputs = [self.last.positions, self.last.planes]
+        wp.launch(_jump, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
 
     def set_start(self, start: StateArrays) -> None:
         """Copies the positions at the start of a step, with errors as of :meth:`.state.mesh.ModelMesh.positions`."""
-        inputs = [self.mesh.place(start.particle_q, start.body_q), self._last, self.vertices, self.planes]
+        inputs = [self.mesh.place(start.particle_q, start.body_q), self.last.starts, self.vertices, self.planes]
         wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
         if self.keeps_poses:
             wp.copy(self.vertices.bodies.start, start.body_q)
@@ -402,8 +313,8 @@ class ModelMotion:
         elif self.keeps_poses:
             wp.copy(self.vertices.bodies.end, end.body_q)
         if self.turns is not None:
-            self.turns.set_end(self.vertices, end.body_q)
-        inputs = [place, end.particle_qd, dt, self._last, self.vertices, self.planes]
+            self.turns.set_end(self.vertices, end.body_q, continues=self.last.starts is not None)
+        inputs = [place, end.particle_qd, dt, self.last.starts, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
     def set_body_ends(self, end: StateArrays) -> None:

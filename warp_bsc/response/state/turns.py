@@ -120,35 +120,23 @@ class BodyTurns:
         turns: The poses and the arcs.
     """
 
-    def __init__(self, mesh: ModelMesh):
-        """Allocates buffers for a model with bodies."""
+    def __init__(self, mesh: ModelMesh, poses: wp.array[wp.transform]):
+        """Allocates buffers for a model with bodies; ``poses`` are those at the end of the last step, then of this."""
         self._mesh, model = mesh, mesh.model
         particles = np.full(model.particle_count, -1)
         self.turns = turns = Turns()
         count, device = model.body_count, mesh.device
         turns.arcs = allocate_arcs(np.concatenate([particles, mesh.shape_vertices.body]), count, device)
-        turns.start, turns.end = (wp.zeros(count, dtype=wp.transform, device=device) for _ in range(2))
+        turns.start, turns.end = wp.zeros_like(poses), poses
         turns.com, turns.world = model.body_com, model.body_world
-        self._continues = False
-
-    def remember(self, misplaced: np.ndarray) -> None:
-        """Makes bodies that the response cannot move start each step where they ended the last one.
-
-        Args:
-            misplaced: Bodies that start the first step where its state is, as of :meth:`.motion.ModelMotion.remember`.
-        """
-        poses = self.turns.end.numpy().copy()
-        poses[misplaced] = np.nan
-        self.turns.end.assign(poses)
-        self._continues = True
 
     def set_start(self, body_q: wp.array[wp.transform]) -> None:
         """Copies the poses at the start of a step."""
         wp.copy(self.turns.start, body_q)
 
-    def set_end(self, motion: Motion, body_q: wp.array[wp.transform]) -> None:
-        """Copies the predicted poses at the end of a step."""
-        inputs = [motion, body_q, self._continues, self.turns]
+    def set_end(self, motion: Motion, body_q: wp.array[wp.transform], *, continues: bool) -> None:
+        """Copies the predicted poses at the end of a step, which ``continues`` the last one unless a world does not."""
+        inputs = [motion, body_q, continues, self.turns]
         wp.launch(_write_ends, len(body_q), inputs=inputs, device=self._mesh.device)
 
     def write_arcs(self, motion: Motion, vertices: Vertices) -> None:

@@ -214,6 +214,7 @@ class Workspace(Launches):
         step.separation, step.restitution = separation, restitution
         size = vertices, 3
         step.vertices = allocate(Vertices, vertices, device, particle_delta_x=size, particle_delta_v=size)
+        step.vertices.x1 = motion.last.positions
         if motion.moves_bodies:
             size = self.body_count, 6
             step.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
@@ -269,7 +270,7 @@ class Workspace(Launches):
             self.ends = wp.zeros(n, dtype=wp.vec3, device=self.device)
 
     def forget_crossings(self, world_mask: wp.array[wp.bool] | None = None) -> None:
-        """Makes the next step a first one, in the worlds of a mask as of :meth:`.ModelMotion.interrupt`, or in all."""
+        """Makes the next step a first one, in the worlds of a mask as of :meth:`.LastStep.interrupt`, or in all."""
         if world_mask is None:
             self.last_crossings.fill_(_VERY_MANY)
         else:

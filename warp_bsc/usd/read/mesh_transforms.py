@@ -6,14 +6,7 @@ from itertools import pairwise
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from .instancers import (
-    Instance,
-    are_finite,
-    masking_attributes,
-    transform_attributes,
-    transform_ops,
-    transform_times,
-)
+from .instancers import Instance, are_finite, masking_attributes, transform_attributes, transform_ops, transform_times
 from .samples import may_jump
 
 __all__ = ["MeshTransforms"]

@@ -72,11 +72,7 @@ class Strands:
         if self.has_edges:
             return [self.topology_attributes[0].Get(time), None, None]
         points = self.read_points(time)
-        return [
-            None if points is None else [len(points)] * bool(len(points)),
-            self._ids.Get(time),
-            None,
-        ]
+        return [None if points is None else [len(points)] * bool(len(points)), self._ids.Get(time), None]
 
     def read_edges(self, counts: np.ndarray, point_count: int, where: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns the edges of curves, and the curve of each point.

@@ -84,7 +84,7 @@ class Contacts:
 
 
 class ContactReport:
-    """What contacts did to momentum in the last step, if ``report_contacts`` of the stage asks for it.
+    """What contacts did to momentum in the last step, with ``report=["contacts"]``.
 
     All arrays are on the device, are written anew in each step, and stay where they are, so that a program may read
     them in a CUDA graph. They hold impulses of the stage [N s]; those of a step in substeps are sums over these. What
