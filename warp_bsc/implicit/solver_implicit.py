@@ -137,6 +137,7 @@ class SolverImplicit(SolverCCD):
         work: The buffers of a step, ``response.state.workspace.Workspace``.
     """
 
+    _has_adjoint = False  # gradients go through the solve
     _near = 0.0  # no constraints for near pairs: barriers keep them apart
     _has_few_contacts = True
     report: ImplicitStepReport

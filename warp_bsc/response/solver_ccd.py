@@ -117,6 +117,7 @@ class SolverCCD(CollisionStage):
         work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
+    _has_adjoint = True  # of the response, for steps on a tape
     _near = 1.0  # share of the separation within which pairs near their distance are moved apart like contacts
 
     def __init__(
@@ -217,7 +218,8 @@ class SolverCCD(CollisionStage):
         integrator = innermost(solver)
         moves, responds = moves_bodies(bodies, mesh, integrator), bodies == "separated"
         coefficients = friction_of(mesh, self.friction, table=table)
-        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=responds, watches_turns=True)
+        moving = {"moves_bodies": moves, "responds_to_bodies": responds, "has_adjoint": self._has_adjoint}
+        motion = ModelMotion(mesh, coefficients, watches_turns=True, **moving)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         self.work.watch_inversions(inversions)
         if contact_layer and self.model.requires_grad and not isinstance(solver, ContactLayer):
@@ -232,7 +234,7 @@ class SolverCCD(CollisionStage):
             )
         if isinstance(self.solver, ContactLayer):
             self.report.layer_overflows, self.report.thickness = self.solver.skipped, self.solver.thickness_values
-        self._watch_between_steps(bodies=True)
+        self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
         self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self.work)
         self._inner = self._choose_steps(integrator)

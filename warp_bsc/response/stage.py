@@ -61,9 +61,10 @@ class CollisionStage(CouplingHooks):
         motion.set_end(arrays_of(model), 1.0)
         prepare(self.work)
         self._recount_crossings()
-        motion.last.begin()
+        if not motion.differentiable:
+            motion.last.begin()
         self.report = self._report_type(self.work, responds=responds)
-        self._watches_bodies = motion.moves_bodies
+        self._watches_bodies = motion.moves_bodies and not motion.differentiable
         coupled: Any = innermost(self.solver)
         if isinstance(coupled, SolverCoupled):
             for stage in map(coupled.solver, coupled.entry_names()):

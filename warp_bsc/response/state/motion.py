@@ -214,8 +214,9 @@ class ModelMotion:
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.
         turns: How bodies turn, None if nothing asks for it or no body has a shape.
+        differentiable: Whether steps may be recorded for the adjoint of the response.
         keeps_poses: Whether ``vertices.bodies`` has the poses of bodies at the start and end: if the response can move
-            bodies, or if the model requires gradients.
+            bodies, or if it is differentiable.
     """
 
     def __init__(
@@ -226,6 +227,7 @@ class ModelMotion:
         moves_bodies: bool = False,
         responds_to_bodies: bool = False,
         watches_turns: bool = False,
+        has_adjoint: bool = True,
     ):
         """Allocates buffers.
 
@@ -235,9 +237,11 @@ class ModelMotion:
             moves_bodies: Whether the response can move bodies.
             responds_to_bodies: Whether it keeps bodies apart from each other and from static shapes.
             watches_turns: Whether the arcs of bodies that turn are to be known.
+            has_adjoint: Whether steps may be recorded for the adjoint of the response, if the model requires gradients.
         """
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
+        self.differentiable = has_adjoint and model.requires_grad
         self.vertices = vertices = Motion()
         add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
         self.last = last = LastStep(mesh)
@@ -261,7 +265,7 @@ class ModelMotion:
             vertices.bodies.responds = int(responds_to_bodies)
         has_turns = watches_turns and (mesh.shape_vertices.body >= 0).any()
         self.turns = BodyTurns(mesh, last.poses) if has_turns else None
-        self.keeps_poses = moves_bodies
+        self.keeps_poses = moves_bodies or bool(self.differentiable and model.body_count)
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
             add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
 

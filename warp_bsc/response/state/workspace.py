@@ -188,7 +188,7 @@ class Workspace(Launches):
         """
         self.mesh = mesh = motion.mesh
         self.device, vertices = mesh.device, mesh.vertex_count
-        self.differentiable = differentiable = False
+        self.differentiable = differentiable = motion.differentiable
         self.tolerance = 0.0 if differentiable else TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
         self.particle_count, device = mesh.model.particle_count, mesh.device
