@@ -10,7 +10,7 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
 from .._arguments import checked_choice, checked_flag, checked_integer
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev
+from .._private_names.of_newton import body_q_prev, has_external_rigid_solver
 from ..detection.run.host_function import run_on_host
 from .adjoint.adjoint import RecordedStep, StepAdjoint
 from .contacts.arc_check import check_arcs
