@@ -219,7 +219,7 @@ class StepGradients:
         outputs = [of.particle_q, of.particle_qd, self._carried_x]
         self._launch(kernels.finish_gradients, particles, inputs, outputs)
         if model.particle_inv_mass.grad is not None:
-            inputs = [of_motion.inverse_mass, step.is_fixed, equations.unknown]
+            inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
         self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
         self._carried_to = before
