@@ -82,28 +82,34 @@ class ReferenceSteps:
 
     def _place_bodies(self, step, x0, x1):
         """Places what moves with bodies in float64, and writes the positions at both ends of a step."""
-        mesh, n, attached = self._solver.mesh, len(self.x), self._gradients.equations.attachments
         if step.poses[0] is not None:
-            poses = [pose.numpy().astype(float) for pose in step.poses]
-            held = np.zeros(0, dtype=int)
-            if attached is not None:
-                held = np.flatnonzero(np.isinf(attached.stiffness.numpy()) & attached.enabled.numpy().astype(bool))
-                body, point, particle = (a.numpy()[held] for a in (attached.body, attached.body_point, attached.particle))
-                x1[particle] = _placed(poses[0][body], point)
+            mesh, n = self._solver.mesh, len(self.x)
+            ends, starts = (pose.numpy().astype(float) for pose in step.poses)
+            self._place_held(ends, x1)
             shapes, planes = mesh.device_shape_vertices, mesh.device_planes
-            body, moves = shapes.body.numpy(), shapes.body.numpy() >= 0
-            for x, pose in zip((x1, x0), poses, strict=True):
-                x[n:][moves] = _placed(pose[body[moves]], shapes.position.numpy()[moves])
-            moves = np.flatnonzero(planes.body.numpy() >= 0)
-            for array, pose in zip((step.planes.end, step.planes.start), poses, strict=True):
-                values, pose = array.numpy().copy(), pose[planes.body.numpy()[moves]]
-                normal = _placed(pose, planes.normal.numpy()[moves]) - pose[:, :3]
+            body = shapes.body.numpy()
+            moves = body >= 0
+            for x, poses in ((x1, ends), (x0, starts)):
+                x[n:][moves] = _placed(poses[body[moves]], shapes.position.numpy()[moves])
+            body = planes.body.numpy()
+            moves = body >= 0
+            for array, poses in ((step.planes.end, ends), (step.planes.start, starts)):
+                values, at = array.numpy().copy(), poses[body[moves]]
+                normal = _placed(at, planes.normal.numpy()[moves]) - at[:, :3]
                 normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-                at = _placed(pose, planes.point.numpy()[moves])
-                values[moves] = np.concatenate([normal, (normal * at).sum(axis=1, keepdims=True)], axis=1)
+                offset = (normal * _placed(at, planes.point.numpy()[moves])).sum(axis=1, keepdims=True)
+                values[moves] = np.concatenate([normal, offset], axis=1)
                 array.assign(values)
         step.x0.assign(x0)
         step.x1.assign(x1)
+
+    def _place_held(self, poses, x1):
+        """Places particles that attachments hold."""
+        attached = self._gradients.equations.attachments
+        if attached is not None:
+            held = np.isinf(attached.stiffness.numpy()) & attached.enabled.numpy()
+            body, point = attached.body.numpy()[held], attached.body_point.numpy()[held]
+            x1[attached.particle.numpy()[held]] = _placed(poses[body], point)
 
     def _hold(self, step):
         """Lets a step hold what that of another run held, and keeps it."""
