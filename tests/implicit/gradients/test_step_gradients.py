@@ -30,9 +30,9 @@ def parameters(scenes):
 
 
 @pytest.fixture(scope="module", params=parameters(SCENES))
-def scene(request):
+def scene(request, device):
     """A scene, and gradients of it: of the steps of the solver, and of those that are solved in float64."""
-    program = request.param()
+    program = request.param(device)
     of_solver = program.gradients()
     program.refine()
     return program, of_solver, program.gradients()
