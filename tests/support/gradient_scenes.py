@@ -32,8 +32,8 @@ OF_ATTACHMENTS = tuple(f"attachment_particle_body_{name}" for name in ("body_poi
 SIZES = {"x": 0.1, "v": 1.0, "particle_f": 0.1, "poses": 0.1, "places": 0.1, "edge_rest_angle": 1.0}
 SIZES |= {"attachment_particle_body_body_point": 0.1}
 """Sizes of inputs whose differences are not shares of their values."""
-SHARES = {"shape_material_mu": 1e-3, "friction": 1e-3}
-"""Shares of these sizes by which inputs are moved, if not 1e-5: the coefficient of a pair is a root in float32."""
+SHARES = dict.fromkeys(("shape_material_mu", "friction", "gravity"), 1e-3)
+"""Shares of these sizes by which inputs are moved, if not 1e-5: what follows from these is computed in float32."""
 
 
 class Program:

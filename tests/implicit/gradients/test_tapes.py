@@ -189,7 +189,7 @@ def test_worlds_have_the_gradients_that_each_has_alone(device):
     assert solver.newton_method.problem.contacts.count.numpy()[:2].all()
     for world, height in enumerate(heights):
         for alone, of_worlds in zip(falling([height], device)[1], together, strict=True):
-            np.testing.assert_array_equal(of_worlds[world], alone[0])
+            np.testing.assert_allclose(of_worlds[world], alone[0], atol=1e-5 * np.abs(alone).max())
 
 
 def test_worlds_whose_steps_did_not_converge_have_no_gradients(device):

@@ -198,6 +198,7 @@ class StepGradients:
         table = self._work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
         planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
+        contacts, of_contacts = with_gradients(step.contacts, ["fall"])
         poses, of_poses = step.poses, (None, None)
         if model.body_count:
             of_poses = tuple(wp.zeros_like(pose, requires_grad=False) for pose in poses)
@@ -205,7 +206,7 @@ class StepGradients:
             if of.end_body_q is not None:
                 self._launch(kernels.add_poses, model.body_count, [of.end_body_q], [of_poses[0]])
             poses = tuple(_with(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
-        step = step._replace(motion=motion, planes=planes, poses=poses)
+        step = step._replace(contacts=contacts, motion=motion, planes=planes, poses=poses)
         equations.load(step)
         multipliers = self._linear.solve(equations.differentiate(transposed=True), self._of_unknowns)
         self._launch(kernels.set_failed, equations.count, [equations.world, recorded.failed], [multipliers])
@@ -221,6 +222,9 @@ class StepGradients:
         if model.particle_inv_mass.grad is not None:
             inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
+        if model.gravity.grad is not None:  # layers, by which barriers are stiffer, follow from it
+            inputs = [wp.float32(step.dt), model.gravity]
+            self._adjoint(energies.find_falls, self._work.worlds, inputs, of_contacts.fall)
         self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
         self._carried_to = before
         for gradient in (of.end_particle_q, of.end_particle_qd, of.end_body_q):  # the step overwrote what they are of
