@@ -48,7 +48,7 @@ class ReferenceSteps:
         self._solver.reset(state)
         self._states = [state, self._solver.model.state()]
         self.x, self.v = state.particle_q.numpy().astype(float), state.particle_qd.numpy().astype(float)
-        self.recorded, self.loads = [], []
+        self.recorded, self.loads, self._tape = [], [], wp.Tape()
 
     def step(self, control=None):
         """Takes a step; ``control`` may change the state before it."""
@@ -63,7 +63,7 @@ class ReferenceSteps:
         solver.step(first, second, None, None, dt)
         gradients = self._gradients
         end = solver.arrays_of_step(second) if hasattr(solver, "arrays_of_step") else second
-        recorded = gradients.record(dt, first.particle_qd, first.particle_f, end)
+        recorded = gradients.record(self._tape, dt, first.particle_qd, first.particle_f, end)
         step = recorded.step
         n = len(self.x)
         x0 = step.x0.numpy()
@@ -76,7 +76,7 @@ class ReferenceSteps:
         self.loads.append(load)
         step = self._with_candidates(step)
         x1 = self._solve(step)
-        recorded.step, recorded.before = step, self.recorded[-1] if self.recorded else None
+        recorded.step = step
         recorded.failed.zero_()
         self.recorded.append(recorded)
         new = x1[:n]
@@ -157,9 +157,9 @@ class ReferenceSteps:
             return zeros
 
         end = array(of_x), array(of_v)
-        for recorded in reversed(self.recorded):
+        for recorded, before in zip(self.recorded[::-1], [*self.recorded[-2::-1], None], strict=True):
             start = array(), array()
             of = StateGradients(*start, None, None, *end, None)
-            gradients.backward(recorded, recorded.before, of)
+            gradients.backward(recorded, before, of)
             end = start
         return end[0].numpy(), end[1].numpy()

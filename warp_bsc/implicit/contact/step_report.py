@@ -1,11 +1,13 @@
 """The report of steps with contact in the solve: that of the collision stage, and how far Newton's method came."""
 
+import numpy as np
 import warp as wp
 
 from ...kernels.pipeline.queues import has_overflowed
 from ...response.report.report import SolverReport
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
+from ..gradients.report import GradientReport, GradientTotals
 from .system import Progress, is_near_end
 
 wp.set_module_options({"enable_backward": False})
@@ -73,6 +75,28 @@ class ImplicitStepReport(SolverReport):
         super().__init__(work, responds=responds)
         self.results = allocate(StepResults, work.worlds, work.device)
         self.unconverged = wp.zeros(1, dtype=wp.int64, device=work.device)
+        self.of_gradients = GradientReport(work.worlds, work.device)
+
+    def warn(self) -> None:
+        """Warns as of the stage, and once each of gradients that are NaN, or grow, on their way back through steps."""
+        super().warn()
+        for subject, message in self.of_gradients.warnings().items():
+            self._warnings.once(subject, lambda message=message: message)
+
+    @property
+    def gradient_counts(self) -> GradientTotals:
+        """Totals over all gradients that went back through steps so far, as of this access."""
+        self.of_gradients.copy_counts()
+        return self.of_gradients.totals(self._read_totals()["ambiguous_moves"])
+
+    @property
+    def gradient_norms(self) -> np.ndarray:
+        """Norm of the gradient at the start of each step of the last tape, and at the end of the last one.
+
+        Float64, shape [steps + 1, worlds], in the unit of the loss per metre: that of gradients with respect to
+        positions, and with respect to velocities over the length of the step.
+        """
+        return self.of_gradients.norms
 
     @property
     def newton_steps(self) -> int:

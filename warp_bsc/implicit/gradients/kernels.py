@@ -1,5 +1,7 @@
 """Kernels of a step's gradients: what is fixed, gradients at its ends, contacts at its end, and where it failed."""
 
+from enum import IntEnum
+
 import warp as wp
 
 from ...response.state.structs import Motion
@@ -7,6 +9,22 @@ from ..contact.pairs import Trial
 from ..contact.system import Contacts, Unknowns, end_of_contacts, kind_of_key, second_of_key
 
 wp.set_module_options({"enable_backward": False})
+
+GROWTH = wp.constant(wp.float64(1e3))
+"""Factor by which a gradient that grows within a step is reported."""
+
+
+class Count(IntEnum):
+    """What is counted of gradients."""
+
+    STEPS = 0
+    UNSOLVED = 1
+    FAILED_SOLVES = 2
+    GROWING = 3
+    STEP = 4
+    """Number on its tape of the first step in which a gradient grew."""
+    PARTICLE = 5
+    """The particle that had most of it then."""
 
 
 @wp.kernel
@@ -117,23 +135,30 @@ def of_end(
     is_fixed: wp.array[int],
     is_held: wp.array[int],
     carried: wp.array[wp.vec3d],
+    world: wp.array[int],
     # out
     of_unknowns: wp.array[wp.vec3d],
     of_x1: wp.array[wp.vec3d],
+    norms: wp.array2d[wp.float64],
 ):
     """Sums the gradients by which the end of a step is felt: of what is solved for, and of particles that are given.
 
     The velocity of what is solved for, or held, is (x1 - x0) / dt. ``carried`` are gradients that the next step has by
-    where given particles started it.
+    where given particles started it. Row 0 of ``norms`` becomes the square of the norm of them in each world, see
+    :class:`.report.GradientReport`.
     """
     p = wp.tid()
     gradient = carried[p] + wp.vec3d()
     if of_positions:
         gradient += wp.vec3d(of_positions[p])
+    square = wp.length_sq(gradient)
     u = unknown[p]
     if of_velocities:
+        of_way = wp.vec3d(of_velocities[p]) / dt
+        square += wp.length_sq(of_way)
         if is_fixed[u] == 0 or is_held[p] != 0:
-            gradient += wp.vec3d(of_velocities[p]) / dt
+            gradient += of_way
+    wp.atomic_add(norms, 0, world[p], square)
     if is_fixed[u] == 0:
         of_unknowns[u] = gradient
     else:
@@ -153,16 +178,20 @@ def finish_gradients(
     of_x1: wp.array[wp.vec3d],
     of_x0: wp.array[wp.vec3d],
     of_v0: wp.array[wp.vec3d],
+    world: wp.array[int],
     # in and out
     of_positions: wp.array[wp.vec3],
     of_velocities_0: wp.array[wp.vec3],
     # out
     carried: wp.array[wp.vec3d],
+    norms: wp.array2d[wp.float64],
+    largest: wp.array[wp.int64],
 ):
     """Adds the gradients with respect to the state at the start of a step.
 
     A given particle ends where that state has it. In worlds that continue it starts where the last step ended, to which
-    its gradient is ``carried``.
+    its gradient is ``carried``. Row 1 of ``norms`` becomes the square of the norm, and ``largest`` says which particle
+    has most of it.
     """
     p = wp.tid()
     gradient, of_velocity = of_x0[p] + wp.vec3d(), of_v0[p] + wp.vec3d()
@@ -182,6 +211,9 @@ def finish_gradients(
         of_positions[p] = of_positions[p] + wp.vec3(gradient)
     if of_velocities_0:
         of_velocities_0[p] = of_velocities_0[p] + wp.vec3(of_velocity)
+    square = wp.length_sq(gradient) + wp.length_sq(of_velocity) / (dt * dt)
+    wp.atomic_add(norms, 1, world[p], square)
+    wp.atomic_max(largest, world[p], (wp.int64(wp.cast(float(square), int)) << wp.int64(32)) | wp.int64(p))
 
 
 @wp.kernel
@@ -305,3 +337,34 @@ def add_inverse_masses(
     p = wp.tid()
     if is_fixed[unknown[p]] == 0:
         of_particles[p] = of_particles[p] + of_vertices[p]
+
+
+@wp.kernel
+def report_gradients(
+    # in
+    number: int,
+    failed: wp.array[int],
+    not_solved: wp.array[int],
+    largest: wp.array[wp.int64],
+    # in and out
+    norms: wp.array2d[wp.float64],
+    counts: wp.array[wp.int64],
+):
+    """Counts what became of the gradients of a step in each world, and takes the roots of their squared norms.
+
+    ``number`` is that of the step on its tape. See :class:`.report.GradientReport` for the counts.
+    """
+    w = wp.tid()
+    if w == 0:
+        wp.atomic_add(counts, int(Count.STEPS), wp.int64(1))
+    before, after = norms[0, w], norms[1, w]
+    norms[0, w] = wp.sqrt(before)
+    norms[1, w] = wp.sqrt(after)
+    if failed[w] != 0 and before > wp.float64(0.0):
+        wp.atomic_add(counts, int(Count.UNSOLVED), wp.int64(1))
+    if not_solved[w] != 0:
+        wp.atomic_add(counts, int(Count.FAILED_SOLVES), wp.int64(1))
+    if after > GROWTH * GROWTH * before and before > wp.float64(0.0):
+        if wp.atomic_add(counts, int(Count.GROWING), wp.int64(1)) == wp.int64(0):
+            counts[int(Count.STEP)] = wp.int64(number)
+            counts[int(Count.PARTICLE)] = largest[w] & wp.int64(4294967295)

@@ -22,6 +22,7 @@ from . import energies, kernels
 from .contact_forces import RecordedContacts
 from .equations import SolvedStep, StepEquations
 from .linear import LinearSolver
+from .report import GradientReport
 
 _TOLERANCE, _MAX_ITERATIONS = 1e-6, 1000
 """Residual at which a linear solve ends, relative to its right-hand side, and iterations after which it does."""
@@ -51,7 +52,7 @@ class RecordedStep:
         failed: 1 for worlds that it did not solve, int32, shape [worlds].
         of_particles, of_bodies: 1 for what is in worlds in which it began where the last one ended, int32.
         is_held: 1 for particles that attachments hold.
-        before: The step of the same tape before it, None if there is none.
+        number, norms: Number of the step on its tape, and the norms of its gradients, see :class:`.GradientReport`.
     """
 
     step: SolvedStep
@@ -59,7 +60,8 @@ class RecordedStep:
     of_particles: wp.array
     of_bodies: wp.array
     is_held: wp.array
-    before: "RecordedStep | None" = None
+    number: int
+    norms: wp.array
 
 
 class StepGradients:
@@ -70,15 +72,16 @@ class StepGradients:
         equations: Those of the step that was gone back through last.
     """
 
-    def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool]):
+    def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool], report: GradientReport):
         """Allocates buffers.
 
         Args:
             work: The workspace of the steps.
             newton: The solver, which keeps contacts at the end of its steps.
             converged: Whether it converged, by world.
+            report: Where gradients are counted.
         """
-        self._work, self.newton, self._converged = work, newton, converged
+        self._work, self.newton, self._converged, self._report = work, newton, converged, report
         self._model = model = work.mesh.model
         self.equations = equations = StepEquations(newton)
         self._linear = LinearSolver(
@@ -95,17 +98,18 @@ class StepGradients:
         self._poses, self._carried_poses = None, None
         if model.body_count:
             self._poses, self._carried_poses = wp.clone(model.body_q), wp.zeros_like(model.body_q)
-        self._last: RecordedStep | None = None
+        self._largest = wp.zeros(work.worlds, dtype=wp.int64, device=device)
         self._carried_to: RecordedStep | None = None
 
     def begin(self) -> None:
         """Notes where a step begins, before it is solved."""
         wp.copy(self._interrupted, self._work.motion.vertices.interrupted)
 
-    def record(self, dt: float, v0: wp.array, force: wp.array | None, end: StateArrays) -> RecordedStep:
+    def record(self, tape: wp.Tape, dt: float, v0: wp.array, force: wp.array | None, end: StateArrays) -> RecordedStep:
         """Returns a copy of the step that was taken last.
 
         Args:
+            tape: The tape that records it.
             dt: Its length [s].
             v0: Velocities of particles at its start, vec3.
             force: External forces, vec3, or None; not copied.
@@ -152,8 +156,7 @@ class StepGradients:
             copied(newton.settings, ["load"]),
             poses,
         )
-        self._last = RecordedStep(step, failed, of_particles, of_bodies, is_held)
-        return self._last
+        return RecordedStep(step, failed, of_particles, of_bodies, is_held, *self._report.add_step(tape))
 
     def finish(self, end: StateArrays) -> None:
         """Keeps where bodies ended a step, on a tape or not."""
@@ -189,11 +192,12 @@ class StepGradients:
             self._carried_x.zero_()
             if self._carried_poses is not None:
                 self._carried_poses.zero_()
-        for array in (self._of_x1, self._of_x0, self._of_v0, self._of_unknowns):
+        norms, world = recorded.norms, self._work.mesh.device_world
+        for array in (self._of_x1, self._of_x0, self._of_v0, self._of_unknowns, norms, self._largest):
             array.zero_()
         inputs = [dt, of.end_particle_q, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held]
-        outputs = [self._of_unknowns, self._of_x1]
-        self._launch(kernels.of_end, particles, [*inputs, self._carried_x], outputs)
+        outputs = [self._of_unknowns, self._of_x1, norms]
+        self._launch(kernels.of_end, particles, [*inputs, self._carried_x, world], outputs)
         motion, of_motion = with_gradients(step.motion, ["inverse_mass", "friction"])
         table = self._work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
@@ -215,9 +219,12 @@ class StepGradients:
             inputs = [recorded.of_bodies, *of_poses]
             self._launch(kernels.finish_poses, model.body_count, inputs, [of.body_q, self._carried_poses])
         inputs = [dt, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held, recorded.of_particles]
-        inputs += [self._of_x1, self._of_x0, self._of_v0]
-        outputs = [of.particle_q, of.particle_qd, self._carried_x]
+        inputs += [self._of_x1, self._of_x0, self._of_v0, world]
+        outputs = [of.particle_q, of.particle_qd, self._carried_x, norms, self._largest]
         self._launch(kernels.finish_gradients, particles, inputs, outputs)
+        inputs = [recorded.number, recorded.failed, self._linear.failed, self._largest]
+        self._launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self._report.counts])
+        self._report.copy_counts()
         if model.particle_inv_mass.grad is not None:
             inputs = [of_motion.inverse_mass, step.is_fixed, equations.unknown]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
