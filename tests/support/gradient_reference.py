@@ -12,7 +12,7 @@ import warp as wp
 from warp_bsc.implicit.contact.system import AT_PLANE
 from warp_bsc.implicit.gradients.contact_forces import RecordedContacts
 from warp_bsc.implicit.gradients.linear import LinearSolver
-from warp_bsc.implicit.gradients.step_gradients import StateGradients
+from warp_bsc.implicit.gradients.step_gradients import StartArrays, StateGradients
 
 _NEWTON_STEPS = 40
 _SHARES = 0.5 ** np.arange(12)
@@ -62,8 +62,7 @@ class ReferenceSteps:
         self.x = np.where(free[:, None], self.x, given)
         solver.step(first, second, None, None, dt)
         gradients = self._gradients
-        end = solver.arrays_of_step(second) if hasattr(solver, "arrays_of_step") else second
-        recorded = gradients.record(self._tape, dt, first.particle_qd, first.particle_f, end)
+        recorded = gradients.record(self._tape, dt, StartArrays.of(first), second)
         step = recorded.step
         n = len(self.x)
         x0 = step.x0.numpy()
@@ -159,7 +158,7 @@ class ReferenceSteps:
         end = array(of_x), array(of_v)
         for recorded, before in zip(self.recorded[::-1], [*self.recorded[-2::-1], None], strict=True):
             start = array(), array()
-            of = StateGradients(*start, None, None, *end, None)
+            of = StateGradients(*start, *[None] * 4, *end, None, None)
             gradients.backward(recorded, before, of)
             end = start
         return end[0].numpy(), end[1].numpy()

@@ -28,11 +28,11 @@ from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.step_report import ImplicitStepReport, StepResults
-from .gradients.step_gradients import RecordedStep, StateGradients, StepGradients
+from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
 
 MAX_STEPS, MAX_PRECISE_STEPS = 15, 60
 """Newton steps of a step, and of one whose gradients are wanted: after 48 steps with 15, scenes of ``bench response``
-are within 0.4 mm of where many more lead, in the mean of their particles, but for the pile of cubes, which is chaotic."""
+are within 0.4 mm of where many more lead, in the mean of their particles, but for the chaotic pile of cubes."""
 
 
 def _dynamic_bodies(model: newton.Model) -> np.ndarray:
@@ -242,11 +242,6 @@ class SolverImplicit(SolverCCD):
         raise TypeError("a SolverImplicit cannot be copied: make a new one of the same model")
 
     def _check_tape(self, state_in, state_out, mask):
-        if self._motion.moves_bodies:
-            raise NotImplementedError(
-                "a step of SolverImplicit on a tape carries no gradients through bodies that it moves yet: step "
-                "outside the tape, or pass bodies='ignored'"
-            )
         if mask is not None:
             raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
         if state_in is state_out:
@@ -254,30 +249,29 @@ class SolverImplicit(SolverCCD):
 
     def _record(self, step, end):
         """Solves a step; the tape records its adjoint."""
-        device, start = self.mesh.device, arrays_of(step.state_in)
-        given = [start.particle_q, start.particle_qd, step.state_in.particle_f, start.body_q]
-        ends = [end.particle_q, end.particle_qd, end.body_q]
+        device, start = self.mesh.device, step.state_in
+        given = [start.particle_q, start.particle_qd, start.particle_f, start.body_q, start.body_qd, start.body_f]
+        arrays = [*given, end.particle_q, end.particle_qd, end.body_q, end.body_qd]
         recorded: RecordedStep | None = None
         before: Callable[[], RecordedStep | None] = self._step_before(step.tape)
 
         def forward():
             nonlocal recorded
-            force = given[2]
-            v0, force = wp.clone(given[1]), None if force is None else wp.clone(force, requires_grad=False)
+            copies = StartArrays.of(start)
             self._resolve_motion(step, end)
-            recorded = self.gradients.record(step.tape, step.dt, v0, force, end)
+            recorded = self.gradients.record(step.tape, step.dt, copies, end)
 
         def backward():
             with self._lock:
-                of = [None if array is None else array.grad for array in (*given, *ends)]
-                self.gradients.backward(recorded, before(), StateGradients(*of))
+                gradients = (None if array is None else array.grad for array in arrays)
+                self.gradients.backward(recorded, before(), StateGradients(*gradients))
             if not device.is_capturing:
                 self.report.warn()
 
         run_on_host(forward, device)
         self._last_recorded = weakref.ref(step.tape), lambda: recorded
-        arrays = [array for array in (*given, *ends) if array is not None and array.requires_grad]
-        step.tape.record_func(lambda: run_on_host(backward, device), arrays + self._read_arrays())
+        changed = [array for array in arrays if array is not None and array.requires_grad]
+        step.tape.record_func(lambda: run_on_host(backward, device), changed + self._read_arrays())
 
     def _step_before(self, tape):
         """Returns what returns the step of the same tape that was recorded last, None if there was none."""
@@ -287,7 +281,14 @@ class SolverImplicit(SolverCCD):
     def _read_arrays(self):
         """Returns the arrays that steps read beside those of states and get gradients, which a tape sets to zero."""
         model, friction = self.model, self._motion.friction
-        names = ["particle_inv_mass", "gravity", *(f"tri_{name}" for name in ("poses", "areas", "materials"))]
+        names = [
+            "particle_inv_mass",
+            "body_inv_mass",
+            "body_inertia",
+            "body_inv_inertia",
+            "gravity",
+            *(f"tri_{name}" for name in ("poses", "areas", "materials")),
+        ]
         names += ["tet_poses", "tet_materials"]
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]

@@ -6,7 +6,7 @@ import warp as wp
 
 from ...response.state.structs import Motion
 from ..contact.pairs import Trial
-from ..contact.system import Contacts, Unknowns, end_of_contacts, kind_of_key, second_of_key
+from ..contact.system import Contacts, Unknowns, end_of_contacts, first_unknown, kind_of_key, second_of_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,7 +65,10 @@ def record_contacts(
     kind: wp.array[int],
     plane: wp.array[int],
 ):
-    """Copies the contacts at the end of a step; so many threads share those of a world."""
+    """Copies the contacts at the end of a step; so many threads share those of a world.
+
+    ``rows`` are the unknowns of corners, and behind them, if bodies are solved for, the turns of those on bodies.
+    """
     thread, world = wp.tid()
     for i in range(contacts.start[world] + thread, end_of_contacts(contacts, world), threads):
         slot = wp.atomic_add(count, 0, 1)
@@ -75,7 +78,10 @@ def record_contacts(
         for j in range(4):
             vertex = contacts.corners[i][j]
             vertices[slot, j] = vertex
-            rows[slot, j] = wp.max(unknowns.of_vertex[vertex], -1)
+            u = unknowns.of_vertex[vertex] + int(0)
+            rows[slot, j] = first_unknown(u)
+            if u < -1:
+                rows[slot, 4 + j] = 1 + first_unknown(u)
 
 
 @wp.kernel
@@ -105,11 +111,13 @@ def inertia_of(
     # out
     inertia: wp.array[wp.float64],
 ):
-    """Computes m / dt^2 of unknowns, 1 for what is fixed."""
+    """Computes m / dt^2 of particles, 1 for what is fixed, and 0 for bodies, whose inertia has blocks of its own."""
     u = wp.tid()
     inertia[u] = wp.float64(1.0)
     if is_fixed[u] == 0:
-        inertia[u] = wp.float64(1.0) / (wp.float64(inverse_mass[particle[u]]) * dt * dt)
+        inertia[u] = wp.float64(0.0)
+        if particle[u] >= 0:
+            inertia[u] = wp.float64(1.0) / (wp.float64(inverse_mass[particle[u]]) * dt * dt)
 
 
 @wp.kernel
@@ -277,31 +285,21 @@ def start_poses(
     # in
     given: wp.array[wp.transform],
     continues: wp.array[int],
+    is_solved: wp.array[int],
     # in and out
     poses: wp.array[wp.transform],
 ):
-    """Lets bodies start where they are given, in worlds in which a step does not begin where the last one ended."""
+    """Lets bodies start where they are given, if they are solved for or do not start where the last step ended."""
     body = wp.tid()
-    if continues[body] == 0:
+    if continues[body] == 0 or is_solved[body] != 0:
         poses[body] = given[body]
-
-
-@wp.kernel
-def add_poses(
-    # in
-    of_poses: wp.array[wp.transform],
-    # in and out
-    sums: wp.array[wp.transform],
-):
-    """Adds gradients with respect to poses to others."""
-    body = wp.tid()
-    sums[body] = sums[body] + of_poses[body]
 
 
 @wp.kernel
 def finish_poses(
     # in
     continues: wp.array[int],
+    is_solved: wp.array[int],
     of_pose_1: wp.array[wp.transform],
     of_pose_0: wp.array[wp.transform],
     # in and out
@@ -311,12 +309,15 @@ def finish_poses(
 ):
     """Adds the gradients with respect to poses at both ends of a step to those of the poses that it was given.
 
-    Bodies start where the last step ended in worlds that continue, to which their gradient is ``carried``.
+    Bodies that are not solved for start where the last step ended in worlds that continue, to which their gradient is
+    ``carried``.
     """
     body = wp.tid()
     gradient = of_pose_1[body]
+    if is_solved[body] != 0:  # its pose at the end is what was solved for
+        gradient = wp.transform(wp.vec3(0.0), wp.quat(0.0, 0.0, 0.0, 0.0))
     carried[body] = wp.transform(wp.vec3(0.0), wp.quat(0.0, 0.0, 0.0, 0.0))
-    if continues[body] != 0:
+    if continues[body] != 0 and is_solved[body] == 0:
         carried[body] = of_pose_0[body]
     else:
         gradient = gradient + of_pose_0[body]
@@ -368,3 +369,48 @@ def report_gradients(
         if wp.atomic_add(counts, int(Count.GROWING), wp.int64(1)) == wp.int64(0):
             counts[int(Count.STEP)] = wp.int64(number)
             counts[int(Count.PARTICLE)] = largest[w] & wp.int64(4294967295)
+
+
+@wp.kernel
+def add_of_bodies(
+    # in
+    is_solved: wp.array[int],
+    unknown: wp.array[int],
+    of_changes: wp.array[wp.vec3d],
+    # out
+    of_unknowns: wp.array[wp.vec3d],
+):
+    """Copies the gradients by which the end of bodies is felt to those of their unknowns."""
+    b = wp.tid()
+    if is_solved[b] != 0:
+        u = unknown[b]
+        of_unknowns[u] = of_changes[u]
+        of_unknowns[u + 1] = of_changes[u + 1]
+
+
+@wp.kernel
+def split_end_poses(
+    # in
+    is_solved: wp.array[int],
+    of_end: wp.array[wp.transform],
+    # in and out
+    of_given: wp.array[wp.transform],
+):
+    """Adds the gradients with respect to poses at the end to those of bodies that are not solved for."""
+    b = wp.tid()
+    if is_solved[b] == 0:
+        of_given[b] = of_given[b] + of_end[b]
+    else:
+        of_given[b] = wp.transform(wp.vec3(0.0), wp.quat(0.0, 0.0, 0.0, 0.0))
+
+
+@wp.kernel
+def add_to(
+    # in
+    values: wp.array[float],
+    # in and out
+    sums: wp.array[float],
+):
+    """Adds values to others."""
+    i = wp.tid()
+    sums[i] = sums[i] + values[i]

@@ -57,7 +57,7 @@ class GradientReport:
 
     @property
     def norms(self) -> np.ndarray:
-        """Norm at the start of each step of the last tape, then at the end of the last one, shape [steps + 1, worlds]."""
+        """Norm at the start of each step of the last tape, then at the end of the last, shape [steps + 1, worlds]."""
         if not self._norms:
             return np.zeros((0, self._worlds))
         found = [norms.numpy() for norms in self._norms]
