@@ -20,17 +20,14 @@ _LEAST_CHANGE = 1e-13
 """Change of positions at which a step ends [m]."""
 
 
-class Unsolved(RuntimeError):
-    """A step whose forces do not balance in float64."""
-
-
 class ReferenceSteps:
     """Steps a state in float64.
 
     Attributes:
         x, v: Positions and velocities of particles, float64, shape [particle_count, 3].
         recorded: The steps so far.
-        residual: Largest force that remained in them, as a share of the weight of a particle.
+        residual: Largest force that remained in them, as a share of the weight of the lightest particle, by world.
+        unsolved: Worlds in which the forces of a step did not balance.
     """
 
     def __init__(self, solver, dt, loads=None):
@@ -41,7 +38,9 @@ class ReferenceSteps:
         self._linear = LinearSolver(
             gradients.newton.problem.unknowns.of_worlds, equations.world, tolerance=1e-9, max_iterations=4000
         )
-        self.recorded, self.loads, self.residual = [], [], 0.0
+        worlds = len(gradients.newton.problem.unknowns.of_worlds) - 1
+        self.recorded, self.loads = [], []
+        self.residual, self.unsolved = np.zeros(worlds), np.zeros(worlds, dtype=bool)
 
     def begin(self, state):
         """Starts in a state of Newton."""
@@ -118,31 +117,45 @@ class ReferenceSteps:
         )
 
     def _solve(self, step):
-        equations = self._gradients.equations
-        weight = 9.81 / self._solver.mesh.inverse_masses.numpy()[: len(self.x)][self._free()].max()
-        unknown = equations.unknown.numpy()
+        """Returns positions of vertices where the forces of a step balance; worlds in which they do not are noted."""
+        equations, newton = self._gradients.equations, self._gradients.newton
+        n, unknown, world = len(self.x), equations.unknown.numpy(), newton.mesh.device_world.numpy()[: len(self.x)]
+        weight = 9.81 / self._solver.mesh.inverse_masses.numpy()[:n][self._free()].max()
+        of_unknowns, count = equations.world.numpy(), len(self.unsolved)
+
+        def residuals(positions):
+            step.x1.assign(positions)
+            equations.load(step)
+            found = np.zeros(count)
+            np.maximum.at(found, of_unknowns, np.abs(equations.evaluate().numpy()).max(axis=1))
+            return found
+
         x1 = step.x1.numpy()
-        equations.load(step)
-        forces = equations.evaluate().numpy()
-        size = np.abs(forces).max()
+        size, done = residuals(x1), np.zeros(count, dtype=bool)
         for _k in range(_NEWTON_STEPS):
             change = self._linear.solve(equations.differentiate(transposed=False), equations.forces).numpy()[unknown]
-            if not np.isfinite(change).all():
-                raise Unsolved(f"the linear solve failed, with {size / weight:.1e} weights left")
+            failed = np.zeros(count, dtype=bool)
+            np.logical_or.at(failed, world, ~np.isfinite(change).all(axis=1))
+            change[failed[world] | done[world]] = 0.0
+            largest = np.zeros(count)
+            np.maximum.at(largest, world, np.abs(change).max(axis=1))
+            taken = failed | done
             for share in _SHARES:
-                moved = x1.copy()
-                moved[: len(self.x)] += share * change
-                step.x1.assign(moved)
-                equations.load(step)
-                tried = np.abs(equations.evaluate().numpy()).max()
-                if tried < size or share * np.abs(change).max() < _LEAST_CHANGE:
+                tried = x1.copy()
+                tried[:n][~taken[world]] += share * change[~taken[world]]
+                found = residuals(tried)
+                takes = ~taken & ((found < size) | (share * largest < _LEAST_CHANGE))
+                x1[:n][takes[world]] = tried[:n][takes[world]]
+                size[takes], taken = found[takes], taken | takes
+                if taken.all():
                     break
-            else:
-                raise Unsolved(f"no share of a Newton step leaves less force than {size / weight:.1e} weights")
-            x1, size = moved, tried
-            if np.abs(change).max() < _LEAST_CHANGE * 1e3 and size < 1e-9 * weight:
+            self.unsolved |= failed | ~taken
+            done |= failed | ~taken | ((largest < 1e3 * _LEAST_CHANGE) & (size < 1e-9 * weight))
+            residuals(x1)
+            if done.all():
                 break
-        self.residual = max(self.residual, size / weight)
+        self.unsolved |= ~done
+        self.residual = np.maximum(self.residual, size / weight)
         return x1
 
     def backward(self, of_x, of_v=None):
