@@ -1,4 +1,4 @@
-"""Compares gradients through steps of the solver with contact inside with central differences, by scene, in many worlds.
+"""Compares gradients through steps of the solver with contact inside with central differences, by scene and world.
 
     python tests/support/gradient_accuracy.py --worlds 8
     python tests/support/gradient_accuracy.py throw rope --worlds 64 --steps 40 --device cuda:0
