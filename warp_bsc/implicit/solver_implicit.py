@@ -27,8 +27,9 @@ from ..response.step import begin, detect_contacts, resolve_contacts
 from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
-from .contact.step_report import ImplicitStepReport, StepResults
+from .contact.results import StepResults
 from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
+from .report import ImplicitStepReport
 
 MAX_STEPS, MAX_PRECISE_STEPS = 15, 60
 """Newton steps of a step, and of one whose gradients are wanted: after 48 steps with 15, scenes of ``bench response``
@@ -129,7 +130,7 @@ class SolverImplicit(SolverCCD):
 
     Attributes:
         mesh: The triangles that collide, :class:`.response.state.mesh.ModelMesh`.
-        report: What a step found and did, :class:`.contact.step_report.ImplicitStepReport`.
+        report: What a step found and did, :class:`.report.ImplicitStepReport`.
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         max_iterations: Newton steps of a step at most.
         gradients: What carries gradients of tapes through steps, None unless the model requires gradients.

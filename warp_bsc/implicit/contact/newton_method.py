@@ -30,8 +30,8 @@ from .flow import Flow, Phase, Problem
 from .impulses import publish_contacts
 from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
+from .results import StepResults, note_overflow, write_results
 from .rows import make_rows
-from .step_report import StepResults, note_overflow, write_results
 from .system import Contacts, Progress, Unknowns, Worlds
 
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
