@@ -122,9 +122,21 @@ class SolverImplicit(SolverCCD):
     Each world is stepped as if it were alone, bit for bit as measured on CPUs, but for the distance by which contacts
     that the solve leaves are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
 
+    On a :class:`warp.Tape`, steps of a model that was finalized with ``requires_grad=True`` carry gradients: from
+    positions and velocities of particles and bodies at their end to those at their start, to ``particle_f`` and
+    ``body_f``, and to what requires gradients of ``particle_inv_mass``, ``body_inv_mass``, ``body_inertia``,
+    ``body_inv_inertia`` and ``gravity``; ``tri_poses``, ``tri_areas``, ``tri_materials``, ``edge_rest_angle``,
+    ``edge_rest_length``, ``edge_bending_properties``, ``tet_poses``, ``tet_materials``, ``spring_rest_length``,
+    ``spring_stiffness`` and ``spring_damping``; points, stiffness and damping of attachments; coefficients of friction
+    of particles, shapes and pairs; and to kinematic particles and bodies that a program moves. The implicit function
+    theorem makes them of each converged step, with friction and closest points as they move, by one linear solve, see
+    :mod:`.gradients.equations`. They are NaN, and counted, in worlds whose step did not converge. Such a model is
+    solved closer, in some two Newton steps more. Two things count as constant: which pairs are near, and by how much barriers
+    are stiffer where solids and taut elements press. :mod:`.response.adjoint.between_steps` says where gradients of
+    kinematic particles and bodies are.
+
     Limitations:
-        Restitution does not exist: contacts are without bounce, and implicit steps damp. A step on a tape raises
-        NotImplementedError if the model requires gradients.
+        Restitution does not exist: contacts are without bounce, and implicit steps damp.
         On a GPU, the blocks of a kernel wait for each other, one on each multiprocessor: do not run steps of two such
         solvers at the same time on streams of different priorities, as each may hold what the other waits for.
 

@@ -64,14 +64,19 @@ def record_contacts(
     rows: wp.array2d[int],
     kind: wp.array[int],
     plane: wp.array[int],
+    failed: wp.array[int],
 ):
     """Copies the contacts at the end of a step; so many threads share those of a world.
 
     ``rows`` are the unknowns of corners, and behind them, if bodies are solved for, the turns of those on bodies.
+    Worlds whose contacts do not fit have ``failed``.
     """
     thread, world = wp.tid()
     for i in range(contacts.start[world] + thread, end_of_contacts(contacts, world), threads):
         slot = wp.atomic_add(count, 0, 1)
+        if slot >= kind.shape[0]:
+            failed[world] = 1
+            return
         key = contacts.key[i] + wp.int64(0)
         kind[slot] = kind_of_key(key)
         plane[slot] = second_of_key(key)

@@ -121,6 +121,7 @@ class StepGradients:
         self._poses, self._carried_poses = None, None
         if model.body_count:
             self._poses, self._carried_poses = wp.clone(model.body_q), wp.zeros_like(model.body_q)
+        self._room = 0  # contacts that the arrays of a step in a CUDA graph have room for
         self._largest = wp.zeros(work.worlds, dtype=wp.int64, device=device)
         self._carried_to: RecordedStep | None = None
 
@@ -167,7 +168,7 @@ class StepGradients:
             poses = wp.clone(end.body_q, requires_grad=False), wp.clone(self._poses, requires_grad=False)
             self._launch(kernels.start_poses, model.body_count, [start.body_q, of_bodies, is_solved], [poses[1]])
             bodies = self._predict(dt, start, poses[1], is_solved)
-        contacts = self._record_contacts()
+        contacts = self._record_contacts(failed)
         of_motion = copied(motion, ["inverse_mass", "friction"])
         of_motion.materials = copied_materials(motion.materials)
         step = SolvedStep(
@@ -204,17 +205,26 @@ class StepGradients:
         if self._poses is not None:
             wp.copy(self._poses, end.body_q)
 
-    def _record_contacts(self):
-        """Returns vertices, unknowns, and all else of the contacts at the end of a step."""
+    def _record_contacts(self, failed):
+        """Returns vertices, unknowns, and all else of the contacts at the end of a step.
+
+        In a CUDA graph there is room for half as many again as steps outside of one have had; worlds fail whose
+        contacts do not fit.
+        """
         work, newton, device = self._work, self.newton, self._work.device
-        capacity = len(newton.problem.contacts.corners)
-        sizes = 4, 4 if self.equations.of_bodies is None else 8
-        vertices, rows = (wp.full((capacity, size), -1, dtype=int, device=device) for size in sizes)
+        capacity, size = len(newton.problem.contacts.corners), 4 if self.equations.of_bodies is None else 8
+        if device.is_capturing and self._room:
+            capacity = min(capacity, self._room)
+        vertices, rows = (wp.full((capacity, n), -1, dtype=int, device=device) for n in (4, size))
         kind, plane = wp.full(capacity, -1, dtype=int, device=device), wp.zeros(capacity, dtype=int, device=device)
         count, threads = wp.zeros(1, dtype=int, device=device), _THREADS if device.is_cuda else 1
         inputs = [newton.problem.contacts, newton.problem.unknowns, threads, count]
-        self._launch(kernels.record_contacts, (threads, work.worlds), inputs, [vertices, rows, kind, plane])
-        n = capacity if device.is_capturing or device.is_cuda else int(count.numpy()[0])
+        outputs = [vertices, rows, kind, plane, failed]
+        self._launch(kernels.record_contacts, (threads, work.worlds), inputs, outputs)
+        n = capacity
+        if not device.is_capturing:
+            n = int(count.numpy()[0])
+            self._room = max(self._room, n + n // 2)
         contacts = RecordedContacts()
         contacts.kind, contacts.plane = _first(kind, n), _first(plane, n)
         contacts.fall = wp.clone(newton.problem.progress.fall)
