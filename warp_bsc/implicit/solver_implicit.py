@@ -131,9 +131,9 @@ class SolverImplicit(SolverCCD):
     of particles, shapes and pairs; and to kinematic particles and bodies that a program moves. The implicit function
     theorem makes them of each converged step, with friction and closest points as they move, by one linear solve, see
     :mod:`.gradients.equations`. They are NaN, and counted, in worlds whose step did not converge. Such a model is
-    solved closer, in some two Newton steps more. Two things count as constant: which pairs are near, and by how much barriers
-    are stiffer where solids and taut elements press. :mod:`.response.adjoint.between_steps` says where gradients of
-    kinematic particles and bodies are.
+    solved closer, in some two Newton steps more. Two things count as constant: which pairs are near, and by how much
+    barriers are stiffer where solids and taut elements press. :mod:`.response.adjoint.between_steps` says where
+    gradients of kinematic particles and bodies are.
 
     Limitations:
         Restitution does not exist: contacts are without bounce, and implicit steps damp.
