@@ -7,7 +7,7 @@ from ..response.report.report import SolverReport
 from ..response.state.structs import allocate
 from ..response.state.workspace import Workspace
 from .contact.results import StepResults
-from .gradients.report import GradientReport, GradientTotals
+from .gradients.report import GradientReport, GradientCounts
 
 
 class ImplicitStepReport(SolverReport):
@@ -36,7 +36,7 @@ class ImplicitStepReport(SolverReport):
             self._warnings.once(subject, lambda message=message: message)
 
     @property
-    def gradient_counts(self) -> GradientTotals:
+    def gradient_counts(self) -> GradientCounts:
         """Totals over all gradients that went back through steps so far, as of this access."""
         self.of_gradients.copy_counts()
         return self.of_gradients.totals(self._read_totals()["ambiguous_moves"])

@@ -10,7 +10,7 @@ from .kernels import GROWTH, Count
 
 
 @dataclass(frozen=True)
-class GradientTotals:
+class GradientCounts:
     """Totals over all gradients that went back through steps so far.
 
     Attributes:
@@ -28,6 +28,11 @@ class GradientTotals:
     failed_solves: int
     growing: int
     ambiguous_moves: int
+
+    def text(self) -> str:
+        """Returns what a line of a report says of them, if anything."""
+        lost = self.unsolved + self.failed_solves
+        return f"; gradients: NaN in {lost} worlds of steps" if lost else ""
 
 
 class GradientReport:
@@ -63,10 +68,10 @@ class GradientReport:
         found = [norms.numpy() for norms in self._norms]
         return np.array([*(both[1] for both in found), found[-1][0]])
 
-    def totals(self, ambiguous_moves: int) -> GradientTotals:
+    def totals(self, ambiguous_moves: int) -> GradientCounts:
         """Returns the totals."""
         counts = self.counts.numpy().tolist()
-        return GradientTotals(*counts[: int(Count.STEP)], ambiguous_moves)
+        return GradientCounts(*counts[: int(Count.STEP)], ambiguous_moves)
 
     def warnings(self) -> dict[str, str]:
         """Returns what to warn of, as far as the host knows it, by subject."""
