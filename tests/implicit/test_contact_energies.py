@@ -4,7 +4,6 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from implicit_scenes import exact_hessians
 from newton_scenes import DT
 
 from warp_bsc.implicit.contact.assembly import add_blocks
@@ -22,10 +21,10 @@ from warp_bsc.implicit.contact.matrix import Matrix, make_matrix
 from warp_bsc.implicit.contact.pairs import Trial
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
-from warp_bsc.implicit.elastic import Elastic
 from warp_bsc.implicit.elasticity.derivatives import Derivatives, element_energy, find_derivatives, make_derivatives
 from warp_bsc.implicit.elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, kind_of
-from warp_bsc.implicit.elements import with_gradient
+from warp_bsc.implicit.gradients.elastic import Elastic
+from warp_bsc.implicit.gradients.elements import with_gradient
 from warp_bsc.response.state.structs import Motion, allocate
 
 
@@ -123,9 +122,21 @@ class Scene:
 
     def differentiated(self):
         """Returns the elements, with their exact Hessians."""
-        elastic = Elastic(self.model)
+        count = self.model.particle_count
+        elastic = Elastic(self.model, np.arange(count), count)
         elastic.differentiate(DT, self.array(self.x, wp.vec3d), self.array(self.x0, wp.vec3d))
         return elastic
+
+    def exact_hessians(self, elastic):
+        """Yields the particles of elements of each kind, -1 for none, and the Hessians that ``elastic`` has."""
+        blocks, bends, place = elastic.blocks.numpy(), elastic.bends.numpy(), 0
+        for kind, v in enumerate(self.vertices):
+            n, size = v.shape
+            if kind == ElementKind.BENDING:
+                hessian = bends
+            else:
+                hessian, place = blocks[place : place + n * size * size], place + n * size * size
+            yield v, hessian.reshape(n, size, size, 3, 3).transpose(0, 1, 3, 2, 4)
 
     def by_kind(self, out):
         """Returns gradients, shape [n, size, 3], and Hessians, shape [n, size, 3, size, 3], of each kind."""
@@ -160,10 +171,18 @@ def test_exact_hessians_are_those_that_warp_computes(scene):
     gradient = wp.zeros_like(x1)
     elastic.add_gradients(DT, with_gradient(x1, gradient), x0, multipliers)
     expected, product = -gradient.numpy(), np.zeros_like(way)
-    for v, hessian in exact_hessians(elastic, scene.model):
+    for v, hessian in scene.exact_hessians(elastic):
         along = np.where(v[..., None] >= 0, way[v], 0.0)
         np.add.at(product, v, np.einsum("eiajb,ejb->eia", hessian, along) * (v >= 0)[..., None])
     np.testing.assert_allclose(product, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_forces_in_float64_are_minus_the_derivatives_of_the_energies(scene):
+    elastic, way, h = scene.differentiated(), np.random.default_rng(1).normal(size=scene.x.shape), 1e-6
+    forces = scene.array(np.zeros_like(way), wp.vec3d)
+    elastic.add_forces(DT, scene.array(scene.x, wp.vec3d), scene.array(scene.x0, wp.vec3d), forces)
+    above, below = (np.concatenate(scene.energies(scene.x + sign * h * way)).sum() for sign in (1.0, -1.0))
+    assert (forces.numpy() * way).sum() == pytest.approx((below - above) / (2.0 * h), rel=1e-7)
 
 
 def test_hessians_in_float32_are_the_exact_ones(device, scene):
@@ -172,7 +191,7 @@ def test_hessians_in_float32_are_the_exact_ones(device, scene):
     flat.x[:, :2] += np.random.default_rng(3).normal(0.0, 0.01, (len(flat.x), 2))
     flat.x0 = flat.x
     for each in (scene, flat):
-        exact = exact_hessians(each.differentiated(), each.model)
+        exact = each.exact_hessians(each.differentiated())
         for kind, (_, hessian), (_, expected) in zip(
             ElementKind, each.by_kind(each.differentiate()), exact, strict=True
         ):

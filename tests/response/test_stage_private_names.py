@@ -52,13 +52,6 @@ def vbd_with_self_contact(model):
     return SolverVBD(model, iterations=3, particle_enable_self_contact=True, **margins)
 
 
-def contacts_of(model):
-    """Contacts of particles with the shapes of a model."""
-    contacts = (pipeline := newton.CollisionPipeline(model)).contacts()
-    pipeline.collide(model.state(), contacts)
-    return contacts
-
-
 def step(solver, model, contacts=None, dt=DT):
     """The state after a step."""
     start, end = model.state(), model.state()
@@ -161,19 +154,6 @@ def test_style3d_has_contacts_of_its_own(device, monkeypatch):
         of_newton.with_contacts(solver, None).__enter__()
 
 
-def test_soft_contacts_say_whether_they_are_of_surfaces(device, monkeypatch):
-    contacts = contacts_of(sheet_above_sphere(device))
-    assert not of_newton.has_surface_contacts(contacts)
-    contacts.soft_contact_rigid_indices = contacts.soft_contact_indices  # which Newton 1.6 does not have
-    contacts._soft_contact_mesh_features = wp.zeros(1, dtype=wp.vec3i, device=device)
-    assert of_newton.has_surface_contacts(contacts)
-    monkeypatch.delattr(contacts, "_soft_contact_mesh_features")
-    with pytest.raises(RuntimeError, match=r"no Contacts._soft_contact_mesh_features.*no gradients"):
-        of_newton.has_surface_contacts(contacts)
-    monkeypatch.delattr(contacts, "soft_contact_rigid_indices")
-    assert not of_newton.has_surface_contacts(contacts)
-
-
 class TestNewton16:
     """What stands in for what Newton 1.6 lacks."""
 
@@ -185,20 +165,8 @@ class TestNewton16:
         found = of_newton.attachment_arrays(types.SimpleNamespace(attachment_particle_body_count=1, **arrays))
         assert found == names
 
-    def test_switches_that_vbd_does_not_have_are_off(self):
-        solver = types.SimpleNamespace(rigid_soft_enable_dat=True)
-        assert of_newton.vbd_switch(solver, "rigid_soft_enable_dat")
-        assert not of_newton.vbd_switch(solver, "rigid_soft_contact_use_log_barrier")
-
     def test_observables_are_refused(self, monkeypatch):
         monkeypatch.delattr(SolverBase, "validate_observables", raising=False)
         of_newton.check_observables(None, None, None)
         with pytest.raises(TypeError, match=r"observables: Newton .* has none"):
             of_newton.check_observables(None, {"contact_f"}, None)
-
-    @pytest.mark.parametrize(
-        "cut", [lambda state, contacts: (state.particle_q, contacts), lambda particle_q_out: (particle_q_out, None)]
-    )
-    def test_displacements_are_cut_in_either_form(self, cut):
-        solver = types.SimpleNamespace(**dict.fromkeys(of_newton.CUTS) | {"_penetration_free_truncation": cut})
-        assert of_newton.displacements_since_detection(solver)[2](types.SimpleNamespace(particle_q=1)) == (1, None)

@@ -464,7 +464,7 @@ def calls_of_scenes() -> dict[str, Call]:
 def calls_of_solvers() -> dict[str, Call]:
     """Returns the callables of the collision stage."""
     inner = solver()
-    stage, vbd = bsc.SolverCCD(inner), newton.solvers.SolverVBD(inner.model)
+    stage = bsc.SolverCCD(inner)
     start, end = inner.model.state(), inner.model.state()
     solvers = {**OBJECTS, "model": inner.model}
     count = inner.model.particle_count
@@ -584,17 +584,6 @@ def calls_of_solvers() -> dict[str, Call]:
             },
             raises=bsc.SolverImplicit.__init__,
         ),
-        "SolverImplicitAdjoint": Call(
-            bsc.SolverImplicitAdjoint,
-            {"solver": vbd},
-            {
-                "solver": {**solvers, "another": inner},
-                "polish": NOT_COUNT | {"too many": 101},
-                "tolerance": {**NUMBERS, "zero": 0.0, "negative": -1.0, "above 1": 1.5},
-                "max_iterations": NOT_COUNT | {"zero": 0},
-            },
-            raises=bsc.SolverImplicitAdjoint.__init__,
-        ),
         "CapturedSteps": Call(
             bsc.CapturedSteps,
             {"steps": print, "solver": inner},
@@ -644,7 +633,6 @@ def calls_of_solvers() -> dict[str, Call]:
         ("SolverImplicit", bsc.SolverImplicit(inner.model)),
         ("CollisionMonitor", bsc.CollisionMonitor(inner)),
         ("ContactLayer", bsc.ContactLayer(inner)),
-        ("SolverImplicitAdjoint", bsc.SolverImplicitAdjoint(vbd)),
     ):
         bad = {"dt": lengths}
         found[f"{name}.step"] = Call(
@@ -675,7 +663,7 @@ RESULTS = {
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 
 PASSED_ON = re.compile(
-    r"(SolverCCD|SolverImplicit|CollisionMonitor|ContactLayer|SolverImplicitAdjoint)\.(coupling_\w+|"
+    r"(SolverCCD|SolverImplicit|CollisionMonitor|ContactLayer)\.(coupling_\w+|"
     r"notify_model_changed|observables|reset|"
     r"set_collision_frequency|update_contacts|validate_observables)$"
 )

@@ -177,22 +177,27 @@ def central_differences(run, throws, step):
 
 def run_exactly(scene, steps):
     """Returns gradients and central differences of steps in float64, and worlds in which a step has no solution."""
-    loads, unsolved = None, np.zeros(len(scene.throws), dtype=bool)
+    solver, reference, held = scene.solver, ReferenceSteps(scene.solver), None
+    states, unsolved = [scene.model.state() for _ in range(steps + 1)], np.zeros(len(scene.throws), dtype=bool)
+    x0 = scene.model.particle_q.numpy()
 
-    def run(throws, reference=None):
-        reference = ReferenceSteps(scene.solver, DT, loads) if reference is None else reference
-        reference.begin(scene.state(throws))
-        reference.v = scene.velocities(throws)
-        for _ in range(steps):
-            reference.step()
+    def run(throws):
+        states[0].particle_qd.assign(scene.velocities(throws).astype(np.float32))
+        solver.reset(states[0])
+        reference.begin(x0, scene.velocities(throws), held)
+        with wp.Tape() as tape:  # what records steps solves them in float64
+            for start, end in itertools.pairwise(states):
+                solver.step(start, end, None, None, DT)
         unsolved[:] |= reference.unsolved
-        return scene.losses(reference.x)
+        return tape, scene.losses(reference.x)
 
-    first = ReferenceSteps(scene.solver, DT)
-    run(scene.throws, first)
-    _of_x, of_v = first.backward(scene.loss_weights)
-    gradients, loads = scene.by_world(np.where(scene.thrown[:, None], of_v, 0.0)), first.loads
-    return gradients, central_differences(run, scene.throws, EXACT), unsolved
+    tape, _ = run(scene.throws)
+    held = reference.held
+    states[-1].particle_q.grad.assign(scene.loss_weights.astype(np.float32))
+    tape.backward()
+    of_v = states[0].particle_qd.grad.numpy().astype(float)
+    gradients = scene.by_world(np.where(scene.thrown[:, None], of_v, 0.0))
+    return gradients, central_differences(lambda throws: run(throws)[1], scene.throws, EXACT), unsolved
 
 
 def run_as_computed(scene, steps):

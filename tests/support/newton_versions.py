@@ -1,7 +1,5 @@
 """Marks of tests of what the oldest versions of Newton that the package supports lack."""
 
-import inspect
-
 import newton
 import pytest
 
@@ -11,7 +9,6 @@ __all__ = [
     "HAS_OBSERVABLES",
     "needs_attachments",
     "needs_hard_attachments",
-    "needs_truncation_before_shapes",
 ]
 
 HAS_OBSERVABLES = hasattr(newton.solvers.SolverBase, "observables")
@@ -29,9 +26,4 @@ HAS_HARD_ATTACHMENTS = HAS_ATTACHMENTS and not newton.__version__.startswith("1.
 
 needs_hard_attachments = pytest.mark.skipif(
     not HAS_HARD_ATTACHMENTS, reason="Newton before 1.8 has no attachments of infinite stiffness"
-)
-
-needs_truncation_before_shapes = pytest.mark.skipif(
-    "rigid_soft_enable_dat" not in inspect.signature(newton.solvers.SolverVBD).parameters,
-    reason="VBD of Newton 1.6 does not truncate before shapes",
 )

@@ -1,8 +1,7 @@
 """Names and contracts of Newton, and what its versions differ in."""
 
 import contextlib
-import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -12,9 +11,6 @@ from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 from newton.solvers.experimental.coupled import CouplingInterface
 
 from .versions import missing, version_of, warn_if_untested
-
-CUTS = "pos_prev_collision_detection", "particle_displacements", "_penetration_free_truncation"
-"""Names of VBD that :func:`displacements_since_detection` needs."""
 
 COUPLERS_DECLARE_RESTARTS = hasattr(CouplingInterface, "coupling_notify_iteration_restarts")
 """Whether couplers say, once and before any other hook, whether they restart steps; Newton before 1.8 does not."""
@@ -86,32 +82,6 @@ def attachment_arrays(model: newton.Model) -> AttachmentArrays | None:
     return AttachmentArrays(*(getattr(model, f"attachment_particle_body_{name}") for name in AttachmentArrays._fields))
 
 
-def vbd_switch(solver: SolverVBD, name: str) -> bool:
-    """Returns whether VBD has switched something on, by the name of an attribute.
-
-    Newton 1.6 lacks ``rigid_soft_enable_dat``, ``rigid_soft_contact_use_log_barrier`` and what they switch on.
-    """
-    return bool(getattr(solver, name, False))
-
-
-def displacements_since_detection(solver: SolverVBD) -> tuple[wp.array, wp.array, Callable[[newton.State], None]]:
-    """Returns where particles were at the last detection of self-contact, their displacements, and what cuts these.
-
-    Contract: ``SolverVBD._penetration_free_truncation(state, None)`` cuts the displacements ``particle_displacements``
-    from the positions ``pos_prev_collision_detection``, and writes the sums to ``state.particle_q``. That of Newton 1.6
-    has the array in place of the state, and no second argument.
-
-    Raises:
-        RuntimeError: If VBD has not all of them: polish could move particles through each other.
-    """
-    for name in CUTS:
-        if not hasattr(solver, name):
-            raise missing("newton", f"SolverVBD.{name}", "polish has no use with self-contact")
-    start, displacements, cut = (getattr(solver, name) for name in CUTS)
-    takes_array = "particle_q_out" in inspect.signature(cut).parameters
-    return start, displacements, lambda state: cut(state.particle_q) if takes_array else cut(state, None)
-
-
 def has_external_rigid_solver(solver: SolverBase) -> bool:
     """Returns whether a solver is VBD that leaves bodies to another solver.
 
@@ -141,21 +111,6 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
     return poses
 
 
-def pose_rebaseline_mask(solver: SolverVBD) -> wp.array:
-    """Returns which worlds start their next step with bodies at rest where the state has them.
-
-    Contract: ``SolverVBD`` that integrates bodies has ``_rigid_pose_rebaseline_mask``, bool, one for each world and a
-    last one for bodies of no world. Where it is True, a step sets ``body_q_prev`` to the poses of the state.
-
-    Raises:
-        RuntimeError: If VBD has no such array: friction of the first step would have another gradient than result.
-    """
-    name = "_rigid_pose_rebaseline_mask"
-    if not hasattr(solver, name):
-        raise missing("newton", f"SolverVBD.{name}", "steps with bodies carry no gradients")
-    return getattr(solver, name)
-
-
 @contextlib.contextmanager
 def with_contacts(solver: SolverBase, contacts: Any) -> Iterator[None]:
     """Gives Style3D other contacts than its own while it steps, or none: the stage resolves those.
@@ -179,20 +134,3 @@ def with_contacts(solver: SolverBase, contacts: Any) -> Iterator[None]:
         yield
     finally:
         solver.collision = own
-
-
-def has_surface_contacts(contacts: newton.Contacts) -> bool:
-    """Returns whether soft contacts may be of edges and faces, and not of particles alone.
-
-    Contract: Then ``Contacts`` has the features of meshes that they are of, ``_soft_contact_mesh_features``; else None.
-    Contacts of Newton 1.6, which have no ``soft_contact_rigid_indices``, are of no features of meshes.
-
-    Raises:
-        RuntimeError: If this version of Newton has no such attribute.
-    """
-    name = "_soft_contact_mesh_features"
-    if not hasattr(contacts, "soft_contact_rigid_indices"):
-        return False
-    if not hasattr(contacts, name):
-        raise missing("newton", f"Contacts.{name}", "contacts of surfaces would have no gradients; pass no contacts")
-    return getattr(contacts, name) is not None

@@ -7,7 +7,7 @@ from ..response.report.report import SolverReport
 from ..response.state.structs import allocate
 from ..response.state.workspace import Workspace
 from .contact.results import StepResults
-from .gradients.report import GradientReport, GradientCounts
+from .gradients.report import GradientCounts, GradientReport
 
 
 class ImplicitStepReport(SolverReport):

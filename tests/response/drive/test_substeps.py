@@ -294,7 +294,7 @@ def test_bodies_that_another_solver_moves_have_no_gradients_in_substeps(device):
     builder.color()
     model = builder.finalize(device=device, requires_grad=True)
     inner = newton.solvers.SolverVBD(model, integrate_with_external_rigid_solver=True)
-    solver = bsc.SolverCCD(bsc.SolverImplicitAdjoint(inner), substeps=2)
+    solver = bsc.SolverCCD(inner, substeps=2)
     with wp.Tape(), pytest.raises(NotImplementedError, match="bodies that another solver moves"):
         solver.step(model.state(), model.state(), None, None, DT)
 

@@ -334,14 +334,13 @@ def finish_poses(
 def add_inverse_masses(
     # in
     of_vertices: wp.array[float],
-    is_fixed: wp.array[int],
-    unknown: wp.array[int],
+    inverse_mass: wp.array[float],
     # in and out
     of_particles: wp.array[float],
 ):
-    """Adds gradients with respect to inverse masses of vertices to those of particles that are solved for."""
+    """Adds gradients with respect to inverse masses of vertices to those of particles that have a mass."""
     p = wp.tid()
-    if is_fixed[unknown[p]] == 0:
+    if inverse_mass[p] > 0.0:
         of_particles[p] = of_particles[p] + of_vertices[p]
 
 

@@ -297,7 +297,7 @@ class StepGradients:
         self._launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self._report.counts])
         self._report.copy_counts()
         if model.particle_inv_mass.grad is not None:
-            inputs = [of_motion.inverse_mass, step.is_fixed, equations.unknown]
+            inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
         self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
         self._carried_to = before

@@ -1,0 +1,124 @@
+"""The matrix of a step against differences of its forces, and linear solves with it against dense ones in NumPy."""
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from gradient_scenes import DT, SCENES, add_cloth, cloth_on_edge, marks_of
+
+import warp_bsc as bsc
+from warp_bsc.implicit.gradients.linear import LinearSolver
+from warp_bsc.response.state.motion import arrays_of
+
+TOLERANCE = 1e-9
+
+
+class System:
+    """The equations of a step, at positions that are moved at random from its end, and a right-hand side."""
+
+    def __init__(self, model, solver, states, scale):
+        rng, n = np.random.default_rng(5), model.particle_count
+        start, end = states
+        solver.step(start, end, None, None, DT)
+        self.equations = solver.gradients.equations
+        step = solver.gradients.record(DT, start.particle_qd, start.particle_f, arrays_of(end)).step
+        self.contacts = int((step.contacts.kind.numpy() >= 0).sum())
+        x = step.x1.numpy().copy()
+        x[:n] += scale * rng.normal(size=(n, 3)) * (solver.mesh.inverse_masses.numpy()[:n] > 0.0)[:, None]
+        step.x1.assign(x)
+        self.step, self.of_worlds = step, solver.newton_method.problem.unknowns.of_worlds
+        free = step.is_fixed.numpy() == 0
+        self.free = np.repeat(free, 3)
+        self.b = wp.array(rng.normal(size=(len(free), 3)) * free[:, None], dtype=wp.vec3d, device=model.device)
+
+    def dense(self):
+        """The matrix, by central differences of the forces."""
+        step, equations = self.step, self.equations
+        unknown, x, h = equations.unknown.numpy(), step.x1.numpy().copy(), 1e-8
+        matrix = np.eye(3 * equations.count)
+        for p, c in zip(*np.nonzero(self.free.reshape(-1, 3)[unknown]), strict=True):
+            forces = []
+            for sign in (1.0, -1.0):
+                moved = x.copy()
+                moved[p, c] += sign * h
+                step.x1.assign(moved)
+                equations.load(step)
+                forces.append(equations.evaluate().numpy().ravel().copy())
+            matrix[:, 3 * unknown[p] + c] = (forces[1] - forces[0]) / (2.0 * h)
+        step.x1.assign(x)
+        return matrix
+
+    def solve(self, *, transposed=False, max_iterations=2000, b=None):
+        """The solution, and the solver."""
+        equations = self.equations
+        solver = LinearSolver(self.of_worlds, equations.world, tolerance=TOLERANCE, max_iterations=max_iterations)
+        equations.load(self.step)
+        matrix = equations.differentiate(transposed=transposed)
+        return solver.solve(matrix, self.b if b is None else b).numpy(), solver
+
+
+def in_contact(scene):
+    """The second step of a scene."""
+    program = scene()
+    states = program.begin(program.inputs)[:2]
+    program.write(states[0], program.inputs, 0)
+    program.solver.step(*states, None, None, DT)
+    program.write(states[1], program.inputs, 1)
+    return System(program.model, program.solver, states[::-1], 2e-5)
+
+
+def hanging(scale, worlds=1):
+    """A cloth in each world that one side holds, moved so far from the end of a step."""
+    builder = newton.ModelBuilder()
+    for world in range(worlds):
+        each = newton.ModelBuilder()
+        add_cloth(each, (0.0, 0.0, 1.0), fix_left=True, cell=0.05 + 0.01 * world)
+        builder.add_world(each)
+    builder.color()
+    model = builder.finalize(device="cpu", requires_grad=True)
+    return System(model, bsc.SolverImplicit(model), [model.state(), model.state()], scale)
+
+
+SYSTEMS = {"hanging": lambda: hanging(2e-4), "compressed": lambda: hanging(1e-2), "worlds": lambda: hanging(2e-4, 3)}
+SYSTEMS |= {scene.__name__: (lambda scene=scene: in_contact(scene)) for scene in SCENES[1:]}
+"""Systems by name; that of a sphere has more contacts than is fast."""
+MARKS = {scene.__name__: marks_of(scene) for scene in SCENES}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, [])) for name in SYSTEMS])
+def test_solutions_are_those_of_dense_solves(name):
+    system = SYSTEMS[name]()
+    matrix, b, is_symmetric = system.dense(), system.b.numpy().ravel(), name not in MARKS
+    assert (system.contacts == 0) == is_symmetric
+    scale = np.abs(matrix).max()
+    assert (np.abs(matrix - matrix.T).max() < 1e-6 * scale) == is_symmetric
+    if is_symmetric:
+        assert (np.linalg.eigvalsh(matrix).min() < -1.0) == (name == "compressed")
+    for transposed in (False, True):
+        x, solver = system.solve(transposed=transposed)
+        assert not solver.failed.numpy().any()
+        if is_symmetric:
+            assert solver.indefinite.numpy().any() == (name == "compressed")
+        expected = np.linalg.solve(matrix.T if transposed else matrix, b)
+        np.testing.assert_allclose(x.ravel(), expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_each_world_fails_for_itself():
+    system = hanging(2e-4, 3)
+    b, first, second = system.b.numpy(), *system.of_worlds.numpy()[1:3]
+    alone, _ = system.solve()
+    alone = alone.copy()
+    b[first:second] = 0.0
+    b[second:] = np.nan
+    x, solver = system.solve(b=wp.array(b, dtype=wp.vec3d, device="cpu"))
+    np.testing.assert_array_equal(solver.failed.numpy(), [0, 0, 1])
+    np.testing.assert_allclose(x[:first], alone[:first], rtol=1e-9, atol=1e-12)
+    assert not x[first:second].any()
+    assert np.isnan(x[second:]).all()
+
+
+@pytest.mark.parametrize("make", [lambda: hanging(2e-4), lambda: in_contact(cloth_on_edge)])
+def test_iterations_are_limited(make):
+    x, solver = make().solve(max_iterations=3)
+    assert solver.failed.numpy().all()
+    assert np.isnan(x).all()

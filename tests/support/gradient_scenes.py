@@ -1,0 +1,242 @@
+"""Small scenes of the solver with contact inside, whose gradients tests compare with differences of their inputs."""
+
+import itertools
+
+import newton
+import numpy as np
+import warp as wp
+from gradient_reference import ReferenceSteps
+from newton_versions import needs_attachments, needs_hard_attachments
+
+import warp_bsc as bsc
+
+__all__ = ["DT", "SCENES", "Program", "add_cloth", "cloth_on_edge", "cloth_on_sheet", "marks_of"]
+
+DT = 1.0 / 60.0
+CLOTH = {"tri_ke": 80.0, "tri_ka": 60.0, "tri_kd": 0.05, "edge_ke": 5e-3, "edge_kd": 5e-4, "particle_radius": 0.0}
+OF_CLOTH = "tri_materials", "tri_poses", "tri_areas", "edge_rest_angle", "edge_rest_length", "edge_bending_properties"
+OF_SPRINGS = "spring_rest_length", "spring_stiffness", "spring_damping"
+OF_ATTACHMENTS = tuple(f"attachment_particle_body_{name}" for name in ("body_point", "stiffness", "damping"))
+SIZES = {"x": 0.1, "v": 1.0, "particle_f": 0.1, "poses": 0.1, "places": 0.1, "edge_rest_angle": 1.0}
+SIZES |= {"attachment_particle_body_body_point": 0.1}
+"""Sizes of inputs whose differences are not shares of their values."""
+SHARES = {"shape_material_mu": 1e-3, "friction": 1e-3}
+"""Shares of these sizes by which inputs are moved, if not 1e-5: the coefficient of a pair is a root in float32."""
+
+
+class Program:
+    """Some steps on a tape, and a weighted sum of where they end; :meth:`run` computes both for changed inputs.
+
+    Attributes:
+        model, solver: What is stepped.
+        reference: What solves the steps in float64, after :meth:`refine`.
+        inputs: Values of all inputs by name: of arrays of the model, or of ``arrays``; of positions and velocities of
+            particles at the start, ``x`` and ``v``; of ``particle_f``, the external forces of all steps; of ``poses``
+            of bodies and of ``places`` of particles without mass, in each step, which the program writes before it.
+        free: Which particles have a mass.
+        weights: Those of positions and of velocities at the end, shape [2, particle_count, 3].
+        states, tape: Of the last run.
+    """
+
+    def __init__(self, builder, names=(), *, steps=3, poses=None, places=None, arrays=None, **options):
+        """Finalizes a builder; ``poses`` and ``places`` are those of each step."""
+        builder.color()
+        model = self.model = builder.finalize(device="cpu", requires_grad=True)
+        self.steps, self.reference = steps, None
+        self.arrays = {name: getattr(model, name) for name in ("particle_inv_mass", "gravity", *names)} | (arrays or {})
+        for array in self.arrays.values():
+            array.requires_grad = True
+        self.solver = bsc.SolverImplicit(model, max_iterations=60, **options)
+        rng, n = np.random.default_rng(3), model.particle_count
+        self.weights = rng.normal(size=(2, n, 3)) / n * np.array([1.0, 0.02]).reshape(2, 1, 1)
+        self.free = model.particle_inv_mass.numpy() > 0.0
+        self.inputs = {name: array.numpy().copy() for name, array in self.arrays.items()}
+        self.inputs |= {"x": model.particle_q.numpy().astype(float), "v": model.particle_qd.numpy().astype(float)}
+        self.inputs["particle_f"] = (1e-3 * rng.normal(size=(n, 3))).astype(np.float32)
+        if poses is not None:
+            self.inputs["poses"] = _normalized(np.array(poses)).astype(np.float32)
+        if places is not None:
+            self.inputs["places"] = np.float32(places)
+
+    def refine(self):
+        """Lets steps be solved in float64 from now on."""
+        self.reference = ReferenceSteps(self.solver)
+
+    def begin(self, inputs):
+        """Returns the states of a run, with what all inputs but poses and places say."""
+        for name, array in self.arrays.items():
+            array.assign(inputs[name])
+        self.solver.notify_model_changed(0)
+        states = [self.model.state() for _ in range(self.steps + 1)]
+        states[0].particle_q.assign(inputs["x"].astype(np.float32))
+        states[0].particle_qd.assign(inputs["v"].astype(np.float32))
+        for state in states:
+            state.particle_f.assign(inputs["particle_f"])
+        self.solver.reset(states[0])
+        return states
+
+    def write(self, state, inputs, k):
+        """Writes poses and places before a step, as programs do that no tape sees."""
+        if "poses" in inputs:
+            state.body_q.assign(inputs["poses"][k])
+        if "places" in inputs:
+            x = state.particle_q.numpy().copy()
+            x[~self.free] = inputs["places"][k]
+            state.particle_q.assign(x)
+
+    def run(self, held=None, **changed):
+        """Takes all steps on a tape, and returns the weighted sum of where they end."""
+        inputs = self.inputs | changed
+        states = self.states = self.begin(inputs)
+        if self.reference is not None:
+            self.reference.begin(inputs["x"], inputs["v"], held)
+        self.tape = wp.Tape()
+        for k, (start, end) in enumerate(itertools.pairwise(states)):
+            self.write(start, inputs, k)
+            with self.tape:
+                self.solver.step(start, end, None, None, DT)
+        ends = states[-1].particle_q.numpy(), states[-1].particle_qd.numpy()
+        if self.reference is not None:
+            ends = self.reference.x, self.reference.v
+        return (self.weights * ends).sum()
+
+    def seeds(self):
+        """Returns the gradients of the weighted sum with respect to the last state."""
+        q, v = (wp.array(w, dtype=wp.vec3, device=self.model.device) for w in self.weights)
+        return {self.states[-1].particle_q: q, self.states[-1].particle_qd: v}
+
+    def gradients(self):
+        """Runs, and returns the gradient with respect to each input, of the same shapes."""
+        self.run()
+        for array in self.arrays.values():
+            array.grad.zero_()
+        self.tape.backward(grads=self.seeds())
+        starts = self.states[:-1]
+        found = {name: array.grad.numpy().copy() for name, array in self.arrays.items()}
+        found |= {"x": starts[0].particle_q.grad.numpy(), "v": starts[0].particle_qd.grad.numpy()}
+        found["particle_f"] = sum(state.particle_f.grad.numpy() for state in starts)
+        if "poses" in self.inputs:
+            found["poses"] = np.stack([state.body_q.grad.numpy() for state in starts])
+        if "places" in self.inputs:
+            found["places"] = np.stack([state.particle_q.grad.numpy()[~self.free] for state in starts])
+        return found
+
+    def difference(self, name, held):
+        """Returns the change of the sum along a random way of an input, and that way, as float32 has it."""
+        values = self.inputs[name]
+        size = SIZES.get(name, np.where(np.isfinite(values), values, 0.0))
+        way = SHARES.get(name, 1e-5) * size * np.random.default_rng(5).normal(size=values.shape)
+        if name in ("x", "v"):
+            way[~self.free] = 0.0
+        ends = values + way, values - way
+        if name == "poses":
+            ends = map(_normalized, ends)
+        ends = [end.astype(values.dtype) for end in ends]
+        above, below = (self.run(held, **{name: end}) for end in ends)
+        above_end, below_end = (np.where(np.isfinite(values), end, 0.0).astype(float) for end in ends)
+        return above - below, above_end - below_end
+
+
+def _normalized(poses):
+    return np.concatenate([poses[..., :3], poses[..., 3:] / np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)], -1)
+
+
+TILT = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.7, 0.2)), 0.2)
+
+
+def add_cloth(builder, at, velocity=(0.0, 0.0, 0.0), *, rot=TILT, cell=0.05, **options):
+    """Adds a cloth of two by two cells."""
+    dims = {"dim_x": 2, "dim_y": 2, "cell_x": cell, "cell_y": cell, "mass": 0.002}
+    builder.add_cloth_grid(pos=wp.vec3(*at), rot=rot, vel=wp.vec3(*velocity), **dims, **(CLOTH | options))
+
+
+def cloth_on_sphere():
+    """A cloth thrown on a sphere; each particle has its friction."""
+    builder = newton.ModelBuilder()
+    at = wp.transform(wp.vec3(0.01, 0.005, -0.1), wp.quat_identity())
+    builder.add_shape_sphere(-1, radius=0.1, xform=at, cfg=newton.ModelBuilder.ShapeConfig(mu=0.4))
+    add_cloth(builder, (-0.05, -0.05, 0.006), (0.4, 0.1, -0.6))
+    friction = wp.array(np.linspace(0.2, 0.5, builder.particle_count), dtype=float, device="cpu")
+    names = "shape_material_mu", "tri_materials"
+    return Program(builder, names, steps=2, friction=friction, arrays={"friction": friction})
+
+
+def cloth_on_edge():
+    """A cloth that falls on an edge of a box, with a table of friction."""
+    builder = newton.ModelBuilder()
+    turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.05, 0.03)), 0.8)
+    builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1414), turned), hx=0.2, hy=0.1, hz=0.1)
+    add_cloth(builder, (-0.05, -0.03, 0.008), (0.3, 0.2, -0.5))
+    table = wp.array([[-1.0, 0.3], [0.3, -1.0]], dtype=float, device="cpu")
+    return Program(builder, OF_CLOTH, friction=bsc.FrictionTable(table, 0, 1), arrays={"friction_table": table})
+
+
+def block_on_plane():
+    """A soft block that falls on an infinite plane, which a program shifts and tilts, and from which it keeps 1 mm."""
+    builder = newton.ModelBuilder()
+    body = builder.add_body(is_kinematic=True)
+    builder.add_shape_plane(body=body, width=0.0, length=0.0, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5))
+    cells = dict.fromkeys(("dim_x", "dim_y", "dim_z"), 1) | dict.fromkeys(("cell_x", "cell_y", "cell_z"), 0.05)
+    material = {"density": 300.0, "k_mu": 3000.0, "k_lambda": 4000.0, "k_damp": 2.0, "particle_radius": 0.0}
+    at, velocity = wp.vec3(0.0, 0.0, 0.012), wp.vec3(0.3, 0.1, -0.4)
+    builder.add_soft_grid(pos=at, rot=TILT, vel=velocity, **cells, **material)
+    poses = [[[0.002 * k, 0.001 * k, 0.0, 0.003 * k, -0.003 * k, 0.002 * k, 1.0]] for k in range(4)]
+    names = "tet_poses", "tet_materials", "shape_material_mu"
+    return Program(builder, names, steps=4, friction=0.4, poses=poses, min_distance=0.001)
+
+
+def cloth_on_sheet():
+    """A cloth that falls on a sheet, two sides of which a program moves."""
+    builder = newton.ModelBuilder()
+    add_cloth(builder, (-0.03, -0.02, 0.012), (0.3, 0.1, -0.6))
+    held = dict.fromkeys(["fix_left", "fix_right"], True)
+    add_cloth(builder, (-0.08, -0.08, 0.0), rot=wp.quat_identity(), cell=0.08, **held)
+    x, is_held = np.array(builder.particle_q), np.array(builder.particle_mass) == 0.0
+    places = [x[is_held] + k * np.array([0.001, 0.0005, 0.002]) for k in range(4)]
+    return Program(builder, OF_CLOTH, steps=4, friction=0.3, places=places)
+
+
+def rope_over_bar():
+    """A rope of springs that falls over a bar, and keeps its radius from it."""
+    builder = newton.ModelBuilder()
+    turned = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), np.pi / 2.0)
+    bar = wp.transform(wp.vec3(0.0, 0.0, -0.05), turned)
+    builder.add_shape_capsule(-1, xform=bar, radius=0.05, half_height=0.2)
+    for i in range(5):
+        builder.add_particle(wp.vec3(0.04 * (i - 2), 0.01 * i, 0.012), wp.vec3(0.1, 0.2, -0.6), 0.01, radius=0.005)
+        if i:
+            builder.add_spring(i - 1, i, 60.0, 0.5, 0.0)
+    return Program(builder, (*OF_SPRINGS, "shape_material_mu"), friction=0.3, particle_radius=0.005)
+
+
+def cloth_on_body():
+    """A cloth that lies on a body, which a program moves, with springs to it, and two particles that it holds."""
+    builder = newton.ModelBuilder()
+    body = builder.add_body(is_kinematic=True)
+    at = wp.transform(wp.vec3(0.01, 0.0, -0.1), wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.1, 0.0)), 0.7))
+    builder.add_shape_box(body, xform=at, hx=0.2, hy=0.06, hz=0.08)
+    add_cloth(builder, (-0.05, -0.05, 0.006), (0.3, 0.1, -0.5))
+    x = np.array(builder.particle_q)
+    for p, stiffness in ((0, np.inf), (2, 40.0), (6, 20.0), (7, np.inf)):
+        point = wp.vec3(*(x[p] + 0.001))
+        builder.add_attachment_particle_body(p, body, body_point=point, stiffness=stiffness, damping=0.3)
+    poses = [[[0.003 * k, 0.002 * k, -0.001 * k, 0.01 * k, 0.0, 0.02 * k, 1.0]] for k in range(4)]
+    return Program(builder, ("tri_materials", *OF_ATTACHMENTS), steps=4, friction=0.3, poses=poses)
+
+
+def pushed_cloth():
+    """A cloth that a box pushes, which a program moves and turns, and that keeps 2 mm from it."""
+    builder = newton.ModelBuilder()
+    body = builder.add_body(is_kinematic=True)
+    builder.add_shape_box(body, hx=0.15, hy=0.15, hz=0.02)
+    add_cloth(builder, (-0.05, -0.04, 0.035), (0.1, 0.0, -0.2))
+    poses = [[[0.002 * k, 0.001 * k, 0.006 * k, 0.02 * k, 0.01 * k, 0.02 * k, 1.0]] for k in range(4)]
+    return Program(builder, ("tri_materials",), steps=4, friction=0.4, poses=poses, min_distance=0.002)
+
+
+SCENES = cloth_on_sphere, cloth_on_edge, block_on_plane, cloth_on_sheet, rope_over_bar, cloth_on_body, pushed_cloth
+
+
+def marks_of(scene):
+    """Returns the marks of tests of a scene."""
+    return [needs_attachments, needs_hard_attachments] if scene is cloth_on_body else []
