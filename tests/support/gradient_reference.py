@@ -60,6 +60,10 @@ class ReferenceSteps:
         self.held, self.contacts, self.residual = [], [], 0.0
         self.unsolved = np.zeros(len(self._gradients.newton.problem.unknowns.of_worlds) - 1, dtype=bool)
 
+    def end(self):
+        """Lets the solver record its own steps again."""
+        self._solver.gradients.record = self._record
+
     def record(self, tape, dt, start, end):
         """Returns the step that was taken last, as ``StepGradients.record`` does, after solving it in float64."""
         recorded = self._record(tape, dt, start, end)
