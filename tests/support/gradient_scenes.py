@@ -10,7 +10,19 @@ from newton_versions import needs_attachments, needs_hard_attachments
 
 import warp_bsc as bsc
 
-__all__ = ["DT", "SCENES", "Program", "add_cloth", "cloth_on_edge", "cloth_on_sheet", "marks_of"]
+__all__ = [
+    "DT",
+    "SCENES",
+    "TILT",
+    "Program",
+    "add_cloth",
+    "block_on_plane",
+    "cloth_on_body",
+    "cloth_on_edge",
+    "cloth_on_sheet",
+    "cloth_on_sphere",
+    "marks_of",
+]
 
 DT = 1.0 / 60.0
 CLOTH = {"tri_ke": 80.0, "tri_ka": 60.0, "tri_kd": 0.05, "edge_ke": 5e-3, "edge_kd": 5e-4, "particle_radius": 0.0}
@@ -218,7 +230,7 @@ def cloth_on_body():
     add_cloth(builder, (-0.05, -0.05, 0.006), (0.3, 0.1, -0.5))
     x = np.array(builder.particle_q)
     for p, stiffness in ((0, np.inf), (2, 40.0), (6, 20.0), (7, np.inf)):
-        point = wp.vec3(*(x[p] + 0.001))
+        point = wp.vec3(*(1.02 * x[p]))  # which stretches the cloth
         builder.add_attachment_particle_body(p, body, body_point=point, stiffness=stiffness, damping=0.3)
     poses = [[[0.003 * k, 0.002 * k, -0.001 * k, 0.01 * k, 0.0, 0.02 * k, 1.0]] for k in range(4)]
     return Program(builder, ("tri_materials", *OF_ATTACHMENTS), steps=4, friction=0.3, poses=poses)

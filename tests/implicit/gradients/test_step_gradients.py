@@ -6,19 +6,30 @@ the gradients tell. Inputs are moved by 1e-5 of their size, and rounded to float
 
 import numpy as np
 import pytest
-from gradient_scenes import SCENES, marks_of
+from gradient_scenes import (
+    SCENES,
+    block_on_plane,
+    cloth_on_edge,
+    cloth_on_sheet,
+    cloth_on_sphere,
+    marks_of,
+)
 
 LIMIT = 5e-5
 """Largest deviation of a change, relative to those of all components, added as independent ones are."""
 OF_ROUNDED = {"shape_material_mu": 3e-4, "friction": 3e-4}
 """The same of inputs from which the coefficient of a pair is computed in float32."""
-OF_SOLVER = 0.15
-"""Largest deviation of gradients of the solver's own steps: that of the rope, the others deviate by up to 0.05."""
+OF_SOLVER = 0.03
+"""Largest deviation of gradients of the solver's own steps."""
+SOLVED = cloth_on_sphere, cloth_on_edge, block_on_plane, cloth_on_sheet
+"""Scenes whose steps the solver ends within 1% of the reach of barriers of where they are solved."""
 
 
-@pytest.fixture(
-    scope="module", params=[pytest.param(scene, id=scene.__name__, marks=marks_of(scene)) for scene in SCENES]
-)
+def parameters(scenes):
+    return [pytest.param(scene, id=scene.__name__, marks=marks_of(scene)) for scene in scenes]
+
+
+@pytest.fixture(scope="module", params=parameters(SCENES))
 def scene(request):
     """A scene, and gradients of it: of the steps of the solver, and of those that are solved in float64."""
     program = request.param()
@@ -41,8 +52,9 @@ def test_gradients_are_those_of_central_differences(scene):
     assert not deviations
 
 
+@pytest.mark.parametrize("scene", parameters(SOLVED), indirect=True)
 def test_gradients_of_the_solver_are_as_exact_as_it_solves(scene):
-    """It ends a step where nothing changes by more than 1 mm/s."""
+    """It ends a step where nothing changes by more than 1 mm/s: 17 micrometres, where barriers reach 5 mm."""
     _, of_solver, gradients = scene
     for name in ("x", "v"):
         assert np.linalg.norm(of_solver[name] - gradients[name]) < OF_SOLVER * np.linalg.norm(gradients[name])
