@@ -250,52 +250,6 @@ def _stretch_and_speed(took: Found) -> str:
     return f"{two(took['stretch_at_end'])}, {percent(took['stretch_at_most'])}; {took['rest_speed']:,.0f} mm/s"
 
 
-def implicit_accuracy(found: Found) -> Rows:
-    """Residuals of VBD's steps, and errors of gradients through them."""
-    scenes = {
-        "hanging": "a hanging cloth",
-        "slope": "a cloth on a slope, with friction",
-        "block": "a soft block on the ground",
-        "drape": "a cloth on a sphere, behind `SolverCCD(..., substeps=2)`",
-        "patches": "two patches that collide, behind `SolverCCD`",
-    }
-    inputs = {
-        "tri_materials": "stretch",
-        "tet_materials": "stretch",
-        "edge_bending_properties": "bending",
-        "particle_mass": "mass",
-        "shape_material_mu": "friction",
-    }
-
-    def residual(run: Found) -> str:
-        return f"{run['residual']:.2g}; {percent(100.0 * run['velocity'])}"
-
-    columns = [
-        Column(title, f"{i}", residual)
-        for i, title in enumerate(("10 iterations", "20 iterations", "20 and `polish=3`"))
-    ]
-
-    def materials(run: Found) -> str:
-        return ", ".join(f"{inputs[key]} {percent(100.0 * run[key])}" for key in inputs if key in run)
-
-    columns.append(Column("materials, with `polish=3`", "2", materials))
-    runs = grouped(found["rows"], "scene")
-    return markdown("scene", columns, [(title, runs[name]) for name, title in scenes.items()])
-
-
-def implicit_time(found: Found) -> Rows:
-    """Times of a step of VBD on a tape and back."""
-    titles = {"vbd": "VBD", "on a tape": "on a tape", "back": "back", "polish=3": "VBD with `polish=3`"}
-    scenes = {"hanging": "a hanging cloth", "on a sphere": "a cloth on a sphere"}
-    rows = [
-        (row["scene"].replace(name, title), row["milliseconds"])
-        for row in found["rows"]
-        for name, title in scenes.items()
-        if name in row["scene"]
-    ]
-    return markdown("scene", [Column(title, key, three) for key, title in titles.items()], rows)
-
-
 def arc_cost(small: Found, large: Found) -> Rows:
     """Times of steps and detections by arcs, beside those by chords."""
     degrees = f"{small['degrees']:g} degrees"

@@ -22,7 +22,7 @@ from warp_bsc.bench.measure.penetration import SCENES
 from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
-_GUIDES = "configuration", "contacts", "gradients_vbd", "reports", "turning_bodies"
+_GUIDES = "configuration", "contacts", "reports", "turning_bodies"
 PAGES = [
     ROOT / "README.md",
     ROOT / "docs" / "index.md",
@@ -75,9 +75,6 @@ TABLES = {
     "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), table_rows.detector_stages),
     "newton_coupled": Table(("newton_coupled_gpu",), table_rows.newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), table_rows.newton),
-    "implicit_accuracy": Table(("implicit_accuracy_cpu",), table_rows.implicit_accuracy),
-    "implicit_time_cpu": Table(("implicit_time_cpu",), table_rows.implicit_time),
-    "implicit_time_gpu": Table(("implicit_time_gpu",), table_rows.implicit_time),
     "inverting_steps": Table(_INVERTING, table_rows.inverting_steps),
     "paper": Table(("paper_cpu",), table_rows.paper),
     "penetration": Table(_PENETRATION, table_rows.penetration, needs_all=False, has_sources=False),

@@ -274,21 +274,6 @@ def test_scenes_in_contact():
     assert head[1] == "`SolverImplicit`" and row[1] == f"{moves}; 8.12 (123) ms; 2.3 mm from the converged run"
 
 
-def test_gradients_through_vbd():
-    errors = {"residual": 0.0123, "velocity": 45.69, "tri_materials": 0.001, "particle_mass": 0.02}
-    found = {
-        "rows": [{"scene": "hanging", "iterations": n, "polish": p} | errors for n, p in ((10, 0), (20, 0), (20, 3))]
-    }
-    found["rows"] += [
-        row | {"scene": name} for name in ("slope", "block", "drape", "patches") for row in found["rows"][:3]
-    ]
-    row = rows_of.implicit_accuracy(found)[1]
-    assert row == ("a hanging cloth", *["0.012; 4,569%"] * 3, "stretch 0.10%, mass 2.0%")
-    times = {"vbd": 0.7421, "on a tape": 1.0, "back": 12.34, "polish=3": 123.4}
-    _, row = rows_of.implicit_time({"rows": [{"scene": "hanging, 800 triangles", "milliseconds": times}]})
-    assert row == ("a hanging cloth, 800 triangles", "0.742", "1.00", "12.3", "123")
-
-
 def test_arcs_worlds_and_inversions():
     names = "detect", "ball, 3 degrees a step", "ball, nothing turns", "boxes that tumble"
     times = [{"name": name, "milliseconds": {"arcs": 3.0, "chords": 2.0}} for name in names]

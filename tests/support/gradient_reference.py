@@ -26,10 +26,6 @@ _LEAST_CHANGE = 1e-13
 """Change of positions at which a step ends [m]."""
 
 
-class Unsolved(RuntimeError):
-    """A step whose forces do not balance in float64."""
-
-
 class Held(NamedTuple):
     """What the adjoint of a step holds constant."""
 
@@ -44,7 +40,8 @@ class ReferenceSteps:
         x, v: Positions and velocities of particles, float64, shape [particle_count, 3].
         held: What the adjoint of each step so far holds constant.
         contacts: Number of contacts at the end of each of them.
-        residual: Largest force that remained in them, as a share of the weight of a particle.
+        residual: Largest force that remained in them, as a share of the weight of the lightest particle.
+        unsolved: Worlds in which the forces of a step did not balance.
     """
 
     def __init__(self, solver):
@@ -60,10 +57,15 @@ class ReferenceSteps:
         """Begins a run where particles are, in float64, with what another run held constant."""
         self.x, self.v, self._given = np.array(x, dtype=float), np.array(v, dtype=float), held
         self.held, self.contacts, self.residual = [], [], 0.0
+        self.unsolved = np.zeros(len(self._gradients.newton.problem.unknowns.of_worlds) - 1, dtype=bool)
 
-    def record(self, dt, v0, force, end):
+    def end(self):
+        """Lets the solver record its own steps again."""
+        self._solver.gradients.record = self._record
+
+    def record(self, tape, dt, start, end):
         """Returns the step that was taken last, as ``StepGradients.record`` does, after solving it in float64."""
-        recorded = self._record(dt, v0, force, end)
+        recorded = self._record(tape, dt, start, end)
         self.contacts.append(int((recorded.step.contacts.kind.numpy() >= 0).sum()))
         step, n = recorded.step, len(self.x)
         free = self._solver.mesh.inverse_masses.numpy()[:n] > 0.0
@@ -148,30 +150,45 @@ class ReferenceSteps:
         )
 
     def _solve(self, step, x1):
-        """Returns where the vertices of a step end, which it is written to as well."""
+        """Returns where the vertices of a step end, which it is written to as well.
+
+        Worlds in which the forces do not balance are noted.
+        """
         equations, n = self._gradients.equations, len(self.x)
-        weight = 9.81 / self._solver.mesh.inverse_masses.numpy()[:n].max()
-        unknown = equations.unknown.numpy()
-        equations.load(step)
-        size = np.abs(equations.evaluate().numpy()).max()
+        unknown, of_unknowns, count = equations.unknown.numpy(), equations.world.numpy(), len(self.unsolved)
+        world, weight = of_unknowns[unknown], 9.81 / self._solver.mesh.inverse_masses.numpy()[:n].max()
+
+        def residuals(positions):
+            step.x1.assign(positions)
+            equations.load(step)
+            found = np.zeros(count)
+            np.maximum.at(found, of_unknowns, np.abs(equations.evaluate().numpy()).max(axis=1))
+            return found
+
+        size, done = residuals(x1), np.zeros(count, dtype=bool)
         for _k in range(_NEWTON_STEPS):
             change = self._linear.solve(equations.differentiate(transposed=False), equations.forces).numpy()[unknown]
-            if not np.isfinite(change).all():
-                raise Unsolved(f"the linear solve failed, with {size / weight:.1e} weights left")
+            failed, largest = np.zeros(count, dtype=bool), np.zeros(count)
+            np.logical_or.at(failed, world, ~np.isfinite(change).all(axis=1))
+            change[(failed | done)[world]] = 0.0
+            np.maximum.at(largest, world, np.abs(change).max(axis=1))
+            taken = failed | done
             for share in _SHARES:
-                moved = x1.copy()
-                moved[:n] += share * change
-                step.x1.assign(moved)
-                equations.load(step)
-                tried = np.abs(equations.evaluate().numpy()).max()
-                if tried < size or share * np.abs(change).max() < _LEAST_CHANGE:
+                tried, goes = x1.copy(), ~taken[world]
+                tried[:n][goes] += share * change[goes]
+                found = residuals(tried)
+                takes = ~taken & ((found < size) | (share * largest < _LEAST_CHANGE))
+                x1[:n][takes[world]] = tried[:n][takes[world]]
+                size[takes], taken = found[takes], taken | takes
+                if taken.all():
                     break
-            else:
-                raise Unsolved(f"no share of a Newton step leaves less force than {size / weight:.1e} weights")
-            x1, size = moved, tried
-            if np.abs(change).max() < _LEAST_CHANGE * 1e3 and size < 1e-9 * weight:
+            self.unsolved |= failed | ~taken
+            done |= failed | ~taken | ((largest < 1e3 * _LEAST_CHANGE) & (size < 1e-9 * weight))
+            residuals(x1)
+            if done.all():
                 break
-        self.residual = max(self.residual, size / weight)
+        self.unsolved |= ~done
+        self.residual = max(self.residual, (size[~self.unsolved] / weight).max(initial=0.0))
         return x1
 
 

@@ -27,7 +27,7 @@ CELLS, SIDE, RADIUS = 10, 0.5, 0.2  # m
 CLOTH = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-3, "edge_kd": 1e-4, "particle_radius": 0.005}
 
 
-def build(worlds):
+def build(worlds, *, requires_grad=False):
     """Returns a model of worlds in which cloths start at random places above spheres."""
     world, cell = newton.ModelBuilder(), SIDE / CELLS
     world.add_ground_plane()
@@ -49,7 +49,7 @@ def build(worlds):
     positions = np.reshape(builder.particle_q, (worlds, -1, 3))
     positions[:, :, :2] += np.random.default_rng(0).uniform(-0.05, 0.05, (worlds, 1, 2))
     builder.particle_q = [wp.vec3(x) for x in positions.reshape(-1, 3)]
-    return builder.finalize()
+    return builder.finalize(requires_grad=requires_grad)
 
 
 def vbd(model, self_contact=False):

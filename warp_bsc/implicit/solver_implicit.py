@@ -27,12 +27,13 @@ from ..response.step import begin, detect_contacts, resolve_contacts
 from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
-from .contact.step_report import ImplicitStepReport, StepResults
-from .gradients.step_gradients import RecordedStep, StateGradients, StepGradients
+from .contact.results import StepResults
+from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
+from .report import ImplicitStepReport
 
-MAX_STEPS = 15
-"""Newton steps of a step: after 48 steps, scenes of ``bench response`` are within 0.4 mm of where many more lead, in
-the mean of their particles, but for the pile of cubes, which is chaotic."""
+MAX_STEPS, MAX_PRECISE_STEPS = 15, 60
+"""Newton steps of a step, and of one whose gradients are wanted: after 48 steps with 15, scenes of ``bench response``
+are within 0.4 mm of where many more lead, in the mean of their particles, but for the chaotic pile of cubes."""
 
 
 def _dynamic_bodies(model: newton.Model) -> np.ndarray:
@@ -121,15 +122,27 @@ class SolverImplicit(SolverCCD):
     Each world is stepped as if it were alone, bit for bit as measured on CPUs, but for the distance by which contacts
     that the solve leaves are moved apart: 0.005 of the median edge length of all worlds, in eight bits.
 
+    On a :class:`warp.Tape`, steps of a model that was finalized with ``requires_grad=True`` carry gradients: from
+    positions and velocities of particles and bodies at their end to those at their start, to ``particle_f`` and
+    ``body_f``, and to what requires gradients of ``particle_inv_mass``, ``body_inv_mass``, ``body_inertia``,
+    ``body_inv_inertia`` and ``gravity``; ``tri_poses``, ``tri_areas``, ``tri_materials``, ``edge_rest_angle``,
+    ``edge_rest_length``, ``edge_bending_properties``, ``tet_poses``, ``tet_materials``, ``spring_rest_length``,
+    ``spring_stiffness`` and ``spring_damping``; points, stiffness and damping of attachments; coefficients of friction
+    of particles, shapes and pairs; and to kinematic particles and bodies that a program moves. The implicit function
+    theorem makes them of each converged step, with friction and closest points as they move, by one linear solve, see
+    :mod:`.gradients.equations`. They are NaN, and counted, in worlds whose step did not converge. Such a model is
+    solved closer, in some two Newton steps more. Two things count as constant: which pairs are near, and by how much
+    barriers are stiffer where solids and taut elements press. :mod:`.response.adjoint.between_steps` says where
+    gradients of kinematic particles and bodies are.
+
     Limitations:
-        Restitution does not exist: contacts are without bounce, and implicit steps damp. A step on a tape raises
-        NotImplementedError if the model requires gradients.
+        Restitution does not exist: contacts are without bounce, and implicit steps damp.
         On a GPU, the blocks of a kernel wait for each other, one on each multiprocessor: do not run steps of two such
         solvers at the same time on streams of different priorities, as each may hold what the other waits for.
 
     Attributes:
         mesh: The triangles that collide, :class:`.response.state.mesh.ModelMesh`.
-        report: What a step found and did, :class:`.contact.step_report.ImplicitStepReport`.
+        report: What a step found and did, :class:`.report.ImplicitStepReport`.
         friction: Coefficients of particles, Warp array of float, shape [1] or [particle_count].
         max_iterations: Newton steps of a step at most.
         gradients: What carries gradients of tapes through steps, None unless the model requires gradients.
@@ -153,7 +166,7 @@ class SolverImplicit(SolverCCD):
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         inversions: Inversions = "allowed",
-        max_iterations: int = MAX_STEPS,
+        max_iterations: int | None = None,
         report: Collection[Reported] | Mapping[Reported, int] = (),
     ):
         """Prepares steps of a model.
@@ -173,7 +186,8 @@ class SolverImplicit(SolverCCD):
             inversions: What happens to tetrahedra that invert: ``"allowed"``, ``"reported"`` or ``"prevented"``.
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
                 hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
-                whether they sufficed. While something that a program moves is on its way, at least 16 are allowed.
+                whether they sufficed. While something that a program moves is on its way, at least 16 are allowed. By
+                default 15, and 60 if the model requires gradients: steps then go on until less is left, some 2 more.
             report: What the report of a step has beside its results; impulses of ``"contacts"`` are those of barriers
                 and friction at its end.
 
@@ -203,6 +217,8 @@ class SolverImplicit(SolverCCD):
                     "model: it attaches particles to a body that SolverImplicit would move; make the body kinematic, "
                     "or pass bodies='ignored' if something else writes its pose"
                 )
+        if max_iterations is None:
+            max_iterations = MAX_PRECISE_STEPS if model.requires_grad else MAX_STEPS
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
         if model.particle_count and min_distance is None and particle_radius is None:
             particle_radius = _radii_of_strands(model)
@@ -221,14 +237,16 @@ class SolverImplicit(SolverCCD):
         self.max_iterations = max_steps
         self._last_recorded: tuple = (lambda: None), (lambda: None)
         counts = {"results": self.report.results, "unconverged_steps": self.report.unconverged}
-        method = self.newton_method = NewtonMethod(self.work, max_steps=max_steps, **counts)
+        method = self.newton_method = NewtonMethod(
+            self.work, max_steps=max_steps, precise=model.requires_grad, **counts
+        )
         method.prepare(arrays_of(model))
         if self._forces is not None:
             method.keeps_contacts, self._forces.more = True, method.publish
         self.gradients: StepGradients | None = None
         if model.requires_grad:
             method.keeps_contacts = True
-            self.gradients = StepGradients(self.work, method, self.report.results.converged)
+            self.gradients = StepGradients(self.work, method, self.report.results.converged, self.report.of_gradients)
         if self._counter is not None:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
 
@@ -237,11 +255,6 @@ class SolverImplicit(SolverCCD):
         raise TypeError("a SolverImplicit cannot be copied: make a new one of the same model")
 
     def _check_tape(self, state_in, state_out, mask):
-        if self._motion.moves_bodies:
-            raise NotImplementedError(
-                "a step of SolverImplicit on a tape carries no gradients through bodies that it moves yet: step "
-                "outside the tape, or pass bodies='ignored'"
-            )
         if mask is not None:
             raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
         if state_in is state_out:
@@ -249,28 +262,29 @@ class SolverImplicit(SolverCCD):
 
     def _record(self, step, end):
         """Solves a step; the tape records its adjoint."""
-        device, start = self.mesh.device, arrays_of(step.state_in)
-        given = [start.particle_q, start.particle_qd, step.state_in.particle_f, start.body_q]
-        ends = [end.particle_q, end.particle_qd, end.body_q]
+        device, start = self.mesh.device, step.state_in
+        given = [start.particle_q, start.particle_qd, start.particle_f, start.body_q, start.body_qd, start.body_f]
+        arrays = [*given, end.particle_q, end.particle_qd, end.body_q, end.body_qd]
         recorded: RecordedStep | None = None
         before: Callable[[], RecordedStep | None] = self._step_before(step.tape)
 
         def forward():
             nonlocal recorded
-            force = given[2]
-            v0, force = wp.clone(given[1]), None if force is None else wp.clone(force, requires_grad=False)
+            copies = StartArrays.of(start)
             self._resolve_motion(step, end)
-            recorded = self.gradients.record(step.dt, v0, force, end)
+            recorded = self.gradients.record(step.tape, step.dt, copies, end)
 
         def backward():
             with self._lock:
-                of = [None if array is None else array.grad for array in (*given, *ends)]
-                self.gradients.backward(recorded, before(), StateGradients(*of))
+                gradients = (None if array is None else array.grad for array in arrays)
+                self.gradients.backward(recorded, before(), StateGradients(*gradients))
+            if not device.is_capturing:
+                self.report.warn()
 
         run_on_host(forward, device)
         self._last_recorded = weakref.ref(step.tape), lambda: recorded
-        arrays = [array for array in (*given, *ends) if array is not None and array.requires_grad]
-        step.tape.record_func(lambda: run_on_host(backward, device), arrays + self._read_arrays())
+        changed = [array for array in arrays if array is not None and array.requires_grad]
+        step.tape.record_func(lambda: run_on_host(backward, device), changed + self._read_arrays())
 
     def _step_before(self, tape):
         """Returns what returns the step of the same tape that was recorded last, None if there was none."""
@@ -280,7 +294,14 @@ class SolverImplicit(SolverCCD):
     def _read_arrays(self):
         """Returns the arrays that steps read beside those of states and get gradients, which a tape sets to zero."""
         model, friction = self.model, self._motion.friction
-        names = ["particle_inv_mass", "gravity", *(f"tri_{name}" for name in ("poses", "areas", "materials"))]
+        names = [
+            "particle_inv_mass",
+            "body_inv_mass",
+            "body_inertia",
+            "body_inv_inertia",
+            "gravity",
+            *(f"tri_{name}" for name in ("poses", "areas", "materials")),
+        ]
         names += ["tet_poses", "tet_materials"]
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]

@@ -10,6 +10,7 @@ from gradient_scenes import DT, SCENES, add_cloth, marks_of
 
 import warp_bsc as bsc
 from warp_bsc.implicit.gradients.linear import LinearSolver
+from warp_bsc.implicit.gradients.step_gradients import StartArrays
 from warp_bsc.response.state.motion import arrays_of
 
 TOLERANCE = 1e-9
@@ -23,7 +24,7 @@ class System:
         start, end = states
         solver.step(start, end, None, None, DT)
         self.equations = solver.gradients.equations
-        step = solver.gradients.record(DT, start.particle_qd, start.particle_f, arrays_of(end)).step
+        step = solver.gradients.record(wp.Tape(), DT, StartArrays.of(start), arrays_of(end)).step
         self.contacts = int((step.contacts.kind.numpy() >= 0).sum())
         x = step.x1.numpy().copy()
         x[:n] += scale * rng.normal(size=(n, 3)) * (solver.mesh.inverse_masses.numpy()[:n] > 0.0)[:, None]

@@ -60,6 +60,38 @@ def reach_between_bodies(mesh: ModelMesh) -> np.ndarray:
     return reach
 
 
+@wp.func
+def predicted_body(
+    body: int,
+    pose: wp.transform,
+    velocity: wp.spatial_vector,
+    force: wp.array[wp.spatial_vector],
+    gravity: wp.array[wp.vec3],
+    bodies: Bodies,
+    dt: float,
+):
+    """Returns where a body ends, and its velocity there, if nothing but gravity and external forces acts on it.
+
+    Its angular momentum stays what it is, and turns it by its spin in the middle of the step.
+    """
+    linear, spin = wp.spatial_top(velocity), to_double(wp.spatial_bottom(velocity))
+    linear += dt * gravity[wp.max(bodies.world[body], 0) % gravity.shape[0]]
+    momentum = in_world(bodies.inertia[body], pose) * spin
+    if force:
+        linear += dt * bodies.inverse_mass[body] * wp.spatial_top(force[body])
+        momentum += wp.float64(dt) * to_double(wp.spatial_bottom(force[body]))
+    shift, h = wp.float64(dt) * to_double(linear), wp.float64(dt)
+    turns = wp.trace(bodies.inverse_inertia[body]) > 0.0
+    for _k in range(_ITERATIONS):
+        halfway = turned_pose(bodies, body, pose, shift, HALF * h * spin)
+        if turns:
+            spin = in_world(bodies.inverse_inertia[body], halfway) * momentum
+    end = turned_pose(bodies, body, pose, shift, h * spin)
+    if turns:
+        spin = in_world(bodies.inverse_inertia[body], end) * momentum
+    return end, wp.spatial_vector(linear, to_single(spin))
+
+
 @wp.kernel
 def predict_bodies(
     # in
@@ -74,35 +106,14 @@ def predict_bodies(
     end_q: wp.array[wp.transform],
     end_qd: wp.array[wp.spatial_vector],
 ):
-    """Moves bodies as if nothing but gravity and external forces acted on them.
-
-    Their angular momentum stays what it is, and turns them by their spin in the middle of the step. Kinematic bodies
-    and bodies without mass stay.
-    """
+    """Moves bodies by :func:`predicted_body`. Kinematic ones and those without mass stay."""
     body = wp.tid()
-    pose, velocity = body_q[body], body_qd[body]
-    end_q[body] = pose
-    end_qd[body] = velocity
-    inverse_mass = bodies.inverse_mass[body]
-    if inverse_mass == 0.0 or (flags[body] & BodyFlags.KINEMATIC) != 0:
-        return
-    linear, spin = wp.spatial_top(velocity), to_double(wp.spatial_bottom(velocity))
-    linear += dt * gravity[wp.max(bodies.world[body], 0) % gravity.shape[0]]
-    momentum = in_world(bodies.inertia[body], pose) * spin
-    if force:
-        linear += dt * inverse_mass * wp.spatial_top(force[body])
-        momentum += wp.float64(dt) * to_double(wp.spatial_bottom(force[body]))
-    shift, h = wp.float64(dt) * to_double(linear), wp.float64(dt)
-    turns = wp.trace(bodies.inverse_inertia[body]) > 0.0
-    for _k in range(_ITERATIONS):
-        halfway = turned_pose(bodies, body, pose, shift, HALF * h * spin)
-        if turns:
-            spin = in_world(bodies.inverse_inertia[body], halfway) * momentum
-    end = turned_pose(bodies, body, pose, shift, h * spin)
-    if turns:
-        spin = in_world(bodies.inverse_inertia[body], end) * momentum
-    end_q[body] = end
-    end_qd[body] = wp.spatial_vector(linear, to_single(spin))
+    end_q[body] = body_q[body]
+    end_qd[body] = body_qd[body]
+    if bodies.inverse_mass[body] != 0.0 and (flags[body] & BodyFlags.KINEMATIC) == 0:
+        end, velocity = predicted_body(body, body_q[body], body_qd[body], force, gravity, bodies, dt)
+        end_q[body] = end
+        end_qd[body] = velocity
 
 
 @wp.kernel
@@ -166,6 +177,17 @@ def bend_of(arm: wp.vec3, turn: wp.vec3) -> float:
 
 
 @wp.func
+def gradient_of_turn(inertia: wp.mat33d, turned: wp.vec3d) -> wp.vec3d:
+    """Returns the gradient of half of ``turned . inertia turned`` by a turn after that of the rotation vector."""
+    gradient = inertia * turned
+    angle, factor = wp.length(turned), _TWELFTH
+    if angle > _SMALL_ANGLE:
+        factor = ONE / (angle * angle) - HALF / (angle * wp.tan(HALF * angle))
+    once = wp.cross(turned, gradient)
+    return gradient + HALF * once + factor * wp.cross(turned, once)
+
+
+@wp.func
 def _off_goal(bodies: SolvedBodies, motion: Motion, body: int, pose: wp.transform, low: wp.vec3d):
     """Returns how far a pose is from the goal: its centre [m], and its rotation vector [rad]."""
     goal = bodies.goal[body]
@@ -181,14 +203,7 @@ def inertia_of_body(bodies: SolvedBodies, motion: Motion, body: int, u: int, dt:
     gradient = block * off
     if u != bodies.unknown[body]:
         block = bodies.inertia[body]
-        gradient = block * turned
-        # what a turn changes of the rotation vector
-        angle = wp.length(turned)
-        factor = _TWELFTH
-        if angle > _SMALL_ANGLE:
-            factor = ONE / (angle * angle) - HALF / (angle * wp.tan(HALF * angle))
-        once = wp.cross(turned, gradient)
-        gradient += HALF * once + factor * wp.cross(turned, once)
+        gradient = gradient_of_turn(block, turned)
     return to_single(gradient / (dt * dt)), wp.mat33(block / (dt * dt))
 
 

@@ -133,7 +133,7 @@ class Problem:
         first: Solution of the Newton step before pairs are held.
         leaves: 1 for each world of which a vertex leaves its box.
         any_leaves: 1 if there is one, shape [1].
-        lacks: See :func:`.step_report.write_results`.
+        lacks: See :func:`.results.write_results`.
         vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
         parts: Threads that share rows and blocks.
         turns: Rows that they share, one after the other, no more than they are.

@@ -30,8 +30,8 @@ from .flow import Flow, Phase, Problem
 from .impulses import publish_contacts
 from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
+from .results import StepResults, note_overflow, write_results
 from .rows import make_rows
-from .step_report import StepResults, note_overflow, write_results
 from .system import Contacts, Progress, Unknowns, Worlds
 
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
@@ -57,6 +57,8 @@ _SMOOTHING_SPEED = 0.5e-3
 """Speed below which friction is smoothed [m/s]."""
 _LEAST_SPEED = 1e-3
 """Speed by which no unknown changes any more where a step of 1/60 s ends [m/s], proportionally less in shorter ones."""
+_PRECISE = 0.01
+"""Share of that at which steps end whose gradients are wanted: those are of a converged step."""
 _FAR_SPEED = 0.1
 """Speed by which one that changes still is far from its end [m/s], see ``is_far``."""
 _UNIT_SPEED = 1e-5
@@ -93,16 +95,25 @@ class NewtonMethod:
     keeps_contacts = False
     may_grow = True
 
-    def __init__(self, work: Workspace, *, max_steps: int, results: StepResults, unconverged_steps: wp.array[wp.int64]):
+    def __init__(
+        self,
+        work: Workspace,
+        *,
+        max_steps: int,
+        precise: bool,
+        results: StepResults,
+        unconverged_steps: wp.array[wp.int64],
+    ):
         """Allocates buffers.
 
         Args:
             work: The workspace of the steps: motion, mesh and detection.
             max_steps: Newton steps of a step at most.
+            precise: Whether steps go on until less is left than what counts as converged.
             results: Where solves write what they did.
             unconverged_steps: Where they count steps in which a world did not converge.
         """
-        self._work, self.max_steps = work, max_steps
+        self._work, self.max_steps, self._precision = work, max_steps, _PRECISE if precise else 1.0
         mesh = self.mesh = work.mesh
         model, device = mesh.model, mesh.device
         particles, vertices = model.particle_count, mesh.vertex_count
@@ -346,7 +357,10 @@ class NewtonMethod:
         self.settings.recovery = self._metre * _RECOVERY_SPEED * dt
         self.settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
         p = self.problem
-        p.least_change, p.far_change = self._least_speed * self._dt, self._metre * _FAR_SPEED * self._dt
+        p.least_change, p.far_change = (
+            self._precision * self._least_speed * self._dt,
+            self._metre * _FAR_SPEED * self._dt,
+        )
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
         self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
         if self._attachments is not None:

@@ -61,15 +61,17 @@ def block(jacobian: wp.array3d[wp.vec3d], e: int, i: int, j: int):
 @wp.kernel
 def add_blocks(
     # in
-    vertices: wp.array2d[int],
+    unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
     jacobian: wp.array3d[wp.vec3d],
     # out
     blocks: wp.array[wp.mat33d],
 ):
-    """Subtracts the blocks of Jacobians on the diagonal."""
+    """Subtracts the blocks of Jacobians on the diagonal. Several places of an element may have one unknown."""
     e, i = wp.tid()
-    v = vertices[e, i]
-    if v >= 0:
-        if is_fixed[v] == 0:
-            wp.atomic_sub(blocks, v, block(jacobian, e, i, i))
+    u = unknowns[e, i]
+    if u >= 0:
+        if is_fixed[u] == 0:
+            for j in range(unknowns.shape[1]):
+                if unknowns[e, j] == u:
+                    wp.atomic_sub(blocks, u, block(jacobian, e, i, j))

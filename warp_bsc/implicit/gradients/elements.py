@@ -24,6 +24,7 @@ class Elements:
         vertices: Vertices of the elements, -1 for none, int32, shape [capacity, size].
         rows: The unknown of each of these, -1 for none.
         count: Elements in use.
+        forces: Forces on the vertices, vec3d, shape [capacity, 1, size].
         jacobian: Derivatives of the forces with respect to positions at the end, float64, shape
             [capacity, 3 size, size] of vec3: row 3 i + j belongs to component j of the force on particle i.
     """
@@ -45,7 +46,7 @@ class Elements:
         def zeros(*dimensions):
             return wp.zeros(dimensions, dtype=wp.vec3d, device=device)
 
-        self._x1, self._x0, self._forces = zeros(*shape), zeros(*shape), zeros(*shape)
+        self._x1, self._x0, self.forces = zeros(*shape), zeros(*shape), zeros(*shape)
         self._of_x1, self._of_x0, self._of_forces = zeros(*shape), zeros(*shape), zeros(*shape)
         self.jacobian = zeros(self.count, rows, self._size)
         self._units = zeros(1, rows, self._size)
@@ -59,9 +60,13 @@ class Elements:
 
     def add_forces(self, dt: float, forces: wp.array) -> None:
         """Adds the forces to those on unknowns, vec3d."""
+        self.compute_forces(dt)
+        self._launch(element_kernels.scatter, (self.count, self._size), [self.rows, self.forces], [forces])
+
+    def compute_forces(self, dt: float) -> None:
+        """Computes the forces on the vertices of each element."""
         inputs = [wp.float64(dt), self._x1, self._x0, *self.parameters]
-        self._launch(self.kernel, (self.count, 1), inputs, [self._forces])
-        self._launch(element_kernels.scatter, (self.count, self._size), [self.rows, self._forces], [forces])
+        self._launch(self.kernel, (self.count, 1), inputs, [self.forces])
 
     def differentiate(self, dt: float) -> None:
         """Computes the Jacobian."""
@@ -77,7 +82,7 @@ class Elements:
     def add_blocks(self, is_fixed: wp.array, blocks: wp.array) -> None:
         """Subtracts the blocks of the Jacobian on the diagonal from those of unknowns, mat33d."""
         inputs = [self.rows, is_fixed, self.jacobian]
-        self._launch(element_kernels.add_blocks, (self.count, self._size), inputs, [blocks])
+        self._launch(element_kernels.add_blocks, (self.count, self.rows.shape[1]), inputs, [blocks])
 
     def add_gradients(self, dt: float, of_forces: wp.array, of_x1: wp.array, of_x0: wp.array) -> None:
         """Adds gradients with respect to positions of vertices, given those with respect to forces on unknowns, vec3d.
@@ -87,12 +92,16 @@ class Elements:
         shape = self.count, self._size
         for array in (self._of_x1, self._of_x0):
             array.zero_()
-        self._launch(element_kernels.gather, shape, [self.rows, of_forces], [self._of_forces])
+        self.gather_multipliers(of_forces, self._of_forces)
         x1, x0 = with_gradient(self._x1, self._of_x1), with_gradient(self._x0, self._of_x0)
         inputs = [wp.float64(dt), x1, x0, *self.parameters]
         launch_adjoint(self.kernel, (self.count, 1), inputs, [self._of_forces], self.device)
         self._launch(element_kernels.scatter, shape, [self.vertices, self._of_x1], [of_x1])
         self._launch(element_kernels.scatter, shape, [self.vertices, self._of_x0], [of_x0])
+
+    def gather_multipliers(self, of_unknowns: wp.array, of_vertices: wp.array) -> None:
+        """Copies gradients with respect to forces on unknowns to the vertices of each element."""
+        self._launch(element_kernels.gather, (self.count, self._size), [self.rows, of_unknowns], [of_vertices])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)

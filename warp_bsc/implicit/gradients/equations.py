@@ -19,11 +19,29 @@ from ...response.state.structs import Motion
 from ..contact.newton_method import NewtonMethod
 from ..contact.pairs import BarrierSettings
 from . import energies, kernels
+from .bodies import ContactsOnBodies, find_arms, inertial_forces_on_bodies
 from .contact_forces import RecordedContacts, contact_forces
 from .elastic import Elastic
 from .elements import Elements, with_gradient
 from .matrix import StepMatrix
 from .matrix_kernels import Matrix
+
+
+class SolvedBodies(NamedTuple):
+    """Bodies that a step has solved for.
+
+    Attributes:
+        is_solved: 1 for those, int32, shape [body_count], like all that follow.
+        velocities: Velocities at the start of the step.
+        force: External forces, or None.
+        goals, goal_velocities: Where inertia leads them, and their velocities there.
+    """
+
+    is_solved: wp.array
+    velocities: wp.array
+    force: wp.array | None
+    goals: wp.array
+    goal_velocities: wp.array
 
 
 class SolvedStep(NamedTuple):
@@ -39,6 +57,7 @@ class SolvedStep(NamedTuple):
         contacts: The same contacts.
         motion, planes, settings: What barriers and friction depend on; with the gradients that are wanted.
         poses: Poses of bodies at the end and at the start, None without bodies.
+        bodies: Those that are solved for, None if none can be.
     """
 
     dt: float
@@ -54,6 +73,7 @@ class SolvedStep(NamedTuple):
     planes: MovingPlanes
     settings: BarrierSettings
     poses: tuple[wp.array | None, wp.array | None]
+    bodies: SolvedBodies | None
 
 
 class StepEquations:
@@ -64,6 +84,9 @@ class StepEquations:
         forces: Sum of the forces on each, 0 for those that are fixed [N], vec3d.
         matrix: What :meth:`differentiate` computed.
         attachments: Attachments of the model, None without any.
+        unknown: Unknown of each particle.
+        of_bodies: First unknown of each body, -1 for none; None if no body is solved for.
+        world: World of each unknown.
     """
 
     def __init__(self, newton: NewtonMethod):
@@ -82,15 +105,31 @@ class StepEquations:
             particles = self.attachments.particle
             rows = wp.array(unknown[particles.numpy()].reshape(-1, 1), dtype=int, device=self.device)
             self._springs = [Elements(energies.attachment_forces, particles.reshape((-1, 1)), rows)]
+        of_bodies = newton.problem.bodies.unknown
+        self.of_bodies = of_bodies if len(of_bodies) else None
+        self._inertia_of_bodies: Elements | None = None
+        if self.of_bodies is not None:
+            self._inertia_of_bodies = self._elements_of_bodies(of_bodies.numpy())
         of_worlds = unknowns.of_worlds.numpy()
         world = np.repeat(np.arange(len(of_worlds) - 1), np.diff(of_worlds))
         self.world = wp.array(world.astype(np.int32), dtype=int, device=self.device)
         self._is_fixed = wp.zeros(self.count, dtype=int, device=self.device)
-        self._matrix = StepMatrix(self._elastic, self._springs, self._is_fixed, self.world, len(of_worlds) - 1)
+        self._matrix = StepMatrix(self._elastic, self._of_one_unknown(), self._is_fixed, self.world, len(of_worlds) - 1)
         self._contacts: Elements | None = None
         self._in_contact: list[Elements] = []
         self._step: SolvedStep | None = None
         self.matrix: Matrix | None = None
+
+    def _elements_of_bodies(self, unknown):
+        """Returns elements of the inertia of shifts and turns of bodies, at changes of 0."""
+        bodies = np.flatnonzero(unknown >= 0)
+        arrays = np.repeat(bodies, 2), np.tile([0, 1], len(bodies)), np.ravel(unknown[bodies, None] + np.arange(2))
+        self._body, self._is_turn, rows = (wp.array(a.astype(np.int32), dtype=int, device=self.device) for a in arrays)
+        vertices = wp.full((len(rows), 1), -1, dtype=int, device=self.device)
+        return Elements(inertial_forces_on_bodies, vertices, rows.reshape((-1, 1)))
+
+    def _of_one_unknown(self):
+        return self._springs if self._inertia_of_bodies is None else [*self._springs, self._inertia_of_bodies]
 
     @property
     def step(self) -> SolvedStep:
@@ -108,6 +147,9 @@ class StepEquations:
             attached = self.attachments
             parameters = [attached.body, attached.body_point, attached.stiffness, attached.damping, attached.enabled]
             springs.parameters = [*parameters, *step.poses]
+        if self._inertia_of_bodies is not None:
+            parameters = [self._body, self._is_turn, step.poses[0], step.bodies.goals, step.motion.bodies]
+            self._inertia_of_bodies.parameters = parameters
         self._in_contact = self._load_contacts(step)
         for elements in self._elements():
             elements.load(step.x1, step.x0)
@@ -117,13 +159,20 @@ class StepEquations:
         if not count:
             return []
         if elements is None or len(elements.vertices) < count:
-            shape = (count + (count // 2 if self.device.is_cpu else 0), 4)  # elsewhere the number does not change
-            vertices, rows = (wp.full(shape, -1, dtype=int, device=self.device) for _ in range(2))
-            elements = self._contacts = Elements(contact_forces, vertices, rows)
+            capacity = count + (count // 2 if self.device.is_cpu else 0)  # elsewhere the number does not change
+            of_type, size = (Elements, 4) if self.of_bodies is None else (ContactsOnBodies, 8)
+            sizes = (capacity, 4), (capacity, size)
+            vertices, rows = (wp.full(shape, -1, dtype=int, device=self.device) for shape in sizes)
+            elements = self._contacts = of_type(contact_forces, vertices, rows)
         elements.count = count
         wp.copy(elements.vertices[:count], step.vertices)
         wp.copy(elements.rows[:count], step.rows)
         elements.parameters = [elements.vertices, step.contacts, step.motion, step.planes, step.settings]
+        if isinstance(elements, ContactsOnBodies):
+            mesh = self._newton.mesh
+            inputs = [elements.vertices, elements.rows, step.x1, step.motion.bodies, step.poses[0]]
+            inputs += [mesh.device_shape_vertices.body, mesh.model.particle_count]
+            wp.launch(find_arms, (count, 4), inputs=inputs, outputs=[elements.arms], device=self.device)
         return [elements]
 
     def evaluate(self) -> wp.array:
@@ -163,7 +212,7 @@ class StepEquations:
             elements.add_gradients(step.dt, multipliers, of_x1, of_x0)
 
     def _elements(self):
-        return [*self._springs, *self._in_contact]
+        return [*self._of_one_unknown(), *self._in_contact]
 
     def _inertial(self, x1, x0, v0, of_force=None):
         step, model = self.step, self.model

@@ -62,10 +62,11 @@ class StepMatrix:
 
     def _load_contacts(self, elements, transposed):
         """Scales and lists the Jacobians of contacts."""
-        matrix, is_fixed, n = self._matrix, self._is_fixed, elements.count * 4
-        unknowns, shape = elements.rows, (elements.count, 4)
+        matrix, is_fixed, unknowns = self._matrix, self._is_fixed, elements.rows
+        shape = elements.count, unknowns.shape[1]
+        n = shape[0] * shape[1]
         inputs = [transposed, unknowns, is_fixed, matrix.roots]
-        self._launch(matrix_kernels.scale_jacobians, (*shape, 4), inputs, [elements.jacobian])
+        self._launch(matrix_kernels.scale_jacobians, (*shape, shape[1]), inputs, [elements.jacobian])
         rows = self._contacts
         if rows.entries is None or len(rows.entries) < n:
             rows.entries = wp.zeros(unknowns.size, dtype=int, device=self._device)

@@ -16,8 +16,8 @@ class ContactRows:
 
     Attributes:
         offsets: First entry of each unknown, and the end of the last, int32, shape [unknown_count + 1].
-        entries: Four times an element plus the place of the unknown in it, int32.
-        unknowns: Unknowns of elements, -1 for none, int32, shape [n, 4].
+        entries: Size times an element plus the place of the unknown in it, int32.
+        unknowns: Unknowns of elements, -1 for none, int32, shape [n, size].
         jacobian: Minus blocks of the matrix, see :class:`.elements.Elements`.
     """
 
@@ -82,10 +82,10 @@ def _sum_of_parts(value: wp.vec3d, parts: int) -> wp.vec3d:
 @wp.func
 def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
     """Returns a part of row i of the product of the Jacobian of contacts with x."""
-    product = wp.vec3d()
+    product, size = wp.vec3d(), rows.unknowns.shape[1]
     for k in range(rows.offsets[i] + part, rows.offsets[i + 1], parts):
-        e, row = rows.entries[k] // 4, 3 * (rows.entries[k] % 4)
-        for j in range(4):
+        e, row = rows.entries[k] // size, 3 * (rows.entries[k] % size)
+        for j in range(size):
             u = rows.unknowns[e, j] + int(0)
             if u >= 0:
                 of = vector_at(x, u)
@@ -239,18 +239,4 @@ def list_entries(
     v = unknowns[e, i]
     if v >= 0:
         if is_fixed[v] == 0:
-            entries[wp.atomic_add(ends, v, 1)] = 4 * e + i
-
-
-@wp.kernel
-def sum_scaled_squares(
-    # in
-    world: wp.array[int],
-    roots: wp.array[wp.mat33d],
-    forces: wp.array[wp.vec3d],
-    # out
-    sums: wp.array[wp.float64],
-):
-    """Adds the squares of scaled forces to sums by world."""
-    i = wp.tid()
-    wp.atomic_add(sums, world[i], wp.length_sq(wp.transpose(roots[i]) * forces[i]))
+            entries[wp.atomic_add(ends, v, 1)] = unknowns.shape[1] * e + i

@@ -4,8 +4,9 @@ A step that a tape records keeps what it began and ended with, and the contacts 
 one linear solve, see :mod:`.equations`, whatever the Newton steps were.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+import newton
 import warp as wp
 
 from ...response.adjoint.arrays import (
@@ -19,14 +20,34 @@ from ...response.state.motion import StateArrays
 from ...response.state.workspace import Workspace
 from ..contact.newton_method import NewtonMethod
 from . import energies, kernels
+from .bodies import end_bodies, find_solved, leave_out_solved, predict_goals
 from .contact_forces import RecordedContacts
-from .equations import SolvedStep, StepEquations
+from .elements import with_gradient
+from .equations import SolvedBodies, SolvedStep, StepEquations
 from .linear import LinearSolver
+from .report import GradientReport
 
 _TOLERANCE, _MAX_ITERATIONS = 1e-6, 1000
 """Residual at which a linear solve ends, relative to its right-hand side, and iterations after which it does."""
 _THREADS = 256
 """Threads for each world that copy its contacts on a GPU."""
+
+
+@dataclass(eq=False)
+class StartArrays:
+    """Copies of arrays of the state at the start of a step; None where there is none."""
+
+    particle_qd: wp.array
+    particle_f: wp.array | None
+    body_q: wp.array | None
+    body_qd: wp.array | None
+    body_f: wp.array | None
+
+    @classmethod
+    def of(cls, state: newton.State) -> "StartArrays":
+        """Copies those of a state."""
+        arrays = (getattr(state, field.name) for field in fields(cls))
+        return cls(*(None if array is None else wp.clone(array, requires_grad=False) for array in arrays))
 
 
 @dataclass(eq=False)
@@ -37,9 +58,12 @@ class StateGradients:
     particle_qd: wp.array | None
     particle_f: wp.array | None
     body_q: wp.array | None
+    body_qd: wp.array | None
+    body_f: wp.array | None
     end_particle_q: wp.array | None
     end_particle_qd: wp.array | None
     end_body_q: wp.array | None
+    end_body_qd: wp.array | None
 
 
 @dataclass(eq=False)
@@ -51,7 +75,7 @@ class RecordedStep:
         failed: 1 for worlds that it did not solve, int32, shape [worlds].
         of_particles, of_bodies: 1 for what is in worlds in which it began where the last one ended, int32.
         is_held: 1 for particles that attachments hold.
-        before: The step of the same tape before it, None if there is none.
+        number, norms: Number of the step on its tape, and the norms of its gradients, see :class:`.GradientReport`.
     """
 
     step: SolvedStep
@@ -59,7 +83,8 @@ class RecordedStep:
     of_particles: wp.array
     of_bodies: wp.array
     is_held: wp.array
-    before: "RecordedStep | None" = None
+    number: int
+    norms: wp.array
 
 
 class StepGradients:
@@ -70,15 +95,16 @@ class StepGradients:
         equations: Those of the step that was gone back through last.
     """
 
-    def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool]):
+    def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool], report: GradientReport):
         """Allocates buffers.
 
         Args:
             work: The workspace of the steps.
             newton: The solver, which keeps contacts at the end of its steps.
             converged: Whether it converged, by world.
+            report: Where gradients are counted.
         """
-        self._work, self.newton, self._converged = work, newton, converged
+        self._work, self.newton, self._converged, self._report = work, newton, converged, report
         self._model = model = work.mesh.model
         self.equations = equations = StepEquations(newton)
         self._linear = LinearSolver(
@@ -95,27 +121,28 @@ class StepGradients:
         self._poses, self._carried_poses = None, None
         if model.body_count:
             self._poses, self._carried_poses = wp.clone(model.body_q), wp.zeros_like(model.body_q)
-        self._last: RecordedStep | None = None
+        self._room = 0  # contacts that the arrays of a step in a CUDA graph have room for
+        self._largest = wp.zeros(work.worlds, dtype=wp.int64, device=device)
         self._carried_to: RecordedStep | None = None
 
     def begin(self) -> None:
         """Notes where a step begins, before it is solved."""
         wp.copy(self._interrupted, self._work.motion.vertices.interrupted)
 
-    def record(self, dt: float, v0: wp.array, force: wp.array | None, end: StateArrays) -> RecordedStep:
+    def record(self, tape: wp.Tape, dt: float, start: StartArrays, end: StateArrays) -> RecordedStep:
         """Returns a copy of the step that was taken last.
 
         Args:
+            tape: The tape that records it.
             dt: Its length [s].
-            v0: Velocities of particles at its start, vec3.
-            force: External forces, vec3, or None; not copied.
+            start: What of the state at its start no later step may change.
             end: The state at its end.
         """
         work, newton, model, device = self._work, self.newton, self._model, self._work.device
         motion, particles = work.motion.vertices, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
         self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
-        self._launch(kernels.to_double, particles, [v0], [velocity])
+        self._launch(kernels.to_double, particles, [start.particle_qd], [velocity])
         is_fixed = wp.zeros(self.equations.count, dtype=int, device=device)
         self._launch(kernels.find_fixed, len(is_fixed), [newton.problem.unknowns.is_free], [is_fixed])
         is_held = wp.zeros(particles, dtype=int, device=device)
@@ -130,13 +157,18 @@ class StepGradients:
         of_particles = wp.zeros(particles, dtype=int, device=device)
         inputs = [work.mesh.device_world, self._interrupted]
         self._launch(kernels.find_continuing, particles, inputs, [of_particles])
-        of_bodies, poses = wp.zeros(model.body_count, dtype=int, device=device), (None, None)
+        of_bodies, poses, bodies = wp.zeros(model.body_count, dtype=int, device=device), (None, None), None
         if model.body_count:
             inputs = [model.body_world, self._interrupted]
             self._launch(kernels.find_continuing, model.body_count, inputs, [of_bodies])
-            poses = wp.clone(end.body_q), wp.clone(self._poses)
-            self._launch(kernels.start_poses, model.body_count, [end.body_q, of_bodies], [poses[1]])
-        contacts = self._record_contacts()
+            is_solved = wp.zeros(model.body_count, dtype=int, device=device)
+            if self.equations.of_bodies is not None:
+                inputs = [self.equations.of_bodies, is_fixed]
+                self._launch(find_solved, model.body_count, inputs, [is_solved])
+            poses = wp.clone(end.body_q, requires_grad=False), wp.clone(self._poses, requires_grad=False)
+            self._launch(kernels.start_poses, model.body_count, [start.body_q, of_bodies, is_solved], [poses[1]])
+            bodies = self._predict(dt, start, poses[1], is_solved)
+        contacts = self._record_contacts(failed)
         of_motion = copied(motion, ["inverse_mass", "friction"])
         of_motion.materials = copied_materials(motion.materials)
         step = SolvedStep(
@@ -144,32 +176,55 @@ class StepGradients:
             x0,
             wp.clone(newton.problem.trial.exact),
             velocity,
-            force,
+            start.particle_f,
             is_fixed,
             *contacts,
             of_motion,
             copied(work.motion.planes, ["start", "end", "friction"]),
             copied(newton.settings, ["load"]),
             poses,
+            bodies,
         )
-        self._last = RecordedStep(step, failed, of_particles, of_bodies, is_held)
-        return self._last
+        return RecordedStep(step, failed, of_particles, of_bodies, is_held, *self._report.add_step(tape))
+
+    def _predict(self, dt, start, poses, is_solved):
+        """Returns the bodies that the last step has solved for, and where inertia led them."""
+        goals, velocities = wp.clone(poses), wp.zeros_like(start.body_qd, requires_grad=False)
+        bodies = SolvedBodies(is_solved, start.body_qd, start.body_f, goals, velocities)
+        if self.equations.of_bodies is not None:
+            inputs = self._inputs_of_goals(bodies, poses, dt, self._work.motion.vertices.bodies)
+            self._launch(predict_goals, len(poses), inputs, [goals, velocities])
+        return bodies
+
+    def _inputs_of_goals(self, bodies, poses, dt, of_motion):
+        inputs = [bodies.is_solved, poses, bodies.velocities, bodies.force, self._model.gravity]
+        return [*inputs, of_motion, float(dt)]
 
     def finish(self, end: StateArrays) -> None:
         """Keeps where bodies ended a step, on a tape or not."""
         if self._poses is not None:
             wp.copy(self._poses, end.body_q)
 
-    def _record_contacts(self):
-        """Returns vertices, unknowns, and all else of the contacts at the end of a step."""
+    def _record_contacts(self, failed):
+        """Returns vertices, unknowns, and all else of the contacts at the end of a step.
+
+        In a CUDA graph there is room for half as many again as steps outside of one have had; worlds fail whose
+        contacts do not fit.
+        """
         work, newton, device = self._work, self.newton, self._work.device
-        capacity = len(newton.problem.contacts.corners)
-        vertices, rows = (wp.full((capacity, 4), -1, dtype=int, device=device) for _ in range(2))
+        capacity, size = len(newton.problem.contacts.corners), 4 if self.equations.of_bodies is None else 8
+        if device.is_capturing and self._room:
+            capacity = min(capacity, self._room)
+        vertices, rows = (wp.full((capacity, n), -1, dtype=int, device=device) for n in (4, size))
         kind, plane = wp.full(capacity, -1, dtype=int, device=device), wp.zeros(capacity, dtype=int, device=device)
         count, threads = wp.zeros(1, dtype=int, device=device), _THREADS if device.is_cuda else 1
         inputs = [newton.problem.contacts, newton.problem.unknowns, threads, count]
-        self._launch(kernels.record_contacts, (threads, work.worlds), inputs, [vertices, rows, kind, plane])
-        n = capacity if device.is_capturing or device.is_cuda else int(count.numpy()[0])
+        outputs = [vertices, rows, kind, plane, failed]
+        self._launch(kernels.record_contacts, (threads, work.worlds), inputs, outputs)
+        n = capacity
+        if not device.is_capturing:
+            n = int(count.numpy()[0])
+            self._room = max(self._room, n + n // 2)
         contacts = RecordedContacts()
         contacts.kind, contacts.plane = _first(kind, n), _first(plane, n)
         contacts.fall = wp.clone(newton.problem.progress.fall)
@@ -189,36 +244,59 @@ class StepGradients:
             self._carried_x.zero_()
             if self._carried_poses is not None:
                 self._carried_poses.zero_()
-        for array in (self._of_x1, self._of_x0, self._of_v0, self._of_unknowns):
+        norms, world = recorded.norms, self._work.mesh.device_world
+        for array in (self._of_x1, self._of_x0, self._of_v0, self._of_unknowns, norms, self._largest):
             array.zero_()
         inputs = [dt, of.end_particle_q, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held]
-        outputs = [self._of_unknowns, self._of_x1]
-        self._launch(kernels.of_end, particles, [*inputs, self._carried_x], outputs)
+        outputs = [self._of_unknowns, self._of_x1, norms]
+        self._launch(kernels.of_end, particles, [*inputs, self._carried_x, world], outputs)
         motion, of_motion = with_gradients(step.motion, ["inverse_mass", "friction"])
         table = self._work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
         planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
         contacts, of_contacts = with_gradients(step.contacts, ["fall"])
-        poses, of_poses = step.poses, (None, None)
+        poses, of_poses, bodies = step.poses, (None, None), step.bodies
         if model.body_count:
             of_poses = tuple(wp.zeros_like(pose, requires_grad=False) for pose in poses)
+            poses = tuple(with_gradient(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
             wp.copy(of_poses[0], self._carried_poses)
             if of.end_body_q is not None:
-                self._launch(kernels.add_poses, model.body_count, [of.end_body_q], [of_poses[0]])
-            poses = tuple(_with(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
-        step = step._replace(contacts=contacts, motion=motion, planes=planes, poses=poses)
+                self._launch(
+                    kernels.split_end_poses, model.body_count, [bodies.is_solved, of.end_body_q], [of_poses[0]]
+                )
+            if equations.of_bodies is not None:
+                motion.bodies, of_motion.bodies = with_gradients(step.motion.bodies, ["inverse_mass"])
+                of_goals = wp.zeros_like(bodies.goals), wp.zeros_like(bodies.goal_velocities)
+                bodies = bodies._replace(
+                    goals=with_gradient(bodies.goals, of_goals[0]),
+                    goal_velocities=with_gradient(bodies.goal_velocities, of_goals[1]),
+                    velocities=with_gradient(bodies.velocities, of.body_qd),
+                    force=None if bodies.force is None else with_gradient(bodies.force, of.body_f),
+                )
+                self._from_end_of_bodies(step, bodies, motion.bodies, of)
+        step = step._replace(contacts=contacts, motion=motion, planes=planes, poses=poses, bodies=bodies)
         equations.load(step)
         multipliers = self._linear.solve(equations.differentiate(transposed=True), self._of_unknowns)
         self._launch(kernels.set_failed, equations.count, [equations.world, recorded.failed], [multipliers])
         equations.add_gradients(multipliers, self._of_x1, self._of_x0, self._of_v0, of.particle_f)
         if model.body_count:
-            self._go_to_poses(poses, planes, of_planes)
-            inputs = [recorded.of_bodies, *of_poses]
+            self._go_to_poses(step, of_planes)
+            if equations.of_bodies is not None:
+                inputs = self._inputs_of_goals(bodies, poses[1], step.dt, motion.bodies)
+                launch_adjoint(predict_goals, model.body_count, inputs, [*of_goals], self._work.device)
+                if model.body_inv_mass.grad is not None:
+                    self._launch(
+                        kernels.add_to, model.body_count, [of_motion.bodies.inverse_mass], [model.body_inv_mass.grad]
+                    )
+            inputs = [recorded.of_bodies, bodies.is_solved, *of_poses]
             self._launch(kernels.finish_poses, model.body_count, inputs, [of.body_q, self._carried_poses])
         inputs = [dt, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held, recorded.of_particles]
-        inputs += [self._of_x1, self._of_x0, self._of_v0]
-        outputs = [of.particle_q, of.particle_qd, self._carried_x]
+        inputs += [self._of_x1, self._of_x0, self._of_v0, world]
+        outputs = [of.particle_q, of.particle_qd, self._carried_x, norms, self._largest]
         self._launch(kernels.finish_gradients, particles, inputs, outputs)
+        inputs = [recorded.number, recorded.failed, self._linear.failed, self._largest]
+        self._launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self._report.counts])
+        self._report.copy_counts()
         if model.particle_inv_mass.grad is not None:
             inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
@@ -227,14 +305,34 @@ class StepGradients:
             self._adjoint(energies.find_falls, self._work.worlds, inputs, of_contacts.fall)
         self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
         self._carried_to = before
-        for gradient in (of.end_particle_q, of.end_particle_qd, of.end_body_q):  # the step overwrote what they are of
+        for gradient in (
+            of.end_particle_q,
+            of.end_particle_qd,
+            of.end_body_q,
+            of.end_body_qd,
+        ):  # the step overwrote what they are of
             if gradient is not None:
                 gradient.zero_()
 
-    def _go_to_poses(self, poses, planes, of_planes):
+    def _from_end_of_bodies(self, step, bodies, of_motion, of):
+        """Turns gradients with respect to states at the end of bodies that are solved for into those of unknowns."""
+        equations, n = self.equations, self._model.body_count
+        ends = [of.end_body_q, of.end_body_qd]
+        for k, array in enumerate((self._model.body_q, self._model.body_qd)):
+            ends[k] = wp.zeros_like(array, requires_grad=False) if ends[k] is None else ends[k]
+        changes = with_gradient(wp.zeros_like(self._of_unknowns), wp.zeros_like(self._of_unknowns))
+        inputs = [bodies.is_solved, equations.of_bodies, changes, step.poses[0], bodies.goals, bodies.goal_velocities]
+        launch_adjoint(end_bodies, n, [*inputs, of_motion, wp.float64(step.dt)], ends, self._work.device)
+        inputs = [bodies.is_solved, equations.of_bodies, changes.grad]
+        self._launch(kernels.add_of_bodies, n, inputs, [self._of_unknowns])
+
+    def _go_to_poses(self, step, of_planes):
         """Turns gradients with respect to what moves with bodies into those with respect to their poses."""
         mesh, particles, at = self._work.mesh, self._model.particle_count, self.equations.attachments
-        shapes, infinite = mesh.device_shape_vertices, mesh.device_planes
+        shapes, infinite, poses = mesh.device_shape_vertices, mesh.device_planes, step.poses
+        if self.equations.of_bodies is not None:
+            inputs = [step.bodies.is_solved, shapes.body, particles]
+            self._launch(leave_out_solved, len(shapes.body), inputs, [self._of_x1])
         if at is not None:
             inputs = [at.particle.reshape((-1, 1)), at.body, at.body_point, at.stiffness, at.enabled, poses[0]]
             self._adjoint(energies.place_held, len(at.particle), inputs, self._of_x1)
@@ -259,9 +357,3 @@ def _first(array, n):
     if not n:
         return wp.empty((0, *array.shape[1:]), dtype=array.dtype, device=array.device)
     return array if n == len(array) else wp.clone(array[:n])
-
-
-def _with(values, gradient):
-    alias = values[:]
-    alias.grad, alias.retain_grad = gradient, True
-    return alias

@@ -132,7 +132,7 @@ def uncertified_warning(
 
 def line_of(report: Any) -> str:
     """Returns what a :class:`.report.SolverReport` says of the steps so far, in one line."""
-    totals, gradients, inside = report.totals, report.gradient_counts, len(np.unique(report.inside.particles))
+    totals, inside = report.totals, len(np.unique(report.inside.particles))
     line = (
         f"{totals.steps} steps, {totals.truncated_steps} with truncation, {totals.frozen_steps} with frozen "
         f"vertices, {totals.uncertified_steps} not certified"
@@ -156,12 +156,7 @@ def line_of(report: Any) -> str:
         line += f"; {report.filtered} filtered pairs in the last step, which are not certified"
     if totals.not_finite_steps:
         line += f", {totals.not_finite_steps} steps with positions that are not finite"
-    if gradients.grazing or gradients.lost_steps:
-        line += f"; gradients: {gradients.grazing} grazing contacts, {gradients.lost_steps} steps lost"
+    line += report.gradient_counts.text()
     if report.layer_thickness is not None:
         line += f"; contact layer of {1e3 * report.layer_thickness:.3g} mm"
-    if gradients.layer_passed_steps:
-        line += f", which contacts passed in {gradients.layer_passed_steps} steps"
-    if gradients.layer_overflows:
-        line += f"; {gradients.layer_overflows} steps without their contact layer"
     return line

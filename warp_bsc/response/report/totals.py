@@ -121,3 +121,14 @@ class GradientTotals:
     layer_overflows: int
     layer_passed_steps: int
     ambiguous_moves: int
+
+    def text(self) -> str:
+        """Returns what a line of a report says of them, if anything."""
+        text = ""
+        if self.grazing or self.lost_steps:
+            text += f"; gradients: {self.grazing} grazing contacts, {self.lost_steps} steps lost"
+        if self.layer_passed_steps:
+            text += f"; contacts passed the contact layer in {self.layer_passed_steps} steps"
+        if self.layer_overflows:
+            text += f"; {self.layer_overflows} steps without their contact layer"
+        return text

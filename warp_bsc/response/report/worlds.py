@@ -30,7 +30,7 @@ class Worlds:
         inverted_at_start: Tetrahedra that were inverted at the start, int; None if the stage was not asked to count
             them.
         newton_steps, last_change, converged, arrived: As of
-            :class:`warp_bsc.implicit.contact.step_report.ImplicitStepReport`, int, float and bool; None if another
+            :class:`warp_bsc.implicit.report.ImplicitStepReport`, int, float and bool; None if another
             solver steps.
     """
 

@@ -10,13 +10,14 @@ _SMALL = wp.constant(wp.float64(1e-12))
 
 
 @wp.func
-def _rotation(pose: wp.transform) -> wp.quatd:
+def rotation_of(pose: wp.transform) -> wp.quatd:
+    """Returns the rotation of a pose."""
     q = wp.transform_get_rotation(pose)
     return wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
 
 
 @wp.func
-def _turned(rotation: wp.quatd, turn: wp.vec3d) -> wp.quatd:
+def turned_by(rotation: wp.quatd, turn: wp.vec3d) -> wp.quatd:
     """Returns a rotation followed by a turn about a fixed axis, given as axis times angle [rad]."""
     square = wp.length_sq(turn)
     half = HALF - square / wp.float64(48.0)  # sine of half the angle by the angle
@@ -29,9 +30,8 @@ def _turned(rotation: wp.quatd, turn: wp.vec3d) -> wp.quatd:
 
 
 @wp.func
-def turn_between(start: wp.transform, end: wp.transform) -> wp.vec3d:
-    """Returns the shortest turn from one pose to another, as axis times angle [rad]."""
-    q = _rotation(end) * wp.quat_inverse(_rotation(start))
+def turn_of(q: wp.quatd) -> wp.vec3d:
+    """Returns the shortest turn that is a rotation, as axis times angle [rad]."""
     axis = wp.vec3d(q[0], q[1], q[2])
     square = wp.length_sq(axis)
     cosine = wp.abs(q[3])
@@ -43,9 +43,15 @@ def turn_between(start: wp.transform, end: wp.transform) -> wp.vec3d:
 
 
 @wp.func
+def turn_between(start: wp.transform, end: wp.transform) -> wp.vec3d:
+    """Returns the shortest turn from one pose to another, as axis times angle [rad]."""
+    return turn_of(rotation_of(end) * wp.quat_inverse(rotation_of(start)))
+
+
+@wp.func
 def point_of(pose: wp.transform, point: wp.vec3) -> wp.vec3d:
     """Returns a point of a body in the frame of the world [m]."""
-    return to_double(wp.transform_get_translation(pose)) + wp.quat_rotate(_rotation(pose), to_double(point))
+    return to_double(wp.transform_get_translation(pose)) + wp.quat_rotate(rotation_of(pose), to_double(point))
 
 
 @wp.func
@@ -60,13 +66,13 @@ def _pose(bodies: Bodies, body: int, centre: wp.vec3d, rotation: wp.quatd) -> wp
     q = wp.normalize(rotation)
     stored = wp.quat(float(q[0]), float(q[1]), float(q[2]), float(q[3]))
     origin = wp.transform(wp.vec3(), stored)
-    return wp.transform(to_single(centre - wp.quat_rotate(_rotation(origin), to_double(bodies.com[body]))), stored)
+    return wp.transform(to_single(centre - wp.quat_rotate(rotation_of(origin), to_double(bodies.com[body]))), stored)
 
 
 @wp.func
 def turned_pose(bodies: Bodies, body: int, pose: wp.transform, shift: wp.vec3d, turn: wp.vec3d) -> wp.transform:
     """Returns a pose whose centre is shifted, and which is turned about it."""
-    return _pose(bodies, body, centre_of(bodies, body, pose) + shift, _turned(_rotation(pose), turn))
+    return _pose(bodies, body, centre_of(bodies, body, pose) + shift, turned_by(rotation_of(pose), turn))
 
 
 @wp.func
@@ -74,7 +80,7 @@ def pose_between(bodies: Bodies, body: int, start: wp.transform, end: wp.transfo
     """Returns the pose of a body after a share of its path: its centre moves straight, and it turns evenly."""
     before = centre_of(bodies, body, start)
     path = centre_of(bodies, body, end) - before
-    return _pose(bodies, body, before + share * path, _turned(_rotation(start), share * turn_between(start, end)))
+    return _pose(bodies, body, before + share * path, turned_by(rotation_of(start), share * turn_between(start, end)))
 
 
 @wp.func
@@ -89,7 +95,7 @@ def velocity_between(
 @wp.func
 def in_world(matrix: wp.mat33, pose: wp.transform) -> wp.mat33d:
     """Returns an inertia, or its inverse, of a body in the frame of the world, given that in the frame of the body."""
-    rotation = wp.quat_to_matrix(_rotation(pose))
+    rotation = wp.quat_to_matrix(rotation_of(pose))
     return rotation * wp.mat33d(matrix) * wp.transpose(rotation)
 
 

@@ -1,59 +1,13 @@
 """The report of steps with contact in the solve: that of the collision stage, and how far Newton's method came."""
 
+import numpy as np
 import warp as wp
 
-from ...kernels.pipeline.queues import has_overflowed
-from ...response.report.report import SolverReport
-from ...response.state.structs import allocate
-from ...response.state.workspace import Workspace
-from .system import Progress, is_near_end
-
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class StepResults:
-    """How far each world came in a step, shape [worlds], see :class:`ImplicitStepReport`."""
-
-    newton_steps: wp.array[int]
-    last_change: wp.array[float]
-    converged: wp.array[wp.bool]
-    arrived: wp.array[wp.bool]
-
-
-@wp.kernel
-def note_overflow(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], lacks: wp.array[int]):
-    """Notes whether candidates did not fit, as can be in a CUDA graph."""
-    if has_overflowed(counts, capacities):
-        lacks[0] = 1
-
-
-@wp.kernel
-def write_results(
-    # in
-    progress: Progress,
-    dt: float,
-    least_speed: float,
-    # in and out
-    lacks: wp.array[int],
-    # out
-    results: StepResults,
-    unconverged_steps: wp.array[wp.int64],
-):
-    """Writes what each world did in a solve, and counts the step if one did not converge.
-
-    The first of ``lacks`` is 1 if candidates or contacts did not fit; the second becomes 1 once the step is counted.
-    """
-    w = wp.tid()
-    arrived = progress.remaining[w] == 0.0 or progress.scale[w] == 1.0
-    converged = arrived and lacks[0] == 0 and is_near_end(progress, w, least_speed * dt)
-    converged = wp.isfinite(progress.change[w]) and (progress.steps[w] == 0 or converged)
-    results.newton_steps[w] = progress.steps[w]
-    results.last_change[w] = progress.change[w] / dt
-    results.arrived[w] = arrived
-    results.converged[w] = converged
-    if not converged and wp.atomic_max(lacks, 1, 1) == 0:
-        unconverged_steps[0] += wp.int64(1)
+from ..response.report.report import SolverReport
+from ..response.state.structs import allocate
+from ..response.state.workspace import Workspace
+from .contact.results import StepResults
+from .gradients.report import GradientCounts, GradientReport
 
 
 class ImplicitStepReport(SolverReport):
@@ -73,6 +27,28 @@ class ImplicitStepReport(SolverReport):
         super().__init__(work, responds=responds)
         self.results = allocate(StepResults, work.worlds, work.device)
         self.unconverged = wp.zeros(1, dtype=wp.int64, device=work.device)
+        self.of_gradients = GradientReport(work.worlds, work.device)
+
+    def warn(self) -> None:
+        """Warns as of the stage, and once each of gradients that are NaN, or grow, on their way back through steps."""
+        super().warn()
+        for subject, message in self.of_gradients.warnings().items():
+            self._warnings.once(subject, lambda message=message: message)
+
+    @property
+    def gradient_counts(self) -> GradientCounts:
+        """Totals over all gradients that went back through steps so far, as of this access."""
+        self.of_gradients.copy_counts()
+        return self.of_gradients.totals(self._read_totals()["ambiguous_moves"])
+
+    @property
+    def gradient_norms(self) -> np.ndarray:
+        """Norm of the gradient at the start of each step of the last tape, and at the end of the last one.
+
+        Float64, shape [steps + 1, worlds], in the unit of the loss per metre: that of gradients with respect to
+        positions, and with respect to velocities over the length of the step.
+        """
+        return self.of_gradients.norms
 
     @property
     def newton_steps(self) -> int:
