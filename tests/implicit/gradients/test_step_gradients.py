@@ -6,30 +6,19 @@ the gradients tell. Inputs are moved by 1e-5 of their size, or 1e-3, and rounded
 
 import numpy as np
 import pytest
-from gradient_scenes import (
-    SCENES,
-    block_on_plane,
-    cloth_on_edge,
-    cloth_on_sheet,
-    cloth_on_sphere,
-    marks_of,
-)
+from gradient_scenes import SCENES, marks_of
 
 LIMIT = 5e-5
 """Largest deviation of a change, relative to those of all components, added as independent ones are."""
 OF_ROUNDED = {"shape_material_mu": 3e-4, "friction": 3e-4}
 """The same of inputs from which the coefficient of a pair is computed in float32."""
-OF_SOLVER = 0.03
+OF_SOLVER = 5e-3
 """Largest deviation of gradients of the solver's own steps."""
-SOLVED = cloth_on_sphere, cloth_on_edge, block_on_plane, cloth_on_sheet
-"""Scenes whose steps the solver ends within 1% of the reach of barriers of where they are solved."""
 
 
-def parameters(scenes):
-    return [pytest.param(scene, id=scene.__name__, marks=marks_of(scene)) for scene in scenes]
-
-
-@pytest.fixture(scope="module", params=parameters(SCENES))
+@pytest.fixture(
+    scope="module", params=[pytest.param(scene, id=scene.__name__, marks=marks_of(scene)) for scene in SCENES]
+)
 def scene(request, device):
     """A scene, and gradients of it: of the steps of the solver, and of those that are solved in float64."""
     program = request.param(device)
@@ -42,7 +31,8 @@ def test_gradients_are_those_of_central_differences(scene):
     """With loads and elasticities held constant, as the adjoint holds them, see ``Held``."""
     program, _, gradients = scene
     held = program.reference.held
-    assert min(program.reference.contacts) > 0 and program.reference.residual < 1e-9
+    assert min(program.reference.contacts) > 0
+    assert program.reference.residual < 1e-9 and not program.reference.unsolved.any()
     deviations = {}
     for name, gradient in gradients.items():
         change, way = program.difference(name, held)
@@ -52,9 +42,12 @@ def test_gradients_are_those_of_central_differences(scene):
     assert not deviations
 
 
-@pytest.mark.parametrize("scene", parameters(SOLVED), indirect=True)
 def test_gradients_of_the_solver_are_as_exact_as_it_solves(scene):
-    """It ends a step where nothing changes by more than 1 mm/s: 17 micrometres, where barriers reach 5 mm."""
+    """They fail as well where the equations are not those of the solver."""
     _, of_solver, gradients = scene
-    for name in ("x", "v"):
-        assert np.linalg.norm(of_solver[name] - gradients[name]) < OF_SOLVER * np.linalg.norm(gradients[name])
+    deviations = {}
+    for name, expected in gradients.items():
+        deviation = np.linalg.norm(of_solver[name] - expected) / np.linalg.norm(expected)
+        if not deviation < OF_SOLVER:
+            deviations[name] = deviation
+    assert not deviations
