@@ -7,8 +7,8 @@ solver. The tape then has the adjoint of these steps, as it would have that of t
 end are smooth enough in all inputs for differences of 1e-5 of these.
 
 What barriers depend on and the adjoint holds constant is held constant in a run that is given what another one held:
-the loads by which what presses hard has stiffer barriers, how far gravity moves what is at rest, and the stiffness of
-solids, which the solver reads from their materials before steps.
+the loads by which what presses hard has stiffer barriers, and the stiffness of solids, which the solver reads from
+their materials before steps.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,6 @@ class Held(NamedTuple):
     """What the adjoint of a step holds constant."""
 
     load: np.ndarray
-    fall: np.ndarray
     elasticity: np.ndarray
 
 
@@ -115,7 +114,7 @@ class ReferenceSteps:
 
     def _hold(self, step):
         """Lets a step hold what that of another run held, and keeps it."""
-        held = Held(step.settings.load, step.contacts.fall, step.settings.elasticity)
+        held = Held(step.settings.load, step.settings.elasticity)
         if self._given is not None:
             for array, values in zip(held, self._given[len(self.held)], strict=True):
                 array.assign(values)

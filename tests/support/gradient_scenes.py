@@ -32,8 +32,8 @@ OF_ATTACHMENTS = tuple(f"attachment_particle_body_{name}" for name in ("body_poi
 SIZES = {"x": 0.1, "v": 1.0, "particle_f": 0.1, "poses": 0.1, "places": 0.1, "edge_rest_angle": 1.0}
 SIZES |= {"attachment_particle_body_body_point": 0.1}
 """Sizes of inputs whose differences are not shares of their values."""
-SHARES = {"shape_material_mu": 1e-3, "friction": 1e-3}
-"""Shares of these sizes by which inputs are moved, if not 1e-5: the coefficient of a pair is a root in float32."""
+SHARES = dict.fromkeys(("shape_material_mu", "friction", "gravity"), 1e-3)
+"""Shares of these sizes by which inputs are moved, if not 1e-5: what follows from these is computed in float32."""
 
 
 class Program:
@@ -50,10 +50,10 @@ class Program:
         states, tape: Of the last run.
     """
 
-    def __init__(self, builder, names=(), *, steps=3, poses=None, places=None, arrays=None, **options):
+    def __init__(self, builder, device, names=(), *, steps=3, poses=None, places=None, arrays=None, **options):
         """Finalizes a builder; ``poses`` and ``places`` are those of each step."""
         builder.color()
-        model = self.model = builder.finalize(device="cpu", requires_grad=True)
+        model = self.model = builder.finalize(device=device, requires_grad=True)
         self.steps, self.reference = steps, None
         self.arrays = {name: getattr(model, name) for name in ("particle_inv_mass", "gravity", *names)} | (arrays or {})
         for array in self.arrays.values():
@@ -162,28 +162,28 @@ def add_cloth(builder, at, velocity=(0.0, 0.0, 0.0), *, rot=TILT, cell=0.05, **o
     builder.add_cloth_grid(pos=wp.vec3(*at), rot=rot, vel=wp.vec3(*velocity), **dims, **(CLOTH | options))
 
 
-def cloth_on_sphere():
+def cloth_on_sphere(device):
     """A cloth thrown on a sphere; each particle has its friction."""
     builder = newton.ModelBuilder()
     at = wp.transform(wp.vec3(0.01, 0.005, -0.1), wp.quat_identity())
     builder.add_shape_sphere(-1, radius=0.1, xform=at, cfg=newton.ModelBuilder.ShapeConfig(mu=0.4))
     add_cloth(builder, (-0.05, -0.05, 0.006), (0.4, 0.1, -0.6))
-    friction = wp.array(np.linspace(0.2, 0.5, builder.particle_count), dtype=float, device="cpu")
+    friction = wp.array(np.linspace(0.2, 0.5, builder.particle_count), dtype=float, device=device)
     names = "shape_material_mu", "tri_materials"
-    return Program(builder, names, steps=2, friction=friction, arrays={"friction": friction})
+    return Program(builder, device, names, steps=2, friction=friction, arrays={"friction": friction})
 
 
-def cloth_on_edge():
+def cloth_on_edge(device):
     """A cloth that falls on an edge of a box, with a table of friction."""
     builder = newton.ModelBuilder()
     turned = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.05, 0.03)), 0.8)
     builder.add_shape_box(-1, xform=wp.transform(wp.vec3(0.0, 0.0, -0.1414), turned), hx=0.2, hy=0.1, hz=0.1)
     add_cloth(builder, (-0.05, -0.03, 0.008), (0.3, 0.2, -0.5))
-    table = wp.array([[-1.0, 0.3], [0.3, -1.0]], dtype=float, device="cpu")
-    return Program(builder, OF_CLOTH, friction=bsc.FrictionTable(table, 0, 1), arrays={"friction_table": table})
+    table = wp.array([[-1.0, 0.3], [0.3, -1.0]], dtype=float, device=device)
+    return Program(builder, device, OF_CLOTH, friction=bsc.FrictionTable(table, 0, 1), arrays={"friction_table": table})
 
 
-def block_on_plane():
+def block_on_plane(device):
     """A soft block that falls on an infinite plane, which a program shifts and tilts, and from which it keeps 1 mm."""
     builder = newton.ModelBuilder()
     body = builder.add_body(is_kinematic=True)
@@ -194,10 +194,10 @@ def block_on_plane():
     builder.add_soft_grid(pos=at, rot=TILT, vel=velocity, **cells, **material)
     poses = [[[0.002 * k, 0.001 * k, 0.0, 0.003 * k, -0.003 * k, 0.002 * k, 1.0]] for k in range(4)]
     names = "tet_poses", "tet_materials", "shape_material_mu"
-    return Program(builder, names, steps=4, friction=0.4, poses=poses, min_distance=0.001)
+    return Program(builder, device, names, steps=4, friction=0.4, poses=poses, min_distance=0.001)
 
 
-def cloth_on_sheet():
+def cloth_on_sheet(device):
     """A cloth that falls on a sheet, two sides of which a program moves."""
     builder = newton.ModelBuilder()
     add_cloth(builder, (-0.03, -0.02, 0.012), (0.3, 0.1, -0.6))
@@ -205,10 +205,10 @@ def cloth_on_sheet():
     add_cloth(builder, (-0.08, -0.08, 0.0), rot=wp.quat_identity(), cell=0.08, **held)
     x, is_held = np.array(builder.particle_q), np.array(builder.particle_mass) == 0.0
     places = [x[is_held] + k * np.array([0.001, 0.0005, 0.002]) for k in range(4)]
-    return Program(builder, OF_CLOTH, steps=4, friction=0.3, places=places)
+    return Program(builder, device, OF_CLOTH, steps=4, friction=0.3, places=places)
 
 
-def rope_over_bar():
+def rope_over_bar(device):
     """A rope of springs that falls over a bar, and keeps its radius from it."""
     builder = newton.ModelBuilder()
     turned = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), np.pi / 2.0)
@@ -218,10 +218,10 @@ def rope_over_bar():
         builder.add_particle(wp.vec3(0.04 * (i - 2), 0.01 * i, 0.012), wp.vec3(0.1, 0.2, -0.6), 0.01, radius=0.005)
         if i:
             builder.add_spring(i - 1, i, 60.0, 0.5, 0.0)
-    return Program(builder, (*OF_SPRINGS, "shape_material_mu"), friction=0.3, particle_radius=0.005)
+    return Program(builder, device, (*OF_SPRINGS, "shape_material_mu"), friction=0.3, particle_radius=0.005)
 
 
-def cloth_on_body():
+def cloth_on_body(device):
     """A cloth that lies on a body, which a program moves, with springs to it, and two particles that it holds."""
     builder = newton.ModelBuilder()
     body = builder.add_body(is_kinematic=True)
@@ -233,17 +233,17 @@ def cloth_on_body():
         point = wp.vec3(*(1.02 * x[p]))  # which stretches the cloth
         builder.add_attachment_particle_body(p, body, body_point=point, stiffness=stiffness, damping=0.3)
     poses = [[[0.003 * k, 0.002 * k, -0.001 * k, 0.01 * k, 0.0, 0.02 * k, 1.0]] for k in range(4)]
-    return Program(builder, ("tri_materials", *OF_ATTACHMENTS), steps=4, friction=0.3, poses=poses)
+    return Program(builder, device, ("tri_materials", *OF_ATTACHMENTS), steps=4, friction=0.3, poses=poses)
 
 
-def pushed_cloth():
+def pushed_cloth(device):
     """A cloth that a box pushes, which a program moves and turns, and that keeps 2 mm from it."""
     builder = newton.ModelBuilder()
     body = builder.add_body(is_kinematic=True)
     builder.add_shape_box(body, hx=0.15, hy=0.15, hz=0.02)
     add_cloth(builder, (-0.05, -0.04, 0.035), (0.1, 0.0, -0.2))
     poses = [[[0.002 * k, 0.001 * k, 0.006 * k, 0.02 * k, 0.01 * k, 0.02 * k, 1.0]] for k in range(4)]
-    return Program(builder, ("tri_materials",), steps=4, friction=0.4, poses=poses, min_distance=0.002)
+    return Program(builder, device, ("tri_materials",), steps=4, friction=0.4, poses=poses, min_distance=0.002)
 
 
 SCENES = cloth_on_sphere, cloth_on_edge, block_on_plane, cloth_on_sheet, rope_over_bar, cloth_on_body, pushed_cloth

@@ -60,6 +60,19 @@ def inertial_forces(
 
 
 @wp.kernel
+def find_falls(
+    # in
+    dt: float,
+    gravity: wp.array[wp.vec3],
+    # out
+    fall: wp.array[float],
+):
+    """Computes how far gravity moves what is at rest in a step, by world."""
+    world = wp.tid()
+    fall[world] = dt * dt * wp.length(gravity[world % gravity.shape[0]])
+
+
+@wp.kernel
 def attachment_forces(
     # in
     dt: wp.float64,

@@ -254,6 +254,7 @@ class StepGradients:
         table = self._work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
         planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
+        contacts, of_contacts = with_gradients(step.contacts, ["fall"])
         poses, of_poses, bodies = step.poses, (None, None), step.bodies
         if model.body_count:
             of_poses = tuple(wp.zeros_like(pose, requires_grad=False) for pose in poses)
@@ -273,7 +274,7 @@ class StepGradients:
                     force=None if bodies.force is None else with_gradient(bodies.force, of.body_f),
                 )
                 self._from_end_of_bodies(step, bodies, motion.bodies, of)
-        step = step._replace(motion=motion, planes=planes, poses=poses, bodies=bodies)
+        step = step._replace(contacts=contacts, motion=motion, planes=planes, poses=poses, bodies=bodies)
         equations.load(step)
         multipliers = self._linear.solve(equations.differentiate(transposed=True), self._of_unknowns)
         self._launch(kernels.set_failed, equations.count, [equations.world, recorded.failed], [multipliers])
@@ -299,6 +300,9 @@ class StepGradients:
         if model.particle_inv_mass.grad is not None:
             inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
+        if model.gravity.grad is not None:  # layers, by which barriers are stiffer, follow from it
+            inputs = [wp.float32(step.dt), model.gravity]
+            self._adjoint(energies.find_falls, self._work.worlds, inputs, of_contacts.fall)
         self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
         self._carried_to = before
         for gradient in (
