@@ -6,7 +6,7 @@ from diffsim import DiffsimExample
 
 import warp_bsc as bsc
 
-MAX_ITERATIONS = 100  # so that all steps converge: others carry no gradients
+MAX_ITERATIONS = 100  # so that more steps converge: others carry no gradients
 
 
 @wp.kernel
