@@ -44,7 +44,6 @@ def build_worlds(world, count):
     """Returns a model of this many copies of a world, with gradients."""
     builder = newton.ModelBuilder()
     builder.replicate(world, count)
-    builder.color()  # for VBD
     model = builder.finalize(requires_grad=True)
     # the solver's own contacts between particles are penalties, and not needed here
     model.particle_ke = model.particle_kd = model.particle_kf = 0.0

@@ -6,8 +6,7 @@
 A cloth is held by one edge, level at first, and drops. The positions of its particles in 120 frames of 1/60 s, with
 noise, are what is known. Three guesses of its stiffness against stretching, ``tri_ke``, and against bending,
 ``edge_ke``, are improved at once, each in a world of its own, until both are within two percent of the truth. The loss
-is the mean squared distance from the frames; its gradient goes back through all steps, which are those of VBD behind
-the stage, made differentiable by ``SolverImplicitAdjoint``.
+is the mean squared distance from the frames; its gradient goes back through all steps of ``SolverImplicit``.
 """
 
 import newton
@@ -16,9 +15,6 @@ import warp as wp
 from common import main
 from diffsim import build_worlds
 from diffsim_targets import TargetExample
-from newton.solvers import SolverVBD
-
-import warp_bsc as bsc
 
 SIDE = 0.5  # [m]
 DENSITY = 0.2  # [kg/m^2]
@@ -68,17 +64,15 @@ class Example(TargetExample):
         model = build_worlds(world, args.starts)
         model.tri_materials.requires_grad = model.edge_bending_properties.requires_grad = True
         self.per_world = world.tri_count, world.edge_count
-        adjoint = bsc.SolverImplicitAdjoint(SolverVBD(model, iterations=20), polish=3)
-        self.start_solver(adjoint, (wp.vec3(0.0, -1.6, 0.0), -10.0, 90.0))
+        self.start_solver(model, (wp.vec3(0.0, -1.6, 0.0), -10.0, 90.0))
         truth, starts = (np.log(np.float32(values)) for values in ([TRUTH] * args.starts, STARTS[: args.starts]))
         self.logarithms = wp.array(truth, dtype=wp.vec2, device=model.device, requires_grad=True)
         self.prepare_descent([self.logarithms], STEPS, targets=np.zeros((STEPS, world.particle_count, 3)))
-        with wp.Tape():  # so that steps leave their start as it is
-            self.forward()
+        self.forward()
         frames = self.positions()[1:, 0]
         self.targets.assign(frames + np.random.default_rng(7).normal(scale=NOISE, size=frames.shape))
         self.errors = []
-        self.search_from([starts], first=0.5, longest=1.0)
+        self.search_from([starts], first=0.5, longest=0.5)
 
     def forward(self):
         """Simulates the drapes, and computes their losses."""
@@ -100,7 +94,7 @@ class Example(TargetExample):
         assert np.abs(self.errors[-1]).max() < 0.02, self.errors[-1]
 
     def print_report(self):
-        """Prints what the stage did, and what was found."""
+        """Prints what the solver did, and what was found."""
         super().print_report()
         for start, found, error in zip(STARTS, self.found, self.errors[-1], strict=False):
             errors = " and ".join(f"{value:+.2%}" for value in error)

@@ -12,7 +12,6 @@ import argparse
 import cma
 import newton.viewer
 import numpy as np
-import warp as wp
 from example_diffsim_identify import STARTS, TRUTH, Example
 
 SPREAD = 0.5  # standard deviation of the first samples, of logarithms
@@ -39,8 +38,7 @@ def sample(start, most, triangles, seed):
     while len(errors) < most:
         samples = search.ask()
         example.logarithms.assign(np.float32(samples))
-        with wp.Tape():  # so that steps leave their start as it is
-            example.forward()
+        example.forward()
         losses = example.losses.numpy().astype(float)
         search.tell(samples, losses.tolist())
         for x, loss in zip(samples, losses, strict=True):

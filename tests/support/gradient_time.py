@@ -83,7 +83,7 @@ def measure(worlds, steps):
     found = Steps(worlds, steps, requires_grad=True)
     times = [without, timed(found.forward, device), timed(lambda: found.forward_and_back(backward=False), device)]
     both = timed(found.forward_and_back, device)
-    finite = np.isfinite(found.states[0].particle_qd.grad.numpy()).all(axis=1).mean()
+    finite = np.isfinite(found.begin.particle_qd.grad.numpy()).all(axis=1).mean()
     return [1e3 * t / steps for t in (*times, both - times[2])], finite, found.solver.report.gradient_counts
 
 

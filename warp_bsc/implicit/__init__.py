@@ -1,1 +1,1 @@
-"""Gradients through implicit time steps, by the implicit function theorem. Guide: docs/newton/gradients_vbd.md."""
+"""The solver with contact inside, and gradients through its steps. Guides: docs/newton/implicit.md, gradients.md."""

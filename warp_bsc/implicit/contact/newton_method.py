@@ -16,7 +16,7 @@ from ...detection.run.settings import capacity_for
 from ...response.contacts.queue import PairQueue, queues_of
 from ...response.report.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.solve.bodies import begin_bodies as begin_response_to_bodies
-from ...response.state.mesh import ModelMesh, grouped_by_world, host_array
+from ...response.state.mesh import grouped_by_world, host_array
 from ...response.state.motion import StateArrays
 from ...response.state.structs import allocate
 from ...response.state.workspace import Workspace
@@ -32,7 +32,9 @@ from .matrix import make_matrix
 from .pairs import BarrierSettings, Candidates, Trial
 from .results import StepResults, note_overflow, write_results
 from .rows import make_rows
+from .scales import edges_of_particles, in_each_world, metre_of
 from .system import Contacts, Progress, Unknowns, Worlds
+from .touching import part_touching
 
 _OF_ENTRIES = "entries", "unsorted", "row", "order", "pulled", "entry_weight"
 """Arrays of contacts with several elements for each."""
@@ -67,8 +69,6 @@ _MOST_UNITS, _FAST = 2.0**56, 100.0
 """Units of energy of the heaviest body at a speed [m/s]: they shall not overflow."""
 _MOST_UNITS_OF_ALL = 2.0**61
 """The same of all particles together: many and fast ones have coarser units."""
-_GRAVITY, _EDGE, _OTHER_UNIT = 9.81, 0.05, 10.0
-"""Usual gravity [m/s^2] and edges [m]; what is that many times as much in a model tells that its unit is no metre."""
 _TOLERANCE = 1e-2
 """Residual at which a solve ends, as a share of the first: by energies, most of which are of what is heavy."""
 _LIGHT = 0.01, 1e-4
@@ -180,7 +180,7 @@ class NewtonMethod:
         self._place = wp.zeros(work.worlds, dtype=int, device=device)
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
         self.settings = BarrierSettings()
-        self._metre = _metre_of(mesh)
+        self._metre = metre_of(mesh)
         reach = self._reach(mesh)
         self.settings.reach = wp.array(reach, dtype=float, device=device)
         self.settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
@@ -191,24 +191,24 @@ class NewtonMethod:
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)
         if len(solved):
-            least = _of_worlds(np.min, reach[:particles], world, work.worlds, np.inf)[worlds]
+            least = in_each_world(np.min, reach[:particles], world, work.worlds, np.inf)[worlds]
             of_bodies = np.minimum(bodies.reach_between_bodies(mesh), least)
             of_bodies[:particles] = np.inf
         self.settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
         reach = np.minimum(reach, of_bodies)
         margin = np.where(np.isfinite(reach), reach, 0.0)
-        margin += 0.5 * _of_worlds(np.max, margin, worlds, work.worlds, 0.0)[worlds]
+        margin += 0.5 * in_each_world(np.max, margin, worlds, work.worlds, 0.0)[worlds]
         self._margin = wp.array(margin, dtype=float, device=device)
         masses = host_array(model.particle_mass)
         moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
-        mass = _of_worlds(np.mean, masses[moves], world[moves], work.worlds, 1.0)
-        total = _of_worlds(np.sum, masses[moves], world[moves], work.worlds, 0.0)
+        mass = in_each_world(np.mean, masses[moves], world[moves], work.worlds, 1.0)
+        total = in_each_world(np.sum, masses[moves], world[moves], work.worlds, 0.0)
         units = 1.0 / np.maximum(mass * _UNIT_SPEED**2, total * _FAST**2 / _MOST_UNITS_OF_ALL) / self._metre**2
-        light = _of_worlds(np.median, masses[moves], world[moves], work.worlds, 1.0) / mass
+        light = in_each_world(np.median, masses[moves], world[moves], work.worlds, 1.0) / mass
         tolerance = _TOLERANCE * np.where(light < _LIGHT[0], np.sqrt(np.maximum(light, _LIGHT[1])), 1.0)
         self._tolerance = wp.array(tolerance, dtype=float, device=device)
         if len(solved):
-            heaviest = _of_worlds(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
+            heaviest = in_each_world(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * (_FAST * self._metre) ** 2, 1e-9))
         self.settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._attachments = attachments_of_model(model)
@@ -269,9 +269,9 @@ class NewtonMethod:
         """Returns the gap from which each vertex pushes [m], infinite for shapes."""
         model, particles = mesh.model, mesh.model.particle_count
         reach = np.full(mesh.vertex_count, np.inf)
-        edges, lengths = _edges_of_particles(mesh)
+        edges, lengths = edges_of_particles(mesh)
         world, least = mesh.device_world.numpy(), self._metre * _USUAL_REACH
-        usual = _of_worlds(np.median, lengths, world[edges[:, 0]], self._work.worlds, least / _REACH_OF_EDGE)
+        usual = in_each_world(np.median, lengths, world[edges[:, 0]], self._work.worlds, least / _REACH_OF_EDGE)
         reach[:particles] = _REACH_OF_EDGE * usual[world[:particles]]
         for k in range(2):
             np.minimum.at(reach, edges[:, k], _SHORT_EDGE * lengths)
@@ -451,7 +451,7 @@ class NewtonMethod:
 
     def _part_touching(self):
         inputs = [self._work.step, self.settings, self._touching]
-        self._launch(pairs.part_touching, self.mesh.model.particle_count, inputs, [self._trial, self.origin])
+        self._launch(part_touching, self.mesh.model.particle_count, inputs, [self._trial, self.origin])
         self._prepare_candidates()
 
     def _allocate_candidates(self, queues):
@@ -546,25 +546,3 @@ class NewtonMethod:
     def _launch_over_bodies(self, kernel, inputs):
         """Launches a kernel over the bodies, with those of the solve as its last argument, if there are any."""
         self._launch(kernel, len(self._bodies.unknown), inputs, [self._bodies])
-
-
-def _edges_of_particles(mesh: ModelMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the edges between particles, shape [n, 2], and their lengths in the model, shape [n]."""
-    edges = mesh.edges[(mesh.edges < mesh.model.particle_count).all(axis=1)]
-    ends = host_array(mesh.model.particle_q)[edges] if len(edges) else np.zeros((0, 2, 3))
-    return edges, np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-
-
-def _metre_of(mesh: ModelMesh) -> float:
-    """Returns how many units of length of a model are a metre: as its gravity tells, or its edges if it has none."""
-    gravity = np.linalg.norm(host_array(mesh.model.gravity), axis=1).max()
-    lengths = _edges_of_particles(mesh)[1]
-    metre = gravity / _GRAVITY if gravity > 0.0 or not len(lengths) else np.median(lengths) / _EDGE
-    return float(metre) if metre > _OTHER_UNIT else 1.0
-
-
-def _of_worlds(function, values: np.ndarray, world: np.ndarray, worlds: int, default: float) -> np.ndarray:
-    """Returns a function of the values of each world, which is as if the world were alone; the default of none."""
-    order, first = grouped_by_world(world, worlds)
-    parts = np.split(values[order], first[1:-1])
-    return np.array([function(part) if len(part) else default for part in parts], dtype=float)

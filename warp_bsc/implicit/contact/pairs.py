@@ -40,10 +40,6 @@ FAR_TOGETHER = wp.constant(3.0)
 """The same, as long as its vertices take the same part: displacements that hardly differ do not bring it nearer."""
 _FARTHER = wp.constant(2.5)
 """What comes within its reach if two vertices go so many times the way of the step before, together, is not far."""
-_PARTED = wp.constant(1e-3)
-"""How far what touches a shape is moved off it, as a share of its reach."""
-_PARTED_ROUNDED = wp.constant(2.0**-20)
-"""The same at least, as a share of its largest coordinate."""
 
 
 @wp.struct
@@ -493,31 +489,6 @@ def prepare_candidates(
             if has_pair(of, i):
                 _prepare(step, of, settings, origin, crossings, progress, candidates, touching, i)
             number += 1
-
-
-@wp.kernel
-def part_touching(
-    # in
-    step: Step,
-    settings: BarrierSettings,
-    touching: Touching,
-    # in and out
-    trial: Trial,
-    origin: wp.array[wp.vec3],
-):
-    """Moves particles that touch a face of a shape off it a little, to the side to which it faces."""
-    v = wp.tid()
-    face = touching.face[v]
-    if face == NO_FACE:
-        return
-    x, mesh = trial.x[v] + wp.vec3(), step.mesh
-    a, b, c = trial.x[mesh.faces[face, 0]], trial.x[mesh.faces[face, 1]], trial.x[mesh.faces[face, 2]]
-    off = wp.max(_PARTED * settings.reach[v], _PARTED_ROUNDED * wp.max(wp.abs(x)))
-    parted = x + off * wp.normalize(wp.cross(b - a, c - a))
-    trial.x[v] = parted
-    trial.exact[v] = to_double(parted)
-    trial.moved[v] = to_double(parted)
-    origin[v] = parted
 
 
 @wp.func

@@ -1,6 +1,6 @@
-"""Draws what the examples with gradients behind VBD begin with and what they find, as film strips, and their distances.
+"""Draws what examples with gradients of SolverImplicit begin with and what they find, as film strips, and distances.
 
-    python examples/figures/diffsim_vbd.py diffsim_vbd.png
+    python examples/figures/diffsim_implicit.py diffsim_implicit.png
 
 Takes as long as the three examples. Needs matplotlib (``pip install matplotlib``).
 """
