@@ -579,7 +579,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "collision_filter": filters,
                 "bodies": {"unknown": "moved", "flag": True, "None": None},
                 "inversions": {"unknown": "counted", "flag": True, "None": None},
-                "max_iterations": NOT_COUNT | {"zero": 0},
+                "max_iterations": without(NOT_COUNT, "None") | {"zero": 0},
                 "report": reported,
             },
             raises=bsc.SolverImplicit.__init__,
