@@ -367,7 +367,7 @@ def report_gradients(
     norms[1, w] = wp.sqrt(after)
     if failed[w] != 0 and before > wp.float64(0.0):
         wp.atomic_add(counts, int(Count.UNSOLVED), wp.int64(1))
-    if not_solved[w] != 0:
+    if not_solved[w] != 0 and wp.isfinite(before):
         wp.atomic_add(counts, int(Count.FAILED_SOLVES), wp.int64(1))
     if after > GROWTH * GROWTH * before and before > wp.float64(0.0):
         if wp.atomic_add(counts, int(Count.GROWING), wp.int64(1)) == wp.int64(0):
