@@ -17,8 +17,8 @@ class GradientCounts:
         steps: Steps that they went back through.
         unsolved: Worlds of these steps, each step for itself, whose gradients are NaN: the step did not converge in
             them, or the response behind the solve has changed its end.
-        failed_solves: Worlds of these steps whose linear solve did not converge: gradients are NaN as well. Worlds whose
-            gradients were NaN before do not count.
+        failed_solves: Worlds of these steps whose linear solve did not converge: gradients are NaN as well. Worlds
+            whose gradients were NaN before do not count.
         growing: Worlds of these steps within which the norm of the gradient grew by more than 1,000.
         ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps, and of which it
             cannot be known what they are of: they are NaN, see :mod:`..response.adjoint.between_steps`.
