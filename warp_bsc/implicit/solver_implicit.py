@@ -262,7 +262,8 @@ class SolverImplicit(SolverCCD):
 
     def _record(self, step, end):
         """Solves a step; the tape records its adjoint."""
-        device, start = self.mesh.device, step.state_in
+        device, start, gradients = self.mesh.device, step.state_in, self.gradients
+        assert gradients is not None
         given = [start.particle_q, start.particle_qd, start.particle_f, start.body_q, start.body_qd, start.body_f]
         arrays = [*given, end.particle_q, end.particle_qd, end.body_q, end.body_qd]
         recorded: RecordedStep | None = None
@@ -272,12 +273,13 @@ class SolverImplicit(SolverCCD):
             nonlocal recorded
             copies = StartArrays.of(start)
             self._resolve_motion(step, end)
-            recorded = self.gradients.record(step.tape, step.dt, copies, end)
+            recorded = gradients.record(step.tape, step.dt, copies, end)
 
         def backward():
+            assert recorded is not None
             with self._lock:
-                gradients = (None if array is None else array.grad for array in arrays)
-                self.gradients.backward(recorded, before(), StateGradients(*gradients))
+                of_arrays = (None if array is None else array.grad for array in arrays)
+                gradients.backward(recorded, before(), StateGradients(*of_arrays))
             if not device.is_capturing:
                 self.report.warn()
 

@@ -7,7 +7,7 @@ elements are not made positive definite, closest points move, and friction follo
 symmetric.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -99,7 +99,7 @@ class StepEquations:
         unknown = unknowns.of_vertex.numpy()[: model.particle_count]
         self.unknown = unknowns.of_vertex[: model.particle_count]
         self._elastic = Elastic(model, unknown, self.count)
-        self.attachments = attachment_arrays(model)
+        self.attachments: Any = attachment_arrays(model)
         self._springs: list[Elements] = []
         if self.attachments is not None:
             particles = self.attachments.particle
@@ -147,7 +147,7 @@ class StepEquations:
             attached = self.attachments
             parameters = [attached.body, attached.body_point, attached.stiffness, attached.damping, attached.enabled]
             springs.parameters = [*parameters, *step.poses]
-        if self._inertia_of_bodies is not None:
+        if self._inertia_of_bodies is not None and step.bodies is not None:
             parameters = [self._body, self._is_turn, step.poses[0], step.bodies.goals, step.motion.bodies]
             self._inertia_of_bodies.parameters = parameters
         self._in_contact = self._load_contacts(step)

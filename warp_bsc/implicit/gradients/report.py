@@ -71,8 +71,8 @@ class GradientReport:
 
     def totals(self, ambiguous_moves: int) -> GradientCounts:
         """Returns the totals."""
-        counts = self.counts.numpy().tolist()
-        return GradientCounts(*counts[: int(Count.STEP)], ambiguous_moves)
+        steps, unsolved, failed, growing = self.counts.numpy()[: int(Count.STEP)].tolist()
+        return GradientCounts(steps, unsolved, failed, growing, ambiguous_moves)
 
     def warnings(self) -> dict[str, str]:
         """Returns what to warn of, as far as the host knows it, by subject."""

@@ -5,6 +5,7 @@ one linear solve, see :mod:`.equations`, whatever the Newton steps were.
 """
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import newton
 import warp as wp
@@ -37,7 +38,7 @@ _THREADS = 256
 class StartArrays:
     """Copies of arrays of the state at the start of a step; None where there is none."""
 
-    particle_qd: wp.array
+    particle_qd: wp.array | None
     particle_f: wp.array | None
     body_q: wp.array | None
     body_qd: wp.array | None
@@ -105,18 +106,17 @@ class StepGradients:
             report: Where gradients are counted.
         """
         self._work, self.newton, self._converged, self._report = work, newton, converged, report
-        self._model = model = work.mesh.model
-        self.equations = equations = StepEquations(newton)
-        self._linear = LinearSolver(
-            newton.problem.unknowns.of_worlds, equations.world, tolerance=_TOLERANCE, max_iterations=_MAX_ITERATIONS
-        )
+        self._model: Any = work.mesh.model
+        model, self.equations = self._model, StepEquations(newton)
+        limits = {"tolerance": _TOLERANCE, "max_iterations": _MAX_ITERATIONS}
+        self._linear = LinearSolver(newton.problem.unknowns.of_worlds, self.equations.world, **limits)
         vertices, particles, device = work.mesh.vertex_count, model.particle_count, work.device
 
         def zeros(n):
             return wp.zeros(n, dtype=wp.vec3d, device=device)
 
         self._of_x1, self._of_x0, self._of_v0 = zeros(vertices), zeros(vertices), zeros(particles)
-        self._of_unknowns, self._carried_x = zeros(equations.count), zeros(particles)
+        self._of_unknowns, self._carried_x = zeros(self.equations.count), zeros(particles)
         self._interrupted = wp.clone(work.motion.vertices.interrupted)
         self._poses, self._carried_poses = None, None
         if model.body_count:
@@ -255,7 +255,9 @@ class StepGradients:
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
         planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
         contacts, of_contacts = with_gradients(step.contacts, ["fall"])
-        poses, of_poses, bodies = step.poses, (None, None), step.bodies
+        bodies: Any = step.bodies
+        poses: Any = step.poses
+        of_poses: Any = None, None
         if model.body_count:
             of_poses = tuple(wp.zeros_like(pose, requires_grad=False) for pose in poses)
             poses = tuple(with_gradient(pose, of_pose) for pose, of_pose in zip(poses, of_poses, strict=True))
