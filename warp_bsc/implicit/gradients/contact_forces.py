@@ -1,6 +1,6 @@
 """Forces of barriers and friction as a kernel over contacts, which Warp differentiates.
 
-The form is that of :mod:`..elements`. An element is a pair of :mod:`..contact.pairs`, or a particle near an infinite
+The form is that of :mod:`.elements`. An element is a pair of :mod:`..contact.pairs`, or a particle near an infinite
 plane. All follows from positions at both ends of the step as in the solve, in float64: the closest points, the reach of
 the barrier, which depends on the distance at the start, and its stiffness. The gradient of a distance does not depend
 on how closest points move, so that forces are exact; their derivatives do, and have it.

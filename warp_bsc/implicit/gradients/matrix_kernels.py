@@ -149,10 +149,7 @@ def factor_blocks(
     roots: wp.array[wp.mat33d],
     eigenvalues: wp.array[wp.float64],
 ):
-    """Factors the inverse of the symmetric parts of blocks, with eigenvalues made positive and at least the inertia.
-
-    VBD leaves the negative terms of its blocks out, so that they are positive definite; this has the same purpose.
-    """
+    """Factors the inverse of the symmetric parts of blocks, with eigenvalues made positive and at least the inertia."""
     i = wp.tid()
     block = blocks[i]
     q, values = wp.eig3(wp.float64(0.5) * (block + wp.transpose(block)))
