@@ -259,6 +259,8 @@ class SolverImplicit(SolverCCD):
             raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
         if state_in is state_out:
             raise ValueError("on a tape, state_out must not be state_in")
+        if not self.model.particle_count:
+            raise NotImplementedError("steps of a model without particles carry no gradients: step outside the tape")
 
     def _record(self, step, end):
         """Solves a step; the tape records its adjoint."""
@@ -315,6 +317,8 @@ class SolverImplicit(SolverCCD):
 
     def _resolve(self, step):
         super()._resolve(step)
+        if not step.is_recorded:  # gradients of what starts where this one ended go no further
+            self._last_recorded = (lambda: None), (lambda: None)
         if self.gradients is not None:
             self.gradients.finish(arrays_of(step.state_out))
 

@@ -82,7 +82,6 @@ class StepEquations:
     Attributes:
         count: Number of unknowns.
         forces: Sum of the forces on each, 0 for those that are fixed [N], vec3d.
-        matrix: What :meth:`differentiate` computed.
         attachments: Attachments of the model, None without any.
         unknown: Unknown of each particle.
         of_bodies: First unknown of each body, -1 for none; None if no body is solved for.
@@ -118,7 +117,6 @@ class StepEquations:
         self._contacts: Elements | None = None
         self._in_contact: list[Elements] = []
         self._step: SolvedStep | None = None
-        self.matrix: Matrix | None = None
 
     def _elements_of_bodies(self, unknown):
         """Returns elements of the inertia of shifts and turns of bodies, at changes of 0."""

@@ -362,7 +362,7 @@ def report_gradients(
     w = wp.tid()
     if w == 0:
         wp.atomic_add(counts, int(Count.STEPS), wp.int64(1))
-    before, after = norms[0, w], norms[1, w]
+    before, after = norms[0, w] + wp.float64(0.0), norms[1, w] + wp.float64(0.0)  # copies
     norms[0, w] = wp.sqrt(before)
     norms[1, w] = wp.sqrt(after)
     if failed[w] != 0 and before > wp.float64(0.0):
