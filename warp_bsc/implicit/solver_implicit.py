@@ -31,7 +31,7 @@ from .contact.results import StepResults
 from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
 from .report import ImplicitStepReport
 
-MAX_STEPS, MAX_PRECISE_STEPS = 15, 60
+MAX_STEPS, MAX_PRECISE_STEPS = 15, 100
 """Newton steps of a step, and of one whose gradients are wanted: after 48 steps with 15, scenes of ``bench response``
 are within 0.4 mm of where many more lead, in the mean of their particles, but for the chaotic pile of cubes."""
 
@@ -187,7 +187,7 @@ class SolverImplicit(SolverCCD):
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
                 hits. Fewer bound the time of an impact, and let cloth lag behind its forces; ``report.converged`` says
                 whether they sufficed. While something that a program moves is on its way, at least 16 are allowed. By
-                default 15, and 60 if the model requires gradients: steps then go on until less is left, some 2 more.
+                default 15, and 100 if the model requires gradients: steps then go on until less is left, some 2 more.
             report: What the report of a step has beside its results; impulses of ``"contacts"`` are those of barriers
                 and friction at its end.
 

@@ -118,6 +118,8 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
     else:
         p.flow.goes_on[0] = 1
         p.progress.energy[w] = wp.int64(0)  # the Newton step begins anew
+        p.progress.square[w] = wp.int64(0)
+        p.progress.product[w] = wp.int64(0)
         p.progress.held[w] = 0
         if phase == Phase.SEARCH_CANDIDATES:
             p.any_leaves[0] = 1

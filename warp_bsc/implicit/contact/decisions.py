@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from ...response.state.vectors import ZERO
 from .system import Progress, Unknowns, is_near_end
 
 wp.set_module_options({"enable_backward": False})
@@ -10,6 +11,8 @@ _NOISE = wp.constant(wp.float64(1e-9))
 """Rise of energy that may be rounding, as a share of it."""
 PATH = wp.constant(8)
 """Newton steps of which positions are kept."""
+_LEAST_DAMPING, _GROWTH = wp.constant(float(2.0**-4)), wp.constant(float(1.1))
+"""Least share of displacements that a world takes where it goes to and fro, and factor by which that grows again."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
@@ -22,7 +25,7 @@ def take_bound(w: int, progress: Progress):
 @wp.func
 def may_cut(progress: Progress, w: int) -> bool:
     """Returns whether cuts of vertices may let a world go further: not while something that a program moves comes."""
-    return progress.scale[w] < 1.0 and progress.remaining[w] == 0.0
+    return progress.scale[w] < progress.damping[w] and progress.remaining[w] == 0.0
 
 
 @wp.func
@@ -48,7 +51,7 @@ def rises(w: int, progress: Progress) -> bool:
 @wp.func
 def begin_release(w: int, progress: Progress):
     """Lets a world go along its solution without pairs held."""
-    progress.scale[w] = 1.0
+    progress.scale[w] = progress.damping[w]
     progress.trial[w] = wp.int64(0)
 
 
@@ -56,7 +59,7 @@ def begin_release(w: int, progress: Progress):
 def begin_cuts(w: int, whole: wp.array[float], progress: Progress):
     """Lets a world that takes less than all of its displacements cut those of single vertices instead."""
     whole[w] = progress.scale[w]
-    progress.scale[w] = 1.0
+    progress.scale[w] = progress.damping[w]
     progress.bound[w] = 1.0
 
 
@@ -97,10 +100,39 @@ def begin_newton_step(w: int, progress: Progress):
     progress.remaining[w] = 0.0
     progress.cuts[w] = 0
     progress.held[w] = 0
-    progress.scale[w] = 1.0
+    progress.scale_before[w] = progress.scale[w]
+    progress.scale[w] = progress.damping[w]
     progress.bound[w] = 1.0
+    progress.square_before[w] = progress.square[w]
+    progress.square[w] = wp.int64(0)
+    progress.product[w] = wp.int64(0)
     progress.energy[w] = wp.int64(0)
     progress.trial[w] = wp.int64(0)
+
+
+@wp.func
+def _damp(w: int, progress: Progress):
+    """Chooses the share that a world takes at most in its next Newton step.
+
+    Load, direction and place of friction are those where a Newton step begins, so that Newton steps may go to and fro
+    for ever: the energy then is higher than the one that the last Newton step has reached. Where a displacement is q
+    times the last one, of which a share s was taken, the share s / (1 - q) leads to the end, by Aitken's method. Shares
+    grow slowly again.
+
+    References:
+        B. M. Irons and R. C. Tuck, A Version of the Aitken Accelerator for Computer Iteration, International Journal
+        for Numerical Methods in Engineering 1(3), 1969, doi:10.1002/nme.1620010306.
+    """
+    before, now = wp.float64(progress.square_before[w]), wp.float64(progress.square[w])
+    product, damping = wp.float64(progress.product[w]), progress.damping[w] + float(0.0)
+    most, changed = wp.min(_GROWTH * damping, 1.0), before - wp.float64(2.0) * product + now
+    energy, reached = wp.float64(progress.energy[w]), wp.float64(progress.reached[w])
+    lags = energy > reached + _NOISE * wp.abs(reached)
+    falls_fast = damping == 1.0 and wp.float64(4.0) * now <= before
+    progress.damping[w] = most
+    if lags and not falls_fast and before > ZERO and changed > ZERO:
+        share = progress.scale_before[w] * float((before - product) / changed)
+        progress.damping[w] = wp.clamp(share, _LEAST_DAMPING, most)
 
 
 @wp.func
@@ -124,7 +156,7 @@ def decide(
     A world ends whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one. They
     are counted from when what a program moves arrives, if it does.
     """
-    takes_share = takes(w, progress)
+    takes_share, reaches = takes(w, progress), progress.trial[w] + wp.int64(0)
     progress.trial[w] = wp.int64(0)
     progress.searches[w] = int(not takes_share)
     if not takes_share:
@@ -146,6 +178,9 @@ def decide(
     if ends or (steps >= max_late_steps and not arrived):
         progress.active[w] = 0
         return
+    if arrived and progress.held[w] == 0 and progress.cuts[w] == 0:
+        _damp(w, progress)
+    progress.reached[w] = reaches
     begin_newton_step(w, progress)
 
 

@@ -131,6 +131,7 @@ class Problem:
         plane_share: Share of their ways that infinite planes have gone, by world.
         whole: Share that each world takes without cuts of single vertices.
         first: Solution of the Newton step before pairs are held.
+        last: The same of the Newton step before.
         leaves: 1 for each world of which a vertex leaves its box.
         any_leaves: 1 if there is one, shape [1].
         lacks: See :func:`.results.write_results`.
@@ -163,6 +164,7 @@ class Problem:
     plane_share: wp.array[float]
     whole: wp.array[float]
     first: wp.array[wp.vec3]
+    last: wp.array[wp.vec3]
     leaves: wp.array[int]
     any_leaves: wp.array[int]
     lacks: wp.array[int]

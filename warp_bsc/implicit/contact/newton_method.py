@@ -230,7 +230,7 @@ class NewtonMethod:
         p.goal, p.lower, p.upper, p.limit = self._goal, self._lower, self._upper, limit
         p.plane_share, p.whole, p.lacks = self._plane_share, whole, self._lacks
         p.leaves, p.any_leaves = self._leaves, self._any_leaves
-        p.first = wp.zeros(self._count, dtype=wp.vec3, device=device)
+        p.first, p.last = (wp.zeros(self._count, dtype=wp.vec3, device=device) for _ in range(2))
         p.worlds = self._in_worlds(of_elements, unknowns)
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1

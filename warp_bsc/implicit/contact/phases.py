@@ -280,6 +280,9 @@ def displace(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settin
         bodies.displace_body(u, motion, p.unknowns, p.vectors.solution, p.bodies)
     if first_body < end:
         wait_for_team(p.flow.arrived, w, at.blocks)
+    if at.solves == 0 and at.then == Phase.BOUNDED:
+        for u in range(p.unknowns.of_worlds[w] + t, first_body, n):
+            steps.compare_solutions(u, w, settings, p.unknowns, p.vectors.solution, p.last, p.progress)
     for k in range(p.worlds.first_vertex[w] + t, _end_of_vertices(p.worlds, p.progress, w), n):
         steps.displace(
             p.worlds.vertices[k],

@@ -14,6 +14,8 @@ from .system import NOT_UNKNOWN, Progress, Unknowns, displacement, is_solved, lo
 
 wp.set_module_options({"enable_backward": False})
 
+_FINE = wp.constant(wp.float64(2.0**16))
+"""Factor on products of displacements: a unit of energy is too coarse for them."""
 _ROUNDED = wp.constant(2.0**-20)
 """More than what rounding changes, as a share of a length."""
 
@@ -92,6 +94,8 @@ def begin_step(
         progress.steps[v] = 0
         progress.solving[v] = 0
         progress.scale[v] = 1.0
+        progress.damping[v] = 1.0
+        progress.square[v] = wp.int64(0)
         progress.bound[v] = 1.0
         progress.change[v] = 0.0
         progress.way_before[v] = progress.way[v]
@@ -175,6 +179,24 @@ def find_remaining(
         if wp.length_sq(d) > 0.0:
             raise_to(progress.remaining, world, wp.length(d))
             raise_to(progress.given_way, world, _way(motion, trial, v))
+
+
+@wp.func
+def compare_solutions(
+    u: int,
+    world: int,
+    settings: BarrierSettings,
+    unknowns: Unknowns,
+    solution: wp.array[wp.vec3],
+    last: wp.array[wp.vec3],
+    progress: Progress,
+):
+    """Adds the products of the solution of a particle with itself, and with the ``last`` one, which becomes this."""
+    now, before = solution[u] + wp.vec3(), last[u] + wp.vec3()
+    last[u] = now
+    weight = _FINE * unknowns.inertia[u]
+    add_energy(progress.square, world, weight * wp.float64(wp.dot(now, now)), settings.units)
+    add_energy(progress.product, world, weight * wp.float64(wp.dot(now, before)), settings.units)
 
 
 @wp.func

@@ -64,9 +64,14 @@ class Progress:
         solving: 1 of a world for which a solve comes next.
         steps: Newton steps so far.
         scale: Share of the displacements that is taken.
+        scale_before: The same in the Newton step before.
+        damping: Share that is taken at most.
+        square, product: Of the displacements with themselves, and with those of the Newton step before, in units.
+        square_before: Square of the latter, in units.
         bound: Share of the displacements before two elements meet.
         searches: 1 while the share is halved, as the energy has risen.
         energy: Energy at the positions, in units.
+        reached: Energy where the Newton step before ended, in units.
         trial: Energy at the displaced positions, in units.
         uncut: The same, before displacements of single vertices are cut.
         cuts: 1 if those are cut.
@@ -88,9 +93,15 @@ class Progress:
     solving: wp.array[int]
     steps: wp.array[int]
     scale: wp.array[float]
+    scale_before: wp.array[float]
+    damping: wp.array[float]
+    square: wp.array[wp.int64]
+    square_before: wp.array[wp.int64]
+    product: wp.array[wp.int64]
     bound: wp.array[float]
     searches: wp.array[int]
     energy: wp.array[wp.int64]
+    reached: wp.array[wp.int64]
     trial: wp.array[wp.int64]
     uncut: wp.array[wp.int64]
     cuts: wp.array[int]
