@@ -49,9 +49,7 @@ class ReferenceSteps:
         self._solver, self._gradients = solver, solver.gradients
         self._record, solver.gradients.record = solver.gradients.record, self.record
         gradients = self._gradients
-        self._linear = LinearSolver(
-            gradients.newton.problem.unknowns.of_worlds, gradients.equations.world, tolerance=1e-9, max_iterations=4000
-        )
+        self._linear = LinearSolver(gradients.newton.problem.unknowns.of_worlds, tolerance=1e-9, max_iterations=4000)
 
     def begin(self, x, v, held=None):
         """Begins a run where particles are, in float64, with what another run held constant."""

@@ -32,7 +32,7 @@ _LEAST_REACH = wp.constant(wp.float64(0.1))
 """It is that share of a tenth of the reach at least, however short a step cuts that: positions are rounded."""
 _LAYERS = wp.constant(wp.float64(64.0 * barrier.CURVATURE_AT_HALF / barrier.FORCE_AT_FLOOR))
 """For so many layers, 64, that it carries at :data:`.barrier.FLOOR`, the stiffness of a barrier by that for one."""
-_PARALLEL = wp.constant(wp.float64(1e-3))
+PARALLEL = wp.constant(wp.float64(1e-3))
 """Square of the sine of the angle below which edges are nearly parallel."""
 FAR = wp.constant(2.0)
 """In place of a share of the last displacements: no part of them brings a pair within its reach."""
@@ -225,7 +225,7 @@ def share_of_parallel(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.
     Their closest points jump from end to end then; their ends are near these faces, which push as well.
     """
     u, v = b - a, d - c
-    scaled = wp.length_sq(wp.cross(u, v)) / (_PARALLEL * wp.length_sq(u) * wp.length_sq(v))
+    scaled = wp.length_sq(wp.cross(u, v)) / (PARALLEL * wp.length_sq(u) * wp.length_sq(v))
     if scaled < ONE:
         return scaled * (wp.float64(2.0) - scaled)
     return ONE

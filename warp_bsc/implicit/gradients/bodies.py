@@ -220,9 +220,9 @@ class ContactsOnBodies(Elements):
     Columns 4 to 7 of :attr:`rows` are the turns of such corners, and the Jacobian has rows and columns of them.
     """
 
-    def __init__(self, kernel: wp.Kernel, vertices: wp.array, rows: wp.array):
+    def __init__(self, kernel: wp.Kernel, vertices: wp.array, rows: wp.array, *, jacobians: wp.Kernel):
         """Allocates buffers, as of :class:`.Elements`; ``rows`` has shape [capacity, 8]."""
-        super().__init__(kernel, vertices, rows)
+        super().__init__(kernel, vertices, rows, jacobians=jacobians)
         count = len(vertices)
         self._of_corners, self.arms = self.jacobian, wp.zeros((count, 4), dtype=wp.vec3d, device=self.device)
         self.jacobian = wp.zeros((count, 24, 8), dtype=wp.vec3d, device=self.device)

@@ -63,12 +63,16 @@ def add_blocks(
     # in
     unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
+    leave_out: wp.array[int],
     jacobian: wp.array3d[wp.vec3d],
     # out
     blocks: wp.array[wp.mat33d],
 ):
     """Subtracts the blocks of Jacobians on the diagonal. Several places of an element may have one unknown."""
     e, i = wp.tid()
+    if leave_out:
+        if leave_out[e] != 0:
+            return
     u = unknowns[e, i]
     if u >= 0:
         if is_fixed[u] == 0:

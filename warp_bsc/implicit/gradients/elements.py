@@ -29,7 +29,14 @@ class Elements:
             [capacity, 3 size, size] of vec3: row 3 i + j belongs to component j of the force on particle i.
     """
 
-    def __init__(self, kernel: wp.Kernel, vertices: wp.array, rows: wp.array, parameters: Sequence = ()):
+    def __init__(
+        self,
+        kernel: wp.Kernel,
+        vertices: wp.array,
+        rows: wp.array,
+        parameters: Sequence = (),
+        jacobians: wp.Kernel | None = None,
+    ):
         """Allocates buffers for forces on ``vertices``.
 
         Args:
@@ -37,7 +44,9 @@ class Elements:
             vertices: Vertices of the elements, int32, shape [capacity, size].
             rows: Their unknowns, likewise.
             parameters: What the kernel reads beside positions; arrays that require gradients get them.
+            jacobians: A kernel that computes Jacobians from the same but the time, in place of adjoints, a corner each.
         """
+        self._jacobians = jacobians
         self.kernel, self.vertices, self.rows, self.parameters = kernel, vertices, rows, list(parameters)
         self.device = device = vertices.device
         self.count, self._size = vertices.shape
@@ -72,6 +81,10 @@ class Elements:
         """Computes the Jacobian."""
         shape = self.count, 3 * self._size, self._size
         x1, x0, units = (_repeated(array, shape) for array in (self._x1, self._x0, self._units))
+        if self._jacobians is not None:
+            inputs = [self._x1, self._x0, *self.parameters]
+            self._launch(self._jacobians, (self.count, self._size), inputs, [self.jacobian])
+            return
         self.jacobian.zero_()
         constants = [without_gradients(value) for value in self.parameters]
         adjoints = [None, self.jacobian, None, *(empty_struct(value) for value in constants)]
@@ -79,9 +92,12 @@ class Elements:
         options = {"adj_inputs": adjoints, "adj_outputs": [units], "adjoint": True, "device": self.device}
         wp.launch(self.kernel, shape[:2], inputs=inputs, outputs=[units], **options)
 
-    def add_blocks(self, is_fixed: wp.array, blocks: wp.array) -> None:
-        """Subtracts the blocks of the Jacobian on the diagonal from those of unknowns, mat33d."""
-        inputs = [self.rows, is_fixed, self.jacobian]
+    def add_blocks(self, blocks: wp.array, *, is_fixed: wp.array, leave_out: wp.array | None = None) -> None:
+        """Subtracts the blocks of the Jacobian on the diagonal from those of unknowns, mat33d.
+
+        Elements with ``leave_out``, not 0, are left out.
+        """
+        inputs = [self.rows, is_fixed, leave_out, self.jacobian]
         self._launch(element_kernels.add_blocks, (self.count, self.rows.shape[1]), inputs, [blocks])
 
     def add_gradients(self, dt: float, of_forces: wp.array, of_x1: wp.array, of_x0: wp.array) -> None:

@@ -20,7 +20,7 @@ from ..contact.newton_method import NewtonMethod
 from ..contact.pairs import BarrierSettings
 from . import energies, kernels
 from .bodies import ContactsOnBodies, find_arms, inertial_forces_on_bodies
-from .contact_forces import RecordedContacts, contact_forces
+from .contact_forces import RecordedContacts, contact_forces, contact_jacobians
 from .elastic import Elastic
 from .elements import Elements, with_gradient
 from .matrix import StepMatrix
@@ -113,9 +113,9 @@ class StepEquations:
         world = np.repeat(np.arange(len(of_worlds) - 1), np.diff(of_worlds))
         self.world = wp.array(world.astype(np.int32), dtype=int, device=self.device)
         self._is_fixed = wp.zeros(self.count, dtype=int, device=self.device)
-        self._matrix = StepMatrix(self._elastic, self._of_one_unknown(), self._is_fixed, self.world, len(of_worlds) - 1)
+        self._matrix = StepMatrix(self._elastic, self._of_one_unknown(), self._is_fixed)
         self._contacts: Elements | None = None
-        self._in_contact: list[Elements] = []
+        self._in_contact: Elements | None = None  # those of the step, if it has any
         self._step: SolvedStep | None = None
 
     def _elements_of_bodies(self, unknown):
@@ -155,13 +155,13 @@ class StepEquations:
     def _load_contacts(self, step):
         count, elements = len(step.vertices), self._contacts
         if not count:
-            return []
+            return None
         if elements is None or len(elements.vertices) < count:
             capacity = count + (count // 2 if self.device.is_cpu else 0)  # elsewhere the number does not change
             of_type, size = (Elements, 4) if self.of_bodies is None else (ContactsOnBodies, 8)
             sizes = (capacity, 4), (capacity, size)
             vertices, rows = (wp.full(shape, -1, dtype=int, device=self.device) for shape in sizes)
-            elements = self._contacts = of_type(contact_forces, vertices, rows)
+            elements = self._contacts = of_type(contact_forces, vertices, rows, jacobians=contact_jacobians)
         elements.count = count
         wp.copy(elements.vertices[:count], step.vertices)
         wp.copy(elements.rows[:count], step.rows)
@@ -171,7 +171,7 @@ class StepEquations:
             inputs = [elements.vertices, elements.rows, step.x1, step.motion.bodies, step.poses[0]]
             inputs += [mesh.device_shape_vertices.body, mesh.model.particle_count]
             wp.launch(find_arms, (count, 4), inputs=inputs, outputs=[elements.arms], device=self.device)
-        return [elements]
+        return elements
 
     def evaluate(self) -> wp.array:
         """Returns the forces, which vanish where the step is solved."""
@@ -210,7 +210,7 @@ class StepEquations:
             elements.add_gradients(step.dt, multipliers, of_x1, of_x0)
 
     def _elements(self):
-        return [*self._of_one_unknown(), *self._in_contact]
+        return [*self._of_one_unknown(), *([] if self._in_contact is None else [self._in_contact])]
 
     def _inertial(self, x1, x0, v0, of_force=None):
         step, model = self.step, self.model

@@ -34,12 +34,10 @@ class Matrix:
     Attributes:
         offsets: First block of each row, and the end of the last, int32, shape [unknown_count + 1].
         columns: Columns of blocks, int32, shape [n].
-        values: Blocks of inertia and elastic forces, shape [n].
-        contacts: Blocks of contacts.
+        values: Blocks of inertia, elastic forces, and contacts whose unknowns are all of one element, shape [n].
+        contacts: Blocks of the other contacts.
         roots: R by unknown.
-        eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R, float64,
-            shape [3 unknown_count].
-        unsymmetric: 1 for worlds with contacts, whose friction depends on their load, int32, shape [world_count].
+        eigenvalues: Eigenvalues of the blocks of the diagonal that R R^T inverts, one for each column of R.
     """
 
     offsets: wp.array[int]
@@ -47,20 +45,7 @@ class Matrix:
     values: wp.array[wp.mat33d]
     contacts: ContactRows
     roots: wp.array[wp.mat33d]
-    eigenvalues: wp.array[wp.float64]
-    unsymmetric: wp.array[int]
-
-
-@wp.func
-def vector_at(x: wp.array[wp.float64], i: int) -> wp.vec3d:
-    """Returns the vector of unknown i."""
-    return wp.vec3d(x[3 * i], x[3 * i + 1], x[3 * i + 2])
-
-
-@wp.func
-def component(vector: wp.vec3d, c: int) -> wp.float64:
-    """Returns component c of a vector, which an index that is not constant would put into slow local memory."""
-    return wp.where(c == 0, vector[0], wp.where(c == 1, vector[1], vector[2]))
+    eigenvalues: wp.array[wp.vec3d]
 
 
 @wp.func_native(
@@ -80,30 +65,22 @@ def _sum_of_parts(value: wp.vec3d, parts: int) -> wp.vec3d:
 
 
 @wp.func
-def _contact_product(rows: ContactRows, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
-    """Returns a part of row i of the product of the Jacobian of contacts with x."""
-    product, size = wp.vec3d(), rows.unknowns.shape[1]
+def row_product(matrix: Matrix, i: int, x: wp.array[wp.vec3d], part: int, parts: int) -> wp.vec3d:
+    """Returns row i of the product of a matrix with x, in each of the ``parts`` threads that compute it together."""
+    product, rows, size = wp.vec3d(), matrix.contacts, matrix.contacts.unknowns.shape[1]
+    for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
+        product += matrix.values[k] * x[matrix.columns[k]]
     for k in range(rows.offsets[i] + part, rows.offsets[i + 1], parts):
         e, row = rows.entries[k] // size, 3 * (rows.entries[k] % size)
         for j in range(size):
             u = rows.unknowns[e, j] + int(0)
             if u >= 0:
-                of = vector_at(x, u)
-                product += wp.vec3d(
+                of = x[u] + wp.vec3d()
+                product -= wp.vec3d(
                     wp.dot(rows.jacobian[e, row, j], of),
                     wp.dot(rows.jacobian[e, row + 1, j], of),
                     wp.dot(rows.jacobian[e, row + 2, j], of),
                 )
-    return product
-
-
-@wp.func
-def row_product(matrix: Matrix, i: int, x: wp.array[wp.float64], part: int, parts: int) -> wp.vec3d:
-    """Returns row i of the product of a matrix with x, in each of the ``parts`` threads that compute it together."""
-    product = wp.vec3d()
-    for k in range(matrix.offsets[i] + part, matrix.offsets[i + 1], parts):
-        product += matrix.values[k] * vector_at(x, matrix.columns[k])
-    product -= _contact_product(matrix.contacts, i, x, part, parts)
     return _sum_of_parts(product, parts)
 
 
@@ -147,7 +124,7 @@ def factor_blocks(
     blocks: wp.array[wp.mat33d],
     # out
     roots: wp.array[wp.mat33d],
-    eigenvalues: wp.array[wp.float64],
+    eigenvalues: wp.array[wp.vec3d],
 ):
     """Factors the inverse of the symmetric parts of blocks, with eigenvalues made positive and at least the inertia."""
     i = wp.tid()
@@ -157,7 +134,7 @@ def factor_blocks(
     for k in range(3):
         values[k] = wp.max(wp.abs(values[k]), inertia[i])
         scale[k] = _ONE / wp.sqrt(values[k])
-        eigenvalues[3 * i + k] = values[k]
+    eigenvalues[i] = values
     roots[i] = q * wp.diag(scale)
 
 
@@ -176,11 +153,70 @@ def scale_rows(
         values[k] = wp.transpose(roots[u]) * values[k] * roots[columns[k]]
 
 
+@wp.func
+def _place_in_row(rows: Rows, u: int, column: int) -> int:
+    """Returns the place of a block in row u, -1 if it has none."""
+    for k in range(rows.first[u], rows.first[u + 1]):
+        if rows.column[k] == column:
+            return k
+    return -1
+
+
+@wp.kernel
+def find_inside(
+    # in
+    unknowns: wp.array2d[int],
+    is_fixed: wp.array[int],
+    rows: Rows,
+    # out
+    is_inside: wp.array[int],
+):
+    """Finds contacts whose free unknowns all are of one element, which has places for their blocks."""
+    e = wp.tid()
+    found = int(1)
+    for i in range(unknowns.shape[1]):
+        for j in range(unknowns.shape[1]):
+            u, v = unknowns[e, i] + int(0), unknowns[e, j] + int(0)
+            if found == 1 and u >= 0 and v >= 0:
+                if is_fixed[u] == 0 and is_fixed[v] == 0 and _place_in_row(rows, u, v) < 0:
+                    found = int(0)
+    is_inside[e] = found
+
+
+@wp.kernel
+def add_contacts(
+    # in
+    transposed: int,
+    contacts: ContactRows,
+    is_fixed: wp.array[int],
+    rows: Rows,
+    # in and out
+    values: wp.array[wp.mat33d],
+    # out
+    diagonal: wp.array[wp.mat33d],
+):
+    """Adds the blocks of contacts inside of elements, or of the transpose, to those of a row; returns its diagonal."""
+    u, size = wp.tid(), contacts.unknowns.shape[1]
+    for k in range(contacts.offsets[u], contacts.offsets[u + 1]):
+        e, i = contacts.entries[k] // size, contacts.entries[k] % size
+        for j in range(size):
+            v = contacts.unknowns[e, j] + int(0)
+            if v >= 0:
+                if is_fixed[v] == 0:
+                    added = block(contacts.jacobian, e, i, j)
+                    if transposed != 0:
+                        added = wp.transpose(block(contacts.jacobian, e, j, i))
+                    place = _place_in_row(rows, u, v)
+                    values[place] = values[place] - added
+    diagonal[u] = values[rows.first[u]]
+
+
 @wp.kernel
 def scale_jacobians(
     # in
     transposed: int,
     unknowns: wp.array2d[int],
+    is_inside: wp.array[int],
     is_fixed: wp.array[int],
     roots: wp.array[wp.mat33d],
     # in and out
@@ -189,7 +225,7 @@ def scale_jacobians(
     """Multiplies the blocks of Jacobians, or of their transposes, by roots; those of what is fixed become 0."""
     e, i, j = wp.tid()
     v, w = unknowns[e, i], unknowns[e, j]
-    if i > j or v < 0 or w < 0:
+    if i > j or v < 0 or w < 0 or is_inside[e] != 0:
         return
     upper, lower = wp.mat33d(), wp.mat33d()
     if is_fixed[v] == 0 and is_fixed[w] == 0:
@@ -202,23 +238,29 @@ def scale_jacobians(
         jacobian[e, 3 * j + k, i] = lower[k]
 
 
+@wp.func
+def _lists(unknowns: wp.array2d[int], is_fixed: wp.array[int], is_inside: wp.array[int], inside: int, e: int, i: int):
+    """Returns whether an element is listed with the unknown of a place in it."""
+    u = unknowns[e, i]
+    if u < 0 or is_inside[e] != inside:
+        return False
+    return is_fixed[u] == 0
+
+
 @wp.kernel
 def count_entries(
     # in
     unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
-    world: wp.array[int],
+    is_inside: wp.array[int],
+    inside: int,
     # out
     counts: wp.array[int],
-    unsymmetric: wp.array[int],
 ):
-    """Counts the elements of each free unknown, and marks worlds that have some."""
+    """Counts the elements of each free unknown, of those that are ``inside``, 1, or of the others, 0."""
     e, i = wp.tid()
-    v = unknowns[e, i]
-    if v >= 0:
-        if is_fixed[v] == 0:
-            wp.atomic_add(counts, v, 1)
-            unsymmetric[world[v]] = 1
+    if _lists(unknowns, is_fixed, is_inside, inside, e, i):
+        wp.atomic_add(counts, unknowns[e, i], 1)
 
 
 @wp.kernel
@@ -226,14 +268,14 @@ def list_entries(
     # in
     unknowns: wp.array2d[int],
     is_fixed: wp.array[int],
+    is_inside: wp.array[int],
+    inside: int,
     # in and out
     ends: wp.array[int],
     # out
     entries: wp.array[int],
 ):
-    """Lists the elements of each free unknown; ``ends`` are the ends of what is listed."""
+    """Lists the same elements; ``ends`` are the ends of what is listed."""
     e, i = wp.tid()
-    v = unknowns[e, i]
-    if v >= 0:
-        if is_fixed[v] == 0:
-            entries[wp.atomic_add(ends, v, 1)] = unknowns.shape[1] * e + i
+    if _lists(unknowns, is_fixed, is_inside, inside, e, i):
+        entries[wp.atomic_add(ends, unknowns[e, i], 1)] = unknowns.shape[1] * e + i

@@ -109,7 +109,7 @@ class StepGradients:
         self._model: Any = work.mesh.model
         model, self.equations = self._model, StepEquations(newton)
         limits = {"tolerance": _TOLERANCE, "max_iterations": _MAX_ITERATIONS}
-        self._linear = LinearSolver(newton.problem.unknowns.of_worlds, self.equations.world, **limits)
+        self._linear = LinearSolver(newton.problem.unknowns.of_worlds, **limits)
         vertices, particles, device = work.mesh.vertex_count, model.particle_count, work.device
 
         def zeros(n):
