@@ -216,8 +216,8 @@ class Style3DContacts:
         mesh, device = work.mesh, work.device
         model = mesh.model
         self._work, self._model = work, model
-        self._flight = ModelMotion(mesh, work.motion.friction)
-        self._flight.last.begin()
+        self._flight = ModelMotion(mesh, work.motion.friction, last=work.motion.last)
+        self._ends = wp.zeros_like(work.vertices.x1)
         self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
         self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
         self._keys: wp.array[wp.uint64] | None = None
@@ -228,7 +228,7 @@ class Style3DContacts:
         work, flight, model, start = self._work, self._flight, self._model, arrays_of(state)
         motion, work.motion, last = work.motion, flight, flight.last.positions
         try:
-            wp.copy(last, work.vertices.x1)
+            wp.copy(self._ends, last)
             flight.set_start(start)
             flight.set_end(start, dt)
             inputs = [start, state.particle_f, model.particle_world, model.gravity, dt]
@@ -236,7 +236,7 @@ class Style3DContacts:
             find_contacts(work)
             add_proximities(work)
             self._sort()
-            wp.copy(work.vertices.x1, last)  # where the step before ended
+            wp.copy(last, self._ends)  # which the response overwrites
         finally:
             work.motion = motion
 

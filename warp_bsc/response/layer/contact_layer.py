@@ -162,8 +162,6 @@ class ContactLayer(WrappedSolver):
             self._poses = wp.zeros(body_count, dtype=wp.transform, device=device)
         self._layer, self._body_count = layer, body_count
         self.skipped, self._not_followed = (wp.zeros(1, dtype=wp.int64, device=device) for _ in range(2))
-        self._motion.set_start(arrays_of(self.model))
-        self._motion.set_end(arrays_of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
 
     @property
