@@ -9,7 +9,7 @@ import pytest
 from dipping import FRAMES, HIT, SIZE, dipping_sheet, points_of, quads, repaired, sheet
 from pxr import Gf, Usd, UsdGeom, UsdSkel
 from replay_files import Page
-from stages import add_mesh, find, new_stage, save
+from usd_stages import add_mesh, find, new_stage, save
 
 from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
 from warp_bsc.cli.main import main

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.results.collisions import DetectionStats, StageCounts
+from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
@@ -129,7 +129,7 @@ class IntervalSummary:
         earliest: The earliest contact, None if there is none.
         certified: Whether floating point or exact arithmetic has certified that no collision is missing, for vertices
             that move straight from the start to the end.
-        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
+        stats: Counts and times of the detector's phases; the counts include pairs that the selection excludes.
         validation: The comparison with the exact checker, None without validation.
         intersections: The intersections at the start and at the end; None if they were not checked. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
@@ -171,15 +171,15 @@ class IntervalSummary:
     @property
     def pairs_tested(self) -> int:
         """Number of candidate pairs."""
-        return sum(stage.candidates for stage in self._stages)
+        return sum(phase.candidates for phase in self._phases)
 
     @property
     def unsure(self) -> int:
         """Number of candidate pairs that floating point could not certify."""
-        return sum(stage.unsure for stage in self._stages)
+        return sum(phase.unsure for phase in self._phases)
 
     @property
-    def _stages(self) -> list[StageCounts]:
+    def _phases(self) -> list[PhaseCounts]:
         return [getattr(self.stats, kind.label) for kind in DistanceKind]
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from ..detection.results.collisions import DetectionStats, StageCounts
+from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
 from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
@@ -90,7 +90,7 @@ def summary_fields(summary: IntervalSummary, kinds: Sequence[str], numbers: Mapp
 
 
 def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -> IntervalSummary:
-    """Returns the summary of an interval, without the times of its stages.
+    """Returns the summary of an interval, without the times of its phases.
 
     Args:
         fields: The fields of :func:`summary_fields`.
@@ -99,7 +99,7 @@ def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -
     """
     # a scene without curves and points has no counts of their pairs
     labels = [kind.label for kind in DistanceKind]
-    counts = {label: StageCounts(**fields["stages"].get(label, {})) for label in labels}
+    counts = {label: PhaseCounts(**fields["stages"].get(label, {})) for label in labels}
     validation = fields["validation"]
     if validation:
         validation = Validation(**validation | {"disagreements": tuple(validation["disagreements"])})

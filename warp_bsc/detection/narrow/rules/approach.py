@@ -20,9 +20,9 @@ from ....kernels.signs import FREE, ROUNDOFF
 from ....kernels.time_of_impact import Impact
 from ...mesh import CollisionMesh
 from ...run.launch import made_once
+from ...run.phase_timer import PhaseTimer
 from ...run.settings import TOLERANCE
-from ...run.stage_timer import StageTimer
-from ..narrow_phase import Phases, launch_culls, launch_decisions, stages_of
+from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions
 from ..pair_kernels import PairRule
 from ..rings import Rings, are_within_rings, make_rings
 
@@ -214,9 +214,9 @@ def run_approaches(
     proximities: bool,
     tolerance: float = TOLERANCE,
     arcs: "Arcs | None" = None,
-    timer: StageTimer,
+    timer: PhaseTimer,
 ) -> None:
-    """Launches all stages over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
+    """Launches all phases over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
 
     The status of a proximity is FREE. Times of impact are those at which a pair comes nearer than it may, 2 if it does
     not. With ``proximities``, coordinates and normals are those at which the pair comes within reach, at the start if
@@ -232,10 +232,10 @@ def run_approaches(
     options.distances, options.proximities, options.tolerance = distances, proximities, tolerance
     if arcs is not None:
         options.arcs = arcs
-    stages = stages_of(phases)
-    with timer.stage("cull"):
+    buffers = buffers_of(phases)
+    with timer.phase("cull"):
         for rule in rules:
-            launch_culls(rule, stages, x0, x1, options)
-    with timer.stage("classify"):
+            launch_culls(rule, buffers, x0, x1, options)
+    with timer.phase("classify"):
         for rule in rules:
-            launch_decisions(rule, stages, x0, x1, options)
+            launch_decisions(rule, buffers, x0, x1, options)
