@@ -94,7 +94,7 @@ def test_kept_meshes_do_not_move_and_are_not_left(tmp_path, capsys):
     hits = sum(len(result.contacts) for result in replay(Scene(save(stage)), device="cpu"))
     assert hits
     assert f"note: collisions of meshes that are not moved with each other: {hits}, not counted" in printed
-    assert f"Nothing was moved: no layer was written.\n{output} is that of an earlier run" in printed
+    assert f"Nothing was moved: no USD layer was written.\n{output} is that of an earlier run" in printed
     assert (tmp_path / "fixed.usdc").read_text() == "earlier"
 
 

@@ -1,4 +1,4 @@
-"""The command ``warp-bsc repair``: writes a layer over a USD scene in which its meshes do not collide."""
+"""The command ``warp-bsc repair``: writes a USD layer over a scene in which its meshes do not collide."""
 
 import argparse
 import contextlib
@@ -98,7 +98,7 @@ def add_to(commands: Commands, summary: str) -> None:
     add_options(
         out,
         {
-            "--output": {"required": True, "metavar": "FILE", "help": "the layer, .usda, .usdc or .usd"},
+            "--output": {"required": True, "metavar": "FILE", "help": "the USD layer, .usda, .usdc or .usd"},
             "--report": file_option(
                 "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
             ),

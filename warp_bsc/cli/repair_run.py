@@ -1,4 +1,4 @@
-"""A run of warp-bsc repair: finds collisions, repairs, and writes the layer and what a later run needs to resume."""
+"""A run of warp-bsc repair: finds collisions, repairs, and writes the USD layer and what it takes to resume."""
 
 import argparse
 import errno
@@ -28,7 +28,7 @@ __all__ = ["RepairRun", "count_found", "find"]
 
 
 class RepairRun:
-    """Finds collisions, repairs, and writes the layer of the stretches that are done.
+    """Finds collisions, repairs, and writes the USD layer of the stretches that are done.
 
     Attributes:
         scene: The scene.
@@ -43,7 +43,7 @@ class RepairRun:
         interrupt: The signal that ended it.
         problems: Messages of errors.
         notes: Messages on what else did not work.
-        output: Path of the layer.
+        output: Path of the USD layer.
         is_written: Whether there is a layer: there is none if nothing is moved.
         page: Path of the report, once it is written.
     """

@@ -66,7 +66,7 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
     if run.is_written:
         say(console, f"Wrote {run.output}.")
     else:
-        say(console, "Nothing was moved: no layer was written.")
+        say(console, "Nothing was moved: no USD layer was written.")
         if Path(run.output).exists():
             say(console, f"{run.output} is that of an earlier run, and stays as it is.")
     if run.page:

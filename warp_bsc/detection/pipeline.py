@@ -202,7 +202,7 @@ class DetectionPipeline:
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs is not None:
-            # of layers that lie on each other, three of four pairs are of edges, and most pairs of faces have none
+            # of sheets that lie on each other, three of four pairs are of edges, and most pairs of faces have none
             sizes = [min(max(n * pairs // 4, MIN_CAPACITY), 2**31 - 1) for n in (1, 3, 8)]
             vertex_face, edge_edge, face_pairs = sizes
         self.broad_phase: BroadPhase = make_broad_phase(

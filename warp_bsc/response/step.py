@@ -116,7 +116,7 @@ def _cut_paths(work):
 
 @phase("add proximities")
 def add_proximities(work: Workspace) -> None:
-    """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
+    """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not sheet by sheet."""
     wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
 
 

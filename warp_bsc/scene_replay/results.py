@@ -139,7 +139,7 @@ class IntervalSummary:
         phases: Number of pairs of meshes that collide by :data:`~warp_bsc.scene_replay.scene_contacts.PHASES`; None if
             intersections were not checked.
         proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
-        duplicates: Groups of meshes that are duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by
+        duplicates: Names of duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by
             their names, in the scene's order; empty if intersections were not checked.
     """
 
@@ -297,8 +297,8 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
     order = np.argsort(found.distance, kind="stable")
     _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
     nearest = []
-    for group in np.argsort(firsts).tolist():
-        row = int(order[firsts[group]])
+    for pair in np.argsort(firsts).tolist():
+        row = int(order[firsts[pair]])
         rows = slice(row, row + 1)
         x, y, z = found.position[row].tolist()
         nearest.append(
@@ -308,7 +308,7 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
                 found.time,
                 float(found.distance[row]),
                 (x, y, z),
-                int(numbers[group]),
+                int(numbers[pair]),
             )
         )
     return ProximitySummary(found.time, len(found), tuple(nearest))

@@ -1,7 +1,7 @@
 """The summary of an interval in the JSON file of a replay: neighbouring functions write and read each of its parts.
 
 The file names meshes and prims once, in its first line. Everywhere else ``mesh`` holds the numbers of two meshes in
-these lists, where the results have their names, and so does each group of ``duplicates``.
+these lists, where the results have their names, and so do ``duplicates``.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -82,7 +82,7 @@ def summary_fields(summary: IntervalSummary, kinds: Sequence[str], numbers: Mapp
         fields["phases"] = dict(zip(PHASES, summary.phases or (), strict=True))
         found = (_intersection_fields(at, numbers) for at in summary.intersections)
         fields["intersections"] = dict(zip(("start", "end"), found, strict=True))
-        fields["duplicates"] = [[numbers[name] for name in group] for group in summary.duplicates]
+        fields["duplicates"] = [[numbers[name] for name in same] for same in summary.duplicates]
     if summary.proximities:
         found = (_proximity_fields(at, numbers) for at in summary.proximities)
         fields["proximities"] = dict(zip(("start", "end"), found, strict=True))
@@ -120,7 +120,7 @@ def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -
         separate_hits=fields["separate_hits"] if intersections else None,
         phases=tuple(fields["phases"].values()) if intersections else None,
         proximities=_both_times(proximities, _read_proximities, names),
-        duplicates=tuple(tuple(names[number] for number in group) for group in fields.get("duplicates", ())),
+        duplicates=tuple(tuple(names[number] for number in same) for same in fields.get("duplicates", ())),
     )
 
 

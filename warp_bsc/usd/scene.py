@@ -225,7 +225,7 @@ class Scene:
 
     @property
     def has_file(self) -> bool:
-        """Whether there is a file of it, over which a layer can be put; not if it is a USD stage in memory alone."""
+        """Whether there is a file, over which a USD layer can be put; not if it is a USD stage in memory alone."""
         return not self._is_given or bool(self.stage.GetRootLayer().realPath)
 
     @property

@@ -5,7 +5,7 @@ They decide as those of :mod:`.pair_kernels`, pair by pair where SIMD instructio
 
 import warp as wp
 
-from ...kernels.arcs import Arcs, any_turns, are_of_one_group, turns
+from ...kernels.arcs import Arcs, any_turns, move_as_one, turns
 from ...kernels.bits import count_bits, lowest_bit
 from ...kernels.classification import classify
 from ...kernels.motion import relative_motion
@@ -96,7 +96,7 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bo
                 )
                 while left != wp.uint64(0):
                     pair = buffers.queue[turning + lowest_bit(left)]
-                    if not are_of_one_group(arcs, vertices_of_pair(kind_number, buffers.elements, pair)):
+                    if not move_as_one(arcs, vertices_of_pair(kind_number, buffers.elements, pair)):
                         buffers.queue[i + kept] = pair
                         kept += 1
                     left = left & (left - wp.uint64(1))

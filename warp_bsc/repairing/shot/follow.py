@@ -26,7 +26,7 @@ _DETECTIONS = 16
 _PROJECTIONS = 20
 """Sweeps over the contacts after each detection."""
 _GAP = 0.005
-"""Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes layers that lie on
+"""Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes sheets that lie on
 each other into the next ones."""
 _REACH = 0.07
 """Distance, as a share of that length, from which a contact of the frame before is none."""

@@ -10,7 +10,7 @@ all that their forces depend on: forces are added up in the same order in equal 
 added up in any order, and so are the forces of Style3D itself.
 
 The springs are implicit, and add no energy. Multipliers in their place (an augmented Lagrangian) would meet the
-contacts closer, but those of the first iterations threw layers apart.
+contacts closer, but those of the first iterations threw sheets apart.
 """
 
 import functools

@@ -65,7 +65,7 @@ def _divide_proximity(step: Step, dividing: DividingPlanes, status: SolveStatus,
 def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus, threads: int):
     """Adds dividing planes for proximities, of which those of vertices and faces then may change velocities.
 
-    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
+    In a stack, a vertex that is moved onto one side comes into the next sheet, which would need an iteration for each.
     """
     for i in range(wp.tid(), constraint_count(step), threads):
         _divide_proximity(step, dividing, status, i)

@@ -84,16 +84,16 @@ def _write_turns(turns: Turns, motion: Motion, moved: MovedBodies):
 
 @wp.kernel
 def _write_arcs(turns: Turns, motion: Motion, x1: wp.array[wp.vec3], particles: int):
-    """Bounds the arcs of all vertices; pairs of two that nothing can move are of one group."""
+    """Bounds the arcs of all vertices; vertices that nothing can move have one rigid id."""
     vertex = wp.tid()
     bound_arc(turns.arcs, vertex, to_double(motion.x0[vertex]), to_double(x1[vertex]))
     body = turns.arcs.body[vertex]
-    group = int(-1)
+    rigid_id = int(-1)
     if vertex >= particles:
-        group = wp.where(can_move(motion, body), body + 1, 0)
+        rigid_id = wp.where(can_move(motion, body), body + 1, 0)
     elif motion.inverse_mass[vertex] == 0.0:
-        group = 0
-    turns.arcs.group[vertex] = group
+        rigid_id = 0
+    turns.arcs.rigid_id[vertex] = rigid_id
 
 
 @wp.kernel

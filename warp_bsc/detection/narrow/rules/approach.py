@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ....kernels.arcs import Arcs, are_of_one_group, distance_at, impact_on_arcs
+from ....kernels.arcs import Arcs, distance_at, impact_on_arcs, move_as_one
 from ....kernels.ccd import impact_at_distance
 from ....kernels.min_distance import clears_at_once, closest_at
 from ....kernels.motion import doubles, motion_and_distance
@@ -56,18 +56,18 @@ class MinDistances:
         of_planes: Radius of each infinite plane, half of the minimum distance included [m].
         reach: Largest distance of proximities beyond their minimum distance [m].
         rings: Vertices whose elements have no minimum distance.
-        group: Group of each vertex; pairs within a group are skipped. -1 for none.
+        rigid_id: Rigid body of each vertex, by any number; pairs within one are skipped. -1 for none.
     """
 
     radius: wp.array[wp.float64]
     of_planes: wp.array[wp.float64]
     reach: wp.float64
     rings: Rings
-    group: wp.array[int]
+    rigid_id: wp.array[int]
 
 
 def make_min_distances(
-    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, group: np.ndarray
+    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, rigid_id: np.ndarray
 ) -> MinDistances:
     """Returns the minimum distances of a mesh on its device, see :class:`MinDistances`.
 
@@ -76,14 +76,14 @@ def make_min_distances(
         radius: Radius of each vertex, float64, shape [vertex_count].
         of_planes: Radius of each infinite plane, float64, shape [plane_count].
         reach: Largest distance of proximities beyond their minimum distance.
-        group: Group of each vertex, int, shape [vertex_count].
+        rigid_id: As of :class:`MinDistances`, int, shape [vertex_count].
     """
     distances = MinDistances()
     distances.radius = wp.array(radius, dtype=wp.float64, device=mesh.device)
     distances.of_planes = wp.array(of_planes, dtype=wp.float64, device=mesh.device)
     distances.reach = reach
     distances.rings = make_rings(mesh, _RINGS)
-    distances.group = wp.array(group, dtype=int, device=mesh.device)
+    distances.rigid_id = wp.array(rigid_id, dtype=int, device=mesh.device)
     return distances
 
 
@@ -145,11 +145,11 @@ def _rule(turning: bool) -> PairRule:
 
     @wp.func
     def excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
-        group = options.distances.group[v[0]]
-        if group >= 0 and options.distances.group[v[3]] == group:
+        body = options.distances.rigid_id[v[0]]
+        if body >= 0 and options.distances.rigid_id[v[3]] == body:
             return True
         if wp.static(turning):
-            return are_of_one_group(options.arcs, v)
+            return move_as_one(options.arcs, v)
         return False
 
     @wp.func

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ....kernels.arcs import Arcs, arc_bounds, are_of_one_group, impact_on_arcs, sagitta_of_part
+from ....kernels.arcs import Arcs, arc_bounds, impact_on_arcs, move_as_one, sagitta_of_part
 from ....kernels.min_distance import clears_at_once
 from ....kernels.motion import motion_and_distance
 from ....kernels.pairs import distance_of_corners, ends_of, vertices_of_pair
@@ -42,7 +42,7 @@ def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance
     arcs = Arcs()
     arcs.turning = wp.zeros(1, dtype=int, device=device)
     arcs.body = wp.array(body, dtype=int, device=device)
-    arcs.group = wp.array(body, dtype=int, device=device)
+    arcs.rigid_id = wp.array(body, dtype=int, device=device)
     arcs.centre = wp.zeros(bodies, dtype=wp.vec3d, device=device)
     arcs.turn = wp.zeros(bodies, dtype=wp.vec3d, device=device)
     arcs.bounds = wp.zeros(len(body), dtype=wp.vec3d, device=device)
@@ -84,7 +84,7 @@ class Options:
 
 @wp.func
 def _excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
-    return are_of_one_group(options.arcs, v)
+    return move_as_one(options.arcs, v)
 
 
 @wp.func
