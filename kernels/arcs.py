@@ -74,7 +74,7 @@ _TINY = wp.constant(wp.float64(2.0**-1000))
 _STEPS_OF_ROUNDING = wp.constant(wp.float64(32.0))
 _ZERO = wp.constant(wp.float64(0.0))
 _AHEAD = wp.constant(wp.float64(3.0))
-"""Deviations that a part is expected to close; where motion goes on evenly, two are left."""
+"""Deviations that a part is expected to close; where motion goes on evenly, two remain."""
 _EIGHTH = wp.constant(wp.float64(0.125))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))

@@ -34,7 +34,7 @@ def repair(
 ) -> RepairResult:
     """Returns positions near the given ones at which no edge meets a face, or names what still does.
 
-    The contours along which the surface crosses itself are shortened until none is left, while springs keep its shape.
+    The contours along which the surface crosses itself are shortened until none remains, while springs keep its shape.
     From there the surface returns towards the given positions along a path without collisions, as near as contact
     allows. The result is decided exactly in its own type. It never crosses more than the input. Where nothing crosses,
     nothing moves::

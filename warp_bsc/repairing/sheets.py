@@ -18,7 +18,7 @@ _SWEEPS = 12
 
 
 def separate_sheets(surface: Surface, sheet: np.ndarray) -> np.ndarray:
-    """Returns positions in which sheets that cross are on their sides, nearly: contours may be left.
+    """Returns positions in which sheets that cross are on their sides, nearly: contours may remain.
 
     Parts of a sheet that are behind the sheets inside, bounded by contours, move in front of these: to the side to
     which their faces point. Where the sheet is fixed, the sheets inside move back instead.

@@ -96,7 +96,7 @@ def _prevent_inversions(work, dt):
     wp.capture_while(work.loop[Loop.ACTIVE], _iterate_cuts, work=work, dt=dt)
     division.freeze_if_undetected(work)
     work.launch_over_particles(division.take_velocities_of_paths, work.ends, dt)
-    find_inversions(work)  # those that are left
+    find_inversions(work)  # those that remain
 
 
 def _iterate_cuts(work, dt):

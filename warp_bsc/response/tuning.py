@@ -63,7 +63,7 @@ MAX_TURN = wp.constant(wp.float64(0.1))
 SHARE_OF_PATH = wp.constant(wp.float64(0.9))
 """Share of the way to its first contact that a truncated vertex goes, and a body whose vertices have no planes."""
 CUT = wp.constant(wp.float64(0.5))
-"""Least share of its path that is left to a vertex in a sweep that prevents inversions."""
+"""Least share of its path that a vertex keeps in a sweep that prevents inversions."""
 MARGIN = wp.constant(wp.float64(0.2))
 """Least distance from a dividing plane after projection, as a share of the elements' distance at the start."""
 CLOSE_MARGIN = wp.constant(wp.float64(0.45))

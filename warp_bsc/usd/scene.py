@@ -285,7 +285,7 @@ class Scene:
         Raises:
             TypeError: If a number is not an integer.
             IndexError: If there is no such interval.
-            ValueError: If a mesh is broken and may not be left out, nothing that moves is left, or the stage has
+            ValueError: If a mesh is broken and may not be left out, nothing that moves remains, or the stage has
                 changed.
         """
         index = self._checked_index(index, "index", len(self) - 1)

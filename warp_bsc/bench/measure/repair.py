@@ -126,7 +126,7 @@ class RepairAttempt:
         strain: Largest change of the length of an edge, as a share of its length in the input.
         seconds: Time of a second call with the same arguments, which makes its mesh from faces and has the positions
             on the host [s].
-        reasons: Why crossings are left, each reason once.
+        reasons: Why crossings remain, each reason once.
         toolkit_crosses: Whether the IPC Toolkit finds intersections afterwards; None if it is not installed.
     """
 

@@ -56,7 +56,7 @@ def _move_turning_pairs(kind: int, buffers: PairBuffers, arcs: Arcs, first: int,
 def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bool) -> wp.Kernel:
     """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position.
 
-    If a vertex turns, each batch of the queue then begins with the pairs on arcs that are left, for :mod:`.arc`,
+    If a vertex turns, each batch of the queue then begins with the pairs on arcs that remain, for :mod:`.arc`,
     and (-1, -1) after them. Without ``on_arcs`` nothing turns.
     """
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)

@@ -3,8 +3,8 @@
 Contacts that the previous phase has enqueued are decided in integers of one limb a coordinate, see
 :mod:`warp_bsc.kernels.exact.first_contact`. Those whose exponents are too far apart for that go to the next queue,
 for two limbs, on a CPU then to that for four, and at last to the queue for eight, which suffice for every query in
-single precision. Contacts that are too wide for eight limbs are counted and left to the host. Each width has its own
-kernel, so that the usual one stays small.
+single precision. Contacts that are too wide for eight limbs are counted and delegated to the host. Each width has its
+own kernel, so that the usual one stays small.
 
 Contacts with a minimum distance are decided as far as :mod:`warp_bsc.kernels.exact.distance` can. The host decides the
 others, and those that are too wide.
@@ -181,7 +181,7 @@ def launch_exact_distances(
     tolerance: float,
     buffers: PairBuffers,
 ) -> None:
-    """Decides contacts with a minimum distance exactly, and counts those left to the host; does not synchronize.
+    """Decides contacts with a minimum distance exactly, and counts those delegated to the host; does not synchronize.
 
     Args:
         x0: Positions at the start of the step, array of vec3 or vec3d.

@@ -102,7 +102,7 @@ def entry_of_two(
 
 @wp.func
 def take_contact(pair: wp.vec2i, buffers: PairBuffers) -> int:
-    """Returns the row of a new contact, to which the pair is written; -1 if there is no row left."""
+    """Returns the row of a new contact, to which the pair is written; -1 if no row remains."""
     slot = take_slot(buffers.counts, _CONTACTS)
     if slot >= wp.int64(buffers.contacts.pairs.shape[0]):
         return -1
@@ -143,7 +143,7 @@ def count_found(status: int, buffers: PairBuffers):
 
 @wp.func
 def add_contact(pair: wp.vec2i, result: Impact, buffers: PairBuffers):
-    """Counts a pair as found, and adds it to the contacts if there is a row left."""
+    """Counts a pair as found, and adds it to the contacts if a row remains."""
     k = take_contact(pair, buffers)
     count_found(result.status, buffers)
     if k >= 0:
@@ -153,7 +153,7 @@ def add_contact(pair: wp.vec2i, result: Impact, buffers: PairBuffers):
 
 @wp.func
 def add_open_contact(pair: wp.vec2i, result: Impact, buffers: PairBuffers):
-    """Adds a pair to the contacts with its status alone, if there is a row left."""
+    """Adds a pair to the contacts with its status alone, if a row remains."""
     k = take_contact(pair, buffers)
     if k >= 0:
         buffers.contacts.status[k] = wp.int8(result.status)

@@ -143,7 +143,7 @@ class Collisions:
 
     Their number is their length, so that ``if collisions`` asks whether there are any; it does not read the device.
     They are in arrays of their own, on the device until they are first read, which later detections do not change. A
-    detector reuses these arrays once no reference to the result is left.
+    detector reuses these arrays once no reference to the result remains.
 
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides

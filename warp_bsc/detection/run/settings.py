@@ -123,7 +123,7 @@ class Count(enum.IntEnum):
         TOO_WIDE_2: Pairs of the exact phase whose exponents are too far apart for two limbs.
         TOO_WIDE_4: Pairs of the exact phase whose exponents are too far apart for four limbs, on a CPU.
         TOO_WIDE_8: Pairs of the exact phase whose exponents are too far apart for eight limbs or, with a minimum
-            distance, that it does not decide: left to the host.
+            distance, that it does not decide: delegated to the host.
         REFUTED: Found pairs that the exact phase decides to be free.
         SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
         FILTERED: Pairs that would be candidates, but are left out by groups and masks.

@@ -3,7 +3,7 @@
 Before a step, the contacts of particles that fly on are detected. They and the proximities become constraints, planes
 at the times of impact, which Style3D gets in place of contacts of its own: forces that push, with friction, and their
 derivatives. The motion that Style3D predicts therefore nearly meets the contacts, and its whole step is in equilibrium
-with them. What is left, the stage detects and resolves as ever.
+with them. What remains, the stage detects and resolves as ever.
 
 On the CPU, where threads of the detection find contacts in any order, constraints are sorted once a step by a hash of
 all that their forces depend on: forces are added up in the same order in equal steps, bit for bit. On a GPU they are

@@ -157,7 +157,7 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
     reached = planes.reached[particle]
     wanted = planes.wanted[particle]
     end = reached
-    if passes == 1:  # later, when a plane has moved, what is left of the way is mostly across it
+    if passes == 1:  # later, when a plane has moved, what remains of the way is mostly across it
         exact, cut = position_on_sides(planes, particle, reached, wanted)
         end = exact
         planes.placed[particle] = wp.where(cut, CUT_SHORT, PLACED)

@@ -126,8 +126,8 @@ def _write_bodies(
 ):
     """Writes poses, velocities and inverse masses of bodies at the end of the step.
 
-    A body whose pose or velocity is not finite is left to the inner solver, and so is one that is in all of several
-    worlds.
+    A body whose pose or velocity is not finite is delegated to the inner solver, and so is one that is in all of
+    several worlds.
     """
     body = wp.tid()
     pose = end.body_q[body]

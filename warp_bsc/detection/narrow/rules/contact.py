@@ -170,7 +170,7 @@ def run_contacts(
         phases: Narrow phases of different kinds, each with the vertex indices of its elements.
         x0: Positions at the start of the step, array of vec3 or vec3d.
         x1: Positions at its end, of the same type.
-        method: One of :data:`METHODS`; with "exact", pairs too wide for the device are left to
+        method: One of :data:`METHODS`; with "exact", pairs too wide for the device are delegated to
             :func:`.decide_on_host`.
         timed: Whether to find times of impact, coordinates and normals.
         tolerance: Of the times of impact, as a share of the step.

@@ -202,8 +202,8 @@ def run_distances(
 ) -> None:
     """Launches all phases but the sorting over the queued pairs, without synchronizing with a GPU.
 
-    Arguments are those of :func:`.run_contacts` and the :class:`Options`. With "exact", pairs that stay UNSURE are left
-    to :func:`.decide_on_host`.
+    Arguments are those of :func:`.run_contacts` and the :class:`Options`. With "exact", pairs that stay UNSURE are
+    delegated to :func:`.decide_on_host`.
     """
     options = Options()
     options.radius, options.rings, options.body = radius, rings, body
