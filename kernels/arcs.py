@@ -74,7 +74,7 @@ _TINY = wp.constant(wp.float64(2.0**-1000))
 _STEPS_OF_ROUNDING = wp.constant(wp.float64(32.0))
 _ZERO = wp.constant(wp.float64(0.0))
 _AHEAD = wp.constant(wp.float64(3.0))
-"""Deviations that a part is expected to close; where motion goes on evenly, two are left."""
+"""Deviations that a part is expected to close; where motion goes on evenly, two remain."""
 _EIGHTH = wp.constant(wp.float64(0.125))
 _HALF = wp.constant(wp.float64(0.5))
 _ONE = wp.constant(wp.float64(1.0))
@@ -114,7 +114,7 @@ class Arcs:
     Attributes:
         turning: 1 if a vertex turns, one number; where it is 0, nothing else is read.
         body: Body of each vertex, -1 for those that move straight.
-        group: Group of each vertex; pairs with a turning vertex within a group of 0 or more are excluded.
+        rigid_id: Vertices of one, 0 or more, keep their distances: pairs of them with a turning vertex are excluded.
         centre: A point of each body's axis at the start.
         turn: Axis of each body times the angle of its turn [rad].
         bounds: Bounds of how far each vertex is from its chord, see :func:`arc_bounds`.
@@ -124,7 +124,7 @@ class Arcs:
 
     turning: wp.array[int]
     body: wp.array[int]
-    group: wp.array[int]
+    rigid_id: wp.array[int]
     centre: wp.array[wp.vec3d]
     turn: wp.array[wp.vec3d]
     bounds: wp.array[wp.vec3d]
@@ -150,10 +150,10 @@ def turns(arcs: Arcs, v: wp.vec4i) -> bool:
 
 
 @wp.func
-def are_of_one_group(arcs: Arcs, v: wp.vec4i) -> bool:
-    """Returns whether all vertices of a pair are of one group."""
-    group = arcs.group[v[0]]
-    return group >= 0 and arcs.group[v[1]] == group and arcs.group[v[2]] == group and arcs.group[v[3]] == group
+def move_as_one(arcs: Arcs, v: wp.vec4i) -> bool:
+    """Returns whether all vertices of a pair keep their distances."""
+    first = arcs.rigid_id[v[0]]
+    return first >= 0 and arcs.rigid_id[v[1]] == first and arcs.rigid_id[v[2]] == first and arcs.rigid_id[v[3]] == first
 
 
 @wp.func

@@ -281,7 +281,7 @@ def _cleared_until(motion: Motion, direction: wp.vec3d, start: wp.float64, dista
 
 @wp.func
 def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
-    """Returns a search by advancement after its next time; it has ended if nothing is left to do, or is given up."""
+    """Returns a search by advancement after its next time; it has ended if nothing remains to do, or is given up."""
     if before.ended:
         return before
     search = before
@@ -336,7 +336,7 @@ def advance(motion: Motion, distance: wp.float64, timed: bool, before: Search) -
 
 @wp.func
 def visit_part(kind: int, motion: Motion, distance: wp.float64, timed: bool, before: Search) -> Search:
-    """Returns a search by subdivision after its next part; it has ended if nothing is left to do."""
+    """Returns a search by subdivision after its next part; it has ended if nothing remains to do."""
     if before.ended:
         return before
     search = before

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 from replay_files import OUTPUTS, falling_through_quads, left_behind, replay
-from stages import save
+from usd_stages import save
 
 from warp_bsc import _atomic_file
 from warp_bsc.cli.main import main

@@ -51,7 +51,7 @@ class OutputFile:
     """
 
     def __init__(self, path: str | os.PathLike):
-        """Opens a temporary file; without a name where the system allows, so that nothing of it is left after a crash.
+        """Opens a temporary file; without a name where the system allows, so that nothing of it remains after a crash.
 
         Raises:
             OSError: If the temporary file or the path cannot be written.

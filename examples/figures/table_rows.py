@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from warp_bsc.bench.measure import given_queries as given
-from warp_bsc.bench.measure.detector import ipc_milliseconds, stage_columns
+from warp_bsc.bench.measure.detector import ipc_milliseconds, phase_columns
 from warp_bsc.bench.measure.penetration import SIMULATORS
 from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH, PAGE_COSTS, PAGE_MESHES, RepairRun, summarize
 from warp_bsc.bench.tables import Column, grouped, markdown, three, two
@@ -62,8 +62,8 @@ def detector(gpu: Found, two_cores: Found, one_core: Found) -> Rows:
 
 def detector_stages(gpu: Found, worlds: Found) -> Rows:
     """Where the time of a detection goes on a GPU."""
-    stages = [stage for stage in gpu["scenes"][0]["milliseconds"]["stages"] if stage not in ("sort", "exact")]
-    columns = [Column("whole graph", "cuda_graph", ",.2f"), *stage_columns(stages, "stages")]
+    phases = [phase for phase in gpu["scenes"][0]["milliseconds"]["stages"] if phase not in ("sort", "exact")]
+    columns = [Column("whole graph", "cuda_graph", ",.2f"), *phase_columns(phases, "stages")]
     scenes = (*gpu["scenes"], *worlds["scenes"])
     rows = [(f"{_scene_name(scene)}, {scene['hits']:,} hits", scene["milliseconds"]) for scene in scenes]
     return markdown("scene", columns, rows)

@@ -4,7 +4,7 @@ Their chords must stay farther apart than the bounds of the deviations of both e
 :mod:`warp_bsc.kernels.arcs`. That is shown for the whole step by the plane of the pair or the direction through the
 centroids, the first two proofs of :mod:`.separation_proof`; or by directions between the closest points at a few times,
 each for the times around its own, as in the advancement of :mod:`warp_bsc.kernels.min_distance`. Bounds are theirs.
-Pairs that :mod:`.simd_query` cannot use are left.
+Pairs that :mod:`.simd_query` cannot use stay open.
 """
 
 import functools

@@ -18,7 +18,7 @@ BATCH = wp.constant(32)
 """Pairs that one call classifies."""
 
 OPEN = wp.constant(3)
-"""Stands for a status, where a pair is left open."""
+"""Stands for a status, where a pair remains open."""
 
 _CONSTANTS = QUERY_CONSTANTS | ROOT_CONSTANTS | {"split_error": float(SPLIT_ERROR), "tiny_share": float(TINY)}
 

@@ -2,7 +2,7 @@
 
 It is :func:`warp_bsc.kernels.time_of_impact.impact`, operation by operation, so that it finds the same bits. A pair
 whose search ends makes room for the next one of the batch, so that no lane waits for a harder neighbour. Pairs that
-:mod:`.simd_query` cannot use are left open.
+:mod:`.simd_query` cannot use stay open.
 """
 
 import functools
@@ -39,7 +39,7 @@ def impact_batch_of(dtype: type, vertex_face: bool) -> wp.Function:
         whether times are needed, the largest power of two that is at most the tolerance, and the arrays that it changes
         in the rows of the pairs: statuses by classification, HIT or UNSURE, and if times are needed whether they are
         within the tolerance, the times, and the coordinates and normals of those that are not FREE. Without times it
-        only decides what is UNSURE. It returns a bit for each pair, set where the pair is left open. Indices are not
+        only decides what is UNSURE. It returns a bit for each pair, set where the pair remains open. Indices are not
         checked.
     """
     snippet = native_for_pairs(dtype, vertex_face, "simd_query.h", "batch_impacts.h", **_CONSTANTS)

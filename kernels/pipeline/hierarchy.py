@@ -1,4 +1,4 @@
-"""A hierarchy of boxes over faces in a fixed order: faces, clusters of 32 places, and groups of 32 clusters.
+"""A hierarchy of boxes over faces in a fixed order: faces, clusters of 32 places, and bundles of 32 clusters.
 
 On a GPU the threads of a warp work on a cluster together: each has one of its faces, and tests one child of a node. All
 threads of a warp must therefore call the functions below together. On the CPU, threads run one after the other, in
@@ -116,7 +116,7 @@ def count_set_bits(bits: wp.uint32) -> int:
 
 @wp.struct
 class HierarchyLevel:
-    """The nodes of one level: faces by place, clusters or groups.
+    """The nodes of one level: faces by place, clusters or bundles.
 
     Attributes:
         boxes: Box of each node, shape [n, 4], with lowest coordinates higher than the highest where there is no face.

@@ -1,4 +1,4 @@
-"""Queues between the stages of a pipeline: an array of entries, and a count on the device that any thread may raise.
+"""Queues between the phases of a pipeline: an array of entries, and a count on the device that any thread may raise.
 
 Counts go on where a queue is full, so that they tell how many entries did not fit: nothing is dropped silently.
 """

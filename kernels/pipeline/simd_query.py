@@ -6,7 +6,7 @@ Operations and their order are those of the functions for one query, which have 
 a positive and those with a negative value.
 
 Lanes whose motion is out of range, or that have subnormal numbers in single precision, which a processor may flush to
-zero, are not usable: they are left to the functions for one query.
+zero, are not usable: they are delegated to the functions for one query.
 """
 
 from ..culling import DIRECTION_ERROR

@@ -7,7 +7,7 @@ from generators import GENERATORS
 
 from warp_bsc import checker
 from warp_bsc.bench.measure import methods
-from warp_bsc.bench.measure.methods import METHODS, STAGES, MethodRun, Queries, QuerySet, trace
+from warp_bsc.bench.measure.methods import METHODS, PHASES, MethodRun, Queries, QuerySet, trace
 from warp_bsc.detection.run.settings import PairKind
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
@@ -79,18 +79,18 @@ def test_hand_made_queries():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_stages_are_those_that_decide(kind):
+def test_phases_are_those_that_decide(kind):
     rng = np.random.default_rng(3)
     names = ("uniform", "mostly_hits", "touching", "coplanar")
     points = np.concatenate([GENERATORS[name](rng, 100, kind, np.float32) for name in names])
     points[:50, [0, 1, 4, 5] if kind == "edge_edge" else [0, 4]] += 9.0
     queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
-    stages, _ = trace(queries, "exact")
-    assert set(stages) == set(range(len(STAGES)))
-    assert (stages[:50] == STAGES.index("axis boxes")).all()
+    phases, _ = trace(queries, "exact")
+    assert set(phases) == set(range(len(PHASES)))
+    assert (phases[:50] == PHASES.index("axis boxes")).all()
     run = MethodRun("conservative", queries)
     run.launch()
-    assert np.array_equal(stages == STAGES.index("exact"), run.read_status() == UNSURE)
+    assert np.array_equal(phases == PHASES.index("exact"), run.read_status() == UNSURE)
 
 
 def test_clock_runs_for_every_query(device):

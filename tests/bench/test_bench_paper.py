@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_bsc import CollisionDetector, CollisionMesh, checker
 from warp_bsc.bench.measure import paper as bench_paper
-from warp_bsc.bench.measure.methods import METHODS, STAGES
+from warp_bsc.bench.measure.methods import METHODS, PHASES
 from warp_bsc.bench.measure.paper import Effort, benchmark_scene, find_places
 from warp_bsc.bench.measure.worst_case import find_worst
 from warp_bsc.bench.peers import ipc_toolkit
@@ -59,7 +59,7 @@ def test_json_has_everything(capsys):
     total = sum(scene["queries"].values())
     assert total <= 3002
     assert sum(scene["decided_by"].values()) == total
-    assert list(scene["decided_by"]) == list(STAGES)
+    assert list(scene["decided_by"]) == list(PHASES)
     assert total == scene["overlapping"]
     assert scene["collisions"] == len(collisions.vertex_face) + len(collisions.edge_edge)
     assert scene["errors"]["exact"] == {"hits": scene["collisions"], "false_positives": 0, "false_negatives": 0}

@@ -23,10 +23,10 @@ def cross(*, size=32):
     )
     flat = np.stack([u, v, 0 * u], -1)
     slope = np.stack([u + 0.013, v + 0.0071, 0.3 * (u - 0.7) + 0.0003], -1)
-    layer = np.repeat([0, 1], len(u))
+    sheet = np.repeat([0, 1], len(u))
     x = np.concatenate([flat, slope])
-    free = x + (layer == 1)[:, None] * np.array([0.0, 0.0, 0.3])
-    return TangledMesh(np.concatenate([faces, faces + len(u)]), x, free, np.zeros(len(x), bool), layer)
+    free = x + (sheet == 1)[:, None] * np.array([0.0, 0.0, 0.3])
+    return TangledMesh(np.concatenate([faces, faces + len(u)]), x, free, np.zeros(len(x), bool), sheet)
 
 
 def test_what_is_free_without_a_hint(device):
@@ -61,7 +61,7 @@ def test_what_needs_a_hint_is_repaired_with_each(device):
 
 def test_what_has_no_hints(device):
     mesh = cross(size=8)
-    held = replace(mesh, free=None, layer=np.full(len(mesh.x), -1), fixed=np.ones(len(mesh.x), bool))
+    held = replace(mesh, free=None, sheet=np.full(len(mesh.x), -1), fixed=np.ones(len(mesh.x), bool))
     run = measure_repair(FILE, "held.obj", held, device=device)
     assert [attempt.hint for attempt in run.attempts] == ["none"]
     assert (run.is_freed("order", "x_previous"), run.keeps_free) == (False, None)
@@ -86,7 +86,7 @@ def test_a_file_is_welded_and_keeps_its_order(tmp_path, device):
     mesh = load_tangled(str(tmp_path / "soup.ply"))
     assert (len(mesh.x), len(mesh.faces)) == (len(balls.vertices), len(balls.faces))
     assert (mesh.x[mesh.faces] == balls.triangles.astype(np.float32)).all()
-    assert mesh.free is None and not mesh.fixed.any() and (mesh.layer == -1).all()
+    assert mesh.free is None and not mesh.fixed.any() and (mesh.sheet == -1).all()
     run = measure_repair(FILE, "soup.ply", mesh, device=device)
     assert run.crossings > 0 and run.is_freed() and run.keeps_free is True
 

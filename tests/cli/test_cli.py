@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from progress_lines import without_progress
 from pxr import Tf, Usd, UsdGeom
-from stages import with_names
+from usd_stages import with_names
 
 from warp_bsc.cli import progress, replay_options
 from warp_bsc.cli.main import main

@@ -1,7 +1,7 @@
 """The exit status of a replay by its findings."""
 
 import pytest
-from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 from warp_bsc.cli.main import main
 

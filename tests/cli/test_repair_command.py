@@ -11,7 +11,7 @@ import time
 import pytest
 from pxr import Usd, UsdGeom
 from replay_files import Page
-from stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, animate, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, animate, new_stage, save
 
 from warp_bsc.cli import device
 from warp_bsc.cli.main import main

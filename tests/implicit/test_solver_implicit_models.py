@@ -190,6 +190,20 @@ def test_attachments_are_springs_with_damping(device):
     assert state.particle_q.numpy()[1, 2] == pytest.approx(free, abs=1e-4)
 
 
+@needs_attachments
+def test_damping_of_attachments_does_not_see_what_a_reset_moves(device):
+    model = attached(device, stiffness=0.0, damping=1.0)
+    solver, state, other = SolverImplicit(model), model.state(), model.state()
+    for _ in range(2):
+        solver.step(state, other, None, None, DT)
+        state, other = other, state
+    start = model.state()
+    change(start.body_q, 0, (0.5, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    solver.reset(start)
+    solver.step(start, other, None, None, DT)
+    np.testing.assert_allclose(other.particle_q.numpy()[0, :2], (0.1, 0.0), atol=1e-6)
+
+
 @needs_hard_attachments
 def test_attachments_of_infinite_stiffness_hold_particles(device):
     model = attached(device, stiffness=np.inf)

@@ -65,17 +65,17 @@ def test_a_contour_from_border_to_border_is_named():
 @pytest.mark.parametrize("hint", ["order", "groups", "x_previous"])
 def test_order_or_history_solves_it(hint):
     scene = KNOWN["corner"]()
-    groups = [np.flatnonzero(scene.layer == 0), scene.layer == 1]
-    option = {"order": scene.layer} if hint == "order" else {"order": groups}
+    groups = [np.flatnonzero(scene.sheet == 0), scene.sheet == 1]
+    option = {"order": scene.sheet} if hint == "order" else {"order": groups}
     result = repair(scene, scene.x, **({"x_previous": scene.free} if hint == "x_previous" else option))
     assert result.certified
     assert result.max_strain <= 0.1
 
 
-@pytest.mark.parametrize("layer", [0, 1])
-def test_what_is_fixed_stays_where_history_has_it_elsewhere(layer):
+@pytest.mark.parametrize("sheet", [0, 1])
+def test_what_is_fixed_stays_where_history_has_it_elsewhere(sheet):
     scene = KNOWN["sheets"]()
-    held = replace(scene, fixed=scene.layer == layer)
+    held = replace(scene, fixed=scene.sheet == sheet)
     moved = scene.free + np.array([0.0, 0.0, 0.05])
     assert repair(held, scene.x, x_previous=moved).certified
 
@@ -125,7 +125,7 @@ def test_no_mesh_of_no_faces_is_built(device, monkeypatch):
     monkeypatch.setattr(wp, "Mesh", Mesh)
     scene = KNOWN["corner"]()
     everything = np.ones(len(scene.x), bool)
-    for options in ({}, {"order": scene.layer}):
+    for options in ({}, {"order": scene.sheet}):
         result = bsc.repair(scene.faces, scene.x, fixed=everything, device=device, **options)
         assert result.crossings == result.crossings_before > 0
     edges = [[0, 1], [2, 3]]

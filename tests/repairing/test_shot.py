@@ -9,7 +9,7 @@ import pytest
 from dipping import FRAMES, HIT, SIZE, dipping_sheet, points_of, quads, repaired, sheet
 from pxr import Gf, Usd, UsdGeom, UsdSkel
 from replay_files import Page
-from stages import add_mesh, find, new_stage, save
+from usd_stages import add_mesh, find, new_stage, save
 
 from warp_bsc import CollisionDetector, CollisionMesh, Scene, replay
 from warp_bsc.cli.main import main
@@ -85,16 +85,16 @@ def test_kept_meshes_do_not_move_and_are_not_left(tmp_path, capsys):
     """What they do among themselves is counted in a note alone; an earlier layer stays, and a line says so."""
     stage = dipping_sheet(tmp_path)
     (tmp_path / "fixed.usdc").write_text("earlier")
-    output = repaired(stage, "--keep", "/World/Sheet", "--json", "--fail-on", "left")
+    output = repaired(stage, "--keep", "/World/Sheet", "--json", "--fail-on", "remaining")
     found = json.loads(capsys.readouterr().out)
     assert found["kept"]["/World/Sheet"] == "it is to be kept"
-    assert found["left"] == found["before"] == {"collisions": 0, "intersections": 0} and found["output"] is None
+    assert found["remaining"] == found["before"] == {"collisions": 0, "intersections": 0} and found["output"] is None
     repaired(stage, "--keep", "/World/Sheet")
     printed = capsys.readouterr().out
     hits = sum(len(result.contacts) for result in replay(Scene(save(stage)), device="cpu"))
     assert hits
     assert f"note: collisions of meshes that are not moved with each other: {hits}, not counted" in printed
-    assert f"Nothing was moved: no layer was written.\n{output} is that of an earlier run" in printed
+    assert f"Nothing was moved: no USD layer was written.\n{output} is that of an earlier run" in printed
     assert (tmp_path / "fixed.usdc").read_text() == "earlier"
 
 
@@ -109,13 +109,13 @@ def overlapping_sheets(folder):
 
 def test_meshes_that_cross_at_first_are_left_and_named(tmp_path, capsys):
     output = repaired(
-        overlapping_sheets(tmp_path), "--report", str(tmp_path / "moves.html"), "--fail-on", "left", status=1
+        overlapping_sheets(tmp_path), "--report", str(tmp_path / "moves.html"), "--fail-on", "remaining", status=1
     )
     printed = capsys.readouterr().out
-    assert "Left: /World/Board with /World/Sheet, which cross at 0 already." in printed
-    assert "Collisions: " in printed and ", 0 left." in printed
+    assert "Not repaired: /World/Board with /World/Sheet, which cross at 0 already." in printed
+    assert "Collisions: " in printed and ", 0 remain." in printed
     page = Page((tmp_path / "moves.html").read_text())
-    assert ["Left: /World/Board", "with /World/Sheet, which it crosses at first"] in page.data["facts"]
+    assert ["Not repaired: /World/Board", "with /World/Sheet, which it crosses at first"] in page.data["facts"]
     assert page.data["tiles"][2][1].startswith("collisions of meshes that cross at the first frame, of ")
     assert np.array_equal(points_of(output, 0), sheet(0.1)), "what is left moves nothing"
     command = ["replay", output, "--device", "cpu", "--fail-on", "collisions"]
@@ -127,9 +127,9 @@ def test_meshes_that_cross_at_first_are_left_and_named(tmp_path, capsys):
 
 def test_ignored_meshes_are_not_kept_apart(tmp_path, capsys):
     """Only the dip is repaired: the board, which the sheet crosses at all times, keeps every bit."""
-    options = ["--ignore", "/World/Board", "/World/Sheet", "--fail-on", "left"]
+    options = ["--ignore", "/World/Board", "/World/Sheet", "--fail-on", "remaining"]
     output = repaired(overlapping_sheets(tmp_path), *options)
-    assert "Left: " not in capsys.readouterr().out
+    assert "Not repaired: " not in capsys.readouterr().out
     assert np.array_equal(points_of(output, 0), sheet(0.1))
     assert not np.array_equal(points_of(output, HIT), sheet(0.1 + 0.001 * HIT, -0.12))
     board = sheet(0.0)[:, [2, 0, 1]] * np.float32(0.6) + np.float32([0.31, 0.0, 0.35])
@@ -137,9 +137,9 @@ def test_ignored_meshes_are_not_kept_apart(tmp_path, capsys):
 
 
 def test_meshes_that_cross_at_first_are_repaired_if_asked(tmp_path, capsys):
-    output = repaired(overlapping_sheets(tmp_path), "--include-initial", "--fail-on", "left", "--json")
+    output = repaired(overlapping_sheets(tmp_path), "--include-initial", "--fail-on", "remaining", "--json")
     found = json.loads(capsys.readouterr().out)
-    assert found["left_pairs"] == [] and not any(found["left"].values())
+    assert found["unrepaired_pairs"] == [] and not any(found["remaining"].values())
     assert main(["replay", output, "--device", "cpu", "--fail-on", "collisions,intersections"]) == 0
 
 
@@ -163,8 +163,8 @@ def test_groups_leave_out_kept_and_left_pairs(seed):
         return bool(group[i] & mask[j] and group[j] & mask[i])
 
     for i, j in itertools.product(range(count), repeat=2):
-        is_left = (min(i, j), max(i, j)) in pairs or kept >= {names[i], names[j]}
-        assert meet(i, j) != is_left, (i, j)
+        is_unrepaired = (min(i, j), max(i, j)) in pairs or kept >= {names[i], names[j]}
+        assert meet(i, j) != is_unrepaired, (i, j)
         assert meet(count, j) or not (meet(0, j) or meet(1, j)), "a shared vertex meets what either mesh meets"
 
 
@@ -179,7 +179,7 @@ def test_groups_are_limited():
 
 def test_larger_moves_are_not_made(tmp_path, capsys):
     stage = dipping_sheet(tmp_path)
-    repaired(stage, "--max-move", "0.001", "--fail-on", "left", status=1)
+    repaired(stage, "--max-move", "0.001", "--fail-on", "remaining", status=1)
     assert "more than 0.001" in capsys.readouterr().out
 
 
@@ -304,7 +304,7 @@ def test_skinned_mesh_gets_points_of_its_own(tmp_path, capsys, by_blend_shape):
     stage = skinned_dipping_sheet(tmp_path, by_blend_shape=by_blend_shape)
     output = repaired(stage, "--json")
     found = json.loads(capsys.readouterr().out)
-    assert all(found["before"].values()) and not any(found["left"].values())
+    assert all(found["before"].values()) and not any(found["remaining"].values())
     before, after = (list(Scene(str(path))) for path in (save(stage), output))
     plays = Usd.Stage.Open(output)
     cache = UsdSkel.Cache()
@@ -324,7 +324,7 @@ def test_minimum_distance_is_kept_between_samples(tmp_path, capsys):
     assert "Nothing was moved" in capsys.readouterr().out
     output = repaired(stage, "--min-distance", "0.03", "--json")
     found = json.loads(capsys.readouterr().out)
-    assert found["before"]["pairs nearer than 0.03"] and not found["left"]["pairs nearer than 0.03"]
+    assert found["before"]["pairs nearer than 0.03"] and not found["remaining"]["pairs nearer than 0.03"]
     assert not found["stretches"][0]["uncertified"] and found["initially_near"] == 0
     for interval in Scene(output):
         faces, count = interval.segment.faces, interval.segment.vertex_count

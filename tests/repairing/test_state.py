@@ -113,8 +113,8 @@ def test_a_rope_comes_out_of_cloth_end_first(device):
     assert (result.crossings_before, result.near) == (1, 0)
 
 
-def test_layers_change_places_by_their_order(device):
-    """The outer layer has gone through the inner one from border to border: the order tells what is right."""
+def test_sheets_change_places_by_their_order(device):
+    """The outer sheet has gone through the inner one from border to border: the order tells what is right."""
     builder = newton.ModelBuilder()
     add_cloth(builder, (-0.3, -0.3, 0.0))
     add_cloth(builder, (-0.307, -0.309, -0.03), wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.1))

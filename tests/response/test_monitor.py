@@ -6,21 +6,9 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import DT, SOLVERS, STIFF, Rollout, add_patch, bullet
+from newton_scenes import DT, SOLVERS, STIFF, Changed, Rollout, add_patch, bullet
 
 import warp_bsc as bsc
-
-
-class Changed(newton.solvers.SolverXPBD):
-    """Moves free particles ahead, then does to the state at the end what a function says."""
-
-    def __init__(self, model, change):
-        super().__init__(model, iterations=0)
-        self.change = change
-
-    def step(self, state_in, state_out, *arguments, **options):
-        super().step(state_in, state_out, *arguments, **options)
-        self.change(state_out)
 
 
 def lose(particle):

@@ -5,7 +5,7 @@ import json
 import pytest
 from chromium import Browser
 from replay_files import Page, replay
-from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 from warp_bsc.cli.main import main
 

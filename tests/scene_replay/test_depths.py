@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from pxr import UsdGeom, Vt
-from stages import new_stage, save
+from usd_stages import new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.depths import DepthFinder

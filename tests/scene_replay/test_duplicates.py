@@ -7,7 +7,7 @@ import pytest
 from boxes import CORNERS, SIDES
 from pxr import Usd
 from replay_files import Page, replay
-from stages import add_mesh, find, moved, new_stage, save
+from usd_stages import add_mesh, find, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from replay_files import falling_through_quads, many_hits, near_and_inside_stage, replay
-from stages import save
+from usd_stages import save
 
 from warp_bsc.cli.main import main
 

@@ -5,7 +5,7 @@ import json
 
 import pytest
 from replay_files import falling_through_quads, near_and_inside_stage, replay
-from stages import FALLING, add_mesh, moved, save
+from usd_stages import FALLING, add_mesh, moved, save
 
 from warp_bsc.cli.main import main
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from chromium import CHROMIUM, Browser
 from replay_files import Page, add_up, falling_through_quads, many_hits, near_and_inside_stage, replay
-from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, with_names
+from usd_stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, with_names
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay import html_report, view_blocks

@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 import pytest
 from pxr import Ts
-from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.results import IntervalResult, IntervalSummary

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pxr import Sdf
 from replay_files import OPTIONS, OUTPUTS, Page, falling_through_quads, many_hits, near_and_inside_stage, replay
-from stages import save
+from usd_stages import save
 from waving_sheets import write_scene
 
 import warp_bsc as bsc

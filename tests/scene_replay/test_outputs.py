@@ -24,7 +24,7 @@ from replay_files import (
     read_polygons,
     replay,
 )
-from stages import FALLING, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_floor, add_mesh, moved, new_stage, save
 
 from warp_bsc._atomic_file import OutputFile
 from warp_bsc.cli import replay_run

@@ -16,7 +16,7 @@ from replay_files import (
     read_polygons,
     replay,
 )
-from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, save, with_names
+from usd_stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc._version import __version__

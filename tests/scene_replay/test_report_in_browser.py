@@ -10,7 +10,7 @@ import pytest
 from chromium import CHROMIUM, Browser
 from pxr import Gf, UsdGeom
 from replay_files import Page, falling_through_quads, many_hits, near_and_inside_stage, replay
-from stages import FALLING, add_floor, add_mesh, falling, moved, new_stage
+from usd_stages import FALLING, add_floor, add_mesh, falling, moved, new_stage
 
 pytestmark = pytest.mark.browser
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from pxr import UsdGeom
-from stages import FALLING, add_mesh, animate, find, hits, moved, new_stage, save
+from usd_stages import FALLING, add_mesh, animate, find, hits, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from boxes import add_box, sum_up
-from stages import FALLING, FLOOR, add_floor, add_mesh, animate, find, moved, new_stage, save
+from usd_stages import FALLING, FLOOR, add_floor, add_mesh, animate, find, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc import checker

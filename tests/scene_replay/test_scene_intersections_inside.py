@@ -5,7 +5,7 @@ import json
 
 import pytest
 from boxes import CORNERS, SIDES, add_box, sum_up
-from stages import FALLING, add_mesh, animate, find, moved, new_stage, save
+from usd_stages import FALLING, add_mesh, animate, find, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

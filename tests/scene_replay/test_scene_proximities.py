@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 import pytest
-from stages import FALLING, FLOOR, add_floor, add_mesh, animate, find, moved, new_stage, save
+from usd_stages import FALLING, FLOOR, add_floor, add_mesh, animate, find, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

@@ -19,7 +19,7 @@ from replay_files import (
     read_polygons,
     replay,
 )
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save, with_names
+from usd_stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, falling, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

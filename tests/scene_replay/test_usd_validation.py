@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from pxr import Gf, Usd, UsdGeom
-from stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
 
 UsdValidation = pytest.importorskip("pxr.UsdValidation")
 if not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"):

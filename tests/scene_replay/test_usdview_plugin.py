@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from stages import FALLING, add_floor, add_instancer, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_floor, add_instancer, add_mesh, moved, new_stage, save
 from usdview import Menu, Registry, UsdviewApi, define_usdview
 
 import warp_bsc as bsc

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from progress_lines import without_progress
 from pxr import Ts, UsdGeom, Vt
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save, with_names
+from usd_stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc.cli import replay_run

@@ -1,6 +1,6 @@
 """Boxes of quads, and the summary of a replay from Python."""
 
-from stages import add_mesh, moved
+from usd_stages import add_mesh, moved
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.summary import Summary

@@ -25,8 +25,8 @@ from warp_bsc.detection.narrow.narrow_phase import NarrowPhase
 from warp_bsc.detection.narrow.rings import Rings
 from warp_bsc.detection.narrow.rules.distance import run_distances
 from warp_bsc.detection.run.launch import cores
+from warp_bsc.detection.run.phase_timer import PhaseTimer
 from warp_bsc.detection.run.settings import Count, DistanceKind, PairCounts
-from warp_bsc.detection.run.stage_timer import StageTimer
 
 TOLERANCE = 2.0**-20
 ITERATIONS = 20000  # of Tight-Inclusion: with its own limit of 10^7, a few of the queries take minutes each
@@ -146,7 +146,7 @@ def time_queries(kind, points, distance, timed, repeat):
     inputs = x0, x1, wp.array(radius.ravel(), dtype=wp.float64), Rings()
     elements = wp.array(elements, dtype=int)
     times = []
-    options = {"method": "conservative", "timed": timed, "timer": StageTimer(None)}
+    options = {"method": "conservative", "timed": timed, "timer": PhaseTimer(None)}
     with cores(1):
         while len(times) < repeat:
             counts.assign(PairCounts(queued=len(rows)).values())

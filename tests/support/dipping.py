@@ -2,7 +2,7 @@
 
 import numpy as np
 from pxr import Usd, UsdGeom
-from stages import add_mesh, new_stage, save
+from usd_stages import add_mesh, new_stage, save
 
 from warp_bsc.cli.main import main
 

@@ -17,12 +17,15 @@ __all__ = [
     "Changed",
     "DistanceRollout",
     "Rollout",
+    "Still",
     "add_crossing_sheets",
     "add_patch",
     "add_plates",
     "add_rope",
+    "add_square",
     "bullet",
     "crossing_sheets",
+    "grid",
     "place_plates",
     "strands",
 ]
@@ -67,23 +70,37 @@ class Changed(newton.solvers.SolverXPBD):
             self.change(state_out)
 
 
+class Still(newton.solvers.SolverBase):
+    """Leaves the state at the end as it is given, or as a function makes it that gets both states."""
+
+    def __init__(self, model, move=None):
+        super().__init__(model)
+        self._move = move
+
+    def step(self, state_in, state_out, control, contacts, dt):
+        if self._move is not None:
+            self._move(state_in, state_out)
+
+
+def grid(cells, cell, axes="xy"):
+    """Arguments of a grid with as many cells of one size [m] along each axis."""
+    return {f"dim_{axis}": cells for axis in axes} | {f"cell_{axis}": cell for axis in axes}
+
+
+def add_square(builder, n, cell, at, axis=(1.0, 0.0, 0.0), angle=0.0, velocity=(0.0, 0.0, 0.0), **options):
+    """A square patch of cloth, centred, turned about an axis."""
+    rotation = wp.quat_from_axis_angle(wp.normalize(wp.vec3(*axis)), angle)
+    corner = wp.vec3(*at) + wp.quat_rotate(rotation, wp.vec3(-0.5 * n * cell, -0.5 * n * cell, 0.0))
+    place = {"pos": corner, "rot": rotation, "vel": wp.vec3(*velocity)}
+    builder.add_cloth_grid(**place, **grid(n, cell), mass=0.001, **options)
+
+
 def add_patch(builder, n, cell, at, *, velocity=(0, 0, 0), fixed=False, **options):
     """A square patch of cloth, centred, in the xy plane."""
     corner = np.subtract(at, (0.5 * n * cell, 0.5 * n * cell, 0.0))
     sides = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], fixed)
-    builder.add_cloth_grid(
-        pos=wp.vec3(*corner),
-        rot=wp.quat_identity(),
-        vel=wp.vec3(*velocity),
-        dim_x=n,
-        dim_y=n,
-        cell_x=cell,
-        cell_y=cell,
-        mass=0.001,
-        **sides,
-        **STIFF,
-        **options,
-    )
+    place = {"pos": wp.vec3(*corner), "rot": wp.quat_identity(), "vel": wp.vec3(*velocity)}
+    builder.add_cloth_grid(**place, **grid(n, cell), mass=0.001, **sides, **STIFF, **options)
 
 
 def bullet(speed, *, device, worlds=1):
@@ -99,13 +116,13 @@ def bullet(speed, *, device, worlds=1):
     return builder.finalize(device=device)
 
 
-def add_rope(builder, points, *, mass=0.002, velocity=(0.0, 0.0, 0.0), stiffness=1e3):
+def add_rope(builder, points, *, mass=0.002, velocity=(0, 0, 0), stiffness=1e3, damping=0.01, radius=0.004):
     """Particles at some positions, and springs from each to the next."""
     first = builder.particle_count
     for point in np.asarray(points, dtype=float).tolist():
-        builder.add_particle(wp.vec3(*point), wp.vec3(*velocity), mass, radius=0.004)
+        builder.add_particle(wp.vec3(*point), wp.vec3(*velocity), mass, radius=radius)
     for i in range(first, builder.particle_count - 1):
-        builder.add_spring(i, i + 1, stiffness, 0.01, 0.0)
+        builder.add_spring(i, i + 1, stiffness, damping, 0.0)
 
 
 def strands(device, worlds=1):
@@ -130,7 +147,7 @@ def add_crossing_sheets(builder, pull, n=8, cell=0.05):
     """Two sheets that cross each other, the lower one with velocity ``-pull``, the upper one with ``pull``."""
     side = n * cell
     tilt = wp.quat_from_axis_angle(wp.normalize(wp.vec3(0.3, 1.0, 0.1)), 0.3)
-    options = {"dim_x": n, "dim_y": n, "cell_x": cell, "cell_y": cell, "mass": 0.001, **SOFT}
+    options = {**grid(n, cell), "mass": 0.001, **SOFT}
     at, tilted_at = wp.vec3(-0.5 * side, -0.5 * side, 0.0), wp.vec3(-0.5 * side, 0.01 - 0.5 * side, 0.16 * side)
     builder.add_cloth_grid(pos=at, rot=wp.quat_identity(), vel=wp.vec3(0.0, 0.0, -pull), **options)
     builder.add_cloth_grid(pos=tilted_at, rot=tilt, vel=wp.vec3(0.0, 0.0, pull), **options)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import newton
 import numpy as np
 import warp as wp
+from newton_scenes import grid
 
 import warp_bsc as bsc
 from warp_bsc._private_names.of_newton import make_style3d
@@ -82,7 +83,7 @@ class Scene:
         rng, settings = self._rng, self._settings
         cell = side / n
         options = {"pos": wp.vec3(*at), "rot": wp.quat_identity(), "vel": self._velocity()}
-        options |= {"dim_x": n, "dim_y": n, "cell_x": cell, "cell_y": cell, "particle_radius": self._radius}
+        options |= grid(n, cell) | {"particle_radius": self._radius}
         options |= {"mass": rng.uniform(0.2, 1.0) * cell * cell}
         stiffness = 10.0 ** rng.uniform(2.0, 3.5)
         if settings.inner == "xpbd":  # stiffer springs than this burst in XPBD itself
@@ -135,12 +136,7 @@ class Scene:
                 pos=wp.vec3(x, y, height),
                 rot=wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), rng.uniform(0.0, 0.7)),
                 vel=self._velocity(),
-                dim_x=n,
-                dim_y=n,
-                dim_z=2,
-                cell_x=cell,
-                cell_y=cell,
-                cell_z=cell,
+                **grid(n, cell, "xyz") | {"dim_z": 2},
                 density=rng.uniform(200.0, 1000.0),
                 k_mu=stiffness,
                 k_lambda=stiffness,

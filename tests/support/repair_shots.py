@@ -99,7 +99,7 @@ def main():
             path, output = (folder if name == DRAPE else ASSETS) / name, folder / "fixed.usdc"
             runs = [repair(path, output, options) for _ in range(RUNS)]
             seconds = {key: min(run["seconds"][key] for run in runs) for key in runs[0]["seconds"]}
-            row = {"shot": name, "options": list(options), "before": runs[0]["before"], "left": runs[0]["left"]}
+            row = {"shot": name, "options": list(options), "before": runs[0]["before"], "left": runs[0]["remaining"]}
             row |= compare(path, output) | {"seconds": seconds}
             rows.append(row)
     report(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from stages import FALLING, FLOOR, add_floor, add_mesh, animate, moved, new_stage, save
+from usd_stages import FALLING, FLOOR, add_floor, add_mesh, animate, moved, new_stage, save
 
 from warp_bsc.cli.main import main
 

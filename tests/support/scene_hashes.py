@@ -17,6 +17,7 @@ from pathlib import Path
 import newton
 import numpy as np
 import warp as wp
+from newton_scenes import Still, add_rope, grid
 
 import warp_bsc as bsc
 
@@ -28,18 +29,16 @@ COUNTS = "steps", "uncertified_steps", "truncated_steps", "frozen_steps", "total
 COUNTS += "predicted_contacts", "remaining", "excluded", "crossings", "body_contacts", "truncated", "frozen"
 
 
-class Given(newton.solvers.SolverBase):
-    """Moves particles at random, whatever the state."""
+def moved_at_random(model, seed, path):
+    """Returns a solver that moves particles at random, whatever the state."""
+    rng = np.random.default_rng(seed)
 
-    def __init__(self, model, seed, path):
-        super().__init__(model)
-        self._rng, self._path = np.random.default_rng(seed), path
+    def move(start, end):
+        x = start.particle_q.numpy()
+        end.particle_q.assign(x + rng.uniform(-path, path, x.shape).astype(np.float32))
+        end.particle_qd.zero_()
 
-    def step(self, state_in, state_out, control, contacts, dt):
-        """Moves particles along random paths."""
-        x = state_in.particle_q.numpy()
-        state_out.particle_q.assign(x + self._rng.uniform(-self._path, self._path, x.shape).astype(np.float32))
-        state_out.particle_qd.assign(np.zeros_like(x))
+    return Still(model, move)
 
 
 def add_cloth(builder, rng, *, z, cells=6, size=0.5, vel=(0.0, 0.0, -1.0), fixed=False, tilt=0.05, **options):
@@ -49,16 +48,15 @@ def add_cloth(builder, rng, *, z, cells=6, size=0.5, vel=(0.0, 0.0, -1.0), fixed
     shift = wp.vec3(*(-0.5 * size + rng.uniform(-0.05, 0.05, 2)).tolist(), z)
     settings = {"mass": 0.01, "tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-4, "edge_ke": 0.05, "edge_kd": 1e-4}
     settings |= {"particle_radius": 0.005, "fix_left": fixed, "fix_right": fixed} | options
-    grid = {"dim_x": cells, "dim_y": cells, "cell_x": size / cells, "cell_y": size / cells}
-    builder.add_cloth_grid(pos=shift, rot=rotation, vel=wp.vec3(*vel), **grid, **settings)
+    builder.add_cloth_grid(pos=shift, rot=rotation, vel=wp.vec3(*vel), **grid(cells, size / cells), **settings)
 
 
 def add_soft(builder, rng, z):
     """Adds a soft box."""
     settings = {"density": 200.0, "k_mu": 2e4, "k_lambda": 2e4, "k_damp": 1e-3, "particle_radius": 0.005}
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), float(rng.uniform(0.0, 0.5)))
-    grid = {"dim_x": 3, "dim_y": 3, "dim_z": 2, "cell_x": 0.08, "cell_y": 0.08, "cell_z": 0.08}
-    builder.add_soft_grid(pos=wp.vec3(-0.1, -0.1, z), rot=turn, vel=wp.vec3(0.0, 0.0, -2.0), **grid, **settings)
+    settings |= grid(3, 0.08, "xyz") | {"dim_z": 2}
+    builder.add_soft_grid(pos=wp.vec3(-0.1, -0.1, z), rot=turn, vel=wp.vec3(0.0, 0.0, -2.0), **settings)
 
 
 def add_body(builder, rng, z, *, kind=None, kinematic=False):
@@ -110,12 +108,8 @@ def make_scene(seed):
         dt = 1.0 / 1000.0
     elif kind == 6:  # ropes
         for i in range(3):
-            first = builder.particle_count
-            for j in range(8):
-                x = (0.05 * (j - 4), 0.04 * i, 0.1 + 0.05 * i + 0.001 * float(rng.normal()))
-                builder.add_particle(wp.vec3(*x), wp.vec3(0.0, -1.0 * i, -2.0), 0.01, radius=0.01)
-                if j:
-                    builder.add_spring(first + j - 1, first + j, 1e3, 1.0, 0)
+            points = [(0.05 * (j - 4), 0.04 * i, 0.1 + 0.05 * i + 0.001 * rng.normal()) for j in range(8)]
+            add_rope(builder, points, mass=0.01, velocity=(0.0, -1.0 * i, -2.0), damping=1.0, radius=0.01)
         options, inner, dt = {"min_distance": 0.002, "particle_radius": 0.005}, "xpbd", 1.0 / 240.0
     elif kind == 7:  # minimum distances
         for layer in range(3):
@@ -174,7 +168,7 @@ def make_scene(seed):
         "vbd": lambda: newton.solvers.SolverVBD(model, iterations=5),
         "xpbd": lambda: newton.solvers.SolverXPBD(model, iterations=5),
         "semi": lambda: newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
-        "given": lambda: Given(model, seed, 0.02 if seed % 2 else 0.1),
+        "given": lambda: moved_at_random(model, seed, 0.02 if seed % 2 else 0.1),
     }
     return model, make_stage(solvers[inner](), options), dt, recorded
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import newton
 import numpy as np
 import warp as wp
-from newton_scenes import DT, DistanceRollout, Rollout
+from newton_scenes import DT, DistanceRollout, Rollout, Still
 from random_scenes import KINDS, Settings
 from random_scenes import Scene as Simulation
 from rich.console import Console
@@ -77,16 +77,6 @@ SCENES = {
 }
 
 
-class Given(newton.solvers.SolverBase):
-    """Wants given positions."""
-
-    wanted: np.ndarray
-
-    def step(self, state_in, state_out, control, contacts, dt):
-        state_out.particle_q.assign(self.wanted)
-        state_out.particle_qd.zero_()
-
-
 @dataclass
 class Judged:
     """Counts of steps.
@@ -141,12 +131,11 @@ class Stress:
             builder.end_world()
         self._worlds = worlds
         self._model = builder.finalize(device=device)
-        self._inner = Given(self._model)
         distance = scene.min_distance
         if implicit:
             solver = SolverImplicit(self._model, min_distance=distance)
         else:
-            solver = bsc.SolverCCD(self._inner, min_distance=distance)
+            solver = bsc.SolverCCD(Still(self._model, self._end), min_distance=distance)
         self._rollout = (
             Rollout(self._model, solver) if distance is None else DistanceRollout(self._model, solver, distance)
         )
@@ -197,16 +186,20 @@ class Stress:
             path = np.round(2.0 * _CELLS * path) / (2.0 * _CELLS)
         return (x + path).astype(np.float32)
 
+    def _end(self, start, end):
+        end.particle_q.assign(self._predicted)
+        end.particle_qd.zero_()
+
     def step(self) -> bool:
         """Makes a step and judges it; returns whether its certificate was right."""
         rollout, judged = self._rollout, self.judged
         approaches = getattr(rollout, "approaches", 0)
         start = self._place()
-        self._inner.wanted = self._move(start)
+        self._predicted = self._move(start)
         state = rollout.states[0]
         state.particle_q.assign(start)
         if self._implicit:  # where inertia leads, which the faces of these sheets, that are at rest as they are, resist
-            state.particle_qd.assign((self._inner.wanted - start) / DT)
+            state.particle_qd.assign((self._predicted - start) / DT)
         rollout.solver.reset(state)
         rollout.step(DT)
         return not judged.add(rollout, getattr(rollout, "approaches", 0) - approaches)

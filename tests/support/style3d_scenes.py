@@ -3,6 +3,7 @@
 import newton
 import warp as wp
 from newton.solvers import SolverStyle3D
+from newton_scenes import grid
 
 
 def add_sheet(builder, cells, height, *, size=0.6, speed=0.0):
@@ -11,7 +12,7 @@ def add_sheet(builder, cells, height, *, size=0.6, speed=0.0):
         pos=wp.vec3(-0.5 * size, -0.5 * size, height),
         rot=wp.quat_identity(),
         vel=wp.vec3(0.0, 0.0, speed),
-        **{"dim_x": cells, "dim_y": cells, "cell_x": size / cells, "cell_y": size / cells},
+        **grid(cells, size / cells),
         mass=5e-4,
         particle_radius=0.002,
         tri_aniso_ke=wp.vec3(2e2, 2e2, 2e1),

@@ -12,6 +12,7 @@ import warnings
 import newton
 import numpy as np
 import warp as wp
+from newton_scenes import grid
 from rich.progress import track
 
 import warp_bsc as bsc
@@ -44,14 +45,12 @@ def random_model(seed, device="cpu"):
     pieces = rng.integers(0, 3)
     for _ in range(pieces):
         cells, size, where = int(rng.integers(6, 20)), rng.uniform(0.3, 0.8), place(rng, -0.4, 0.1)
-        grid = {f"dim_{axis}": cells for axis in "xy"} | {f"cell_{axis}": size / cells for axis in "xy"}
-        held = bool(rng.random() < 0.3)
-        builder.add_cloth_grid(pos=where.p, rot=where.q, vel=wp.vec3(), mass=0.001, fix_left=held, **grid)
+        options = grid(cells, size / cells) | {"mass": 0.001, "fix_left": bool(rng.random() < 0.3)}
+        builder.add_cloth_grid(pos=where.p, rot=where.q, vel=wp.vec3(), **options)
     for _ in range(rng.integers(0, 2) if pieces else rng.integers(1, 3)):
         cells, size, where = int(rng.integers(3, 7)), rng.uniform(0.15, 0.4), place(rng, -0.3, 0.1)
-        grid = {f"dim_{axis}": cells for axis in "xyz"} | {f"cell_{axis}": size / cells for axis in "xyz"}
-        stiffness = {"k_mu": 1e3, "k_lambda": 1e3, "k_damp": 0.0}
-        builder.add_soft_grid(pos=where.p, rot=where.q, vel=wp.vec3(), density=100.0, **grid, **stiffness)
+        options = grid(cells, size / cells, "xyz") | {"density": 100.0, "k_mu": 1e3, "k_lambda": 1e3, "k_damp": 0.0}
+        builder.add_soft_grid(pos=where.p, rot=where.q, vel=wp.vec3(), **options)
     builder.color()
     return builder.finalize(device=device)
 

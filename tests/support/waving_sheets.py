@@ -2,7 +2,7 @@
 
 import numpy as np
 from pxr import UsdGeom, Vt
-from stages import new_stage, save
+from usd_stages import new_stage, save
 
 OUTPUTS = {
     "--json": "hits.json",

@@ -1,7 +1,7 @@
 """The part of a scene's time that is checked, and its steps."""
 
 import pytest
-from stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
 from replay_files import falling_through_quads, many_hits
-from stages import save
+from usd_stages import save
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.usd_overlay import Overlay
@@ -91,7 +91,7 @@ def test_a_layer_needs_a_file(tmp_path):
     anonymous.TransferContent(stage.GetRootLayer())
     scene = bsc.Scene(anonymous)
     for make in (functools.partial(Overlay, command=""), PointsLayer):
-        with pytest.raises(ValueError, match="a stage in memory has no file for a layer to be over: export it"):
+        with pytest.raises(ValueError, match="a USD stage in memory has no file for a layer to be over: export it"):
             make(tmp_path / "layer.usda", scene=scene)
     assert not (tmp_path / "layer.usda").exists()
 

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
+from usd_stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
 
 from warp_bsc.cli.main import main
 from warp_bsc.usd.frames import FrameRange

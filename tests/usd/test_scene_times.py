@@ -6,7 +6,7 @@ import random
 import numpy as np
 import pytest
 from pxr import Gf, Ts, Usd, UsdGeom, UsdSkel
-from stages import (
+from usd_stages import (
     FALLING,
     HIT,
     add_falling,

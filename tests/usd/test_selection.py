@@ -2,7 +2,7 @@
 
 import pytest
 from pxr import UsdGeom
-from stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import Gf, UsdGeom
-from stages import FALLING, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save
+from usd_stages import FALLING, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save
 
 import warp_bsc as bsc
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom
-from stages import FALLING, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_mesh, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.scene_arcs import arcs_of

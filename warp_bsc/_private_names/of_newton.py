@@ -115,8 +115,8 @@ def body_q_prev(solver: SolverBase) -> wp.array | None:
 def with_contacts(solver: SolverBase, contacts: Any) -> Iterator[None]:
     """Gives Style3D other contacts than its own while it steps, or none: the stage resolves those.
 
-    Style3D pushes what comes near by stiff springs, and lets layers rest farther apart than the stage does. Between
-    both, layers that the stage has moved together are thrown apart. Has no effect on other solvers.
+    Style3D pushes what comes near by stiff springs, and lets sheets rest farther apart than the stage does. Between
+    both, sheets that the stage has moved together are thrown apart. Has no effect on other solvers.
 
     Contract: ``SolverStyle3D.collision`` holds these contacts, whose methods are those of :class:`.Style3DContacts`;
     None disables them.

@@ -86,7 +86,7 @@ def warn_of_one_thread() -> None:
 def paused_tape() -> Iterator[wp.Tape | None]:
     """Pauses the active tape, if any, so that it records no launches, and yields it; None if there is none.
 
-    Contract: ``warp._src.context.runtime.tape`` is the active :class:`warp.Tape`, or None. A tape that is left and
+    Contract: ``warp._src.context.runtime.tape`` is the active :class:`warp.Tape`, or None. A tape that is exited and
     entered again continues its record.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Draws the paper's benchmarks in the layout of its Figure 7: a group of bars for each scene, a bar for each method."""
+"""Draws the paper's benchmarks in the layout of its Figure 7: bars for each scene, one for each method."""
 
 import os
 from typing import Any

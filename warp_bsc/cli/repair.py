@@ -1,4 +1,4 @@
-"""The command ``warp-bsc repair``: writes a layer over a USD scene in which its meshes do not collide."""
+"""The command ``warp-bsc repair``: writes a USD layer over a scene in which its meshes do not collide."""
 
 import argparse
 import contextlib
@@ -41,14 +41,14 @@ points leave their places, and return to them after it.
 Meshes that only transforms move, shapes, curves, points and instances keep
 their places, and so do meshes of --keep: the others are kept apart from them.
 Two meshes that cross at the first frame, such as the parts of a body, are
-mostly meant to: they are named and left as they are, at all frames.
+mostly meant to: they are named, and stay as they are, at all frames.
 Curves and points are not seen. --ignore and --between choose what is looked
 for; where something is found, all pairs except ignored ones are kept apart.
 Skeletons and blend shapes no longer deform a mesh that is moved; it has points
-of its own. The layer is then replayed, and what is left is named.
+of its own. The layer is then replayed, and what remains is named.
 If Ctrl-C, SIGTERM, SIGHUP, an error or a full disk stops the run, the layer
 ends at the last repaired frame, and is marked partial. If it is killed too, a
-file beside the layer is left from which --resume continues."""
+file beside the layer remains from which --resume continues."""
 
 _EPILOG = f"""\
 examples:
@@ -57,7 +57,7 @@ examples:
   warp-bsc repair shot.usd --output fixed.usdc --report moves.html --resume
   warp-bsc repair shot.usd --output fixed.usdc --min-distance 0.002
   warp-bsc repair shot.usd --output fixed.usdc --frames 101:150 --max-move 0.02
-  warp-bsc repair shot.usd --output fixed.usdc --fail-on left --json > done.json
+  warp-bsc repair shot.usd --output fixed.usdc --fail-on remaining --json > done.json
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
 
@@ -76,7 +76,7 @@ def add_to(commands: Commands, summary: str) -> None:
         how,
         {
             "--include-initial": flag(
-                "repair also pairs of two meshes that cross at the first frame; by default these are left"
+                "repair also pairs of two meshes that cross at the first frame; by default these stay as they are"
             ),
             "--max-move": number(
                 distance,
@@ -98,7 +98,7 @@ def add_to(commands: Commands, summary: str) -> None:
     add_options(
         out,
         {
-            "--output": {"required": True, "metavar": "FILE", "help": "the layer, .usda, .usdc or .usd"},
+            "--output": {"required": True, "metavar": "FILE", "help": "the USD layer, .usda, .usdc or .usd"},
             "--report": file_option(
                 "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
             ),
@@ -109,7 +109,7 @@ def add_to(commands: Commands, summary: str) -> None:
         },
     )
     add_options(command, JSON)
-    add_fail_on(out, {"left": "collisions or intersections that are left"})
+    add_fail_on(out, {"remaining": "collisions or intersections that remain"})
     add_options(command, DEVICE)
 
 
@@ -148,7 +148,7 @@ def _run(arguments: argparse.Namespace) -> int:
         if run.is_whole and run.is_written:
             fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
-            after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].left_pairs)
+            after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].unrepaired_pairs)
         if page and run.journal.findings is not None:
             run.report(page, kept, after)
         if run.interrupt:
@@ -156,11 +156,11 @@ def _run(arguments: argparse.Namespace) -> int:
         if run.problems:
             raise ValueError("; ".join(run.problems))
     assert after is not None
-    left = count_found(after, arguments.min_distance)
+    remaining = count_found(after, arguments.min_distance)
     if arguments.json:
-        print(json.dumps(run.facts(kept, left), indent=1))
+        print(json.dumps(run.facts(kept, remaining), indent=1))
     else:
-        print_repair(Console(), run, kept, left)
-    if "left" in arguments.fail_on and any(left.values()):
+        print_repair(Console(), run, kept, remaining)
+    if "remaining" in arguments.fail_on and any(remaining.values()):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE

@@ -1,4 +1,4 @@
-"""A run of warp-bsc repair: finds collisions, repairs, and writes the layer and what a later run needs to resume."""
+"""A run of warp-bsc repair: finds collisions, repairs, and writes the USD layer and what it takes to resume."""
 
 import argparse
 import errno
@@ -13,7 +13,7 @@ from .._atomic_file import naming, unfinished_path
 from ..repairing.shot.findings import Finding, MeshPair, find_collisions
 from ..repairing.shot.journal import Journal
 from ..repairing.shot.repair_shot import repair_shot
-from ..repairing.shot.report import LEFT_HITS, RepairPage
+from ..repairing.shot.report import UNREPAIRED_HITS, RepairPage
 from ..repairing.shot.stretch import RepairedStretch
 from ..scene_replay.intervals import replay
 from ..scene_replay.results import IntervalResult
@@ -28,14 +28,14 @@ __all__ = ["RepairRun", "count_found", "find"]
 
 
 class RepairRun:
-    """Finds collisions, repairs, and writes the layer of the stretches that are done.
+    """Finds collisions, repairs, and writes the USD layer of the stretches that are done.
 
     Attributes:
         scene: The scene.
         journal: The findings, and the stretches with their frames, also those of an earlier run.
         found: Numbers of what was found before, by its name.
         initially_near: Number of pairs that are nearer than the minimum distance from the start.
-        left_pairs: Pairs of meshes that are left as they are.
+        unrepaired_pairs: Pairs of meshes that stay as they are.
         stretches: The stretches, without their frames.
         frames: Times and numbers of moved vertices of the moved frames, by stretch.
         earlier: Number of stretches of an earlier run.
@@ -43,7 +43,7 @@ class RepairRun:
         interrupt: The signal that ended it.
         problems: Messages of errors.
         notes: Messages on what else did not work.
-        output: Path of the layer.
+        output: Path of the USD layer.
         is_written: Whether there is a layer: there is none if nothing is moved.
         page: Path of the report, once it is written.
     """
@@ -66,7 +66,7 @@ class RepairRun:
             raise
         self.found: dict[str, int] = {}
         self.initially_near = 0
-        self.left_pairs: tuple[MeshPair, ...] = ()
+        self.unrepaired_pairs: tuple[MeshPair, ...] = ()
         self.stretches: list[RepairedStretch] = []
         self.frames: list[list[tuple[float, int]]] = []
         self.earlier = 0
@@ -113,13 +113,13 @@ class RepairRun:
         scene, arguments, journal = self.scene, self._arguments, self.journal
         started = time.perf_counter()
         if journal.findings is None:
-            left_pairs = () if arguments.include_initial else None
-            findings = find(scene, "Finding", arguments, self._device, left_pairs)
+            unrepaired_pairs = () if arguments.include_initial else None
+            findings = find(scene, "Finding", arguments, self._device, unrepaired_pairs)
             self._keep(lambda: journal.begin(findings))
         assert journal.findings is not None
         self.found = count_found(journal.findings, arguments.min_distance)
         self.initially_near = sum(finding.initially_near for finding in journal.findings)
-        self.left_pairs = journal.findings[0].left_pairs
+        self.unrepaired_pairs = journal.findings[0].unrepaired_pairs
         if self.initially_near:
             self.notes.append(
                 f"pairs that are nearer than {arguments.min_distance:g} from the start: {self.initially_near:,}, which "
@@ -217,7 +217,7 @@ class RepairRun:
         except Exception as error:
             self.problems.append(f"{page.file.name}: not written: {describe(error)}")
 
-    def facts(self, kept: dict[str, str], left: dict[str, int]) -> dict[str, Any]:
+    def facts(self, kept: dict[str, str], remaining: dict[str, int]) -> dict[str, Any]:
         """Returns what was done, for programs."""
         stretches = []
         for stretch, frames in zip(self.stretches, self.frames, strict=True):
@@ -231,9 +231,9 @@ class RepairRun:
             "scene": self.scene.path,
             "output": str(self._arguments.output) if self.is_written else None,
             "before": self.found,
-            "left": left,
+            "remaining": remaining,
             "initially_near": self.initially_near,
-            "left_pairs": self.left_pairs,
+            "unrepaired_pairs": self.unrepaired_pairs,
             "kept": kept,
             "stretches": stretches,
             "seconds": self.seconds,
@@ -245,10 +245,10 @@ def find(
     activity: str,
     arguments: argparse.Namespace,
     device: str,
-    left_pairs: tuple[MeshPair, ...] | None,
+    unrepaired_pairs: tuple[MeshPair, ...] | None,
 ) -> list[Finding]:
     """Returns what an exact replay of a scene finds, and shows its progress; pairs as of :func:`.find_collisions`."""
-    options = {"keep": arguments.keep, "left_pairs": left_pairs, "min_distance": arguments.min_distance}
+    options = {"keep": arguments.keep, "unrepaired_pairs": unrepaired_pairs, "min_distance": arguments.min_distance}
     return list(find_collisions(scene, _tracked(scene, activity, device), **options, device=device))
 
 
@@ -258,8 +258,8 @@ def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
     counts = {"collisions": sum(finding.hits for finding in findings), "intersections": crossings}
     if min_distance:
         counts[f"pairs nearer than {min_distance:g}"] = sum(finding.near for finding in findings)
-    if findings[0].left_pairs:
-        counts[LEFT_HITS] = sum(finding.left_hits for finding in findings)
+    if findings[0].unrepaired_pairs:
+        counts[UNREPAIRED_HITS] = sum(finding.unrepaired_hits for finding in findings)
     return counts
 
 

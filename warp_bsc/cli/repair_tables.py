@@ -1,4 +1,4 @@
-"""Prints what warp-bsc repair did: a table of the repaired stretches, and what is left."""
+"""Prints what warp-bsc repair did: a table of the repaired stretches, and what remains."""
 
 from pathlib import Path
 
@@ -23,8 +23,8 @@ _STRETCHES = (  # of a stretch and its frames
 )
 
 
-def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: dict[str, int]) -> None:
-    """Prints what was done, and what is left."""
+def print_repair(console: Console, run: RepairRun, kept: dict[str, str], remaining: dict[str, int]) -> None:
+    """Prints what was done, and what remains."""
     scene = run.scene
     say(
         console,
@@ -39,10 +39,10 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
         say(console, f"note: {name} is not moved: {reason}")
     if len(kept) > LONGEST:
         say(console, f"note: {len(kept) - LONGEST} more are not moved")
-    for first, second in run.left_pairs[:LONGEST]:
-        say(console, f"Left: {first} with {second}, which cross at {scene.times[0]:g} already.")
-    if run.left_pairs:
-        more = len(run.left_pairs) - LONGEST
+    for first, second in run.unrepaired_pairs[:LONGEST]:
+        say(console, f"Not repaired: {first} with {second}, which cross at {scene.times[0]:g} already.")
+    if run.unrepaired_pairs:
+        more = len(run.unrepaired_pairs) - LONGEST
         other = f"{count(more, 'more pair')} of meshes as well; " if more > 0 else ""
         say(console, f"  {other}--include-initial repairs them too, --ignore does not count them.")
     if run.earlier:
@@ -50,13 +50,13 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
     if run.stretches:
         _print_stretches(console, run)
     for stretch in run.stretches[:LONGEST]:
-        for reason in stretch.left:
-            say(console, f"Left from {stretch.start:g} to {stretch.end:g}: {reason}.")
+        for reason in stretch.reasons:
+            say(console, f"Not repaired from {stretch.start:g} to {stretch.end:g}: {reason}.")
         if stretch.uncertified:
             times = ", ".join(f"{time:g}" for time in stretch.uncertified[:4])
             say(console, f"Not certified: {count(len(stretch.uncertified), 'frame')}, the first at {times}.")
     for what, number in run.found.items():
-        say(console, f"{what.capitalize()}: {number:,} before, {left[what]:,} left.")
+        say(console, f"{what.capitalize()}: {number:,} before, {remaining[what]:,} remain.")
     seconds = run.seconds
     say(
         console,
@@ -66,7 +66,7 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], left: d
     if run.is_written:
         say(console, f"Wrote {run.output}.")
     else:
-        say(console, "Nothing was moved: no layer was written.")
+        say(console, "Nothing was moved: no USD layer was written.")
         if Path(run.output).exists():
             say(console, f"{run.output} is that of an earlier run, and stays as it is.")
     if run.page:

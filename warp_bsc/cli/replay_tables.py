@@ -77,7 +77,7 @@ def print_replay(console: Console, summary: Summary) -> None:
     for span in summary.duplicate_spans[:LONGEST]:
         say(console, f"{span.describe(LONGEST)}.")
     if (more := len(summary.duplicate_spans) - LONGEST) > 0:
-        say(console, f"  and {count(more, 'more group')} of duplicates; --json has all.")
+        say(console, f"  and {count(more, 'more set')} of duplicates; --json has all.")
     if summary.clearance is not None:
         _print_proximities(console, summary, summary.clearance)
     if summary.ignored:

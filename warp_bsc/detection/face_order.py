@@ -7,16 +7,16 @@ from ..kernels.pipeline.hierarchy import WIDTH
 from .run.launch import launch, launch_over
 from .run.settings import NO_GRADIENTS
 
-__all__ = ["CLUSTER", "GROUP", "order_faces"]
+__all__ = ["BUNDLE", "CLUSTER", "order_faces"]
 
 CLUSTER = WIDTH
 """Places of a cluster."""
 
-GROUP = WIDTH * CLUSTER
-"""Places of a group of clusters."""
+BUNDLE = WIDTH * CLUSTER
+"""Places of a bundle."""
 
 _CLUSTER = wp.constant(CLUSTER)
-_GROUP = wp.constant(GROUP)
+_BUNDLE = wp.constant(BUNDLE)
 
 _LARGE = wp.constant(4096)
 """Faces of a part that is split along the best of four axes instead of eight, which takes less time."""
@@ -78,10 +78,10 @@ def _visit(
 
 @wp.func
 def _split_at(begin: int, end: int):
-    """Returns where to split a part near the middle: between groups or else between clusters."""
+    """Returns where to split a part near the middle: between bundles or else between clusters."""
     middle = (begin + end) / 2
     quarter = (end - begin) / 4
-    split = (middle + _GROUP / 2) / _GROUP * _GROUP
+    split = (middle + _BUNDLE / 2) / _BUNDLE * _BUNDLE
     if split > begin + quarter and split < end - quarter:
         return split
     split = (middle + _CLUSTER / 2) / _CLUSTER * _CLUSTER

@@ -142,7 +142,7 @@ def inversions_of_motion(
 
 
 def _decided(mesh: CollisionMesh, x0: wp.array, x1: wp.array, status: wp.array) -> np.ndarray:
-    """Returns the status of all tetrahedra after the exact stage, and the checker where numbers are too wide for it."""
+    """Returns the status of all tetrahedra after the exact phase, and the checker where numbers are too wide for it."""
     tets = mesh.device_tets
     for limbs in BITS:
         if not (status.numpy() == UNSURE).any():

@@ -15,6 +15,7 @@ from .narrow.rules.arc import run_arcs
 from .narrow.rules.contact import run_contacts
 from .narrow.rules.distance import run_distances
 from .run.launch import launch, made_once
+from .run.phase_timer import PhaseTimer
 from .run.settings import (
     METHODS,
     NO_GRADIENTS,
@@ -27,7 +28,6 @@ from .run.settings import (
     PairKind,
     checked_tolerance,
 )
-from .run.stage_timer import StageTimer
 
 __all__ = ["DetectionPipeline"]
 
@@ -39,7 +39,7 @@ _LARGEST_RADIUS = 2.0**1000
 
 _ZERO = wp.constant(wp.float64(0.0))
 
-_UNTIMED = StageTimer(None)
+_UNTIMED = PhaseTimer(None)
 
 
 @wp.kernel(**NO_GRADIENTS)
@@ -202,7 +202,7 @@ class DetectionPipeline:
         elements = faces + len(mesh.free_edges) + len(mesh.points)
         face_pairs, vertex_face, edge_edge = 8 * elements, elements, 2 * elements
         if pairs is not None:
-            # of layers that lie on each other, three of four pairs are of edges, and most pairs of faces have none
+            # of sheets that lie on each other, three of four pairs are of edges, and most pairs of faces have none
             sizes = [min(max(n * pairs // 4, MIN_CAPACITY), 2**31 - 1) for n in (1, 3, 8)]
             vertex_face, edge_edge, face_pairs = sizes
         self.broad_phase: BroadPhase = make_broad_phase(
@@ -271,7 +271,7 @@ class DetectionPipeline:
         sort: bool = False,
         keep_separated: bool = False,
         queued: bool = False,
-        timer: StageTimer = _UNTIMED,
+        timer: PhaseTimer = _UNTIMED,
         side_stream: wp.Stream | None = None,
     ) -> None:
         """Launches the broad phase and the narrow phases, whose ``contacts`` are the result.
@@ -287,13 +287,13 @@ class DetectionPipeline:
             keep_separated: As of :meth:`.BroadPhase.pair_elements`.
             queued: Whether to take the candidates of the last run, which kept those that an axis separates, in place of
                 seeking them: each position at the end is to be between its own there and that at the start.
-            timer: Measures the stages.
+            timer: Measures the phases.
             side_stream: Stream on which to sort the vertex-face contacts; None to sort one kind after the other.
         """
         self._captured |= bool(self.mesh.device.is_capturing)
         if self._filtered_of_worlds is not None:
             self._filtered_of_worlds.zero_()
-        with timer.stage("broad phase"):
+        with timer.phase("broad phase"):
             if queued:
                 counts = {kind.label: PairCounts(queued=counts.queued) for kind, counts in self.counts.pairs.items()}
                 self.counters.array.assign(Counts(0, 0, **counts).values())
@@ -315,7 +315,7 @@ class DetectionPipeline:
             return
         for narrow_phase in self.narrow_phases:
             stream = side_stream if narrow_phase is self.vertex_face else None
-            with wp.ScopedStream(stream), timer.stage("sort"):
+            with wp.ScopedStream(stream), timer.phase("sort"):
                 narrow_phase.sort()
         if side_stream is not None:
             wp.wait_stream(side_stream)

@@ -319,8 +319,6 @@ class SolverImplicit(SolverCCD):
         super()._resolve(step)
         if not step.is_recorded:  # gradients of what starts where this one ended go no further
             self._last_recorded = (lambda: None), (lambda: None)
-        if self.gradients is not None:
-            self.gradients.finish(arrays_of(step.state_out))
 
     def _solve(self, step, end, recorder):
         """Solves with contact from the inertial prediction, and detects what the solve left.
@@ -329,8 +327,6 @@ class SolverImplicit(SolverCCD):
         resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
         """
         work = self.work
-        if self.gradients is not None:
-            self.gradients.begin()
         begin(work)
         self.newton_method.solve(end, step.dt)
         detect_contacts(work)

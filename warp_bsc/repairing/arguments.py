@@ -1,4 +1,4 @@
-"""Checks the arguments of a repair and converts them: vertices that stay, and the layer of each vertex."""
+"""Checks the arguments of a repair and converts them: vertices that stay, and the sheet of each vertex."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +8,7 @@ import warp as wp
 
 from .._arguments import as_numpy, given
 
-__all__ = ["checked_layers", "checked_mask"]
+__all__ = ["checked_mask", "checked_sheets"]
 
 
 def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
@@ -40,16 +40,16 @@ def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
     return mask
 
 
-def checked_layers(order: Any, count: int) -> np.ndarray:
-    """Returns the layer of each vertex from inside to outside, -1 for none, int, shape [count].
+def checked_sheets(order: Any, count: int) -> np.ndarray:
+    """Returns the sheet of each vertex from inside to outside, -1 for none, int, shape [count].
 
     Args:
-        order: A layer for each vertex, integers of at least -1, as an array; or a sequence of groups of vertices.
+        order: A sheet for each vertex, integers of at least -1, as an array; or a sequence of sets of vertices.
         count: Number of vertices.
 
     Raises:
         TypeError: If it is neither.
-        ValueError: If layers or groups have another shape or are out of range, or groups share a vertex.
+        ValueError: If sheets or sets have another shape or are out of range, or sets share a vertex.
     """
     if isinstance(order, np.ndarray | wp.array):
         values = as_numpy(order, "order")
@@ -61,13 +61,13 @@ def checked_layers(order: Any, count: int) -> np.ndarray:
             raise ValueError(f"order must be in [-1, 2^31), not {values.min(initial=0)} to {values.max(initial=0)}")
         return values.astype(np.int64)
     if isinstance(order, str) or not isinstance(order, Sequence):
-        raise TypeError(f"order must be an array of layers or a sequence of groups of vertices, not {given(order)}")
-    layer = np.full(count, -1)
-    for number, group in enumerate(order):
-        mask = checked_mask(group, f"order[{number}]", count)
-        shared = mask & (layer >= 0)
+        raise TypeError(f"order must be an array of sheets or a sequence of sets of vertices, not {given(order)}")
+    sheet = np.full(count, -1)
+    for number, vertices in enumerate(order):
+        mask = checked_mask(vertices, f"order[{number}]", count)
+        shared = mask & (sheet >= 0)
         if shared.any():
             vertex = np.argmax(shared)
-            raise ValueError(f"order[{number}] has vertex {vertex}, which order[{layer[vertex]}] has as well")
-        layer[mask] = number
-    return layer
+            raise ValueError(f"order[{number}] has vertex {vertex}, which order[{sheet[vertex]}] has as well")
+        sheet[mask] = number
+    return sheet

@@ -198,7 +198,7 @@ def relax_springs(
     """Moves each vertex towards the lengths of its springs, and out of planes: one Jacobi sweep.
 
     The springs of vertex ``vertices[i]`` lead to ``ends[starts[i]:starts[i + 1]]``, for each i of ``rows``, or each
-    i. Lengths within ``slack``, a share, of their rest length are left.
+    i. Lengths within ``slack``, a share, of their rest length stay.
     """
     i = wp.tid()
     if rows:

@@ -30,17 +30,17 @@ class ModelSurface:
         surface: The surface, without doubled vertices. Pairs that cannot move do not count as crossing.
         mesh: The mesh before vertices were welded.
         weld: The vertex that each vertex is welded to, int, shape [n].
-        layer: Layer of each vertex, -1 for none, int, shape [n].
+        sheet: Sheet of each vertex, -1 for none, int, shape [n].
         tetrahedra: Vertices of the tetrahedra, int, shape [m, 4].
     """
 
-    def __init__(self, model: newton.Model, state: newton.State, layer: np.ndarray, min_distance: float):
+    def __init__(self, model: newton.Model, state: newton.State, sheet: np.ndarray, min_distance: float):
         """Places the mesh of a model.
 
         Args:
             model: The model.
             state: The state.
-            layer: Layer of each particle, -1 for none, int, shape [particle_count].
+            sheet: Sheet of each particle, -1 for none, int, shape [particle_count].
             min_distance: Distance that pairs keep [m].
 
         Raises:
@@ -56,8 +56,8 @@ class ModelSurface:
         self._planes = _planes_in(of_model, state)
         self.mesh, self._x, self._shape, self._world = _with_planes(of_model, x, self._planes)
         more = len(self._x) - model.particle_count
-        self.layer = np.append(layer, np.full(more, -1))
-        self.weld = weld_borders(self.mesh, self._x, np.column_stack([self.layer, self._world, self._shape]))
+        self.sheet = np.append(sheet, np.full(more, -1))
+        self.weld = weld_borders(self.mesh, self._x, np.column_stack([self.sheet, self._world, self._shape]))
         self._soft_body = np.full(len(self._x), -1)
         self._soft_body[self.tetrahedra] = connect_cells(self.tetrahedra, model.particle_count)[self.tetrahedra]
         movable = np.append(of_model.inverse_masses.numpy() > 0.0, np.zeros(len(self._x) - len(x), dtype=bool))

@@ -9,12 +9,12 @@ from .._arguments import check_finite, checked_distance, checked_number, checked
 from ..detection.mesh import CollisionMesh
 from ..detection.run.start import checked_device
 from .approach import approach
-from .arguments import checked_layers, checked_mask
+from .arguments import checked_mask, checked_sheets
 from .elastic import Springs
 from .free import free, restore_parts
-from .layers import separate_layers
 from .motion import near_pairs
 from .results import RepairResult
+from .sheets import separate_sheets
 from .surface import Surface, differ, weld_borders, welded
 from .unresolved import unresolved_contours
 
@@ -34,7 +34,7 @@ def repair(
 ) -> RepairResult:
     """Returns positions near the given ones at which no edge meets a face, or names what still does.
 
-    The contours along which the surface crosses itself are shortened until none is left, while springs keep its shape.
+    The contours along which the surface crosses itself are shortened until none remains, while springs keep its shape.
     From there the surface returns towards the given positions along a path without collisions, as near as contact
     allows. The result is decided exactly in its own type. It never crosses more than the input. Where nothing crosses,
     nothing moves::
@@ -46,7 +46,7 @@ def repair(
             for contour in result.unresolved:
                 print(contour.kind, contour.reason, contour.elements)
 
-    Vertices of borders that have the same position, layer, world, groups and mask are one vertex: the two sides of
+    Vertices of borders that have the same position, sheet, world, groups and mask are one vertex: the two sides of
     a seam do not part. Pairs of elements that share such a vertex are excluded, as all pairs that share a vertex: they
     touch, and do not count. Faces that lie on each other with all of their corners at borders are among them.
 
@@ -56,9 +56,9 @@ def repair(
         x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
         fixed: Vertices that stay, such as the body under a garment: a mask, bool, shape [vertex_count], or indices,
             integers, shape [n].
-        order: Which layers are inside which, for layers that have changed places: groups of vertices (masks or indices
-            as of ``fixed``) from inside to outside, or an array with the layer of each vertex, integers, shape
-            [vertex_count], -1 for those that have none. The faces of a layer must point to the layers outside it.
+        order: Which sheets are inside which, for sheets that have changed places: sets of vertices (masks or indices
+            as of ``fixed``) from inside to outside, or an array with the sheet of each vertex, integers, shape
+            [vertex_count], -1 for those that have none. The faces of a sheet must point to the sheets outside it.
         x_previous: A configuration that does not cross, such as the frame before, of the shape and type of ``x``. It
             tells which side is which: the result is reached from it without a collision.
         min_distance: Distance that elements keep, in the unit of the positions: 0 or at least 2^-1021. What is nearer
@@ -89,11 +89,11 @@ def repair(
         raise ValueError(f"x must have {mesh.vertex_count} rows, one a vertex, got {len(given)}")
     check_finite(given, "x", mesh.vertices)
     fixed_mask = checked_mask(() if fixed is None else fixed, "fixed", len(given))
-    layer = np.full(len(given), -1) if order is None else checked_layers(order, len(given))
+    sheet = np.full(len(given), -1) if order is None else checked_sheets(order, len(given))
     previous = given if x_previous is None else _checked_previous(x_previous, given, mesh)
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
-    weld = weld_borders(mesh, np.hstack([given, previous]), _labels(mesh, layer))
+    weld = weld_borders(mesh, np.hstack([given, previous]), _labels(mesh, sheet))
     welded_mesh = welded(mesh, weld)
     is_fixed = np.bincount(weld, fixed_mask, len(given)) > 0
     surface = Surface(welded_mesh, given, is_fixed, distance)
@@ -104,7 +104,7 @@ def repair(
     near_before = near_pairs(surface, surface.home)
     final, crossings, near = surface.home, before, near_before
     if len(before) or len(near_before):
-        final, crossings = _repaired(surface, before, history, layer if order is not None else None, strain)
+        final, crossings = _repaired(surface, before, history, sheet if order is not None else None, strain)
         near = near_pairs(surface, final)
     if (len(crossings), len(near)) >= (len(before), len(near_before)):
         final, crossings, near = surface.home, before, near_before
@@ -136,13 +136,13 @@ def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: Co
     return previous
 
 
-def _labels(mesh: CollisionMesh, layer: np.ndarray) -> np.ndarray:
+def _labels(mesh: CollisionMesh, sheet: np.ndarray) -> np.ndarray:
     """Returns what the vertices that are welded have in common beside their position, int, shape [n, k]."""
-    return np.column_stack([layer, *(bits for bits in (mesh.world, mesh.group, mesh.mask) if bits is not None)])
+    return np.column_stack([sheet, *(bits for bits in (mesh.world, mesh.group, mesh.mask) if bits is not None)])
 
 
 def _repaired(
-    surface: Surface, before: np.ndarray, history: np.ndarray | None, layer: np.ndarray | None, max_strain: float
+    surface: Surface, before: np.ndarray, history: np.ndarray | None, sheet: np.ndarray | None, max_strain: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the best positions that are found, in units of the surface, and what crosses there; they may be worse."""
     if history is not None:
@@ -150,10 +150,10 @@ def _repaired(
         # fixed vertices that contact keeps from their places cannot stay elsewhere
         if (reached == surface.home)[surface.fixed].all():
             return reached, surface.crossings(reached)
-    if layer is None:
+    if sheet is None:
         x = free(surface, surface.home, before, max_strain)
     else:
-        start = separate_layers(surface, layer)
+        start = separate_sheets(surface, sheet)
         x = free(surface, start, surface.crossings(start), max_strain, movable=~surface.fixed)
     left = surface.crossings(x)
     if not len(left):

@@ -42,7 +42,7 @@ class RepairResult:
         near: Number of those in ``x``.
         moved: Distance of each vertex from its input, in the unit of the positions, float64, shape [vertex_count].
         max_strain: Largest change of the length of an edge, as a share of its length in the input.
-        unresolved: The contours that are left.
+        unresolved: The contours that remain.
     """
 
     x: np.ndarray | wp.array

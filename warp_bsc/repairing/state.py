@@ -10,12 +10,12 @@ import warp as wp
 from .._arguments import check_instance, checked_distance, checked_number
 from ..detection.mesh import CollisionMesh
 from ..response.report.inside import Inside
-from .arguments import checked_layers
+from .arguments import checked_sheets
 from .free import free, restore_parts
-from .layers import separate_layers
 from .model_surface import ModelSurface
 from .motion import near_pairs
 from .results import RepairResult
+from .sheets import separate_sheets
 from .tetrahedra import are_inverted, follow_surface, restore_inverted
 from .unresolved import unresolved_contours
 
@@ -69,7 +69,7 @@ def repair_state(
     Args:
         model: The model.
         state: The state, which is changed.
-        order: Which layers of particles are inside which, as for :func:`warp_bsc.repair`.
+        order: Which sheets of particles are inside which, as for :func:`warp_bsc.repair`.
         min_distance: Distance that pairs keep [m], as for :class:`warp_bsc.SolverCCD`: 0 or at least 2^-1021. With one,
             springs without triangles and single particles take part. What is nearer is moved apart as far as that is
             possible; ``result.near`` tells.
@@ -84,13 +84,13 @@ def repair_state(
     check_instance(model, "model", newton.Model, "a newton.Model")
     check_instance(state, "state", newton.State, "a newton.State")
     count = model.particle_count
-    layer = None if order is None else checked_layers(order, count)
+    sheet = None if order is None else checked_sheets(order, count)
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
-    placed = ModelSurface(model, state, np.full(count, -1) if layer is None else layer, distance)
+    placed = ModelSurface(model, state, np.full(count, -1) if sheet is None else sheet, distance)
     surface, weld = placed.surface, placed.weld
     before = _Faults(placed, surface.home)
-    after = _repaired(placed, before, layer, strain) if before else before
+    after = _repaired(placed, before, sheet, strain) if before else before
     x = placed.positions(after.x)
     if after is not before:
         assert state.particle_q is not None
@@ -146,16 +146,16 @@ class _Faults:
         return are_fewer and self.counts <= before.counts
 
 
-def _repaired(placed: ModelSurface, before: _Faults, layer: np.ndarray | None, max_strain: float) -> _Faults:
+def _repaired(placed: ModelSurface, before: _Faults, sheet: np.ndarray | None, max_strain: float) -> _Faults:
     """Returns the best positions that are found, the input if these are not better.
 
     What is deep inside a solid may leave it only as a whole: that is tried if the way out of its particles is not free.
     """
     surface, best = placed.surface, before
-    start = surface.home if layer is None else separate_layers(surface, placed.layer)
+    start = surface.home if sheet is None else separate_sheets(surface, placed.sheet)
     for whole in (False, True) if len(before.inside) else (False,):
         outside, movable = placed.leave_solids(start, whole=whole)
-        movable = movable if layer is None else ~surface.fixed
+        movable = movable if sheet is None else ~surface.fixed
         x = free(surface, outside, surface.crossings(outside), max_strain, movable=movable)
         if len(placed.tetrahedra):
             x = restore_inverted(surface, follow_surface(surface, x, placed.tetrahedra), placed.tetrahedra)

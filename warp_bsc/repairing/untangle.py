@@ -1,4 +1,4 @@
-"""Untangles a surface: shortens the contours along which it crosses itself, until none is left.
+"""Untangles a surface: shortens the contours along which it crosses itself, until none remains.
 
 References:
     David Baraff, Andrew Witkin, and Michael Kass. "Untangling Cloth." ACM Transactions on Graphics 22, 3 (2003).

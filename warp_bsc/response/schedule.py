@@ -16,9 +16,9 @@ Where a contact has no dividing plane, its paths are truncated too. In the itera
 When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
 more. It ends: vertices that stood apart at the start and stand still do not collide.
 
-When is a vertex frozen, that is, left at its start? If it still collides in the last row, and with all others if the
-last detection was incomplete. One whose prediction is not finite is left at its start as well, and counted apart. A
-detection is incomplete if a queue was too small, and queues cannot grow in a CUDA graph. :mod:`.contacts.search` then
+When is a vertex frozen, that is, kept at its start? If it still collides in the last row, and with all others if the
+last detection was incomplete. One whose prediction is not finite stays at its start as well, and is counted apart.
+A detection is incomplete if a queue was too small, and queues cannot grow in a CUDA graph. :mod:`.contacts.search` then
 finds contacts without queues, and all worlds go to the third row. Recorded steps cannot be searched, and freeze at
 once.
 
@@ -33,8 +33,8 @@ vertices of both. This ends as well: what stands still does not invert.
 What is excluded, from resolution and from the certificate? Pairs of elements that crossed or touched at the start, and
 vertices that were in the solid of a plane there (``Result.EXCLUDED``). They are counted, and a step with them may be
 certified. So may one with tetrahedra that were inverted at the start (``INVERTED``), with contacts of bodies that are
-left to the inner solver (``BODY_CONTACTS``, see :class:`.contacts.rules.ContactClass`), and with pairs that filters
-leave out (``FILTERED``, see :class:`.state.collision_filter.CollisionFilter`).
+delegated to the inner solver (``BODY_CONTACTS``, see :class:`.contacts.rules.ContactClass`), and with pairs that
+filters leave out (``FILTERED``, see :class:`.state.collision_filter.CollisionFilter`).
 """
 
 import warp as wp
@@ -217,7 +217,7 @@ def decide(
 def begin_prevention(status: SolveStatus):
     """Begins to cut paths if the resolved motion inverts tetrahedra.
 
-    Where contacts are left, it begins with the iterations that freeze. It leaves a step whose detection was incomplete
+    Where contacts remain, it begins with the iterations that freeze. It leaves a step whose detection was incomplete
     as it is, with all vertices at their start.
     """
     results, loop = status.results, status.loop

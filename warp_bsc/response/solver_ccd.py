@@ -63,9 +63,9 @@ class SolverCCD(CollisionStage):
 
     A step is certified if its motion, as stored, is free of collisions. Excluded from the certificate are pairs of
     elements that cross or touch at the start of the step, vertices that begin in the solid of an infinite plane, and
-    contacts of which no vertex can be moved: these are left to the inner solver. A particle whose predicted position or
-    velocity is not finite, in the step or a substep, stays where it was; neither such a step nor one with a start
-    position that is not finite is certified, in ``report.worlds`` the world of the particle alone.
+    contacts of which no vertex can be moved: these are delegated to the inner solver. A particle whose predicted
+    position or velocity is not finite, in the step or a substep, stays where it was; neither such a step nor one with a
+    start position that is not finite is certified, in ``report.worlds`` the world of the particle alone.
 
     A kinematic particle or body that a program moves between two steps takes that way in the second step: it starts
     where the last step ended, and in the first step where the model puts it (``particle_q``, ``body_q``). If a movable
@@ -77,8 +77,8 @@ class SolverCCD(CollisionStage):
     ``substeps`` the motion in each of them: particles move straight, and bodies turn evenly, the shorter way, so that
     their vertices move on arcs, see ``state.turns``. A body that the response can move turns about its centre of mass,
     others about the axis of their screw. With ``requires_grad`` the response resolves contacts of straight paths, and a
-    step in which only an arc collides is not certified. A body whose predicted pose or velocity is not finite is left
-    to the inner solver, and the step is not certified.
+    step in which only an arc collides is not certified. A body whose predicted pose or velocity is not finite is
+    delegated to the inner solver, and the step is not certified.
 
     With ``min_distance`` or ``particle_radius`` the certificate is of distances: a pair that started farther apart
     stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-20 of that distance
@@ -154,14 +154,14 @@ class SolverCCD(CollisionStage):
                 solvers raise NotImplementedError for more than one, as their entries take substeps themselves.
             bodies: What happens to dynamic bodies. ``"pushed"``: particles push them, by mass and inertia, with
                 friction and restitution, so that momentum is kept, if the inner solver keeps bodies in maximal
-                coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are left to the
-                inner solver; ``report.body_contacts`` counts those that its motion passes. ``"separated"``: bodies are
-                also kept apart from each other and from static shapes, as their flags, groups and filters of collision
-                say, and certified; the inner solver must read ``body_q`` and ``body_qd`` of the state. ``"ignored"``:
-                no body is pushed. The stage pushes no body into an infinite plane that it collides with, nor deeper
-                than it was or is predicted to be; with ``"separated"``, no motion takes it there. Kinematic bodies,
-                bodies without mass, static shapes and infinite planes are never pushed. If all bodies are kinematic at
-                construction, they stay so.
+                coordinates (VBD that integrates bodies, XPBD, semi-implicit). Contacts between bodies are delegated to
+                the inner solver; ``report.body_contacts`` counts those that its motion passes. ``"separated"``: bodies
+                are also kept apart from each other and from static shapes, as their flags, groups and filters of
+                collision say, and certified; the inner solver must read ``body_q`` and ``body_qd`` of the state.
+                ``"ignored"``: no body is pushed. The stage pushes no body into an infinite plane that it collides with,
+                nor deeper than it was or is predicted to be; with ``"separated"``, no motion takes it there. Kinematic
+                bodies, bodies without mass, static shapes and infinite planes are never pushed. If all bodies are
+                kinematic at construction, they stay so.
             min_distance: Distance that pairs keep [m], vertices from faces and edges from edges, and particles from
                 infinite planes: a pair that started farther apart stays so, and one that started closer comes no
                 closer. Neighbours, elements that an edge of the mesh joins, only do not touch. The stage moves pairs
@@ -173,15 +173,15 @@ class SolverCCD(CollisionStage):
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all: pairs keep the sum of
                 their radii beside ``min_distance``. That of an edge or a face is the largest one of its vertices, that
                 of a shape 0, or its margin with ``min_distance="model"``.
-            collision_filter: Groups and masks of particles and shapes: pairs that they leave out are left to the inner
-                solver, also if ``contacts`` are passed to :meth:`step`, see
+            collision_filter: Groups and masks of particles and shapes: pairs that they leave out are delegated to the
+                inner solver, also if ``contacts`` are passed to :meth:`step`, see
                 :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
                 particles by their flags are left out in any case, pairs of shapes as ``bodies`` says.
             inversions: What happens to tetrahedra whose volume becomes, or may become, 0 or negative at a time of the
                 step. ``"allowed"``: nothing. ``"reported"``: ``report.inverting`` counts those of the step as it is
                 stored. ``"prevented"``: the paths of their vertices are cut as well, as they are for collisions, and a
-                step with one that is left is not certified. Tetrahedra that were inverted at the start are left, and
-                counted apart (``report.inverted_at_start``).
+                step with one that remains is not certified. Tetrahedra that were inverted at the start remain so, and
+                are counted apart (``report.inverted_at_start``).
             contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
                 inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
                 layer, results jump where a contact comes or goes, and gradients miss those jumps.

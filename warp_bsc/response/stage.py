@@ -54,11 +54,9 @@ class CollisionStage(CouplingHooks):
         responds: bool = True,
     ):
         """Allocates the workspace of steps, and makes the report."""
-        self.mesh, self._motion, self._responds, model = motion.mesh, motion, responds, self.model
+        self.mesh, self._motion, self._responds = motion.mesh, motion, responds
         options = {"max_iterations": max_iterations, "responds": responds, "has_few_contacts": self._has_few_contacts}
         self.work = Workspace(motion, separation=separation, restitution=restitution, **options)
-        motion.set_start(arrays_of(model))
-        motion.set_end(arrays_of(model), 1.0)
         prepare(self.work)
         self._recount_crossings()
         if not motion.differentiable:
@@ -191,6 +189,9 @@ class CollisionStage(CouplingHooks):
         with watched:
             yield
         with paused_tape():
+            self._motion.last.end(step.state_out.body_q, self._motion.planes.end)
+            if step.mask is not None:
+                self._world_mask.end(step.mask)
             if self._coupled is not None:
                 self._coupled.finish()
                 self.report.copy_totals()
@@ -233,7 +234,6 @@ class CollisionStage(CouplingHooks):
             self._motion.set_end(end, step.dt)
             with contextlib.nullcontext() if step.mask is None else self._world_mask.applied(step.mask):
                 yield
-                self._motion.last.end(end.body_q)
                 self._count_step(step)
 
     def _count_step(self, step):

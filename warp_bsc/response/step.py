@@ -96,7 +96,7 @@ def _prevent_inversions(work, dt):
     wp.capture_while(work.loop[Loop.ACTIVE], _iterate_cuts, work=work, dt=dt)
     division.freeze_if_undetected(work)
     work.launch_over_particles(division.take_velocities_of_paths, work.ends, dt)
-    find_inversions(work)  # those that are left
+    find_inversions(work)  # those that remain
 
 
 def _iterate_cuts(work, dt):
@@ -116,7 +116,7 @@ def _cut_paths(work):
 
 @phase("add proximities")
 def add_proximities(work: Workspace) -> None:
-    """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not layer by layer."""
+    """Adds constraints for near, slow pairs, in worlds with contacts: a stack is solved at once, not sheet by sheet."""
     wp.capture_if(work.loop[Loop.ACTIVE], proximities.add_proximities, work=work)
 
 

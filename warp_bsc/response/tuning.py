@@ -63,13 +63,13 @@ MAX_TURN = wp.constant(wp.float64(0.1))
 SHARE_OF_PATH = wp.constant(wp.float64(0.9))
 """Share of the way to its first contact that a truncated vertex goes, and a body whose vertices have no planes."""
 CUT = wp.constant(wp.float64(0.5))
-"""Least share of its path that is left to a vertex in a sweep that prevents inversions."""
+"""Least share of its path that a vertex keeps in a sweep that prevents inversions."""
 MARGIN = wp.constant(wp.float64(0.2))
 """Least distance from a dividing plane after projection, as a share of the elements' distance at the start."""
 CLOSE_MARGIN = wp.constant(wp.float64(0.45))
 """The same of elements so close that they may hardly come nearer, step after step: positions are rounded."""
 CLOSE_TOGETHER = wp.constant(wp.float64(2.0))
-"""Their distance in separations at most. With less, a pile becomes so dense that many layers are near each other."""
+"""Their distance in separations at most. With less, a pile becomes so dense that many sheets are near each other."""
 FAR_APART = wp.constant(wp.float64(4.0))
 """Distance at the start, in separations, from which on margins are the same: elements that fall on each other come near
 in the first step, and contacts change only velocities of pairs that are."""
@@ -122,7 +122,7 @@ SEGMENTS = 32
 # capacities
 PAIRS_PER_FACE, PAIRS_PER_STATIC_FACE = 96, 2
 """Capacity of the detector's queues on a GPU, for each face that can move, and for others, which have pairs with those
-alone: queues of a CUDA graph cannot grow. Four layers of cloth that lie on each other have some 50, and up to 160 in a
+alone: queues of a CUDA graph cannot grow. Four sheets of cloth that lie on each other have some 50, and up to 160 in a
 Newton step in which they land."""
 DIVIDING_PLANES, DIVIDING_PLANES_IF_FEW = 32, 8
 """Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9. The second where contacts are few, as
@@ -144,7 +144,7 @@ MAX_SLOW_ITERATIONS = 1
 MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
 MAX_PASSES = wp.constant(4)
-"""Passes over dividing planes in each division: layers that fall together by more than they are apart need several."""
+"""Passes over dividing planes in each division: sheets that fall together by more than they are apart need several."""
 MAX_CUTS = wp.constant(64)
 """Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
 MAX_TRUNCATIONS = wp.constant(8)
@@ -154,6 +154,6 @@ MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
 set, after which the device checks whether a constraint is still active."""
 SLOW_POSITION_SWEEPS = 4
 """Sweeps on positions over constraints that move no body in worlds without fast contacts: division resolves what they
-leave. Velocities need more, as a sweep passes an impulse on by a layer."""
+leave. Velocities need more, as a sweep passes an impulse on by a sheet."""
 MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
 """Sweeps of a step: one ahead of the detection, those of all iterations, and those on velocities."""

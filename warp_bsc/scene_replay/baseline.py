@@ -101,7 +101,7 @@ class Baseline:
         for interval in summary.intervals:
             found += [NewFinding("collides", meshes, interval.start, interval.end) for meshes in interval.mesh_pairs]
             found += [
-                NewFinding("are duplicates", group, interval.start, interval.end) for group in interval.duplicates
+                NewFinding("are duplicates", meshes, interval.start, interval.end) for meshes in interval.duplicates
             ]
         for sample in summary.intersections:
             crossing = [meshes for meshes, (crossings, _) in sample.mesh_pairs.items() if crossings]
@@ -120,8 +120,8 @@ class Baseline:
         """
         what, meshes, start, end = finding
         if what == "are duplicates":
-            groups = self._spans[what].items()
-            spans = [span for group, spans in groups if set(group) >= {*meshes} for span in spans]
+            found = self._spans[what].items()
+            spans = [span for names, spans in found if set(names) >= {*meshes} for span in spans]
             return not any(since <= start and end <= until for since, until in spans)
         events = [what, *(("crosses", "is inside") if what == "is near" else ())]
         spans = [span for event in events for span in self._spans[event].get(tuple(sorted(meshes)), ())]

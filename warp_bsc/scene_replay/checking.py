@@ -1,4 +1,4 @@
-"""Checks the intervals of a scene in one process, as a pipeline of three stages.
+"""Checks the intervals of a scene in one process, as a pipeline of three phases.
 
 While the results of one interval are named, the next one is detected (on a CPU) and the one after it is read.
 """

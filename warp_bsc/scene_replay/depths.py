@@ -234,12 +234,12 @@ class _Sides(NamedTuple):
 
     Attributes:
         region: A number of the region of each vertex: connected on one side, shape [n].
-        group: The group of each region: regions on both sides that edges connect; -1 if it has no two sides.
-        is_second: Whether each region is on the second side of its group.
+        piece: The piece of surface of each region, whose edges connect both sides; -1 if it has no two sides.
+        is_second: Whether each region is on the second side of its piece.
     """
 
     region: np.ndarray
-    group: np.ndarray
+    piece: np.ndarray
     is_second: np.ndarray
 
 
@@ -256,14 +256,14 @@ def _find_sides(shape: _Shape, crossings: _Crossings, left_out: np.ndarray) -> _
     one, other = np.split(sides, 2)
     has_sides = np.zeros(count, dtype=bool)
     has_sides[first] = has_sides[second] = True
-    group = np.where(has_sides & (one != other), np.minimum(one, other), -1)
-    return _Sides(region, group, one > other)
+    piece = np.where(has_sides & (one != other), np.minimum(one, other), -1)
+    return _Sides(region, piece, one > other)
 
 
 def _depth_behind(shape: _Shape, surface: _Surface, x: np.ndarray, crossings: _Crossings) -> _Depth:
     """Returns the depth of a mesh behind the surface of another one that its edges pass through.
 
-    Vertices are searched up to some distance from the surface, which grows until one side of each group is within it.
+    Vertices are searched up to some distance from the surface, which grows until one side of each piece is within it.
     """
     if not len(crossings.odd):
         return _Depth(None, 0.0)
@@ -279,19 +279,19 @@ def _depth_behind(shape: _Shape, surface: _Surface, x: np.ndarray, crossings: _C
         distance[near], at_border[near] = surface.distances(places[near], reach)
         is_far = distance == np.inf
         sides = _find_sides(shape, crossings, at_border | is_far)
-        group, side = (
-            np.where(at_border | is_far, -1, sides.group[sides.region]),
+        piece, side = (
+            np.where(at_border | is_far, -1, sides.piece[sides.region]),
             sides.is_second[sides.region].astype(int),
         )
-        if group.max() < 0:
+        if piece.max() < 0:
             return _Depth(None, at_edges)
-        largest = np.zeros((len(sides.group) + 1, 2))
-        np.maximum.at(largest, (group, side), np.where(is_far, 0.0, distance))
+        largest = np.zeros((len(sides.piece) + 1, 2))
+        np.maximum.at(largest, (piece, side), np.where(is_far, 0.0, distance))
         if is_far.any():
             first, second = shape.edges.T
             first, second = shape.edges[crossings.open & (is_far[first] != is_far[second])].T
             beside = np.where(is_far[first], second, first)
-            largest[group[beside], side[beside]] = np.inf
+            largest[piece[beside], side[beside]] = np.inf
         depth = float(largest[:-1].min(axis=1).max())
         if np.isfinite(depth):
             return _Depth(depth, at_edges)
@@ -306,13 +306,13 @@ def _depth_within(shape: _Shape, x: np.ndarray, crossings: _Crossings) -> _Depth
     if not len(crossings.odd):
         return _Depth(None, 0.0)
     sides = _find_sides(shape, crossings, np.zeros(len(shape.vertices), dtype=bool))
-    group, at_edges, depth = sides.group[sides.region], float(crossings.near.max()), 0.0
-    if group.max() < 0:
+    piece, at_edges, depth = sides.piece[sides.region], float(crossings.near.max()), 0.0
+    if piece.max() < 0:
         return _Depth(None, at_edges)
-    sizes = np.zeros((len(sides.group) + 1, 2), dtype=np.int64)
-    np.add.at(sizes, (group, sides.is_second[sides.region].astype(int)), 1)
-    is_smaller = (sizes[:, 1] < sizes[:, 0])[sides.group] == sides.is_second
-    regions = np.flatnonzero(is_smaller & (sides.group >= 0))
+    sizes = np.zeros((len(sides.piece) + 1, 2), dtype=np.int64)
+    np.add.at(sizes, (piece, sides.is_second[sides.region].astype(int)), 1)
+    is_smaller = (sizes[:, 1] < sizes[:, 0])[sides.piece] == sides.is_second
+    regions = np.flatnonzero(is_smaller & (sides.piece >= 0))
     places = x[shape.vertices]
     low, high = _boxes(shape, places, crossings, sides)
     # A region's border is on the surface: no vertex of it is farther from the surface than the size of its box.
@@ -332,7 +332,7 @@ def _depth_within(shape: _Shape, x: np.ndarray, crossings: _Crossings) -> _Depth
 
 def _boxes(shape: _Shape, places: np.ndarray, crossings: _Crossings, sides: _Sides) -> tuple[np.ndarray, np.ndarray]:
     """Returns the lowest and highest corners of boxes around regions and the edges that leave them."""
-    low, high = np.full((len(sides.group), 3), np.inf), np.full((len(sides.group), 3), -np.inf)
+    low, high = np.full((len(sides.piece), 3), np.inf), np.full((len(sides.piece), 3), -np.inf)
     ends = shape.edges[crossings.odd]
     for region, points in (
         (sides.region, places),

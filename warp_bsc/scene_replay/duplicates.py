@@ -32,35 +32,35 @@ class Duplicates:
         starts = np.array([mesh.faces.start for mesh in segment.meshes], dtype=np.int64)
         counts = np.array([len(mesh.polygons) for mesh in segment.meshes], dtype=np.int64)
         (used,) = np.nonzero(counts)
-        self._groups: list[list[int]] = []
+        self._duplicates: list[list[int]] = []
         self._twin = np.arange(len(counts))  # the first of the twins of each mesh
         if len(used) < 2:
             return
         a, b, c = segment.faces.T
         low, high = (bound.reduceat(bound(bound(a, b), c), starts[used]) for bound in (np.minimum, np.maximum))
-        alike = _grouped(used.tolist(), zip(counts[used].tolist(), low.tolist(), high.tolist(), strict=True))
+        alike = _alike(used.tolist(), zip(counts[used].tolist(), low.tolist(), high.tolist(), strict=True))
         for candidates in alike:
             meshes = [segment.meshes[number] for number in candidates]
             surfaces = (_surface(segment.faces[mesh.faces], mesh.polygons) for mesh in meshes)
-            for group in _grouped(candidates, surfaces):
-                self._groups.append(group)
-                triangles = (segment.faces[segment.meshes[number].faces] for number in group)
-                for twins in _grouped(group, (_surface(faces, np.arange(len(faces))) for faces in triangles)):
+            for same in _alike(candidates, surfaces):
+                self._duplicates.append(same)
+                triangles = (segment.faces[segment.meshes[number].faces] for number in same)
+                for twins in _alike(same, (_surface(faces, np.arange(len(faces))) for faces in triangles)):
                     self._twin[twins] = twins[0]
-        self._groups.sort()
+        self._duplicates.sort()
 
     def named(self, selection: Selection) -> tuple[tuple[str, ...], ...]:
-        """Returns the names of the meshes of each group, without those of which all pairs are excluded or ignored."""
-        meshes, groups = self._segment.meshes, []
-        for group in self._groups:
-            numbers = np.array(group)
+        """Returns the names of duplicates, without meshes of which all pairs are excluded or ignored."""
+        meshes, found = self._segment.meshes, []
+        for same in self._duplicates:
+            numbers = np.array(same)
             if selection.between or selection.ignore or selection.ignored_names:
-                pairs = numbers[np.stack(np.triu_indices(len(group), 1), axis=1)]
+                pairs = numbers[np.stack(np.triu_indices(len(same), 1), axis=1)]
                 counted = selection.counted_pairs(meshes, pairs) & ~selection.ignored_pairs(meshes, pairs)
                 numbers = np.unique(pairs[counted])
             if len(numbers):
-                groups.append(tuple(meshes[number].name for number in numbers))
-        return tuple(groups)
+                found.append(tuple(meshes[number].name for number in numbers))
+        return tuple(found)
 
     def without_twins(self, bodies: np.ndarray) -> np.ndarray:
         """Returns bodies of faces, then of other elements, with -1 for the faces of twins, but the first of each."""
@@ -97,12 +97,12 @@ class Duplicates:
         return faces.start + np.lexsort(np.sort(self._segment.faces[faces], axis=1).T)
 
 
-def _grouped(items: list[int], keys: Iterable[Hashable]) -> list[list[int]]:
+def _alike(items: list[int], keys: Iterable[Hashable]) -> list[list[int]]:
     """Returns the items of which some have the same key, by it."""
-    groups = defaultdict(list)
+    found = defaultdict(list)
     for item, key in zip(items, keys, strict=True):
-        groups[key].append(item)
-    return [group for group in groups.values() if len(group) > 1]
+        found[key].append(item)
+    return [same for same in found.values() if len(same) > 1]
 
 
 def _surface(faces: np.ndarray, polygons: np.ndarray) -> bytes:

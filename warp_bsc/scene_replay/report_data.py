@@ -96,7 +96,7 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         ],
         "notes": [
             *(f"{span.describe(_MAX_NAMES)}." for span in spans[:_MAX_ROWS]),
-            *([f"{len(spans) - _MAX_ROWS:,} more groups of duplicates."] if len(spans) > _MAX_ROWS else ()),
+            *([f"{len(spans) - _MAX_ROWS:,} more sets of duplicates."] if len(spans) > _MAX_ROWS else ()),
             summary.motion,
             *scene.warnings,
         ],

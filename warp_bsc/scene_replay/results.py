@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..detection.results.collisions import DetectionStats, StageCounts
+from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
@@ -129,7 +129,7 @@ class IntervalSummary:
         earliest: The earliest contact, None if there is none.
         certified: Whether floating point or exact arithmetic has certified that no collision is missing, for vertices
             that move straight from the start to the end.
-        stats: Counts and times of the detector's stages; the counts include pairs that the selection excludes.
+        stats: Counts and times of the detector's phases; the counts include pairs that the selection excludes.
         validation: The comparison with the exact checker, None without validation.
         intersections: The intersections at the start and at the end; None if they were not checked. The end is the
             moment just before the end where a mesh jumps, as in :class:`~warp_bsc.usd.interval.Interval`.
@@ -139,7 +139,7 @@ class IntervalSummary:
         phases: Number of pairs of meshes that collide by :data:`~warp_bsc.scene_replay.scene_contacts.PHASES`; None if
             intersections were not checked.
         proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
-        duplicates: Groups of meshes that are duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by
+        duplicates: Names of duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by
             their names, in the scene's order; empty if intersections were not checked.
     """
 
@@ -171,15 +171,15 @@ class IntervalSummary:
     @property
     def pairs_tested(self) -> int:
         """Number of candidate pairs."""
-        return sum(stage.candidates for stage in self._stages)
+        return sum(phase.candidates for phase in self._phases)
 
     @property
     def unsure(self) -> int:
         """Number of candidate pairs that floating point could not certify."""
-        return sum(stage.unsure for stage in self._stages)
+        return sum(phase.unsure for phase in self._phases)
 
     @property
-    def _stages(self) -> list[StageCounts]:
+    def _phases(self) -> list[PhaseCounts]:
         return [getattr(self.stats, kind.label) for kind in DistanceKind]
 
 
@@ -297,8 +297,8 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
     order = np.argsort(found.distance, kind="stable")
     _, firsts, numbers = np.unique(found.mesh_keys()[order], return_index=True, return_counts=True)
     nearest = []
-    for group in np.argsort(firsts).tolist():
-        row = int(order[firsts[group]])
+    for pair in np.argsort(firsts).tolist():
+        row = int(order[firsts[pair]])
         rows = slice(row, row + 1)
         x, y, z = found.position[row].tolist()
         nearest.append(
@@ -308,7 +308,7 @@ def _summarize_proximities(found: SceneProximities) -> ProximitySummary:
                 found.time,
                 float(found.distance[row]),
                 (x, y, z),
-                int(numbers[group]),
+                int(numbers[pair]),
             )
         )
     return ProximitySummary(found.time, len(found), tuple(nearest))

@@ -1,4 +1,4 @@
-"""Holds the time samples of a layer in a temporary file until the layer is written."""
+"""Holds the time samples of a USD layer in a temporary file until the layer is written."""
 
 import os
 import tempfile

@@ -221,10 +221,10 @@ def _farthest(keys: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Returns two distant points of each key, ascending, shape [m, 2, 3]; both points of a key that has two."""
     order = np.argsort(keys, kind="stable")
     keys, points = keys[order], points[order]
-    _, starts, groups = np.unique(keys, return_index=True, return_inverse=True)
+    _, starts, numbers = np.unique(keys, return_index=True, return_inverse=True)
     ends = [points[starts]]
     for _ in range(2):  # from any point to the farthest, and from there to the farthest
-        distance = np.square(points - ends[-1][groups]).sum(axis=1)
+        distance = np.square(points - ends[-1][numbers]).sum(axis=1)
         last = np.append(starts[1:], len(keys))[: len(starts)] - 1
-        ends.append(points[np.lexsort((distance, groups))[last]])
+        ends.append(points[np.lexsort((distance, numbers))[last]])
     return np.stack(ends[1:], axis=1)

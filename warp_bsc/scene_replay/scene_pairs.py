@@ -155,9 +155,9 @@ def count_by_meshes(
     if not len(meshes):
         return {}
     keys = np.minimum(*meshes.T) * len(segment.meshes) + np.maximum(*meshes.T)
-    pairs, groups = np.unique(keys, return_inverse=True)
+    pairs, numbers = np.unique(keys, return_inverse=True)
     columns = [None] if weights is None else weights.T
-    sums = np.stack([np.bincount(groups, column, len(pairs)) for column in columns], axis=1).astype(np.int64)
+    sums = np.stack([np.bincount(numbers, column, len(pairs)) for column in columns], axis=1).astype(np.int64)
     names = [mesh.name for mesh in segment.meshes]
     return {
         (names[pair // len(names)], names[pair % len(names)]): tuple(row)

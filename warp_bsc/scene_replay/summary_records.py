@@ -1,14 +1,14 @@
 """The summary of an interval in the JSON file of a replay: neighbouring functions write and read each of its parts.
 
 The file names meshes and prims once, in its first line. Everywhere else ``mesh`` holds the numbers of two meshes in
-these lists, where the results have their names, and so does each group of ``duplicates``.
+these lists, where the results have their names, and so do ``duplicates``.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from ..detection.results.collisions import DetectionStats, StageCounts
+from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
 from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
@@ -82,7 +82,7 @@ def summary_fields(summary: IntervalSummary, kinds: Sequence[str], numbers: Mapp
         fields["phases"] = dict(zip(PHASES, summary.phases or (), strict=True))
         found = (_intersection_fields(at, numbers) for at in summary.intersections)
         fields["intersections"] = dict(zip(("start", "end"), found, strict=True))
-        fields["duplicates"] = [[numbers[name] for name in group] for group in summary.duplicates]
+        fields["duplicates"] = [[numbers[name] for name in same] for same in summary.duplicates]
     if summary.proximities:
         found = (_proximity_fields(at, numbers) for at in summary.proximities)
         fields["proximities"] = dict(zip(("start", "end"), found, strict=True))
@@ -90,7 +90,7 @@ def summary_fields(summary: IntervalSummary, kinds: Sequence[str], numbers: Mapp
 
 
 def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -> IntervalSummary:
-    """Returns the summary of an interval, without the times of its stages.
+    """Returns the summary of an interval, without the times of its phases.
 
     Args:
         fields: The fields of :func:`summary_fields`.
@@ -99,7 +99,7 @@ def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -
     """
     # a scene without curves and points has no counts of their pairs
     labels = [kind.label for kind in DistanceKind]
-    counts = {label: StageCounts(**fields["stages"].get(label, {})) for label in labels}
+    counts = {label: PhaseCounts(**fields["stages"].get(label, {})) for label in labels}
     validation = fields["validation"]
     if validation:
         validation = Validation(**validation | {"disagreements": tuple(validation["disagreements"])})
@@ -120,7 +120,7 @@ def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -
         separate_hits=fields["separate_hits"] if intersections else None,
         phases=tuple(fields["phases"].values()) if intersections else None,
         proximities=_both_times(proximities, _read_proximities, names),
-        duplicates=tuple(tuple(names[number] for number in group) for group in fields.get("duplicates", ())),
+        duplicates=tuple(tuple(names[number] for number in same) for same in fields.get("duplicates", ())),
     )
 
 

@@ -13,7 +13,7 @@ from .._version import __version__
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.write.layer import just_before, layer_metadata, unused_path
-from ..usd.write.layer_writer import LayerContent, LayerGroup, LayerPrim, PrimKind, write_binary_layer, write_text_layer
+from ..usd.write.layer_writer import LayerContent, LayerPrim, LayerScope, PrimKind, write_binary_layer, write_text_layer
 from .limit import not_listed
 from .results import IntervalResult
 from .sample_spool import Key, Sample, SampleSpool
@@ -91,7 +91,7 @@ _REST = "Rest"
 
 
 class Overlay:
-    """A layer whose sublayer is the scene, so that opening the layer shows both. It does not change the scene's prims.
+    """A USD layer whose sublayer is the scene, so that opening it shows both. It does not change the scene's prims.
 
     ``/Collisions`` has a prim for each pair of meshes, such as ``Coat_with_Body`` or ``Coat_with_itself``, so that a
     pair can be hidden. Its attribute ``meshes`` has their names. The first :data:`MOST_PAIRS` pairs that meet have one,
@@ -151,12 +151,12 @@ class Overlay:
         """
         suffix = Path(path).suffix
         if suffix not in (".usda", ".usdc", ".usd"):
-            raise ValueError(f"{path}: the name of an overlay, a layer of USD, must end in .usda, .usdc or .usd")
+            raise ValueError(f"{path}: the name of an overlay, a USD layer, must end in .usda, .usdc or .usd")
         self._is_text = suffix == ".usda"
         self._scene, self._command = scene, command
         self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
-        self._pairs: dict[frozenset[str], LayerGroup] = {}  # prims of pairs of meshes, by the names of the two
+        self._pairs: dict[frozenset[str], LayerScope] = {}  # prims of pairs of meshes, by the names of the two
         self._root_path = unused_path(scene, "/Collisions")
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
@@ -214,12 +214,12 @@ class Overlay:
             meshes: Two meshes of the segment in each row, shape [n, 2].
         """
         keys = np.sort(meshes, axis=1)
-        pairs, groups, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-        of_groups = np.split(np.argsort(groups.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
+        pairs, numbers, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+        of_pairs = np.split(np.argsort(numbers.reshape(-1), kind="stable"), np.cumsum(counts)[:-1])
         rows: dict[str, list[np.ndarray]] = {}
-        for group in np.argsort(-counts, kind="stable").tolist():
-            first, second = (segment.meshes[mesh].name for mesh in pairs[group])
-            rows.setdefault(self._prim_of(first, second), []).append(of_groups[group])
+        for number in np.argsort(-counts, kind="stable").tolist():
+            first, second = (segment.meshes[mesh].name for mesh in pairs[number])
+            rows.setdefault(self._prim_of(first, second), []).append(of_pairs[number])
         return [(name, np.sort(np.concatenate(parts))) for name, parts in rows.items()]
 
     def _prim_of(self, first: str, second: str) -> str:
@@ -232,12 +232,12 @@ class Overlay:
         words = [re.sub(r"\W", "_", name.rpartition("/")[2], flags=re.ASCII) for name in (first, second)]
         name = f"{words[0]}_with_{'itself' if first == second else words[1]}"
         name = f"_{name}" if name[0].isdigit() else name
-        unique, number, used = name, 1, {group.name for group in self._pairs.values()}
+        unique, number, used = name, 1, {scope.name for scope in self._pairs.values()}
         while unique in used:
             number += 1
             unique = f"{name}_{number}"
         label = f"{first} with {'itself' if first == second else second}"
-        self._pairs[pair] = LayerGroup(unique, label, {"meshes": list(dict.fromkeys((first, second)))})
+        self._pairs[pair] = LayerScope(unique, label, {"meshes": list(dict.fromkeys((first, second)))})
         return unique
 
     def _find_polygons(self, contacts: SceneContacts) -> Sample | None:
@@ -340,7 +340,7 @@ class Overlay:
             sublayer=source if source.startswith("../") else f"./{source}",
             root=self._root_path,
             strings={"prims": list(self._prims)},
-            groups=self._groups({pair for pair, _ in keys}),
+            scopes=self._scopes({pair for pair, _ in keys}),
             prims=[self._layer_prim(pair, name) for pair, name in keys],
             variant_set="warp_bsc",
             hidden=_hidden(keys),
@@ -368,10 +368,10 @@ class Overlay:
             facts["leftOut"] = self._scene.left_out
         return facts
 
-    def _groups(self, used: set[str]) -> list[LayerGroup]:
+    def _scopes(self, used: set[str]) -> list[LayerScope]:
         """Returns the prims of pairs of meshes that have findings, the rest last."""
-        rest = [LayerGroup(_REST, "other pairs of meshes", {})]
-        return [group for group in (*self._pairs.values(), *rest) if group.name in used]
+        rest = [LayerScope(_REST, "other pairs of meshes", {})]
+        return [scope for scope in (*self._pairs.values(), *rest) if scope.name in used]
 
     def _layer_prim(self, pair: str, name: str) -> LayerPrim:
         kind, attributes = _PARTS[name]

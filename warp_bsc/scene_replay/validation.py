@@ -142,7 +142,7 @@ def overlapping_boxes(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Finds all pairs of boxes that overlap or touch, a chunk at a time.
 
-    Boxes are grouped by size. For two groups, a grid assigns each box to the cell of its lowest corner; cells are as
+    Boxes are in classes by size. For two classes, a grid puts each box in the cell of its lowest corner; cells are as
     large as the larger boxes, so that overlapping boxes are in the same cell or in neighbouring ones.
 
     Args:

@@ -1,4 +1,4 @@
-"""The cameras of a stage at some times. Imports pxr, which is slow: import this where used."""
+"""The cameras of a USD stage at some times. Imports pxr, which is slow: import this where used."""
 
 from dataclasses import dataclass, field
 

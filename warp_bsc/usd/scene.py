@@ -65,7 +65,7 @@ class Scene:
     options, and what reading has revealed so far. Unpickling opens the file again, and raises a ValueError if the file
     has changed.
 
-    A stage in memory is read as it is, with edits that are not saved, session layer and population mask::
+    A USD stage in memory is read as it is, with edits that are not saved, session layer and population mask::
 
         scene = bsc.Scene(stage)
         found = [(result.summary.start, len(result.contacts)) for result in bsc.replay(scene)]
@@ -73,7 +73,7 @@ class Scene:
     For other processes it is flattened and written to a temporary file, which warns.
 
     Attributes:
-        path: The file; of a stage in memory the identifier of its root layer.
+        path: The file; of a USD stage in memory the identifier of its root layer.
         selection: The meshes that are checked, and the pairs of them.
         stage: The open ``Usd.Stage``.
         files: The files that the stage is read from.
@@ -225,7 +225,7 @@ class Scene:
 
     @property
     def has_file(self) -> bool:
-        """Whether there is a file of it, over which a layer can be put; not if it is a stage in memory alone."""
+        """Whether there is a file, over which a USD layer can be put; not if it is a USD stage in memory alone."""
         return not self._is_given or bool(self.stage.GetRootLayer().realPath)
 
     @property
@@ -285,7 +285,7 @@ class Scene:
         Raises:
             TypeError: If a number is not an integer.
             IndexError: If there is no such interval.
-            ValueError: If a mesh is broken and may not be left out, nothing that moves is left, or the stage has
+            ValueError: If a mesh is broken and may not be left out, nothing that moves remains, or the stage has
                 changed.
         """
         index = self._checked_index(index, "index", len(self) - 1)

@@ -100,13 +100,13 @@ def _change_warnings(meshes: "list[UsdMesh]", first: float, last: float) -> list
 
 
 def _merge(times: set[float]) -> dict[float, float]:
-    """Returns for each time the one that stands for all of its group: the one nearest to a whole time code."""
+    """Returns for each time the one that stands for all that are the same: the one nearest to a whole time code."""
     ordered = sorted(times)
     largest_gap = _SAME_TIME * min(1.0, ordered[-1] - ordered[0])
-    groups = []
+    merged = []
     for time in ordered:
-        if groups and time - groups[-1][0] <= largest_gap:
-            groups[-1].append(time)
+        if merged and time - merged[-1][0] <= largest_gap:
+            merged[-1].append(time)
         else:
-            groups.append([time])
-    return {time: min(group, key=lambda time: abs(time - round(time))) for group in groups for time in group}
+            merged.append([time])
+    return {time: min(same, key=lambda time: abs(time - round(time))) for same in merged for time in same}

@@ -10,7 +10,7 @@ from .._sorted_keys import distinct, expand_ranges, search, search_ranges
 from .read.position_reader import PositionReader
 from .scene_mesh import InPrims, SceneMesh
 from .turns import Turn, find_turns
-from .welding import group_by_position, split_by_position
+from .welding import first_by_hash, first_by_position
 
 if TYPE_CHECKING:
     from .read.meshes import UsdMesh
@@ -78,7 +78,7 @@ class Segment:
                 used, corners, _ = compact[id(triangles)]
                 curves.append(np.full(len(used), -1))
                 radius.append(np.zeros(len(used)))
-                if not mesh.group:
+                if not mesh.instanced_prim:
                     compact.clear()
             faces.append(corners + vertex_count)
             self.meshes.append(
@@ -225,7 +225,7 @@ class Segment:
     def triangles_in_polygons(self, faces: np.ndarray) -> np.ndarray:
         """Returns the number of each face among the triangles of its polygon, from 0, shape [n]."""
         triangles = np.zeros(len(faces), dtype=np.int64)
-        for number, members in _groups(self._polygons.meshes(faces)):
+        for number, members in _by_mesh(self._polygons.meshes(faces)):
             mesh = self.meshes[number]
             own = faces[members] - mesh.faces.start
             triangles[members] = own - np.searchsorted(mesh.polygons, mesh.polygons[own])
@@ -234,7 +234,7 @@ class Segment:
     def find_faces(self, meshes: np.ndarray, polygons: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         """Returns faces, shape [n]: the inverse of :meth:`locate_faces` and :meth:`triangles_in_polygons`."""
         faces = np.zeros(len(meshes), dtype=np.int64)
-        for number, members in _groups(meshes):
+        for number, members in _by_mesh(meshes):
             mesh = self.meshes[number]
             faces[members] = mesh.faces.start + np.searchsorted(mesh.polygons, polygons[members]) + triangles[members]
         return faces
@@ -242,7 +242,7 @@ class Segment:
     def find_vertices(self, meshes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Returns vertices, given meshes and the indices of points of their prims, shape [n]."""
         vertices = np.zeros(len(meshes), dtype=np.int64)
-        for number, members in _groups(meshes):
+        for number, members in _by_mesh(meshes):
             mesh = self.meshes[number]
             vertices[members] = mesh.vertices.start + np.searchsorted(mesh.points, points[members])
         return np.searchsorted(self._kept, self._welded_to[vertices])
@@ -413,7 +413,7 @@ class Segment:
 
     def _find_welds(self, times, progress) -> np.ndarray:
         """Returns for each vertex the first one that has the same position at every time, shape [vertex_count]."""
-        welded_to = split_by_position(group_by_position(self._start), self._start)
+        welded_to = first_by_position(first_by_hash(self._start), self._start)
         (crowded,) = np.nonzero(np.bincount(welded_to, minlength=len(welded_to))[welded_to] > 1)
         owners = distinct(self._points.meshes(crowded)).tolist()
         moving = [number for number in owners if self.meshes[number].moves]
@@ -425,17 +425,17 @@ class Segment:
             moments.append((times[-1], True))
         reader = self._reader(crowded, moving)
         positions = self._start[crowded]
-        groups = np.searchsorted(crowded, welded_to[crowded])
+        firsts = np.searchsorted(crowded, welded_to[crowded])
         for done, (time, before) in enumerate(moments):
             if progress:
                 progress(done, len(moments))
             reader.read(positions, time, before)
-            groups = split_by_position(groups, positions)
-        welded_to[crowded] = crowded[groups]
+            firsts = first_by_position(firsts, positions)
+        welded_to[crowded] = crowded[firsts]
         return welded_to
 
 
-def _groups(meshes: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+def _by_mesh(meshes: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """Yields each of the given meshes with its rows."""
     order = np.argsort(meshes, kind="stable")
     numbers, starts = np.unique(meshes[order], return_index=True)

@@ -37,7 +37,7 @@ def transform_warnings(meshes: list[UsdMesh], times: list[float]) -> list[str]:
     zero_scales: dict[Instancer, dict[int, float]] = {}
     hidden: dict[str, float] = {}  # first time by mesh
     for mesh in meshes:
-        key = mesh.group or mesh.name
+        key = mesh.instanced_prim or mesh.name
         if key not in ops_of:
             ops_of[key] = list(mesh.transforms.ops(mesh.instance))
         for op in ops_of[key]:

@@ -1,11 +1,11 @@
-"""Groups vertices that have the same position."""
+"""Finds vertices that have the same position."""
 
 import numpy as np
 
-__all__ = ["group_by_position", "split_by_position"]
+__all__ = ["first_by_hash", "first_by_position"]
 
 
-def group_by_position(positions: np.ndarray) -> np.ndarray:
+def first_by_hash(positions: np.ndarray) -> np.ndarray:
     """Returns for each position the first one with the same hash, shape [n]."""
     bits = (positions + positions.dtype.type(0.0)).view(f"u{positions.itemsize}").astype(np.uint64)  # no -0.0
     hashes = np.zeros(len(positions), dtype=np.uint64)
@@ -16,17 +16,17 @@ def group_by_position(positions: np.ndarray) -> np.ndarray:
     return firsts[numbers]
 
 
-def split_by_position(groups: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Returns for each vertex the first one of its group that has the same position, shape [n].
+def first_by_position(candidates: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Returns for each vertex the first one that has the same position, among those of one candidate, shape [n].
 
     Args:
-        groups: The first vertex of each vertex's group, shape [n].
+        candidates: The same vertex for all that may have one position: the first of them, shape [n].
         positions: Positions of the vertices, shape [n, 3].
     """
-    (rows,) = np.nonzero((positions != positions[groups]).any(axis=1))
+    (rows,) = np.nonzero((positions != positions[candidates]).any(axis=1))
     if len(rows):
-        keys = np.column_stack([groups[rows], positions[rows].astype(np.float64)])
+        keys = np.column_stack([candidates[rows], positions[rows].astype(np.float64)])
         _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        groups = groups.copy()
-        groups[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 returns another shape
-    return groups
+        candidates = candidates.copy()
+        candidates[rows] = rows[firsts[numbers.reshape(-1)]]  # NumPy 2.0 returns another shape
+    return candidates

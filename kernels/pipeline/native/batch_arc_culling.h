@@ -40,11 +40,11 @@ auto read_packet = [&](const int* which, int filled) -> Packet {
 };
 
 int open[64], open_count = 0;
-for (int group = 0; group < count; group += 8) {
+for (int begin = 0; begin < count; begin += 8) {
     int which[8];
     for (int lane = 0; lane < 8; ++lane)
-        which[lane] = group + lane;
-    const Packet packet = read_packet(which, count - group < 8 ? count - group : 8);
+        which[lane] = begin + lane;
+    const Packet packet = read_packet(which, count - begin < 8 ? count - begin : 8);
     const Motion& motion = packet.motion;
     const Doubles kept = packet.kept;
     const int usable = packet.usable;
@@ -73,12 +73,12 @@ for (int group = 0; group < count; group += 8) {
         unsure &= ~(bits((gaps.low - gaps.bound > needed) | (-gaps.high - gaps.bound > needed)) & usable);
     }
     for (; unsure; unsure &= unsure - 1)
-        open[open_count++] = group + __builtin_ctz(unsure);
+        open[open_count++] = begin + __builtin_ctz(unsure);
 }
 
 unsigned long long left = 0;
-for (int group = 0; group < open_count; group += 8) {
-    const Packet packet = read_packet(open + group, open_count - group < 8 ? open_count - group : 8);
+for (int begin = 0; begin < open_count; begin += 8) {
+    const Packet packet = read_packet(open + begin, open_count - begin < 8 ? open_count - begin : 8);
     const Motion& motion = packet.motion;
     const Doubles kept = packet.kept;
     const int usable = packet.usable;
@@ -121,6 +121,6 @@ for (int group = 0; group < open_count; group += 8) {
         unsure &= ~(bits(start >= limit) & usable);
     }
     for (; unsure; unsure &= unsure - 1)
-        left |= 1ull << open[group + __builtin_ctz(unsure)];
+        left |= 1ull << open[begin + __builtin_ctz(unsure)];
 }
 return left;

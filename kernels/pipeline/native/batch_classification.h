@@ -225,11 +225,11 @@ auto without_zeros = [&](Cubic k) -> Cubic {
 };
 
 unsigned long long statuses = 0;
-for (int group = 0; group < count; group += 8) {
-    const int filled = count - group < 8 ? count - group : 8;
+for (int begin = 0; begin < count; begin += 8) {
+    const int filled = count - begin < 8 ? count - begin : 8;
     int slots[8];
     for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + group + (lane < filled ? lane : 0);
+        slots[lane] = first + begin + (lane < filled ? lane : 0);
     Scalars points[24];
     read_points(slots, points);
     const int all = (1 << filled) - 1;
@@ -275,6 +275,6 @@ for (int group = 0; group < count; group += 8) {
         return (x | (x << 1)) & 0x5555u;
     };
     const unsigned long long packet = spread(hit | open) | (spread(unsure | open) << 1);
-    statuses |= packet << (2 * group);
+    statuses |= packet << (2 * begin);
 }
 return statuses;

@@ -26,11 +26,11 @@ for (int i = 0; i < count; ++i) {
 }
 
 unsigned long long left = 0;
-for (int group = 0; group < near_count; group += 8) {
-    const int filled = near_count - group < 8 ? near_count - group : 8;
+for (int begin = 0; begin < near_count; begin += 8) {
+    const int filled = near_count - begin < 8 ? near_count - begin : 8;
     int slots[8];
     for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + near[group + (lane < filled ? lane : 0)];
+        slots[lane] = first + near[begin + (lane < filled ? lane : 0)];
     Scalars points[24];
     read_points(slots, points);
 
@@ -89,6 +89,6 @@ for (int group = 0; group < near_count; group += 8) {
         unsure &= ~(bits((lowest > slack) | (highest < -slack)) & trusted);
     }
     for (int lane = 0; lane < filled; ++lane)
-        left |= (unsigned long long)((unsure >> lane) & 1) << near[group + lane];
+        left |= (unsigned long long)((unsure >> lane) & 1) << near[begin + lane];
 }
 return left;

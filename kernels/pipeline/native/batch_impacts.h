@@ -130,22 +130,22 @@ for (int i = 0; i < count; ++i) {
     entry_count += timed || status.data[first + i] != HIT;
 }
 int queue[batch], queued = 0;  // the entries whose search has not begun
-for (int group = 0; group < entry_count; group += 8) {
-    const int filled = entry_count - group < 8 ? entry_count - group : 8;
+for (int begin = 0; begin < entry_count; begin += 8) {
+    const int filled = entry_count - begin < 8 ? entry_count - begin : 8;
     int slots[8];
     for (int lane = 0; lane < 8; ++lane)
-        slots[lane] = first + entries[group + (lane < filled ? lane : 0)];
+        slots[lane] = first + entries[begin + (lane < filled ? lane : 0)];
     Scalars points[24];
     read_points(slots, points);
     int usable = (1 << filled) - 1;
-    Query& query = packets[group / 8];
+    Query& query = packets[begin / 8];
     query.motion = scaled_motion(points, usable);
     query.y = coplanarity(query.motion);
     for (int lane = 0; lane < filled; ++lane) {
         if ((usable >> lane) & 1)
-            queue[queued++] = group + lane;
+            queue[queued++] = begin + lane;
         else
-            open |= 1ull << entries[group + lane];
+            open |= 1ull << entries[begin + lane];
     }
 }
 
@@ -285,18 +285,18 @@ auto contact_at = [&](const Motion& m, Doubles t, Coordinates& at) -> Vectors {
     return Vectors{normal.x / size, normal.y / size, normal.z / size};
 };
 typedef wp::vec_t<3, double> Point;
-for (int group = 0; group < entry_count; group += 8) {
-    const int filled = entry_count - group < 8 ? entry_count - group : 8;
+for (int begin = 0; begin < entry_count; begin += 8) {
+    const int filled = entry_count - begin < 8 ? entry_count - begin : 8;
     Vectors normals;
     Coordinates at;
     if (timed) {
         Doubles t = 0.0;
         for (int lane = 0; lane < filled; ++lane)
-            t[lane] = (open >> entries[group + lane]) & 1 ? 0.0 : time_of_contact[group + lane];
-        normals = contact_at(packets[group / 8].motion, t, at);
+            t[lane] = (open >> entries[begin + lane]) & 1 ? 0.0 : time_of_contact[begin + lane];
+        normals = contact_at(packets[begin / 8].motion, t, at);
     }
     for (int lane = 0; lane < filled; ++lane) {
-        const int i = first + entries[group + lane], e = group + lane;
+        const int i = first + entries[begin + lane], e = begin + lane;
         if ((open >> entries[e]) & 1)
             continue;
         if (outcome[e] != UNSURE)

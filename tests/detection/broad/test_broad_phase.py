@@ -168,8 +168,8 @@ def sorted_face_pairs(mesh, x0, x1, keep_separated=False):
 
 
 @pytest.mark.parametrize("worlds", [1, 3])
-def test_many_groups(worlds):
-    """More groups of clusters than a warp tests at once, of one sheet that moves through itself."""
+def test_many_bundles(worlds):
+    """More bundles than a warp tests at once, of one sheet that moves through itself."""
     n = 132 if worlds == 1 else 76
     x0, x1, faces = crumpled(0, n)
     world = None

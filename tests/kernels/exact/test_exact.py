@@ -1,4 +1,4 @@
-"""The exact stage: true answers in every width, no number beyond its bound, little left to the host."""
+"""The exact phase: true answers in every width, no number beyond its bound, little left to the host."""
 
 import numpy as np
 import pytest
@@ -185,11 +185,11 @@ def test_a_graph_decides_all_but_what_is_too_wide(device):
 # --- Widths ---
 
 
-def stages_kernel(limbs):
-    """A kernel that computes what the exact stage does, step by step."""
+def phases_kernel(limbs):
+    """A kernel that computes what the exact phase does, step by step."""
     one, two, four, eight = (integer(limbs * times) for times in (1, 2, 4, 8))
 
-    # As the exact stage does, functions take the polygon as an array: Warp keeps one instance of a generic function for
+    # As the exact phase does, functions take the polygon as an array: Warp keeps one instance of a generic function for
     # arrays in memory and those of a kernel, whichever came first.
     @wp.func
     def coordinate_of(polygon: wp.array[one], corner: int, end: int, axis: int):
@@ -262,7 +262,7 @@ def stages_kernel(limbs):
     return compute
 
 
-def expected_stages(kind, corners, axes):
+def expected_phases(kind, corners, axes):
     """The same in Python's integers, from corners of shape (n, 4, 2, 3): lists by stage of arrays by query."""
 
     def multiply(f, g):
@@ -336,12 +336,12 @@ def test_no_number_exceeds_its_bound(kind, limbs):
     shapes = [(24, one), (4, two), (3, two), (9, four), (3, eight)]
     outputs = [wp.zeros(n, dtype=int), *(wp.zeros((n, count), dtype=number) for count, number in shapes)]
     inputs = [int(kind == "edge_edge"), wp.array(points, dtype=wp.vec3d)]
-    wp.launch(stages_kernel(limbs), n, inputs=inputs, outputs=outputs)
+    wp.launch(phases_kernel(limbs), n, inputs=inputs, outputs=outputs)
     found = [to_integers(a.numpy().reshape(n, count, -1)) for a, (count, _) in zip(outputs[1:], shapes, strict=True)]
     corners = found[0].reshape(n, 4, 2, 3)
     width = np.vectorize(lambda x: abs(int(x)).bit_length(), otypes=[int])
     assert (width(found[0]).max(axis=1) <= bits).all()
-    expected = expected_stages(kind, corners, np.arange(n) % 3)
+    expected = expected_phases(kind, corners, np.arange(n) % 3)
     closest = []
     for computed, truth, bound in zip(found[1:], expected, zip(*map(bounds, bits), strict=True), strict=True):
         assert np.array_equal(computed.T, truth)

@@ -6,38 +6,13 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from newton_scenes import Still, add_square
 
 import warp_bsc as bsc
 from warp_bsc.response.adjoint.adjoint import RecordedStep, StepAdjoint
 
 DT = 0.01
-
-
-class Still(newton.solvers.SolverBase):
-    """An inner solver that does nothing: states at the end are given."""
-
-    def step(self, state_in, state_out, control, contacts, dt):
-        pass
-
-
-def add_square(builder, n, cell, at, axis, angle):
-    """A square patch of cloth, centred, turned about an axis."""
-    rotation = wp.quat_from_axis_angle(wp.normalize(wp.vec3(*axis)), angle)
-    builder.add_cloth_grid(
-        pos=wp.vec3(*at) + wp.quat_rotate(rotation, wp.vec3(-0.5 * n * cell, -0.5 * n * cell, 0.0)),
-        rot=rotation,
-        vel=wp.vec3(),
-        dim_x=n,
-        dim_y=n,
-        cell_x=cell,
-        cell_y=cell,
-        mass=0.001,
-        tri_ke=50.0,
-        tri_ka=50.0,
-        tri_kd=5e-2,
-        edge_ke=1e-2,
-        edge_kd=1e-3,
-    )
+SOFT = {"tri_ke": 50.0, "tri_ka": 50.0, "tri_kd": 5e-2, "edge_ke": 1e-2, "edge_kd": 1e-3}
 
 
 def add_triangles(builder, vertices):
@@ -300,7 +275,7 @@ class Push:
 
     def __init__(self, device, *, contact_layer):
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        add_square(builder, 2, 0.03, (0.0, 0.0, 0.04), (0.6190, -0.7751, 0.1268), 0.5911)
+        add_square(builder, 2, 0.03, (0.0, 0.0, 0.04), (0.6190, -0.7751, 0.1268), 0.5911, **SOFT)
         poses = [
             wp.transform(wp.vec3(*at), wp.quat_from_axis_angle(wp.normalize(wp.vec3(*axis)), angle))
             for at, axis, angle in (

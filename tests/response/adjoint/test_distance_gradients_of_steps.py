@@ -4,7 +4,8 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from test_solver_gradients import Still, crossing_triangles, on_the_ground, vertex_in_face
+from newton_scenes import Still
+from test_solver_gradients import crossing_triangles, on_the_ground, vertex_in_face
 
 import warp_bsc as bsc
 

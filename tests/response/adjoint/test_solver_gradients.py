@@ -8,6 +8,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
+from newton_scenes import Still, add_square
 
 import warp_bsc as bsc
 from warp_bsc.response.adjoint.adjoint import RecordedStep, StepAdjoint
@@ -35,33 +36,15 @@ def add_to_centre(particle_q: wp.array[wp.vec3], thrown: int, direction: wp.vec3
     wp.atomic_add(centre, 0, wp.dot(particle_q[wp.tid()], direction) / float(thrown))
 
 
-def add_square(builder, n, cell, at, axis, angle, **options):
-    """A square patch of cloth, centred, turned about an axis."""
-    rotation = wp.quat_from_axis_angle(wp.normalize(wp.vec3(*axis)), angle)
-    corner = wp.vec3(*at) + wp.quat_rotate(rotation, wp.vec3(-0.5 * n * cell, -0.5 * n * cell, 0.0))
-    builder.add_cloth_grid(
-        pos=corner,
-        rot=rotation,
-        vel=wp.vec3(),
-        dim_x=n,
-        dim_y=n,
-        cell_x=cell,
-        cell_y=cell,
-        mass=0.001,
-        **options,
-        **SOFT,
-    )
-
-
 class Throw:
     """A small patch of cloth is thrown at a tilted sheet that is held."""
 
     def __init__(self, device, *, steps=STEPS, projections=40, requires_grad=True, **options):
         builder = newton.ModelBuilder()
-        add_square(builder, 2, 0.03, (0.25, 0.0, -0.0025), (0.6190, -0.7751, 0.1268), 0.5911)
+        add_square(builder, 2, 0.03, (0.25, 0.0, -0.0025), (0.6190, -0.7751, 0.1268), 0.5911, **SOFT)
         self.thrown = builder.particle_count
         held = dict.fromkeys(["fix_left", "fix_right", "fix_top", "fix_bottom"], True)
-        add_square(builder, 1, 1.0, (0.0, 0.0, 0.0), (1.0, 0.4, 0.0), 0.25, **held)
+        add_square(builder, 1, 1.0, (0.0, 0.0, 0.0), (1.0, 0.4, 0.0), 0.25, **held, **SOFT)
         self.model = model = builder.finalize(device=device, requires_grad=requires_grad)
         model.particle_ke = model.particle_kd = model.particle_kf = 0.0
         model.particle_grid = None
@@ -164,13 +147,6 @@ def on_the_ground():
     start = [(0.0, 0.0, 0.02), (1.0, 0.1, 0.06), (0.2, 0.9, 0.04)]
     wanted = np.array(start) + np.array([(0.03, 0.01, -0.05), (0.02, 0.02, -0.04), (0.03, 0.0, -0.07)])
     return [*range(3)], start, wanted
-
-
-class Still(newton.solvers.SolverBase):
-    """An inner solver that does nothing: states at the end are given."""
-
-    def step(self, state_in, state_out, control, contacts, dt):
-        pass
 
 
 @pytest.mark.parametrize("projections", [40, 0])

@@ -138,3 +138,24 @@ def test_reset_worlds_start_anew(device):
         rollout.step(1.0 / RATE)
     atol = 1e-6 if device.is_cuda else 0.0
     np.testing.assert_allclose(rollout.positions, first.positions, rtol=0.0, atol=atol)
+
+
+@pytest.mark.parametrize("by_reset", [False, True])
+def test_cloth_that_starts_in_a_solid_is_not_pushed(by_reset, device):
+    """Springs sweep no plane through it: not to where the model has the plane, and not to where a reset puts it."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
+    SolverStyle3D.register_custom_attributes(builder)
+    place = wp.transform(wp.vec3(0.0, 0.0, 0.2 - by_reset), wp.quat_identity())
+    body = builder.add_body(xform=place, is_kinematic=True)
+    builder.add_shape_plane(plane=(0.0, 0.0, 1.0, 0.0), body=body, width=0.0, length=0.0)
+    add_sheet(builder, 4, 0.1)
+    model = builder.finalize(device=device)
+    rollout = Rollout(model, bsc.SolverCCD(SolverStyle3D(model)))
+    if by_reset:
+        rollout.step(1.0 / RATE)
+        for state in rollout.states:
+            state.body_q.assign(np.array([[0.0, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0]], dtype=np.float32))
+        rollout.solver.reset(rollout.states[0])
+    rollout.step(1.0 / RATE)
+    assert rollout.solver.report.excluded == 25
+    np.testing.assert_allclose(rollout.positions, model.particle_q.numpy(), rtol=0.0, atol=1e-6)

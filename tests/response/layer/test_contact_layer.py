@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton.solvers.experimental.coupled import CouplingInterface
-from newton_scenes import Rollout
+from newton_scenes import Rollout, Still, add_square
 
 import warp_bsc as bsc
 from warp_bsc.response.tuning import START_DEPTH
@@ -35,23 +35,6 @@ def add_to_centre(particle_q: wp.array[wp.vec3], thrown: int, per_world: int, ce
     particle = wp.tid()
     if particle % per_world < thrown:
         wp.atomic_add(centre, particle / per_world, particle_q[particle] / float(thrown))
-
-
-def add_square(builder, cells, cell, at, axis=(1.0, 0.0, 0.0), angle=0.0, velocity=(0.0, 0.0, 0.0), **options):
-    """A square patch of cloth, centred, turned about an axis."""
-    rotation = wp.quat_from_axis_angle(wp.normalize(wp.vec3(*axis)), angle)
-    corner = wp.vec3(*at) + wp.quat_rotate(rotation, wp.vec3(-0.5 * cells * cell, -0.5 * cells * cell, 0.0))
-    builder.add_cloth_grid(
-        pos=corner,
-        rot=rotation,
-        vel=wp.vec3(*velocity),
-        dim_x=cells,
-        dim_y=cells,
-        cell_x=cell,
-        cell_y=cell,
-        mass=0.001,
-        **options,
-    )
 
 
 def semi_implicit(model):
@@ -274,13 +257,6 @@ def test_particles_outside_of_the_layer_keep_every_bit(device):
             rollout.step(DT)
         ends.append([x.numpy() for x in (rollout.states[0].particle_q, rollout.states[0].particle_qd)])
     np.testing.assert_array_equal(*ends)
-
-
-class Still(newton.solvers.SolverBase):
-    """An inner solver that does nothing: states at the end are given."""
-
-    def step(self, state_in, state_out, control, contacts, dt):
-        pass
 
 
 @pytest.mark.parametrize("restitution", [0.1, 0.6])

@@ -2,7 +2,7 @@
 
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
-from stages import FALLING, HIT, add_floor, add_mesh, find, hits, moved, new_stage, save
+from usd_stages import FALLING, HIT, add_floor, add_mesh, find, hits, moved, new_stage, save
 
 from warp_bsc.usd.scene import Scene
 

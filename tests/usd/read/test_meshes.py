@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Ts, Usd, UsdGeom, UsdSkel, UsdUtils
-from stages import (
+from usd_stages import (
     FALLING,
     FLOOR,
     HIT,

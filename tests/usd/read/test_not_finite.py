@@ -4,7 +4,7 @@ import math
 
 import pytest
 from pxr import Gf, UsdGeom, UsdSkel
-from stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
+from usd_stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
 
 from warp_bsc.usd import scene as scene_module
 from warp_bsc.usd.frames import FrameRange

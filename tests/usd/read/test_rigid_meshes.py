@@ -2,7 +2,7 @@
 
 import pytest
 from pxr import Gf, UsdGeom
-from stages import FALLING, add_floor, add_mesh, animate, falling, new_stage, save
+from usd_stages import FALLING, add_floor, add_mesh, animate, falling, new_stage, save
 
 import warp_bsc as bsc
 

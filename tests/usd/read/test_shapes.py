@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import UsdGeom
-from stages import FALLING, add_falling, add_mesh, animate, find, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_mesh, animate, find, moved, new_stage, save
 
 import warp_bsc as bsc
 

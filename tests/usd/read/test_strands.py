@@ -9,7 +9,7 @@ from boxes import CORNERS, SIDES
 from chromium import CHROMIUM, Browser
 from pxr import Usd, UsdGeom
 from replay_files import Page, add_up, prims_of_pairs
-from stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
+from usd_stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc import checker

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pxr import Ar, Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 from replay_files import Page
-from stages import (
+from usd_stages import (
     FALLING,
     HIT,
     add_falling,

@@ -13,7 +13,7 @@ import warp as wp
 from ..._arguments import checked_integer
 from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
-from ...detection.results.collisions import DetectionStats, StageCounts
+from ...detection.results.collisions import DetectionStats, PhaseCounts
 from ...detection.run.settings import Method
 from ..peers.ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
 from ..record import name_place, shorten_path
@@ -27,8 +27,8 @@ __all__ = [
     "DetectorBenchmark",
     "benchmark_detector",
     "ipc_milliseconds",
+    "phase_columns",
     "show",
-    "stage_columns",
     "to_dict",
 ]
 
@@ -77,8 +77,8 @@ class DetectorBenchmark:
     Attributes:
         scene: The scene.
         precision: Bits of a coordinate, 32 or 64.
-        vertex_face: Number of vertex-face pairs that entered or left each stage.
-        edge_edge: Number of edge-edge pairs that entered or left each stage.
+        vertex_face: Number of vertex-face pairs that entered or left each phase.
+        edge_edge: Number of edge-edge pairs that entered or left each phase.
         hits: Number of pairs that the method reports.
         earliest_toi: The earliest time of impact, 2.0 if there is none.
         certified: Whether no collision can be missing.
@@ -86,15 +86,15 @@ class DetectorBenchmark:
             host if the host decides pairs that are too wide for the device.
         read_milliseconds: Median time from positions on the device to results on the host [ms].
         graph_milliseconds: Median time of a replay as a CUDA graph [ms], None on the CPU.
-        stage_milliseconds: Median time by stage [ms].
+        stage_milliseconds: Median time by phase [ms].
         memory: Device memory of mesh and detector, queues included [bytes], None where Warp does not count it.
         ipc_toolkit: The IPC Toolkit's measurements, None if it was not measured.
     """
 
     scene: BenchmarkScene
     precision: int
-    vertex_face: StageCounts
-    edge_edge: StageCounts
+    vertex_face: PhaseCounts
+    edge_edge: PhaseCounts
     hits: int
     earliest_toi: float
     certified: bool
@@ -182,7 +182,7 @@ def benchmark_detector(
     memory = wp.get_mempool_used_mem_current(device) - before if counts_memory else None
 
     stats = collisions.stats
-    detect, read, stages = [], [], []
+    detect, read, phases = [], [], []
     for _ in range(repeat):
         wp.synchronize_device(device)
         start = time.perf_counter()
@@ -191,7 +191,7 @@ def benchmark_detector(
         detect.append(1e3 * (time.perf_counter() - start))
         stats = collisions.stats  # reads everything else with it
         read.append(1e3 * (time.perf_counter() - start))
-        stages.append(stats.milliseconds)
+        phases.append(stats.milliseconds)
     return DetectorBenchmark(
         scene=scene,
         precision=8 * scene.x0.itemsize,
@@ -203,7 +203,7 @@ def benchmark_detector(
         detect_milliseconds=statistics.median(detect),
         read_milliseconds=statistics.median(read),
         graph_milliseconds=_replay_detection(detector, x0, x1, stats) if device.is_cuda else None,
-        stage_milliseconds={stage: statistics.median(run[stage] for run in stages) for stage in stages[0]},
+        stage_milliseconds={phase: statistics.median(run[phase] for run in phases) for phase in phases[0]},
         memory=memory,
         ipc_toolkit=benchmark_ipc_toolkit(scene, mesh.edges, repeat=repeat) if compare else None,
     )
@@ -227,9 +227,9 @@ def ipc_milliseconds(took: dict[str, Any]) -> float:
     return took["build_milliseconds"] + took["step_milliseconds"]
 
 
-def stage_columns(stages: Iterable[str], key: str) -> list[Column]:
-    """Returns columns of the times of the stages of detections, which a row has at a key."""
-    return [Column("\n".join(stage.rsplit(" ", 1)), f"{key}.{stage}", ",.2f", title=stage) for stage in stages]
+def phase_columns(phases: Iterable[str], key: str) -> list[Column]:
+    """Returns columns of the times of the phases of detections, which a row has at a key."""
+    return [Column("\n".join(phase.rsplit(" ", 1)), f"{key}.{phase}", ",.2f", title=phase) for phase in phases]
 
 
 def to_dict(benchmarks: list[DetectorBenchmark], **settings: Any) -> dict[str, Any]:
@@ -247,9 +247,9 @@ def show(found: dict[str, Any]) -> Iterator[Table | str]:
     caption = "From positions on the device to results on the device, or read on the host."
     yield Table("Milliseconds", _TIMES, rows, caption=caption)
     yield ""
-    stages = dict.fromkeys(stage for scene in scenes for stage in scene["milliseconds"]["stages"])
+    phases = dict.fromkeys(phase for scene in scenes for phase in scene["milliseconds"]["stages"])
     took = [(name, scene["milliseconds"]) for name, scene in rows]
-    yield Table("Milliseconds by stage", stage_columns(stages, "stages"), took)
+    yield Table("Milliseconds by phase", phase_columns(phases, "stages"), took)
     if other := scenes[0]["ipc_toolkit"] if scenes else None:
         yield ""
         caption = f"Milliseconds on {count(other['threads'], 'core')}; it finds only the earliest time of impact."

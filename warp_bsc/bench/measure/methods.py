@@ -17,7 +17,7 @@ the two features meet. They differ as follows:
 
 No method finds times of impact, and none checks whether positions are finite, which the detector does once a vertex.
 
-The stage that decides a query and its clock cycles come from a kernel of its own, which is never timed: see
+The phase that decides a query and its clock cycles come from a kernel of its own, which is never timed: see
 :func:`trace`.
 """
 
@@ -31,9 +31,9 @@ from ...detection.narrow.narrow_phase import NarrowPhase
 from ...detection.narrow.rules.contact import run_contacts
 from ...detection.queries.query_points import query_points
 from ...detection.run.launch import launch_over, launch_over_queue, retry_until_fits
+from ...detection.run.phase_timer import PhaseTimer
 from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
 from ...detection.run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, PairCounts, PairKind
-from ...detection.run.stage_timer import StageTimer
 from ...kernels.bits import lowest_bit
 from ...kernels.classification import classify
 from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
@@ -46,16 +46,16 @@ from ...kernels.time_of_impact import impact
 from ..peers.baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
 from ..timing import median_milliseconds
 
-__all__ = ["METHODS", "STAGES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace"]
+__all__ = ["METHODS", "PHASES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace"]
 
 METHODS: tuple[str, ...] = (*NARROW_PHASE_METHODS, "cubic", "reduced")
 """The methods that are compared."""
 
-STAGES = ("axis boxes", "Bernstein signs", "separating direction", "classification", "subdivision", "exact")
-"""The stages that decide queries, in the order of the culls on a CPU."""
+PHASES = ("axis boxes", "Bernstein signs", "separating direction", "classification", "subdivision", "exact")
+"""The phases that decide queries, in the order of the culls on a CPU."""
 
 _AXIS_BOXES, _BERNSTEIN_SIGNS, _SEPARATING_DIRECTION, _CLASSIFICATION, _SUBDIVISION, _EXACT = (
-    wp.constant(stage) for stage in range(len(STAGES))
+    wp.constant(phase) for phase in range(len(PHASES))
 )
 
 _WARP_SIZE = 32
@@ -189,7 +189,7 @@ def _kernels(kind: PairKind, dtype: type):
         reduced: bool,
         roundoff: wp.float64,
         # out
-        stage: wp.array[wp.int8],
+        phase: wp.array[wp.int8],
         cycles: wp.array[wp.int64],
     ):
         i = (first + wp.tid()) // lanes
@@ -198,7 +198,7 @@ def _kernels(kind: PairKind, dtype: type):
         a1, b1, c1, d1 = read(x1, elements, pairs[i])
         decided = _AXIS_BOXES
         if solves_cubic:
-            # any stage: only the time counts, and the status must be computed
+            # any phase: only the time counts, and the status must be computed
             decided = wp.int32(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
         elif not boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1):
             motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
@@ -215,7 +215,7 @@ def _kernels(kind: PairKind, dtype: type):
                 decided = _SUBDIVISION
             else:
                 decided = _EXACT
-        stage[i] = wp.int8(decided)
+        phase[i] = wp.int8(decided)
         cycles[i] = _clock() - start
 
     return cubic, cull, cull_batches, classify_survivors, trace
@@ -317,7 +317,7 @@ class MethodRun:
             wp.copy(self._counts, self._start_counts)
             x0, x1, elements = arrays[:3]
             phases = [(self._narrow_phase, elements)]
-            run_contacts(phases, x0, x1, method=self.method, timed=False, timer=StageTimer(None))
+            run_contacts(phases, x0, x1, method=self.method, timed=False, timer=PhaseTimer(None))
             return
         cubic, cull, cull_batches, classify_survivors, _ = _kernels(queries.kind, queries.dtype)
         if self.method == "cubic":
@@ -369,25 +369,25 @@ def measure_nanoseconds(run: MethodRun, *, repeat: int) -> float:
 
 
 def trace(queries: QuerySet, method: str) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the stage that decides each query, and the clock cycles that the query takes up to there.
+    """Finds the phase that decides each query, and the clock cycles that the query takes up to there.
 
-    One kernel runs all stages of a query one after the other, without the queues and vector instructions of the narrow
+    One kernel runs all phases of a query one after the other, without the queues and vector instructions of the narrow
     phase and without exact arithmetic. Cycles therefore rank queries; they do not measure a method. On a GPU each query
     has a warp of its own, because lanes of a warp wait for each other.
 
     Args:
         queries: The queries.
-        method: One of :data:`METHODS`. The stages of "cubic" have no meaning.
+        method: One of :data:`METHODS`. The phases of "cubic" have no meaning.
 
     Returns:
-        Indices into :data:`STAGES`, int8, shape [n]; cycles, int64, shape [n].
+        Indices into :data:`PHASES`, int8, shape [n]; cycles, int64, shape [n].
     """
     n, device = queries.count, queries.device
-    stage = wp.empty(n, dtype=wp.int8, device=device)
+    phase = wp.empty(n, dtype=wp.int8, device=device)
     cycles = wp.empty(n, dtype=wp.int64, device=device)
     lanes = _WARP_SIZE if device.is_cuda else 1
     roundoff = 0.0 if method in ("float", "reduced") else ROUNDOFF
     inputs = [*queries.arrays, lanes, method == "cubic", method == "reduced", roundoff]
     *_, kernel = _kernels(queries.kind, queries.dtype)
-    launch_over(kernel, lanes * n, inputs=inputs, outputs=[stage, cycles], device=device)
-    return stage.numpy().copy(), cycles.numpy().copy()
+    launch_over(kernel, lanes * n, inputs=inputs, outputs=[phase, cycles], device=device)
+    return phase.numpy().copy(), cycles.numpy().copy()

@@ -26,7 +26,7 @@ from ..record import shorten_path
 from ..scenes.detector import BenchmarkScene, find_overlapping
 from ..timing import count_threads
 from .detector import benchmark_detector
-from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
+from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 from .worst_case import WorstQuery, adversarial_queries, find_worst
 
 __all__ = [
@@ -151,9 +151,9 @@ class SceneBenchmark:
         sample: Number of checked queries that no method calls a collision.
         errors: Errors by method.
         disagreeing: Number of results of a method that differ between devices, which should be 0.
-        stages: Number of queries that each of :data:`STAGES` decides.
+        decided_by: Number of queries that each of :data:`PHASES` decides.
         timings: Times by place.
-        stage_milliseconds: Mean time of a detection with method "exact" by stage, on the last place's device [ms].
+        stage_milliseconds: Mean time of a detection with method "exact" by phase, on the last place's device [ms].
         frame_milliseconds: Mean time of a detection with method "exact" [ms].
         ipc_toolkit: Measurements of the IPC Toolkit by method; empty if it was not measured.
     """
@@ -170,7 +170,7 @@ class SceneBenchmark:
     sample: int
     errors: dict[str, Errors]
     disagreeing: int
-    stages: dict[str, int]
+    decided_by: dict[str, int]
     timings: list[Timing]
     stage_milliseconds: dict[str, float]
     frame_milliseconds: float
@@ -178,7 +178,7 @@ class SceneBenchmark:
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the measurements as plain data for JSON."""
-        values = vars(self) | {
+        return vars(self) | {
             "scene": shorten_path(self.name),
             "name": ",".join(
                 Path(path).stem if "/" in path or path.endswith(".usd") else path for path in self.name.split(",")
@@ -188,8 +188,6 @@ class SceneBenchmark:
             "timings": [timing.to_dict() for timing in self.timings],
             "ipc_toolkit": {method: asdict(took) for method, took in self.ipc_toolkit.items()},
         }
-        values["decided_by"] = values.pop("stages")
-        return values
 
 
 def to_dict(
@@ -254,9 +252,9 @@ def benchmark_scene(
     found_hits, unsure, disagreeing = _find_hits(queries, places, progress)
     progress("the truth")
     errors, collisions, checked, sample, truth = _compare(queries, found_hits, effort)
-    stages = np.zeros(len(STAGES), dtype=int)
+    decided_by = np.zeros(len(PHASES), dtype=int)
     for found in queries.values():
-        stages += np.bincount(trace(QuerySet(found, places[-1].device), "exact")[0], minlength=len(STAGES))
+        decided_by += np.bincount(trace(QuerySet(found, places[-1].device), "exact")[0], minlength=len(PHASES))
 
     timings = []
     for place in places:
@@ -265,7 +263,7 @@ def benchmark_scene(
     progress("detections")
     scenes = [scene for _, scene in intervals]
     frames = [benchmark_detector(s, method="exact", device=places[-1].device, repeat=3) for s in scenes]
-    by_stage = [frame.stage_milliseconds for frame in frames]
+    by_phase = [frame.stage_milliseconds for frame in frames]
     compared = {}
     if compare:
         for method in CCD_CLASSES:
@@ -284,9 +282,9 @@ def benchmark_scene(
         sample=sample,
         errors=errors,
         disagreeing=disagreeing,
-        stages=dict(zip(STAGES, stages.tolist(), strict=True)),
+        decided_by=dict(zip(PHASES, decided_by.tolist(), strict=True)),
         timings=timings,
-        stage_milliseconds={stage: float(np.mean([found[stage] for found in by_stage])) for stage in by_stage[0]},
+        stage_milliseconds={phase: float(np.mean([found[phase] for found in by_phase])) for phase in by_phase[0]},
         frame_milliseconds=float(np.mean([frame.detect_milliseconds for frame in frames])),
         ipc_toolkit=compared,
     )

@@ -5,8 +5,8 @@ from typing import Any
 
 from ...detection.run.settings import PairKind
 from ..tables import Column, Table, count
-from .detector import stage_columns
-from .methods import METHODS, STAGES
+from .detector import phase_columns
+from .methods import METHODS, PHASES
 
 __all__ = ["DESCRIPTION", "EXAMPLES", "show"]
 
@@ -15,8 +15,8 @@ Measure the paper's five benchmarks, on the candidate pairs of each scene: the
 mean and the worst time of a query by this project's methods, by a
 floating-point cubic solver, by the paper's own inside tests and, if installed,
 by the IPC Toolkit's methods; the wrong results of each, found by exact
-arithmetic; the stages that decide the queries; and the time of a detection by
-stage. A scene is one of the five by name, or a scene of warp-bsc bench
+arithmetic; the phases that decide the queries; and the time of a detection by
+phase. A scene is one of the five by name, or a scene of warp-bsc bench
 detector. All five together need several minutes, with --quick one or two."""
 
 EXAMPLES = """\
@@ -59,10 +59,10 @@ _QUERIES = (
     Column("Collisions", "collisions"),
     Column("Unsure", "unsure"),
 )
-_STAGE_NAMES = ("Axis\nboxes", "Bern-\nstein", "Direc-\ntion", "Classi-\nfied", "Subdi-\nvided", "\nExact")
+_PHASE_NAMES = ("Axis\nboxes", "Bern-\nstein", "Direc-\ntion", "Classi-\nfied", "Subdi-\nvided", "\nExact")
 _SHARES = [
-    Column(header, lambda scene, stage=stage: scene["decided_by"][stage] / sum(scene["decided_by"].values()), ".2%")
-    for stage, header in zip(STAGES, _STAGE_NAMES, strict=True)
+    Column(header, lambda scene, phase=phase: scene["decided_by"][phase] / sum(scene["decided_by"].values()), ".2%")
+    for phase, header in zip(PHASES, _PHASE_NAMES, strict=True)
 ]
 _TIMES = _method_columns(
     lambda timing, method: timing["nanoseconds"][method],
@@ -115,8 +115,8 @@ def show(found: dict[str, Any]) -> Iterator[Table | str]:
         if scene["disagreeing"]:
             yield f"{name}: {count(scene['disagreeing'], 'result')} depended on the device."
     yield ""
-    stages = dict.fromkeys(stage for _, scene in rows for stage in scene["stage_milliseconds"])
-    frames = [*stage_columns(stages, "stage_milliseconds"), Column("All", "frame_milliseconds", ",.2f")]
+    phases = dict.fromkeys(phase for _, scene in rows for phase in scene["stage_milliseconds"])
+    frames = [*phase_columns(phases, "stage_milliseconds"), Column("All", "frame_milliseconds", ",.2f")]
     place = timings[-1][0][1]["place"]
     yield Table(f"ms a frame, {place}", frames, rows, caption="The detector, with method exact.")
     yield ""

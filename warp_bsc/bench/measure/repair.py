@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 Hint = Literal["none", "order", "x_previous"]
-"""What a repair is told: nothing; which layer is inside which; positions that do not cross."""
+"""What a repair is told: nothing; which sheet is inside which; positions that do not cross."""
 
 HINTS: tuple[Hint, ...] = ("order", "x_previous")
 """The hints with which a mesh is repaired again that was not freed without one."""
@@ -49,7 +49,7 @@ STRAIN = 0.1
 """Strain that :func:`warp_bsc.repair` seeks by default, above which meshes are counted."""
 
 CROSSING_RANGES = ((0, 49), (50, 149), (150, 499), (500, None))
-"""Least and largest numbers of crossings of the groups in which random damage is counted."""
+"""Least and largest numbers of crossings of the ranges in which random damage is counted."""
 
 DESCRIPTION = f"""\
 Measure bsc.repair on known meshes that cross themselves, on mesh files, and on
@@ -126,7 +126,7 @@ class RepairAttempt:
         strain: Largest change of the length of an edge, as a share of its length in the input.
         seconds: Time of a second call with the same arguments, which makes its mesh from faces and has the positions
             on the host [s].
-        reasons: Why crossings are left, each reason once.
+        reasons: Why crossings remain, each reason once.
         toolkit_crosses: Whether the IPC Toolkit finds intersections afterwards; None if it is not installed.
     """
 
@@ -256,8 +256,8 @@ def summarize(runs: Sequence[RepairRun]) -> DamageSummary:
 def _hints(mesh: TangledMesh) -> dict[Hint, dict[str, Any]]:
     """Returns the arguments of a repair for each hint that there is for a mesh."""
     hints: dict[Hint, dict[str, Any]] = {}
-    if (mesh.layer >= 0).any():
-        hints["order"] = {"order": mesh.layer}
+    if (mesh.sheet >= 0).any():
+        hints["order"] = {"order": mesh.sheet}
     if mesh.free is not None:
         hints["x_previous"] = {"x_previous": mesh.free}
     return hints

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from ...detection.run.settings import PairKind
-from .methods import METHODS, STAGES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
+from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 
 __all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
 
@@ -87,14 +87,14 @@ def adversarial_queries(kind: PairKind, count: int, *, seed: int = 0) -> Queries
 
 def _find_suspects(method: str, queries: QuerySet) -> np.ndarray:
     """Returns the indices of the queries that are likely to be the slowest."""
-    stages, cycles = trace(queries, method)
+    phases, cycles = trace(queries, method)
     for _ in range(_LOOKS - 1):
         cycles = np.minimum(cycles, trace(queries, method)[1])
     count = min(_SUSPECTS, queries.count)
     suspects = np.argpartition(cycles, -count)[-count:]
     if method == "exact":
         # the trace has no exact arithmetic
-        left_to_exact = np.flatnonzero(stages == STAGES.index("exact"))
+        left_to_exact = np.flatnonzero(phases == PHASES.index("exact"))
         suspects = np.concatenate([suspects, np.random.default_rng(0).permutation(left_to_exact)[:count]])
     return suspects
 

@@ -1,7 +1,7 @@
 """Runs the scenes of ``warp-bsc bench penetration`` with libuipc, a library of Incremental Potential Contact on CUDA.
 
 Its configuration is the default one but for the step, gravity and the distance at which contact begins: by default
-1 cm, as wide as the thickness of ten layers of cloth here.
+1 cm, as wide as the thickness of ten sheets of cloth here.
 """
 
 import tempfile

@@ -22,14 +22,14 @@ class TangledMesh:
         free: Positions that do not cross, such as those before the damage, float64, shape [vertex_count, 3]; None if
             there are none.
         fixed: Vertices that must stay, bool, shape [vertex_count].
-        layer: Layer of each vertex from inside to outside, -1 for none, int, shape [vertex_count].
+        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [vertex_count].
     """
 
     faces: np.ndarray
     x: np.ndarray
     free: np.ndarray | None
     fixed: np.ndarray
-    layer: np.ndarray
+    sheet: np.ndarray
 
 
 _Surface = tuple[np.ndarray, np.ndarray]
@@ -51,8 +51,8 @@ def _joined(*surfaces: _Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the positions and faces of all surfaces, and the number of the surface of each vertex."""
     counts = np.cumsum([0] + [len(x) for x, _ in surfaces])
     faces = np.concatenate([faces + first for first, (_, faces) in zip(counts, surfaces, strict=False)])
-    layer = np.repeat(np.arange(len(surfaces)), np.diff(counts))
-    return np.concatenate([x for x, _ in surfaces]), faces, layer
+    sheet = np.repeat(np.arange(len(surfaces)), np.diff(counts))
+    return np.concatenate([x for x, _ in surfaces]), faces, sheet
 
 
 def _tube(centre: Callable[[np.ndarray], np.ndarray], radius: Callable, n: int, m: int) -> _Surface:
@@ -126,23 +126,23 @@ def _garment_scene(rng: np.random.Generator):
         return np.stack([2.0 * (0.1 + 0.8 * u), r * np.cos(angle), r * np.sin(angle)], -1)
 
     body = _tube(centre, lambda u: 0.3 * _rounded(u) * (1 + 0.15 * np.sin(7 * u)), 60, 50)
-    x, faces, layer = _joined(body, _grid(56, 64, sleeve, closed=True))
-    return faces, x, layer == 0, layer
+    x, faces, sheet = _joined(body, _grid(56, 64, sleeve, closed=True))
+    return faces, x, sheet == 0, sheet
 
 
 def _stack_scene(rng: np.random.Generator):
     n = int(rng.integers(3, 6))
     phase = rng.uniform(0, 6, 2)
 
-    def sheet(k):
+    def wave(k):
         def place(u, v):
             z = 0.04 * np.sin(5 * u + phase[0]) * np.cos(4 * v + phase[1]) + 0.025 * k
             return np.stack([u + 0.003 * k, v + 0.002 * k, z], -1)
 
         return _grid(32, 32, place)
 
-    x, faces, layer = _joined(*(sheet(k) for k in range(n)))
-    return faces, x, np.zeros(len(x), bool), layer
+    x, faces, sheet = _joined(*(wave(k) for k in range(n)))
+    return faces, x, np.zeros(len(x), bool), sheet
 
 
 def _fold_scene(rng: np.random.Generator):
@@ -171,7 +171,7 @@ KINDS = {
     "folds": _fold_scene,
     "soft bodies": _soft_scene,
 }
-"""Kinds of random damage: each makes faces, free positions, fixed vertices and layers."""
+"""Kinds of random damage: each makes faces, free positions, fixed vertices and sheets."""
 
 
 def damaged(kind: str, seed: int) -> TangledMesh:
@@ -185,7 +185,7 @@ def damaged(kind: str, seed: int) -> TangledMesh:
         seed: Number that the damage depends on, at least 0.
     """
     rng = np.random.default_rng([list(KINDS).index(kind), seed])
-    faces, free, fixed, layer = KINDS[kind](rng)
+    faces, free, fixed, sheet = KINDS[kind](rng)
     mesh = CollisionMesh(faces, len(free), device="cpu")
     finder = IntersectionFinder(mesh)
     if len(finder.find(free).pairs):
@@ -197,7 +197,7 @@ def damaged(kind: str, seed: int) -> TangledMesh:
         x = free.copy()
         for _ in range(rng.integers(1, 5)):
             x += _bump(rng, mesh, x, edge, np.flatnonzero(~fixed))
-    return TangledMesh(faces, x, free, fixed, layer)
+    return TangledMesh(faces, x, free, fixed, sheet)
 
 
 def _bump(rng: np.random.Generator, mesh: CollisionMesh, x: np.ndarray, edge: float, movable: np.ndarray) -> np.ndarray:
@@ -222,19 +222,19 @@ def _sheets() -> TangledMesh:
     waves = _grid(
         40, 40, lambda u, v: np.stack([u + 0.011, v + 0.007, 0.03 * np.sin(7 * u) * np.cos(5 * v) + 0.01], -1)
     )
-    return _of_layers(flat, waves, np.array([0.0, 0.0, 0.1]))
+    return _of_sheets(flat, waves, np.array([0.0, 0.0, 0.1]))
 
 
 def _corner() -> TangledMesh:
     flat = _grid(40, 40, lambda u, v: np.stack([u, v, 0 * u], -1))
     slope = _grid(40, 40, lambda u, v: np.stack([u + 0.013, v + 0.0071, 0.3 * (u - 0.7) + 0.0003], -1))
-    return _of_layers(flat, slope, np.array([0.0, 0.0, 0.3]))
+    return _of_sheets(flat, slope, np.array([0.0, 0.0, 0.3]))
 
 
-def _of_layers(lower: _Surface, upper: _Surface, lift: np.ndarray) -> TangledMesh:
-    """Returns two layers, of which the upper one is free after it is lifted."""
-    x, faces, layer = _joined(lower, upper)
-    return TangledMesh(faces, x, x + (layer == 1)[:, None] * lift, np.zeros(len(x), bool), layer)
+def _of_sheets(lower: _Surface, upper: _Surface, lift: np.ndarray) -> TangledMesh:
+    """Returns two sheets, of which the upper one is free after it is lifted."""
+    x, faces, sheet = _joined(lower, upper)
+    return TangledMesh(faces, x, x + (sheet == 1)[:, None] * lift, np.zeros(len(x), bool), sheet)
 
 
 def _folded() -> TangledMesh:

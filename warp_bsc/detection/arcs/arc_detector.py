@@ -7,8 +7,8 @@ from ..narrow.contact_buffer import ContactRows, contacts_from_host
 from ..pipeline import DetectionPipeline
 from ..results.collision_finder import CollisionFinder
 from ..results.collisions import CapturedCollisions, Collisions
+from ..run.phase_timer import PhaseTimer, PhaseTimers
 from ..run.settings import add_counts
-from ..run.stage_timer import StageTimer, StageTimers
 from .arc_pipeline import LARGEST_TURN, ArcPipeline
 from .arc_search import ArcSearch, join_contacts, straight_mesh
 from .rigid_motion import ArcBounds, RigidMotion
@@ -66,11 +66,11 @@ class ArcDetector:
                 others = CollisionFinder(apart, self._straight.broad_phase.lock)
             self._by_parts = ArcSearch(self._straight, body, **self._distances), others
         search, others = self._by_parts
-        timer = StageTimer(mesh.device)
+        timer = PhaseTimer(mesh.device)
         contacts, counts = search.find(bounds, x0, changed, timer)
         if others is not None:
             found = others.find(x0, x1, changed=changed)
-            timer = StageTimers(timer, found._timer)
+            timer = PhaseTimers(timer, found._timer)
             for kind, rows in found._rows.items():
                 contacts[kind] = join_contacts([contacts[kind], rows.read()])
             counts = add_counts(counts, found._counts.without_filtered())

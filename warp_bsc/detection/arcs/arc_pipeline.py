@@ -80,7 +80,7 @@ class ArcPipeline:
     def set_motion(self, bounds: ArcBounds) -> None:
         """Copies centres, turns, tolerance and rigid bodies of a motion of the same bodies to the device."""
         self.bounds = bounds
-        self._arcs.group.assign(bounds.body)
+        self._arcs.rigid_id.assign(bounds.body)
         self._arcs.centre.assign(bounds.motion.centre)
         self._arcs.turn.assign(bounds.motion.turn)
         self._arcs.tolerance = bounds.tolerance

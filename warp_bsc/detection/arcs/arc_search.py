@@ -18,8 +18,8 @@ from ..narrow.contact_buffer import HostContacts, empty_contacts, read_contacts
 from ..narrow.on_host import pair_distances
 from ..pipeline import DetectionPipeline
 from ..run.launch import retry_until_fits
+from ..run.phase_timer import PhaseTimer
 from ..run.settings import Counts, DistanceKind, add_counts
-from ..run.stage_timer import StageTimer
 from .rigid_motion import ArcBounds
 
 __all__ = ["ArcSearch", "join_contacts", "straight_mesh"]
@@ -78,7 +78,7 @@ class ArcSearch:
         self._elements = {DistanceKind(n.kind): mesh.elements(n.kind) for n in self._pipeline.narrow_phases}
 
     def find(
-        self, bounds: ArcBounds, x0: wp.array, changed: wp.array | None, timer: StageTimer
+        self, bounds: ArcBounds, x0: wp.array, changed: wp.array | None, timer: PhaseTimer
     ) -> tuple[dict[DistanceKind, HostContacts], Counts]:
         """Returns the contacts of each kind of pair, the first of each pair, and the counts of all parts together.
 
@@ -86,7 +86,7 @@ class ArcSearch:
             bounds: The motion, and how far it is from its chords.
             x0: Positions at the start, Warp array of vec3 or vec3d.
             changed: Nonzero for each vertex of interest, Warp array of int; None for all.
-            timer: Measures the stages.
+            timer: Measures the phases.
         """
         self._bounds, self._changed, self._timer = bounds, changed, timer
         self._pipeline.set_bodies(bounds.body)
@@ -147,7 +147,7 @@ class ArcSearch:
         pairs = {kind.label: dataclasses.replace(counts, for_exact=0) for kind, counts in pipeline.counts.pairs.items()}
         counts = dataclasses.replace(pipeline.counts, **pairs)
         self._counts = counts if self._counts is None else add_counts(self._counts, counts)
-        with timer.stage("sort"):
+        with timer.phase("sort"):
             return {
                 DistanceKind(phase.kind): read_contacts(
                     phase.contacts, int(pipeline.counts.pairs[DistanceKind(phase.kind)].contacts)

@@ -281,7 +281,7 @@ def enclosing_boxes(
 ) -> np.ndarray:
     """Returns the pairs of an inner box and an outer one that contains it, borders included.
 
-    Outer boxes are grouped by size. For each group, a grid holds the boxes by their lowest corners; its cells are as
+    Outer boxes are in classes by size. For each class, a grid holds the boxes by their lowest corners; its cells are as
     large as the outer boxes, so that an outer box is in the cell of the inner box or in the one before along some axes.
 
     Args:
@@ -305,11 +305,11 @@ def enclosing_boxes(
     corner = np.minimum(starts.min(axis=0), outer_starts.min(axis=0))
     extent = np.maximum(starts.max(axis=0), outer_starts.max(axis=0)) - corner
     smallest = max(float(extent.max()) * 2.0**-20, float(np.finfo(np.float64).tiny))  # cells fit into 21 bits
-    group = np.ceil(np.log2(np.maximum(sizes / smallest, 1.0)))
+    size_class = np.ceil(np.log2(np.maximum(sizes / smallest, 1.0)))
     weights = np.array([1 << 42, 1 << 21, 1])[:axes]
-    for number in np.unique(group):
+    for number in np.unique(size_class):
         cell = smallest * 2.0**number * (1.0 + 1e-6)  # cells are numbered with rounding
-        (members,) = np.nonzero(group == number)
+        (members,) = np.nonzero(size_class == number)
         keys = (np.floor((outer_starts[members] - corner) / cell).astype(np.int64) + 1) @ weights
         order = np.argsort(keys, kind="stable")
         keys, members = keys[order], near[members[order]]

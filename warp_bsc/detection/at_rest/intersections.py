@@ -114,7 +114,7 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
 def _decided(
     mesh: CollisionMesh, x: wp.array, edges: wp.array, across: wp.array, pairs: wp.array, status: wp.array, count: int
 ) -> np.ndarray:
-    """Returns the status of pairs after the exact stage, UNSURE only where exponents are too far apart for it.
+    """Returns the status of pairs after the exact phase, UNSURE only where exponents are too far apart for it.
 
     Args:
         mesh: The mesh.

@@ -15,7 +15,7 @@ from ...kernels.pipeline.queues import is_filled, take_slot
 from ...kernels.polynomials import EDGE_EDGE, VERTEX_FACE
 from ..broad.broad_phase import make_broad_phase
 from ..mesh import CollisionMesh
-from ..narrow.exact_stage import are_within_distance
+from ..narrow.exact_phase import are_within_distance
 from ..narrow.on_host import pair_distances
 from ..narrow.rings import Rings, are_within_rings, make_rings
 from ..queries.query_points import mesh_of_rows

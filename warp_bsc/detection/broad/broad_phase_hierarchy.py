@@ -11,7 +11,7 @@ from ..mesh import CollisionMesh
 from ..run.launch import THREADS_OF_MULTIPROCESSOR, launch
 from ..run.settings import capacity_for
 from .element_pairs import pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
-from .face_hierarchy import box_groups, fit_kernel, group_count, make_hierarchy, traversal_kernel
+from .face_hierarchy import box_bundles, bundle_count, fit_kernel, make_hierarchy, traversal_kernel
 
 __all__ = ["BroadPhaseHierarchy"]
 
@@ -77,7 +77,7 @@ class BroadPhaseHierarchy:
         places = len(mesh.face_order)
         self._fitted = places + (0 if not_finite is None else mesh.vertex_count)
         self._clusters = places // WIDTH
-        self._groups = group_count(places)
+        self._bundles = bundle_count(places)
         self._warps_of_cluster = 1
         if device.is_cuda and self._clusters:
             warps = _WARPS_OF_MULTIPROCESSOR * device.sm_count // self._clusters
@@ -141,9 +141,9 @@ class BroadPhaseHierarchy:
         outputs = [self._not_finite]
         kernel = fit_kernel(x0.dtype, self.is_padded)
         launch(kernel, self._fitted, inputs=inputs, outputs=outputs, device=self._device, record_tape=False)
-        if self._groups:
-            inputs = [self.hierarchy.clusters, self.hierarchy.groups]
-            launch(box_groups, WIDTH * self._groups, inputs=inputs, device=self._device, record_tape=False)
+        if self._bundles:
+            inputs = [self.hierarchy.clusters, self.hierarchy.bundles]
+            launch(box_bundles, WIDTH * self._bundles, inputs=inputs, device=self._device, record_tape=False)
 
     def traverse(self, kernel: wp.Kernel, arguments: Any) -> None:
         """Launches a kernel of :func:`traversal_kernel` over the hierarchy, whose boxes were fitted, on no tape."""

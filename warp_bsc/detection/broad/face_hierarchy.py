@@ -40,12 +40,12 @@ from ..mesh import CollisionMesh
 from ..run.launch import made_once
 from ..run.settings import NO_GRADIENTS
 
-__all__ = ["FaceHierarchy", "box_groups", "fit_kernel", "group_count", "make_hierarchy", "traversal_kernel"]
+__all__ = ["FaceHierarchy", "box_bundles", "bundle_count", "fit_kernel", "make_hierarchy", "traversal_kernel"]
 
 _WIDTH = wp.constant(WIDTH)
 
-_UNGROUPED = 8
-"""Number of groups up to which all of them are traversed: their boxes would take longer than they save."""
+_FEW_BUNDLES = 8
+"""Number of bundles up to which all of them are traversed: their boxes would take longer than they save."""
 
 
 @wp.struct
@@ -69,7 +69,7 @@ class FaceHierarchy:
         corners: Corners of the face at each place, see :mod:`warp_bsc.kernels.pipeline.corners`.
         places: Level of the faces; where a position is not finite, boxes cover the others.
         clusters: Level above.
-        groups: Highest level; without arrays in a small mesh, where all groups are traversed.
+        bundles: Highest level; without arrays in a small mesh, where all are traversed.
     """
 
     only_free: wp.bool
@@ -85,7 +85,7 @@ class FaceHierarchy:
     corners: wp.array2d[wp.float32]
     places: HierarchyLevel
     clusters: HierarchyLevel
-    groups: HierarchyLevel
+    bundles: HierarchyLevel
 
 
 @wp.func
@@ -189,20 +189,20 @@ def fit_kernel(dtype: type, padded: bool) -> wp.Kernel:
 
 
 @wp.kernel(**NO_GRADIENTS)
-def box_groups(
+def box_bundles(
     # in
     clusters: HierarchyLevel,
     # out
-    groups: HierarchyLevel,
+    bundles: HierarchyLevel,
 ):
-    """Boxes the groups of clusters."""
+    """Boxes the bundles."""
     i = wp.tid()
     box = empty_box()
     has_changed = int(0)
     if i < clusters.boxes.shape[0]:
         box = read_box(clusters.boxes, i)
         has_changed = clusters.changed[i]
-    fit_parent(i, box, has_changed, groups)
+    fit_parent(i, box, has_changed, bundles)
 
 
 @made_once
@@ -228,23 +228,23 @@ def traversal_kernel(visit: Callable, arguments_type: type) -> wp.Kernel:
         place = cluster * _WIDTH + i % _WIDTH
         box = read_box(mesh.places.boxes, place)
         cluster_box = read_box(mesh.clusters.boxes, cluster)
-        own_group = cluster / _WIDTH
+        own_bundle = cluster / _WIDTH
         turn = int(0)
         count = (mesh.clusters.boxes.shape[0] - 1) / _WIDTH + 1
-        for first_group in range(own_group, count, _WIDTH):
-            groups = wp.uint32(0)
-            if mesh.groups.boxes:
-                groups = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.groups, first_group)
+        for first_bundle in range(own_bundle, count, _WIDTH):
+            bundles = wp.uint32(0)
+            if mesh.bundles.boxes:
+                bundles = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.bundles, first_bundle)
             else:
-                groups = ~bits_from(count - first_group)
-            while groups != wp.uint32(0):
-                group = first_group + lowest_set_bit(groups)
-                groups = groups & (groups - wp.uint32(1))
-                clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, group * _WIDTH)
-                if group == own_group:
+                bundles = ~bits_from(count - first_bundle)
+            while bundles != wp.uint32(0):
+                bundle = first_bundle + lowest_set_bit(bundles)
+                bundles = bundles & (bundles - wp.uint32(1))
+                clusters = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.clusters, bundle * _WIDTH)
+                if bundle == own_bundle:
                     clusters = clusters & bits_from(cluster % _WIDTH)
                 while clusters != wp.uint32(0):
-                    first = (group * _WIDTH + lowest_set_bit(clusters)) * _WIDTH
+                    first = (bundle * _WIDTH + lowest_set_bit(clusters)) * _WIDTH
                     clusters = clusters & (clusters - wp.uint32(1))
                     if turn % warps_of_cluster == part:
                         faces = unseparated_children(mesh.clusters, cluster, cluster_box, mesh.places, first)
@@ -275,10 +275,10 @@ def _parents(worlds: np.ndarray | None) -> np.ndarray | None:
     return np.stack([first.min(axis=1), last.max(axis=1)])
 
 
-def group_count(places: int) -> int:
-    """Returns the number of groups that have boxes."""
-    groups = -(-places // (WIDTH * WIDTH))
-    return groups if groups > _UNGROUPED else 0
+def bundle_count(places: int) -> int:
+    """Returns the number of bundles that have boxes."""
+    bundles = -(-places // (WIDTH * WIDTH))
+    return bundles if bundles > _FEW_BUNDLES else 0
 
 
 def make_hierarchy(mesh: CollisionMesh, *, padded: bool) -> FaceHierarchy:
@@ -296,10 +296,10 @@ def make_hierarchy(mesh: CollisionMesh, *, padded: bool) -> FaceHierarchy:
         # empty places have the worlds of the faces before, which keeps those of nodes
         filled = np.maximum.accumulate(np.where(order >= 0, np.arange(len(order)), 0))
         worlds = np.stack([world[filled], world[filled]])
-    clusters, groups = len(order) // WIDTH, group_count(len(order))
+    clusters, bundles = len(order) // WIDTH, bundle_count(len(order))
     hierarchy.places = _level(len(order), worlds, device)
     worlds = _parents(worlds)
     hierarchy.clusters = _level(clusters, worlds, device)
-    if groups:
-        hierarchy.groups = _level(groups, _parents(worlds), device)
+    if bundles:
+        hierarchy.bundles = _level(bundles, _parents(worlds), device)
     return hierarchy

@@ -5,7 +5,7 @@ They decide as those of :mod:`.pair_kernels`, pair by pair where SIMD instructio
 
 import warp as wp
 
-from ...kernels.arcs import Arcs, any_turns, are_of_one_group, turns
+from ...kernels.arcs import Arcs, any_turns, move_as_one, turns
 from ...kernels.bits import count_bits, lowest_bit
 from ...kernels.classification import classify
 from ...kernels.motion import relative_motion
@@ -22,7 +22,7 @@ from ...kernels.signs import FREE, UNSURE
 from ...kernels.time_of_impact import clamped_tolerance, impact, power_of_two
 from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
-from .pair_kernels import PairStages, write_decision, write_impact
+from .pair_kernels import PairBuffers, write_decision, write_impact
 
 __all__ = ["batch_classification_kernel", "batch_culling_kernel", "batch_impact_kernel"]
 
@@ -37,16 +37,16 @@ _LOWER_BITS = wp.constant(wp.uint64(0x5555555555555555))
 
 
 @wp.func
-def _move_turning_pairs(kind: int, stages: PairStages, arcs: Arcs, first: int, count: int) -> int:
+def _move_turning_pairs(kind: int, buffers: PairBuffers, arcs: Arcs, first: int, count: int) -> int:
     """Moves the pairs with a turning vertex to the end of a part of the queue, and returns the number of the others."""
     straight = int(0)
     end = int(count)
     while straight < end:
-        pair = stages.queue[first + straight]
-        if turns(arcs, vertices_of_pair(kind, stages.elements, pair)):
+        pair = buffers.queue[first + straight]
+        if turns(arcs, vertices_of_pair(kind, buffers.elements, pair)):
             end -= 1
-            stages.queue[first + straight] = stages.queue[first + end]
-            stages.queue[first + end] = pair
+            buffers.queue[first + straight] = buffers.queue[first + end]
+            buffers.queue[first + end] = pair
         else:
             straight += 1
     return straight
@@ -56,7 +56,7 @@ def _move_turning_pairs(kind: int, stages: PairStages, arcs: Arcs, first: int, c
 def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bool) -> wp.Kernel:
     """Returns the kernel that culls on the CPU, in batches, for one kind of pair and one type of position.
 
-    If a vertex turns, each batch of the queue then begins with the pairs on arcs that are left, for :mod:`.arc`,
+    If a vertex turns, each batch of the queue then begins with the pairs on arcs that remain, for :mod:`.arc`,
     and (-1, -1) after them. Without ``on_arcs`` nothing turns.
     """
     cull_batch = cull_batch_of(dtype, kind == PairKind.VERTEX_FACE)
@@ -72,34 +72,36 @@ def batch_culling_kernel(kind: PairKind | DistanceKind, dtype: type, on_arcs: bo
         roundoff: wp.float64,
         arcs: Arcs,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
         i = BATCH * (first + wp.tid())
-        filled = wp.int32(wp.min(stages.counts[_QUEUED], wp.int64(stages.queue.shape[0])))
+        filled = wp.int32(wp.min(buffers.counts[_QUEUED], wp.int64(buffers.queue.shape[0])))
         count = wp.min(BATCH, filled - i)
         straight = count
         if wp.static(on_arcs):
             if any_turns(arcs):
-                straight = _move_turning_pairs(kind_number, stages, arcs, i, count)
-        left = cull_batch(x0, x1, stages.elements, stages.queue, i, straight, roundoff)
-        slot = take_slots(stages.counts, _SURVIVORS, count_bits(left))
+                straight = _move_turning_pairs(kind_number, buffers, arcs, i, count)
+        left = cull_batch(x0, x1, buffers.elements, buffers.queue, i, straight, roundoff)
+        slot = take_slots(buffers.counts, _SURVIVORS, count_bits(left))
         while left != wp.uint64(0):
-            write(stages.queue[i + lowest_bit(left)], stages.survivors, slot)
+            write(buffers.queue[i + lowest_bit(left)], buffers.survivors, slot)
             slot += wp.int64(1)
             left = left & (left - wp.uint64(1))
         if wp.static(on_arcs):
             if any_turns(arcs):
                 kept = int(0)
                 turning = i + straight
-                left = cull_arc_batch(x0, x1, stages.elements, stages.queue, arcs.deviation, turning, count - straight)
+                left = cull_arc_batch(
+                    x0, x1, buffers.elements, buffers.queue, arcs.deviation, turning, count - straight
+                )
                 while left != wp.uint64(0):
-                    pair = stages.queue[turning + lowest_bit(left)]
-                    if not are_of_one_group(arcs, vertices_of_pair(kind_number, stages.elements, pair)):
-                        stages.queue[i + kept] = pair
+                    pair = buffers.queue[turning + lowest_bit(left)]
+                    if not move_as_one(arcs, vertices_of_pair(kind_number, buffers.elements, pair)):
+                        buffers.queue[i + kept] = pair
                         kept += 1
                     left = left & (left - wp.uint64(1))
                 if kept < count:
-                    stages.queue[i + kept] = wp.vec2i(-1, -1)
+                    buffers.queue[i + kept] = wp.vec2i(-1, -1)
 
     return cull_batches
 
@@ -118,27 +120,27 @@ def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> w
         x1: wp.array[dtype],
         roundoff: wp.float64,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
         i = CLASSIFIED * (first + wp.tid())
-        number = wp.min(CLASSIFIED, filled_entries(stages.survivors, stages.counts, _SURVIVORS) - i)
-        statuses = classify_batch(x0, x1, stages.elements, stages.survivors, i, number, roundoff)
+        number = wp.min(CLASSIFIED, filled_entries(buffers.survivors, buffers.counts, _SURVIVORS) - i)
+        statuses = classify_batch(x0, x1, buffers.elements, buffers.survivors, i, number, roundoff)
         left = statuses & (statuses >> wp.uint64(1)) & _LOWER_BITS
         while left != wp.uint64(0):
             bit = lowest_bit(left)
-            v = vertices_of_pair(kind_number, stages.elements, stages.survivors[i + bit // 2])
+            v = vertices_of_pair(kind_number, buffers.elements, buffers.survivors[i + bit // 2])
             a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
             status = classify(motion, coplanarity(motion))
             statuses = statuses ^ (wp.uint64(OPEN ^ status) << wp.uint64(bit))
             left = left & (left - wp.uint64(1))
         contacts = (statuses | (statuses >> wp.uint64(1))) & _LOWER_BITS
-        slot = take_slots(stages.counts, _CONTACTS, count_bits(contacts))
+        slot = take_slots(buffers.counts, _CONTACTS, count_bits(contacts))
         while contacts != wp.uint64(0):
             bit = lowest_bit(contacts)
-            if slot < wp.int64(stages.contacts.pairs.shape[0]):
-                stages.contacts.pairs[wp.int32(slot)] = stages.survivors[i + bit // 2]
-                stages.contacts.status[wp.int32(slot)] = wp.int8((statuses >> wp.uint64(bit)) & wp.uint64(3))
+            if slot < wp.int64(buffers.contacts.pairs.shape[0]):
+                buffers.contacts.pairs[wp.int32(slot)] = buffers.survivors[i + bit // 2]
+                buffers.contacts.status[wp.int32(slot)] = wp.int8((statuses >> wp.uint64(bit)) & wp.uint64(3))
             slot += wp.int64(1)
             contacts = contacts & (contacts - wp.uint64(1))
 
@@ -146,29 +148,29 @@ def batch_classification_kernel(kind: PairKind | DistanceKind, dtype: type) -> w
 
 
 @wp.func
-def _decide_batch(first: int, count: int, timed: bool, stages: PairStages):
+def _decide_batch(first: int, count: int, timed: bool, buffers: PairBuffers):
     """Decides contacts as the kernel of a GPU does, with one atomic operation for each count."""
-    contacts = stages.contacts
+    contacts = buffers.contacts
     found = int(0)
     unsure = int(0)
     for_exact = int(0)
     for i in range(first, first + count):
         status = contacts.status[i]
-        write_decision(i, int(status), stages)
+        write_decision(i, int(status), buffers)
         if status != wp.int8(FREE):
             found += 1
             if status == wp.int8(UNSURE):
                 unsure += 1
             if status == wp.int8(UNSURE) or (timed and not contacts.within_tolerance[i]):
                 for_exact += 1
-    raise_count(stages.counts, _FOUND, found)
-    raise_count(stages.counts, _UNSURE, unsure)
+    raise_count(buffers.counts, _FOUND, found)
+    raise_count(buffers.counts, _UNSURE, unsure)
     if for_exact > 0:
-        slot = wp.int32(take_slots(stages.counts, _FOR_EXACT, for_exact))
+        slot = wp.int32(take_slots(buffers.counts, _FOR_EXACT, for_exact))
         for i in range(first, first + count):
             status = contacts.status[i]
             if status == wp.int8(UNSURE) or (status != wp.int8(FREE) and timed and not contacts.within_tolerance[i]):
-                stages.for_exact[slot] = i
+                buffers.for_exact[slot] = i
                 slot += 1
 
 
@@ -188,15 +190,15 @@ def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel
         timed: bool,
         tolerance: wp.float64,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
-        contacts = stages.contacts
+        contacts = buffers.contacts
         i = DECIDED * (first + wp.tid())
-        number = wp.min(DECIDED, filled_entries(contacts.pairs, stages.counts, _CONTACTS) - i)
+        number = wp.min(DECIDED, filled_entries(contacts.pairs, buffers.counts, _CONTACTS) - i)
         left = impact_batch(
             x0,
             x1,
-            stages.elements,
+            buffers.elements,
             contacts.pairs,
             i,
             number,
@@ -211,11 +213,11 @@ def batch_impact_kernel(kind: PairKind | DistanceKind, dtype: type) -> wp.Kernel
         )
         while left != wp.uint64(0):
             row = i + lowest_bit(left)
-            v = vertices_of_pair(kind_number, stages.elements, contacts.pairs[row])
+            v = vertices_of_pair(kind_number, buffers.elements, contacts.pairs[row])
             a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
             motion = relative_motion(kind_number, a0, b0, c0, d0, a1, b1, c1, d1, roundoff)
-            write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), stages)
+            write_impact(row, impact(motion, coplanarity(motion), int(contacts.status[row]), tolerance), buffers)
             left = left & (left - wp.uint64(1))
-        _decide_batch(i, number, timed, stages)
+        _decide_batch(i, number, timed, buffers)
 
     return find_impact_batches

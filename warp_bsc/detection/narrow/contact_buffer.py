@@ -32,7 +32,7 @@ class ContactBuffer:
     Attributes:
         pairs: (vertex, face) or (edge, edge).
         status: What floating point certifies: FREE, HIT or UNSURE.
-        decided: The status after the exact stage, if the method has one; UNSURE for contacts left to the host.
+        decided: The status after the exact phase, if the method has one; UNSURE for contacts delegated to the host.
         within_tolerance: Whether the time of impact is within the tolerance.
         toi: Time of impact as a share of the step.
         coordinates: Contact coordinates.

@@ -1,6 +1,6 @@
-"""The narrow phase: queued pairs -> culls -> certified classification -> times of impact -> exact stage -> order.
+"""The narrow phase: queued pairs -> culls -> certified classification -> times of impact -> exact phase -> order.
 
-Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. Counts stay on
+Every phase writes a compact queue for the next, so that no thread waits for a neighbour's harder pair. Counts stay on
 the device; they tell if a queue was too small, see :mod:`warp_bsc.kernels.pipeline.queues`.
 """
 
@@ -14,10 +14,10 @@ import warp as wp
 from ..run.launch import launch_over, launch_over_queue, max_blocks
 from ..run.settings import UNLIMITED, Count, DistanceKind, PairCounts, PairKind, capacity_for
 from .contact_buffer import ContactBuffer, make_contact_buffer
-from .exact_stage import launch_exact_stage
-from .pair_kernels import PairRule, PairStages, cull_kernel, decide_kernel, gather_contacts, pad_keys
+from .exact_phase import launch_exact_phase
+from .pair_kernels import PairBuffers, PairRule, cull_kernel, decide_kernel, gather_contacts, pad_keys
 
-__all__ = ["NarrowPhase", "Phases", "launch_culls", "launch_decisions", "launch_over_kinds", "stages_of"]
+__all__ = ["NarrowPhase", "Phases", "buffers_of", "launch_culls", "launch_decisions", "launch_over_kinds"]
 
 
 class NarrowPhase:
@@ -54,7 +54,7 @@ class NarrowPhase:
         self._survivors = wp.empty(capacity, dtype=wp.vec2i, device=self.counts.device)
 
     def allocate_contacts(self, capacity: int) -> None:
-        """Replaces the contacts, and the buffers of their order and of the exact stage."""
+        """Replaces the contacts, and the buffers of their order and of the exact phase."""
         device = self.counts.device
         self.contacts = make_contact_buffer(capacity, device)
         self._keys = wp.empty(2 * capacity, dtype=wp.int64, device=device)
@@ -102,14 +102,14 @@ class NarrowPhase:
             self.allocate_contacts(capacity_for(counts.contacts, f"{label} contacts"))
         return overflowed
 
-    def stages(self, elements: wp.array) -> PairStages:
+    def pair_buffers(self, elements: wp.array) -> PairBuffers:
         """Returns the buffers as one argument of kernels, with the vertex indices of the faces or edges."""
-        stages = PairStages()
-        stages.elements, stages.counts = elements, self.counts
-        stages.queue, stages.survivors, stages.contacts = self.queue, self._survivors, self.contacts
-        stages.keys, stages.order, stages.for_exact = self._keys, self._order, self._for_exact[0]
-        stages.second_bits, stages.last_key = self._bits[1], self._last_key
-        return stages
+        buffers = PairBuffers()
+        buffers.elements, buffers.counts = elements, self.counts
+        buffers.queue, buffers.survivors, buffers.contacts = self.queue, self._survivors, self.contacts
+        buffers.keys, buffers.order, buffers.for_exact = self._keys, self._order, self._for_exact[0]
+        buffers.second_bits, buffers.last_key = self._bits[1], self._last_key
+        return buffers
 
     @property
     def _last_key(self) -> int:
@@ -117,9 +117,9 @@ class NarrowPhase:
         return 1 << sum(self._bits)
 
     def decide_exactly(self, x0: wp.array, x1: wp.array, elements: wp.array, *, timed: bool, tolerance: float) -> None:
-        """Launches the exact stage over the contacts that the last run has left to it, see :func:`.run_contacts`."""
+        """Launches the exact phase over the contacts that the last run has left to it, see :func:`.run_contacts`."""
         options = {"timed": timed, "tolerance": tolerance}
-        launch_exact_stage(self.kind, x0, x1, **options, stages=self.stages(elements), left=self._for_exact[1])
+        launch_exact_phase(self.kind, x0, x1, **options, buffers=self.pair_buffers(elements), left=self._for_exact[1])
 
     def sort(self) -> None:
         """Launches the sorting of the contacts by their pairs, without synchronizing with a GPU."""
@@ -151,32 +151,32 @@ Phases = Sequence[tuple[NarrowPhase, wp.array]]
 """Narrow phases of different kinds, each with the vertex indices of its second elements."""
 
 
-def stages_of(phases: Phases) -> dict[PairKind | DistanceKind, PairStages]:
+def buffers_of(phases: Phases) -> dict[PairKind | DistanceKind, PairBuffers]:
     """Returns the buffers of narrow phases by kind, as arguments of kernels."""
-    return {phase.kind: phase.stages(elements) for phase, elements in phases}
+    return {phase.kind: phase.pair_buffers(elements) for phase, elements in phases}
 
 
 def launch_culls(
-    rule: PairRule, stages: Mapping[PairKind | DistanceKind, PairStages], x0: wp.array, x1: wp.array, options: Any
+    rule: PairRule, buffers: Mapping[PairKind | DistanceKind, PairBuffers], x0: wp.array, x1: wp.array, options: Any
 ) -> None:
     """Launches a rule from the queue of each kind to its survivors, from both positions and the rule's options."""
-    for kind, s in stages.items():
+    for kind, s in buffers.items():
         kernel = cull_kernel(rule, x0.dtype, int(kind) if rule.culls_by_kind else -1)
         inputs = [x0, x1, options, int(kind)]
         launch_over_queue(kernel, s.queue, s.counts, Count.QUEUED, inputs=inputs, outputs=[s])
 
 
 def launch_decisions(
-    rule: PairRule, stages: Mapping[PairKind | DistanceKind, PairStages], x0: wp.array, x1: wp.array, options: Any
+    rule: PairRule, buffers: Mapping[PairKind | DistanceKind, PairBuffers], x0: wp.array, x1: wp.array, options: Any
 ) -> None:
     """Launches a rule from the survivors of all kinds to their contacts, as :func:`launch_culls`."""
     kernel, inputs = decide_kernel(rule, x0.dtype), [x0, x1, options]
-    launch_over_kinds(kernel, stages, "survivors", Count.SURVIVORS, inputs=inputs, block_dim=64)
+    launch_over_kinds(kernel, buffers, "survivors", Count.SURVIVORS, inputs=inputs, block_dim=64)
 
 
 def launch_over_kinds(
     kernel: wp.Kernel,
-    stages: Mapping[PairKind | DistanceKind, PairStages],
+    buffers: Mapping[PairKind | DistanceKind, PairBuffers],
     buffer: str,
     count: Count,
     *,
@@ -186,25 +186,25 @@ def launch_over_kinds(
     """Launches a kernel over a buffer of all kinds: on a GPU two at a time, unless they are too long, on a CPU singly.
 
     Args:
-        kernel: The kernel; its last arguments are two kinds of pairs, and the stages of the one and of the other.
-        stages: The stages by kind.
-        buffer: Attribute of the stages: the kernel covers the capacity of this buffer, first of the one kind.
+        kernel: The kernel; its last arguments are two kinds of pairs, and the buffers of the one and of the other.
+        buffers: The buffers by kind.
+        buffer: Attribute of the buffers: the kernel covers the capacity of this buffer, first of the one kind.
         count: Index of the number of entries in it, to which a CPU keeps.
         inputs: Its arguments between the first entry and the kinds.
         block_dim: Threads of a block.
     """
-    entries = {kind: getattr(s, buffer).shape[0] for kind, s in stages.items()}
-    kinds, none = list(stages), PairStages()
+    entries = {kind: getattr(s, buffer).shape[0] for kind, s in buffers.items()}
+    kinds, none = list(buffers), PairBuffers()
     while kinds:
         of_launch = kinds[:2]
-        device = stages[kinds[0]].counts.device
+        device = buffers[kinds[0]].counts.device
         if device.is_cpu or sum(entries[kind] for kind in of_launch) >= 2**31:
             of_launch = kinds[:1]
         kinds = kinds[len(of_launch) :]
         dim = sum(entries[kind] for kind in of_launch)
         if device.is_cpu:
-            dim = min(dim, int(stages[of_launch[0]].counts.numpy()[count]))
+            dim = min(dim, int(buffers[of_launch[0]].counts.numpy()[count]))
         numbers = wp.vec2i(*[int(kind) for kind in of_launch], *[-1] * (2 - len(of_launch)))
-        both = [*(stages[kind] for kind in of_launch), none][:2]
+        both = [*(buffers[kind] for kind in of_launch), none][:2]
         options = {"device": device, "block_dim": block_dim, "max_blocks": max_blocks(device, block_dim)}
         launch_over(kernel, dim, inputs=[*inputs, numbers], outputs=both, **options)

@@ -18,8 +18,8 @@ from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count
 from .contact_buffer import ContactBuffer
 
 __all__ = [
+    "PairBuffers",
     "PairRule",
-    "PairStages",
     "add_contact",
     "add_open_contact",
     "count_found",
@@ -42,8 +42,8 @@ _REFUTED = wp.constant(int(Count.REFUTED))
 
 
 @wp.struct
-class PairStages:
-    """The pairs of one kind in all stages of the narrow phase; without arrays there are none.
+class PairBuffers:
+    """The pairs of one kind in all phases of the narrow phase; without arrays there are none.
 
     Attributes:
         elements: Vertex indices of the faces or edges.
@@ -53,7 +53,7 @@ class PairStages:
         contacts: Survivors that classification does not certify free.
         keys: Sorting keys of the contacts.
         order: Indices of the contacts, to be sorted by their keys.
-        for_exact: Indices of contacts for the exact stage, or for subdivision with a minimum distance.
+        for_exact: Indices of contacts for the exact phase, or for subdivision with a minimum distance.
         second_bits: Bits of the second element in a key.
         last_key: Key of rows that are no contacts, greater than those of contacts.
     """
@@ -86,8 +86,8 @@ def entry_of_two(
     kinds: wp.vec2i,
     queue: wp.array[wp.vec2i],
     other_queue: wp.array[wp.vec2i],
-    one: PairStages,
-    other: PairStages,
+    one: PairBuffers,
+    other: PairBuffers,
     count: int,
 ):
     """Returns the kind, the index in its queue, and the vertices of entry i of two queues, -1 if it is not written.
@@ -101,20 +101,20 @@ def entry_of_two(
 
 
 @wp.func
-def take_contact(pair: wp.vec2i, stages: PairStages) -> int:
-    """Returns the row of a new contact, to which the pair is written; -1 if there is no row left."""
-    slot = take_slot(stages.counts, _CONTACTS)
-    if slot >= wp.int64(stages.contacts.pairs.shape[0]):
+def take_contact(pair: wp.vec2i, buffers: PairBuffers) -> int:
+    """Returns the row of a new contact, to which the pair is written; -1 if no row remains."""
+    slot = take_slot(buffers.counts, _CONTACTS)
+    if slot >= wp.int64(buffers.contacts.pairs.shape[0]):
         return -1
     k = wp.int32(slot)
-    stages.contacts.pairs[k] = pair
+    buffers.contacts.pairs[k] = pair
     return k
 
 
 @wp.func
-def write_impact(k: int, result: Impact, stages: PairStages):
+def write_impact(k: int, result: Impact, buffers: PairBuffers):
     """Writes the first contact of a pair to a row of the contacts."""
-    contacts = stages.contacts
+    contacts = buffers.contacts
     contacts.status[k] = wp.int8(result.status)
     contacts.within_tolerance[k] = result.within_tolerance == 1
     contacts.toi[k] = result.toi
@@ -123,40 +123,40 @@ def write_impact(k: int, result: Impact, stages: PairStages):
 
 
 @wp.func
-def write_decision(k: int, status: int, stages: PairStages):
+def write_decision(k: int, status: int, buffers: PairBuffers):
     """Writes what is decided of a row of the contacts, and its place in their order, the last one if it is free."""
-    stages.contacts.decided[k] = wp.int8(status)
-    stages.order[k] = k
-    stages.keys[k] = stages.last_key
+    buffers.contacts.decided[k] = wp.int8(status)
+    buffers.order[k] = k
+    buffers.keys[k] = buffers.last_key
     if status != FREE:
-        pair = stages.contacts.pairs[k]
-        stages.keys[k] = (wp.int64(pair[0]) << wp.int64(stages.second_bits)) | wp.int64(pair[1])
+        pair = buffers.contacts.pairs[k]
+        buffers.keys[k] = (wp.int64(pair[0]) << wp.int64(buffers.second_bits)) | wp.int64(pair[1])
 
 
 @wp.func
-def count_found(status: int, stages: PairStages):
+def count_found(status: int, buffers: PairBuffers):
     """Counts a contact that is found."""
-    take_slot(stages.counts, _FOUND)
+    take_slot(buffers.counts, _FOUND)
     if status == UNSURE:
-        take_slot(stages.counts, _UNSURE)
+        take_slot(buffers.counts, _UNSURE)
 
 
 @wp.func
-def add_contact(pair: wp.vec2i, result: Impact, stages: PairStages):
-    """Counts a pair as found, and adds it to the contacts if there is a row left."""
-    k = take_contact(pair, stages)
-    count_found(result.status, stages)
+def add_contact(pair: wp.vec2i, result: Impact, buffers: PairBuffers):
+    """Counts a pair as found, and adds it to the contacts if a row remains."""
+    k = take_contact(pair, buffers)
+    count_found(result.status, buffers)
     if k >= 0:
-        write_impact(k, result, stages)
-        write_decision(k, result.status, stages)
+        write_impact(k, result, buffers)
+        write_decision(k, result.status, buffers)
 
 
 @wp.func
-def add_open_contact(pair: wp.vec2i, result: Impact, stages: PairStages):
-    """Adds a pair to the contacts with its status alone, if there is a row left."""
-    k = take_contact(pair, stages)
+def add_open_contact(pair: wp.vec2i, result: Impact, buffers: PairBuffers):
+    """Adds a pair to the contacts with its status alone, if a row remains."""
+    k = take_contact(pair, buffers)
     if k >= 0:
-        stages.contacts.status[k] = wp.int8(result.status)
+        buffers.contacts.status[k] = wp.int8(result.status)
 
 
 class PairRule(NamedTuple):
@@ -207,7 +207,7 @@ def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
         options: rule.options,
         kind: int,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
         if wp.static(turning is True):
             if not any_turns(options.arcs):
@@ -215,7 +215,7 @@ def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
         if wp.static(of_kind >= 0):
             kind = wp.static(of_kind)
         i = first + wp.tid()  # and no pair, which would take registers until the end
-        v = _vertices_at(i, kind, stages.queue, stages.elements, stages.counts, _QUEUED)
+        v = _vertices_at(i, kind, buffers.queue, buffers.elements, buffers.counts, _QUEUED)
         if v[0] < 0:
             return
         if wp.static(turning is not None):
@@ -224,7 +224,7 @@ def cull_kernel(rule: PairRule, dtype: type, of_kind: int = -1) -> wp.Kernel:
         if excludes(options, kind, v):
             return
         if not clears(options, kind, v, x0, x1):
-            append(stages.queue[i], stages.survivors, stages.counts, _SURVIVORS)
+            append(buffers.queue[i], buffers.survivors, buffers.counts, _SURVIVORS)
 
     return cull
 
@@ -250,8 +250,8 @@ def decide_kernel(rule: PairRule, dtype: type) -> wp.Kernel:
         options: rule.options,
         kinds: wp.vec2i,
         # in and out
-        one: PairStages,
-        other: PairStages,
+        one: PairBuffers,
+        other: PairBuffers,
     ):
         if wp.static(turning is True):
             if not any_turns(options.arcs):

@@ -16,8 +16,8 @@ from ..narrow.rings import Rings
 from ..narrow.rules.contact import run_contacts
 from ..narrow.rules.distance import run_distances
 from ..run.launch import retry_until_fits
+from ..run.phase_timer import PhaseTimer
 from ..run.settings import METHODS, TOLERANCE, Count, DistanceKind, Method, PairCounts, PairKind, checked_tolerance
-from ..run.stage_timer import StageTimer
 from ..run.start import checked_device
 from .query_arrays import DeviceQueryResult, query_into
 from .query_points import mesh_of_rows
@@ -297,12 +297,12 @@ def _query(
 
     def solve(method: Method) -> tuple[HostContacts, np.ndarray]:
         """Returns the contacts by a method, and the query of each."""
-        # the exact stage also finds the times of certified hits that floating point did not find within the tolerance
-        stages = "exact" if method == "conservative" and timed else method
+        # the exact phase also finds the times of certified hits that floating point did not find within the tolerance
+        buffers = "exact" if method == "conservative" and timed else method
 
         def launch() -> None:
             counts.assign(all_queued)
-            options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
+            options = {"method": buffers, "timed": timed, "tolerance": tolerance, "timer": PhaseTimer(None)}
             if contact:
                 run_contacts([(narrow_phase, elements)], x0, x1, **options)
             else:
@@ -312,7 +312,7 @@ def _query(
         contacts = read_contacts(narrow_phase.contacts, int(counts.numpy()[Count.CONTACTS]))
         contacts = contacts.rows(contacts.status != FREE)
         if method == "conservative":
-            contacts.decided[:] = HIT  # also those that the exact stage has refuted
+            contacts.decided[:] = HIT  # also those that the exact phase has refuted
         if method != "float":
             left = contacts.hit & ~contacts.within_tolerance & timed & (contacts.status == HIT)
             if method == "exact":

@@ -8,12 +8,12 @@ from ...kernels.pipeline.queues import take_slot
 from ...kernels.polynomials import VERTEX_FACE
 from ...kernels.signs import FREE, UNSURE
 from ..narrow.narrow_phase import NarrowPhase
-from ..narrow.pair_kernels import PairStages
+from ..narrow.pair_kernels import PairBuffers
 from ..narrow.rules.contact import run_contacts
 from ..run.host_function import run_on_host
 from ..run.launch import launch_over, launch_over_queue, made_once
+from ..run.phase_timer import PhaseTimer
 from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, PairKind
-from ..run.stage_timer import StageTimer
 from ..run.start import checked_device
 
 __all__ = ["DeviceQueryResult", "query_into"]
@@ -91,7 +91,7 @@ def _begin_rows(dtype: type) -> wp.Kernel:
 def _write_contacts(
     first: int,
     # in
-    stages: PairStages,
+    buffers: PairBuffers,
     points: int,
     method: int,
     timed: bool,
@@ -102,9 +102,9 @@ def _write_contacts(
 ):
     """Writes the rows of the contacts that are not certified free, but for queries that are not finite."""
     slot = first + wp.tid()
-    if wp.int64(slot) >= stages.counts[_CONTACTS]:
+    if wp.int64(slot) >= buffers.counts[_CONTACTS]:
         return
-    contacts = stages.contacts
+    contacts = buffers.contacts
     status = contacts.status[slot]
     i = contacts.pairs[slot][0] // points
     if status == wp.int8(FREE) or rows.hit[i]:
@@ -216,11 +216,11 @@ class DeviceQueryResult:
             return
         inputs, outputs = [x, timed], [self._rows, self.not_finite]
         launch_over(_begin_rows(x.dtype), self.count, inputs=inputs, outputs=outputs, device=device)
-        # the exact stage also finds the times of certified hits that floating point did not find within the tolerance
-        stages = "exact" if method == "conservative" and timed else method
-        options = {"method": stages, "timed": timed, "tolerance": tolerance, "timer": StageTimer(None)}
+        # the exact phase also finds the times of certified hits that floating point did not find within the tolerance
+        buffers = "exact" if method == "conservative" and timed else method
+        options = {"method": buffers, "timed": timed, "tolerance": tolerance, "timer": PhaseTimer(None)}
         run_contacts([(narrow_phase, elements)], x, x[4:], **options)
-        buffers = narrow_phase.stages(elements)
+        buffers = narrow_phase.pair_buffers(elements)
         points = 8 if kind == PairKind.VERTEX_FACE else 2
         inputs = [buffers, points, METHODS.index(method), timed]
         launch_over_queue(

@@ -11,8 +11,8 @@ from ..narrow.contact_buffer import ContactBufferPool, ContactRows, contacts_fro
 from ..narrow.on_host import decide_on_host
 from ..pipeline import DetectionPipeline
 from ..run.launch import retry_until_fits
+from ..run.phase_timer import PhaseTimer
 from ..run.settings import Counts, DistanceKind
-from ..run.stage_timer import StageTimer
 from .collisions import CapturedCollisions, Collisions
 from .differentiable import DifferentiableContacts
 
@@ -40,8 +40,8 @@ class CollisionFinder:
         """
         pipeline = self.pipeline
 
-        def launch() -> StageTimer:
-            timer = StageTimer(self._device)
+        def launch() -> PhaseTimer:
+            timer = PhaseTimer(self._device)
             pipeline.find_contacts(x0, x1, changed=changed, sort=True, timer=timer, **options)
             return timer
 
@@ -49,10 +49,10 @@ class CollisionFinder:
         counts = pipeline.counts
         self.check_counted_finite(x0, x1)
         differentiable = x0.requires_grad or x1.requires_grad
-        with timer.stage("sort"):
+        with timer.phase("sort"):
             contacts = self._ordered_contacts(counts, recycle=not differentiable)
         if pipeline.method == "exact" and any(pairs.too_wide_8 for pairs in counts.pairs.values()):
-            with timer.stage("exact"):  # now, while the arrays hold these positions
+            with timer.phase("exact"):  # now, while the arrays hold these positions
                 for kind, rows in contacts.items():
                     contacts[kind] = self._decide_on_host(kind, rows, x0, x1)
         buffers = {kind: rows.buffer for kind, rows in contacts.items()}
@@ -88,7 +88,7 @@ class CollisionFinder:
             contacts = self._ordered_contacts(counts, recycle=True)
             pipeline.counts = counts
             certified = certified and certifies(contacts)
-            return Collisions(certified, overflows, arrays, pipeline.method, counts, contacts, StageTimer(None))
+            return Collisions(certified, overflows, arrays, pipeline.method, counts, contacts, PhaseTimer(None))
 
         def read_alone() -> Collisions:
             with self._lock:

@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp
 
 from ..narrow.contact_buffer import ContactRows, HostContacts, empty_contacts
+from ..run.phase_timer import PhaseTimer, PhaseTimers
 from ..run.settings import Counts, DistanceKind, Method, PairCounts
-from ..run.stage_timer import StageTimer, StageTimers
 from .differentiable import DifferentiableContacts
 
 __all__ = [
@@ -19,7 +19,7 @@ __all__ = [
     "Collisions",
     "DetectionStats",
     "FreeStep",
-    "StageCounts",
+    "PhaseCounts",
     "add_stats",
 ]
 
@@ -61,8 +61,8 @@ class FreeStep:
 
 
 @dataclass(frozen=True)
-class StageCounts:
-    """Numbers of pairs of one kind that entered or left each stage.
+class PhaseCounts:
+    """Numbers of pairs of one kind that entered or left each phase.
 
     Attributes:
         candidates: Pairs that share no vertex, whose swept boxes overlap, and that no coordinate axis separates at the
@@ -87,8 +87,8 @@ class StageCounts:
     filtered: int = 0
 
     @classmethod
-    def of(cls, counts: PairCounts, *, exact: bool) -> "StageCounts":
-        """Returns the numbers of one kind of pair from its counters; ``exact``: whether there was an exact stage."""
+    def of(cls, counts: PairCounts, *, exact: bool) -> "PhaseCounts":
+        """Returns the numbers of one kind of pair from its counters; ``exact``: whether there was an exact phase."""
         return cls(
             candidates=counts.queued,
             survivors=counts.survivors,
@@ -106,35 +106,35 @@ class DetectionStats:
     """Counts and times of a detection.
 
     Attributes:
-        vertex_face: Numbers of vertex-face pairs that entered or left each stage.
-        edge_edge: Numbers of edge-edge pairs that entered or left each stage.
+        vertex_face: Numbers of vertex-face pairs that entered or left each phase.
+        edge_edge: Numbers of edge-edge pairs that entered or left each phase.
         vertex_edge: Numbers of pairs of a point and an edge that no face has.
         vertex_vertex: Numbers of pairs of points.
-        milliseconds: Time by stage: "broad phase", "cull", "classify", "time of impact", "sort", "exact". Empty for a
+        milliseconds: Time by phase: "broad phase", "cull", "classify", "time of impact", "sort", "exact". Empty for a
             detection in a CUDA graph.
     """
 
-    vertex_face: StageCounts
-    edge_edge: StageCounts
-    vertex_edge: StageCounts
-    vertex_vertex: StageCounts
+    vertex_face: PhaseCounts
+    edge_edge: PhaseCounts
+    vertex_edge: PhaseCounts
+    vertex_vertex: PhaseCounts
     milliseconds: dict[str, float]
 
     @property
     def filtered(self) -> int:
-        """Number of pairs of all kinds that groups and masks of the mesh leave out, see :class:`StageCounts`."""
+        """Number of pairs of all kinds that groups and masks of the mesh leave out, see :class:`PhaseCounts`."""
         return sum(getattr(self, kind.label).filtered for kind in DistanceKind)
 
 
 def add_stats(first: DetectionStats, second: DetectionStats) -> DetectionStats:
     """Returns the counts and times of two detections together."""
-    stages = {}
+    buffers = {}
     for kind in DistanceKind:
         one, other = asdict(getattr(first, kind.label)), asdict(getattr(second, kind.label))
-        stages[kind.label] = StageCounts(**{name: one[name] + other[name] for name in one})
+        buffers[kind.label] = PhaseCounts(**{name: one[name] + other[name] for name in one})
     milliseconds = Counter(first.milliseconds)
     milliseconds.update(second.milliseconds)
-    return DetectionStats(**stages, milliseconds=dict(milliseconds))
+    return DetectionStats(**buffers, milliseconds=dict(milliseconds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class Collisions:
 
     Their number is their length, so that ``if collisions`` asks whether there are any; it does not read the device.
     They are in arrays of their own, on the device until they are first read, which later detections do not change. A
-    detector reuses these arrays once no reference to the result is left.
+    detector reuses these arrays once no reference to the result remains.
 
     Attributes:
         certified: Whether no collision of the motion can be missing; with method "exact", every reported pair collides
@@ -163,7 +163,7 @@ class Collisions:
     _method: Method = field(repr=False)
     _counts: Counts = field(repr=False)
     _rows: dict[DistanceKind, ContactRows] = field(repr=False)
-    _timer: StageTimer | StageTimers = field(repr=False)
+    _timer: PhaseTimer | PhaseTimers = field(repr=False)
     _read: dict[DistanceKind, HostContacts] = field(default_factory=dict, init=False, repr=False)
 
     def __len__(self) -> int:
@@ -293,13 +293,13 @@ class Collisions:
 
     @functools.cached_property
     def stats(self) -> DetectionStats:
-        """Counts and times of every stage."""
+        """Counts and times of every phase."""
         milliseconds = self._timer.read()
         if milliseconds:
             milliseconds["exact"] = milliseconds.pop("exact", 0.0)
         exact = self._method == "exact"
-        stages = {kind.label: StageCounts.of(counts, exact=exact) for kind, counts in self._counts.pairs.items()}
-        return DetectionStats(**stages, milliseconds=milliseconds)
+        buffers = {kind.label: PhaseCounts.of(counts, exact=exact) for kind, counts in self._counts.pairs.items()}
+        return DetectionStats(**buffers, milliseconds=milliseconds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,7 +109,7 @@ def capacity_for(count: int, buffer: str) -> int:
 
 
 class Count(enum.IntEnum):
-    """Indices of the counts of one kind of pair in an array, in the order of the stages.
+    """Indices of the counts of one kind of pair in an array, in the order of the phases.
 
     Attributes:
         QUEUED: Pairs enqueued for the narrow phase, the candidates: they share no vertex, their swept boxes overlap,
@@ -118,13 +118,13 @@ class Count(enum.IntEnum):
         CONTACTS: Survivors that classification, or advancement with a minimum distance, does not certify free.
         FOUND: Contacts that are not certified free when their time of impact is sought either.
         UNSURE: Found pairs that are not certified hits either.
-        FOR_EXACT: Found pairs that the exact stage decides, or whose times it finds.
-        TOO_WIDE_1: Pairs of the exact stage whose exponents are too far apart for one limb.
-        TOO_WIDE_2: Pairs of the exact stage whose exponents are too far apart for two limbs.
-        TOO_WIDE_4: Pairs of the exact stage whose exponents are too far apart for four limbs, on a CPU.
-        TOO_WIDE_8: Pairs of the exact stage whose exponents are too far apart for eight limbs or, with a minimum
-            distance, that it does not decide: left to the host.
-        REFUTED: Found pairs that the exact stage decides to be free.
+        FOR_EXACT: Found pairs that the exact phase decides, or whose times it finds.
+        TOO_WIDE_1: Pairs of the exact phase whose exponents are too far apart for one limb.
+        TOO_WIDE_2: Pairs of the exact phase whose exponents are too far apart for two limbs.
+        TOO_WIDE_4: Pairs of the exact phase whose exponents are too far apart for four limbs, on a CPU.
+        TOO_WIDE_8: Pairs of the exact phase whose exponents are too far apart for eight limbs or, with a minimum
+            distance, that it does not decide: delegated to the host.
+        REFUTED: Found pairs that the exact phase decides to be free.
         SUBDIVIDED: Contacts with a minimum distance that advancement leaves to subdivision.
         FILTERED: Pairs that would be candidates, but are left out by groups and masks.
     """

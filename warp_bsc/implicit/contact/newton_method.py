@@ -212,7 +212,6 @@ class NewtonMethod:
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * (_FAST * self._metre) ** 2, 1e-9))
         self.settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._attachments = attachments_of_model(model)
-        self._poses = None if self._attachments is None else wp.clone(model.body_q)
         self._touching = allocate(pairs.Touching, vertices, device, any=1)
         self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
@@ -364,10 +363,9 @@ class NewtonMethod:
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
         self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
         if self._attachments is not None:
-            inputs = [self._attachments, self._poses, end.body_q, wp.float64(dt), motion, self._unknowns, self._goal]
-            outputs = [work.vertices, end.particle_q, end.particle_qd]
+            inputs = [self._attachments, work.motion.last.poses, end.body_q, wp.float64(dt)]
+            outputs = [motion, self._unknowns, self._goal, work.vertices, end.particle_q, end.particle_qd]
             self._launch(attach, self.mesh.model.particle_count, inputs, outputs)
-            wp.copy(self._poses, end.body_q)
         self.progress.active.zero_()
         self.progress.given_moves.zero_()
         self._flow.arrived.zero_()

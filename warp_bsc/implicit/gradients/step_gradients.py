@@ -117,20 +117,13 @@ class StepGradients:
 
         self._of_x1, self._of_x0, self._of_v0 = zeros(vertices), zeros(vertices), zeros(particles)
         self._of_unknowns, self._carried_x = zeros(self.equations.count), zeros(particles)
-        self._interrupted = wp.clone(work.motion.vertices.interrupted)
-        self._poses, self._carried_poses = None, None
-        if model.body_count:
-            self._poses, self._carried_poses = wp.clone(model.body_q), wp.zeros_like(model.body_q)
+        self._carried_poses = wp.zeros_like(model.body_q) if model.body_count else None
         self._room = 0  # contacts that the arrays of a step in a CUDA graph have room for
         self._largest = wp.zeros(work.worlds, dtype=wp.int64, device=device)
         self._carried_to: RecordedStep | None = None
 
-    def begin(self) -> None:
-        """Notes where a step begins, before it is solved."""
-        wp.copy(self._interrupted, self._work.motion.vertices.interrupted)
-
     def record(self, tape: wp.Tape, dt: float, start: StartArrays, end: StateArrays) -> RecordedStep:
-        """Returns a copy of the step that was taken last.
+        """Returns a copy of a step that has been taken, before it ends for :class:`.LastStep`.
 
         Args:
             tape: The tape that records it.
@@ -139,7 +132,7 @@ class StepGradients:
             end: The state at its end.
         """
         work, newton, model, device = self._work, self.newton, self._model, self._work.device
-        motion, particles = work.motion.vertices, model.particle_count
+        motion, last, particles = work.motion.vertices, work.motion.last, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
         self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
         self._launch(kernels.to_double, particles, [start.particle_qd], [velocity])
@@ -155,17 +148,17 @@ class StepGradients:
         inputs = [newton.problem.trial, newton.problem.unknowns, end.particle_q, work.mesh.device_world]
         self._launch(kernels.find_changed, particles, inputs, [failed])
         of_particles = wp.zeros(particles, dtype=int, device=device)
-        inputs = [work.mesh.device_world, self._interrupted]
+        inputs = [work.mesh.device_world, last.interrupted]
         self._launch(kernels.find_continuing, particles, inputs, [of_particles])
         of_bodies, poses, bodies = wp.zeros(model.body_count, dtype=int, device=device), (None, None), None
         if model.body_count:
-            inputs = [model.body_world, self._interrupted]
+            inputs = [model.body_world, last.interrupted]
             self._launch(kernels.find_continuing, model.body_count, inputs, [of_bodies])
             is_solved = wp.zeros(model.body_count, dtype=int, device=device)
             if self.equations.of_bodies is not None:
                 inputs = [self.equations.of_bodies, is_fixed]
                 self._launch(find_solved, model.body_count, inputs, [is_solved])
-            poses = wp.clone(end.body_q, requires_grad=False), wp.clone(self._poses, requires_grad=False)
+            poses = wp.clone(end.body_q, requires_grad=False), wp.clone(last.poses)
             self._launch(kernels.start_poses, model.body_count, [start.body_q, of_bodies, is_solved], [poses[1]])
             bodies = self._predict(dt, start, poses[1], is_solved)
         contacts = self._record_contacts(failed)
@@ -199,11 +192,6 @@ class StepGradients:
     def _inputs_of_goals(self, bodies, poses, dt, of_motion):
         inputs = [bodies.is_solved, poses, bodies.velocities, bodies.force, self._model.gravity]
         return [*inputs, of_motion, float(dt)]
-
-    def finish(self, end: StateArrays) -> None:
-        """Keeps where bodies ended a step, on a tape or not."""
-        if self._poses is not None:
-            wp.copy(self._poses, end.body_q)
 
     def _record_contacts(self, failed):
         """Returns vertices, unknowns, and all else of the contacts at the end of a step.

@@ -40,9 +40,9 @@ class Finding:
         crossings: Numbers of edges that meet faces at the start and at the end, which is 0 if it is the same time.
         crossing_meshes: Names of the pairs of meshes that intersect at the start.
         is_joined: Whether the interval starts where the one before ends, with the same meshes.
-        left_pairs: In the first interval the pairs of meshes that are left as they are, each sorted: they cross at its
-            start. The other attributes do not count them. Empty in other intervals.
-        left_hits: Number of pairs that collide of meshes that are left.
+        unrepaired_pairs: In the first interval the pairs of meshes that stay as they are, each sorted: they cross at
+            its start. The other attributes do not count them. Empty in other intervals.
+        unrepaired_hits: Number of pairs that collide of meshes that stay as they are.
         kept_hits: Number of those of meshes that are kept.
         ignored_pairs: Pairs of meshes that collide and are ignored.
     """
@@ -53,8 +53,8 @@ class Finding:
     crossings: tuple[int, int]
     crossing_meshes: tuple[MeshPair, ...]
     is_joined: bool
-    left_pairs: tuple[MeshPair, ...] = ()
-    left_hits: int = 0
+    unrepaired_pairs: tuple[MeshPair, ...] = ()
+    unrepaired_hits: int = 0
     kept_hits: int = 0
     ignored_pairs: tuple[MeshPair, ...] = ()
 
@@ -94,7 +94,7 @@ def find_collisions(
     results: Iterable[IntervalResult],
     *,
     keep: Iterable[str] = (),
-    left_pairs: Iterable[MeshPair] | None = None,
+    unrepaired_pairs: Iterable[MeshPair] | None = None,
     min_distance: float = 0.0,
     device: Any = None,
 ) -> Iterator[Finding]:
@@ -104,7 +104,7 @@ def find_collisions(
         scene: The scene.
         results: Results of its replay with intersections, in order.
         keep: Patterns of meshes that the repair does not move, as of :func:`~.repair_shot.repair_shot`.
-        left_pairs: Names of the pairs of meshes that the repair leaves as they are, each sorted; default: two different
+        unrepaired_pairs: Names of the pairs of meshes that stay as they are, each sorted; default: two different
             meshes that cross at the first time, which are mostly meant to, such as the parts of a body.
         min_distance: Distance that pairs are to keep between the times too, in the scene's unit of length: 0 or at
             least 2^-1021. It is not looked for between elements that an edge of the mesh joins, nor at curves and
@@ -119,11 +119,11 @@ def find_collisions(
     check_instance(scene, "scene", Scene, "a Scene")
     kept = kept_meshes(scene, keep).keys()
     distance = checked_distance(min_distance, "min_distance")
-    left = None if left_pairs is None else frozenset(left_pairs)
-    return _find_collisions(results, scene.selection, kept, left, distance, device)
+    unrepaired = None if unrepaired_pairs is None else frozenset(unrepaired_pairs)
+    return _find_collisions(results, scene.selection, kept, unrepaired, distance, device)
 
 
-def _find_collisions(results, selection, kept, left, min_distance, device) -> Iterator[Finding]:
+def _find_collisions(results, selection, kept, unrepaired, min_distance, device) -> Iterator[Finding]:
     """Yields the findings of :func:`find_collisions`, whose arguments have been checked."""
     last: Segment | None = None
     near_pairs = None
@@ -132,26 +132,26 @@ def _find_collisions(results, selection, kept, left, min_distance, device) -> It
         assert summary.intersections is not None
         start, end = ({p: n for p, n in at.mesh_pairs.items() if not kept >= {*p}} for at in summary.intersections)
         hits = {pair: number for pair, number in summary.mesh_pairs.items() if not kept >= {*pair}}
-        if left is None:
-            left = frozenset(_sorted(pair) for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1])
+        if unrepaired is None:
+            unrepaired = frozenset(_sorted(p) for p, (crosses, _) in start.items() if crosses and p[0] != p[1])
         if last is None and min_distance:
-            selection = replace(selection, ignored_names=selection.ignored_names | left)
+            selection = replace(selection, ignored_names=selection.ignored_names | unrepaired)
             near_pairs = _NearPairs(selection, kept, min_distance, device)
-        is_left = {pair: _sorted(pair) in left for pair in (*start, *end, *hits)}
+        is_unrepaired = {pair: _sorted(pair) in unrepaired for pair in (*start, *end, *hits)}
         is_joined = interval.segment is last and not interval.jumps
         near = near_pairs.find(interval, is_joined) if near_pairs else (0, 0)
-        counted, left_hits = (sum(hits[p] for p in hits if is_left[p] == which) for which in (False, True))
-        low, high = (sum(sum(at[p]) for p in at if not is_left[p]) for at in (start, end))
+        counted, unrepaired_hits = (sum(hits[p] for p in hits if is_unrepaired[p] == which) for which in (False, True))
+        low, high = (sum(sum(at[p]) for p in at if not is_unrepaired[p]) for at in (start, end))
         yield Finding(
             hits=counted,
             near=near[0],
             initially_near=near[1],
             crossings=(low, 0 if interval.is_at_rest else high),
-            crossing_meshes=tuple(pair for pair in start if not is_left[pair]),
+            crossing_meshes=tuple(pair for pair in start if not is_unrepaired[pair]),
             is_joined=is_joined,
-            left_pairs=tuple(sorted(left)) if last is None else (),
-            left_hits=left_hits,
-            kept_hits=sum(summary.mesh_pairs.values()) - counted - left_hits,
+            unrepaired_pairs=tuple(sorted(unrepaired)) if last is None else (),
+            unrepaired_hits=unrepaired_hits,
+            kept_hits=sum(summary.mesh_pairs.values()) - counted - unrepaired_hits,
             ignored_pairs=tuple(summary.ignored),
         )
         last = interval.segment

@@ -22,11 +22,11 @@ __all__ = ["FollowedFrame", "Follower"]
 _SWEEPS = 64, 16, 8
 """Sweeps that spread the displacements by contacts over the mesh, one number after the other."""
 _DETECTIONS = 16
-"""Detections after which a step is left to the stage."""
+"""Detections after which a step is delegated to the stage."""
 _PROJECTIONS = 20
 """Sweeps over the contacts after each detection."""
 _GAP = 0.005
-"""Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes layers that lie on
+"""Distance that contacts are moved apart, as a share of the median edge length: a larger one pushes sheets that lie on
 each other into the next ones."""
 _REACH = 0.07
 """Distance, as a share of that length, from which a contact of the frame before is none."""
@@ -69,7 +69,7 @@ class Follower:
     first widely, then less, and added to the given positions: the neighbourhood of a contact moves with it, and keeps
     the shape that it has in the given positions. All contacts that are known stay apart meanwhile, so that few are new
     in the next detection, which looks at the vertices alone whose motion has changed. What still collides after many
-    is left to :class:`warp_bsc.SolverCCD`.
+    is delegated to :class:`warp_bsc.SolverCCD`.
 
     Attributes:
         mesh: The mesh.
@@ -202,8 +202,8 @@ class Follower:
     def _contacts(self, start: wp.array, target, changed, arcs) -> tuple[Contacts, np.ndarray]:
         """Returns the contacts of a motion that can be moved apart, and which vertices collide or come too near.
 
-        Pairs that start too near are left to the stage, which lets them come no nearer. Those of which no vertex is
-        movable do not count, nor do those of which none is changed.
+        Pairs that start too near are delegated to the stage, which lets them come no nearer. Those of which no vertex
+        is movable do not count, nor do those of which none is changed.
         """
         end = self.mesh.device_positions(target, "target")
         found, touched = [], np.zeros(len(target), dtype=bool)

@@ -155,6 +155,6 @@ def _line(value: Any) -> bytes:
 
 def _as_finding(fields: dict[str, Any]) -> Finding:
     """Returns a finding from its fields in JSON."""
-    pairs = {name: tuple(map(tuple, fields[name])) for name in ("crossing_meshes", "left_pairs", "ignored_pairs")}
+    pairs = {name: tuple(map(tuple, fields[name])) for name in ("crossing_meshes", "unrepaired_pairs", "ignored_pairs")}
     values: dict[str, Any] = fields | pairs | {"crossings": tuple(fields["crossings"])}
     return Finding(**values)

@@ -40,7 +40,7 @@ def groups_of(
     if len(kinds) > _MOST_KINDS:
         raise ValueError(
             f"meshes that cross at the first frame, or are ignored, make {len(kinds)} combinations, of which at most "
-            f"{_MOST_KINDS} can be left as they are; keep or exclude some meshes, or include them in the repair"
+            f"{_MOST_KINDS} can stay as they are; keep or exclude some meshes, or include them in the repair"
         )
     if not any(partners.values()) and not any(are_kept for are_kept, _ in kinds):
         return None, None

@@ -29,7 +29,7 @@ _FADING = 0.7
 _FADED = 0.002
 """Displacement, as a share of the median edge length, below which the next frame begins with none."""
 _SOUGHT, _ACCEPTED = 0.02, 0.05
-"""Displacement of vertices alone, as a share of that length, that is left to them while displacements are sought, and
+"""Displacement of vertices alone, as a share of that length, that they keep while displacements are sought, and
 afterwards."""
 _MORE_DISTANCE = 1.0 + 2.0**-8
 """Distance that is kept, as a multiple of the minimum distance: the points of a layer are rounded."""
@@ -64,7 +64,7 @@ def repair_shot(
         keep: Patterns of meshes that are not moved, but are obstacles. Those that only a transform moves, shapes,
             curves, points, and instances are never moved.
         max_move: Largest distance of a vertex from the shot, in the scene's unit of length, more than 0. A stretch that
-            needs more is left as it is.
+            needs more stays as it is.
         min_distance: Distance that pairs keep in the stretches, in that unit: 0 or at least 2^-1021. It is certified
             for the motion from frame to frame. Pairs that are nearer at the start of a stretch come no nearer;
             elements that an edge of the mesh joins only do not touch.
@@ -78,7 +78,7 @@ def repair_shot(
     Raises:
         TypeError: If an argument has another type.
         ValueError: If a number is out of range, a pattern matches no mesh, the scene is broken at some time, or meshes
-            are left in more combinations than :func:`~.mesh_groups.groups_of` can tell apart.
+            stay as they are in more combinations than :func:`~.mesh_groups.groups_of` can tell apart.
     """
     check_instance(scene, "scene", Scene, "a Scene")
     kept = kept_meshes(scene, keep)
@@ -109,7 +109,7 @@ class _Shot:
         self._scene, self._findings, self._kept = scene, findings, kept
         self._min_distance, self._device = min_distance, device
         self._segment: Segment | None = None
-        self._passing = {pair for finding in findings for pair in (*finding.left_pairs, *finding.ignored_pairs)}
+        self._passing = {pair for finding in findings for pair in (*finding.unrepaired_pairs, *finding.ignored_pairs)}
 
     def stretches(self) -> list[tuple[int, int]]:
         """Returns the first intervals of the stretches and those after their last, ascending; they may overlap."""
@@ -133,8 +133,8 @@ class _Shot:
         last = self._span(first)[1]
         if not self._mesh.is_movable.any():
             return None, stop
-        left = []
-        start = self._start(first, interval, left)
+        reasons = []
+        start = self._start(first, interval, reasons)
         sought = [_nonzero(start.displacement)]
         contacts: dict[int, Contacts] = {}
         for frame in self._follow(first, stop, last, start, contacts):
@@ -151,10 +151,10 @@ class _Shot:
         is_free = all(finding.is_free for finding in self._findings[max(first, stop - 2 * MARGIN) : stop])
         if is_free and frame.differs:
             time = self._scene.times[stop]
-            left.append(f"the meshes have not returned to the shot at time {time:g}, where it ends or jumps")
-        stretch = recorder.finish(left)
+            reasons.append(f"the meshes have not returned to the shot at time {time:g}, where it ends or jumps")
+        stretch = recorder.finish(reasons)
         if max_move is not None and stretch.largest_move > max_move:
-            reason = f"left as it is: a move of {stretch.largest_move:g} is needed, more than {max_move:g}"
+            reason = f"kept as it is: a move of {stretch.largest_move:g} is needed, more than {max_move:g}"
             recorder = StretchRecorder(self._mesh)
             self._record(recorder, first, ShotFrame.of_shot(start.given), 0)
             stretch = replace(recorder.finish([reason]), end=self._scene.times[stop])
@@ -202,8 +202,8 @@ class _Shot:
             return arcs
         return RigidMotion(arcs.body, arcs.centre - self._origin, arcs.turn, tolerance=arcs.tolerance)
 
-    def _start(self, first, interval, left) -> ShotFrame:
-        """Returns the first frame, repaired if it crosses; adds to ``left`` what still does."""
+    def _start(self, first, interval, reasons) -> ShotFrame:
+        """Returns the first frame, repaired if it crosses; adds to ``reasons`` what still does."""
         given = self._single(interval.x0)
         if not self._findings[first].crossings[0]:
             return ShotFrame.of_shot(given)
@@ -212,7 +212,7 @@ class _Shot:
         if result.unresolved:
             pairs = sorted({" and ".join(dict.fromkeys(names)) for names in self._findings[first].crossing_meshes})
             reasons = "; ".join(dict.fromkeys(contour.reason for contour in result.unresolved))
-            left.append(
+            reasons.append(
                 f"the frame at time {interval.start:g} crosses itself, with {result.crossings} edges through faces, of "
                 f"{', '.join(pairs)}: {reasons}"
             )

@@ -18,10 +18,10 @@ from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
 from .stretch import RepairedStretch
 
-__all__ = ["LEFT_HITS", "RepairPage"]
+__all__ = ["UNREPAIRED_HITS", "RepairPage"]
 
-LEFT_HITS = "collisions of meshes that cross at the first frame"
-"""What is left of pairs of meshes that are left as they are."""
+UNREPAIRED_HITS = "collisions of meshes that cross at the first frame"
+"""What remains of pairs of meshes that stay as they are."""
 
 _ALL_FACES = (
     3_000_000  # about 25 MB, in the views of all frames together; divided by their number, the limit of a frame ...
@@ -141,8 +141,8 @@ class _Summary:
         ]
         if min_distance:
             tiles.append(_left(before, after, f"pairs nearer than {min_distance:g}", lambda found: found.near))
-        if before[0].left_pairs:
-            tiles.append(_left(before, after, LEFT_HITS, lambda found: found.left_hits))
+        if before[0].unrepaired_pairs:
+            tiles.append(_left(before, after, UNREPAIRED_HITS, lambda found: found.unrepaired_hits))
         ratios = [stretch.edge_ratio for stretch in stretches]
         tiles += [
             (f"{len(moves.keys() & {frame['time'] for frame in self.frames}):,} of {len(moves):,}", "frames moved"),
@@ -169,7 +169,7 @@ class _Summary:
             "up_axis": scene.up_axis,
             "stretches": [
                 (
-                    [f"{stretch.start:g} to {stretch.end:g}", "; ".join(stretch.left)],
+                    [f"{stretch.start:g} to {stretch.end:g}", "; ".join(stretch.reasons)],
                     f"{len(stretch.largest_moves):,}",
                     f"{stretch.moved:,}",
                     f"{stretch.largest_move / stretch.edge_length:.3f}",
@@ -186,7 +186,10 @@ class _Summary:
                 ("Vertices", f"{scene.vertex_count:,}"),
                 ("Triangles", f"{scene.face_count:,}"),
                 *((f"Kept: {name}", reason) for name, reason in list(kept.items())[:_MAX_ROWS]),
-                *((f"Left: {a}", f"with {b}, which it crosses at first") for a, b in before[0].left_pairs[:_MAX_ROWS]),
+                *(
+                    (f"Not repaired: {a}", f"with {b}, which it crosses at first")
+                    for a, b in before[0].unrepaired_pairs[:_MAX_ROWS]
+                ),
             ],
             "notes": [
                 "Moves are distances from the scene at the same time; edges are compared with the scene at the same "
@@ -295,7 +298,7 @@ def _left(
     *,
     last: bool = False,
 ) -> tuple[str, str]:
-    """Returns how many findings are left and were there before, in words; ``last`` adds the crossings at the end."""
+    """Returns how many findings remain and were there before, in words; ``last`` adds the crossings at the end."""
     sums = [
         None if findings is None else sum(map(number, findings)) + last * findings[-1].crossings[1]
         for findings in (before, after)

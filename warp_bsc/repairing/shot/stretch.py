@@ -26,7 +26,7 @@ class RepairedStretch:
         acceleration: Largest second difference of the displacement of a vertex over three frames, and of its position
             in the shot, in the unit of length.
         uncertified: Times of the frames whose motion from the frame before is not certified.
-        left: Why collisions are left, in words; empty where none should be.
+        reasons: Why collisions remain, in words; empty where none should be.
     """
 
     start: float
@@ -40,7 +40,7 @@ class RepairedStretch:
     edge_ratio: tuple[float, float]
     acceleration: tuple[float, float]
     uncertified: tuple[float, ...]
-    left: tuple[str, ...]
+    reasons: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +123,8 @@ class StretchRecorder:
         ratio = lengths[0] / np.maximum(lengths[1], 1e-12 * self._mesh.length)
         self._ratio = min(self._ratio[0], float(ratio.min())), max(self._ratio[1], float(ratio.max()))
 
-    def finish(self, left: list[str]) -> RepairedStretch:
-        """Returns the stretch; ``left`` says why collisions are left."""
+    def finish(self, reasons: list[str]) -> RepairedStretch:
+        """Returns the stretch; ``reasons`` say why collisions remain."""
         return RepairedStretch(
             start=self._times[0],
             end=self._times[-1],
@@ -137,7 +137,7 @@ class StretchRecorder:
             edge_ratio=self._ratio,
             acceleration=(self._acceleration[0], self._acceleration[1]),
             uncertified=tuple(self._uncertified),
-            left=tuple(left),
+            reasons=tuple(reasons),
         )
 
 

@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def _count(step: Step, contacts: PairQueue, i: int, arcs: Arcs, status: SolveStatus):
-    """Counts a contact on arcs as one that is left."""
+    """Counts a contact on arcs as one that remains."""
     if not has_pair(contacts, i):
         return
     motion, corners = step.motion, vertices_of(contacts, i)

@@ -97,7 +97,7 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
 
 
 def _search(work, overflow):
-    """Completes a detection whose queues were too small: all contacts that are left are divided from here on."""
+    """Completes a detection whose queues were too small: all contacts that remain are divided from here on."""
     broad_phase = work.detector.broad_phase
     broad_phase.fit(work.step.motion.x0, work.vertices.x1)
     find_contacts_without_queues(broad_phase, work.step, work.arcs, work.dividing, work.status)

@@ -1,4 +1,4 @@
-"""The first contact of a vertex as one number, and the path that is left before it."""
+"""The first contact of a vertex as one number, and the path that remains before it."""
 
 import warp as wp
 

@@ -124,7 +124,7 @@ def _disable_if_behind(step: Step, nearest: wp.array2d[float], status: SolveStat
 def disable_contacts_behind(step: Step, nearest: wp.array2d[float], status: SolveStatus, threads: int):
     """Disables constraints for slow contacts of elements with another face between them at the start.
 
-    What falls by more than the layers of a stack are apart would collide with many of them, but meets only the nearest.
+    What falls by more than the sheets of a stack are apart would collide with many of them, but meets only the nearest.
     If it still collides with others after the projection, planes divide them.
     """
     for i in range(wp.tid(), constraint_count(step), threads):
@@ -147,8 +147,8 @@ def drop_proximities(
 def add_proximities(work: Workspace) -> None:
     """Adds constraints for slow pairs whose distance one of the two could cross if the other stood still.
 
-    In a stack that falls on something, only the lowest contact is found at first, and each layer collides as soon as
-    the one below stands still: with constraints for contacts alone, each layer would need an iteration. Only pairs in
+    In a stack that falls on something, only the lowest contact is found at first, and each sheet collides as soon as
+    the one below stands still: with constraints for contacts alone, each sheet would need an iteration. Only pairs in
     worlds that have contacts, and whose closest points are within both elements, are used, because others soon are
     those of other elements, and none with another face between them, if nothing crosses: neighbours in a stack hold
     what is behind them.
@@ -171,7 +171,7 @@ def add_proximities(work: Workspace) -> None:
 def _find_nearest(work):
     """Finds the nearest faces on the ways of all vertices in the last detection."""
     detector, broad_phase = work.detector, work.detector.broad_phase
-    if isinstance(broad_phase, BroadPhaseHierarchy):  # without a queue, as layers behind others are many
+    if isinstance(broad_phase, BroadPhaseHierarchy):  # without a queue, as sheets behind others are many
         arguments = NearestArguments()
         arguments.faces, arguments.step, arguments.nearest = broad_phase.hierarchy, work.step, work.nearest
         broad_phase.fit(work.step.motion.x0, work.vertices.x1, work.active, keep_separated=True)

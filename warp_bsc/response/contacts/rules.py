@@ -157,7 +157,7 @@ def _at(motion: Motion, vertex: int, time: wp.float64) -> wp.vec3d:
 def are_parallel(motion: Motion, edges: wp.vec4i) -> bool:
     """Returns whether two edges are nearly parallel: bending a little turns what is across both by any angle.
 
-    A push in that direction would move cloth sideways, and strain it, where layers lie edge on edge.
+    A push in that direction would move cloth sideways, and strain it, where sheets lie edge on edge.
     """
     a, b, c, d = corners_of(motion.x0, edges)
     u = b - a

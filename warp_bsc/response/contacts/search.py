@@ -9,7 +9,7 @@ from ...detection.broad.element_pairs import filtered_pairs, pair_functions
 from ...detection.broad.face_hierarchy import FaceHierarchy, traversal_kernel
 from ...detection.narrow.rules.approach import impact_on_arcs_at_distance
 from ...detection.run.settings import TOLERANCE
-from ...kernels.arcs import Arcs, are_of_one_group, impact_on_arcs, turns
+from ...kernels.arcs import Arcs, impact_on_arcs, move_as_one, turns
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
@@ -186,7 +186,7 @@ def _kernel(keep_distances: bool, padded: bool, on_arcs: bool) -> wp.Kernel:
                     if owner != ContactClass.NONE:
                         if turns(arguments.arcs, corners):
                             straight = False
-                            if not are_of_one_group(arguments.arcs, corners):
+                            if not move_as_one(arguments.arcs, corners):
                                 decide_on_arcs(arguments, kind, pair, corners, owner)
                 if owner != ContactClass.NONE and straight:
                     decide(arguments, kind, pair, corners, owner)

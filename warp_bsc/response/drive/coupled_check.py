@@ -175,7 +175,6 @@ class CoupledCheck:
         others.bodies = wp.array(np.isin(np.arange(model.body_count), self.bodies), dtype=int, device=device)
         others.body_world = model.body_world
         self._start, self._end = model.state(), model.state()
-        motion.set_start(arrays_of(self._start))
         self._inspect()
         motion.last.begin()
         step.lost.fill_(1)
@@ -226,6 +225,7 @@ class CoupledCheck:
         self._motion.set_end(arrays_of(self._end), 1.0)
         self._work.loop[Loop.RECOUNT].fill_(1)
         inspect(self._work)
+        self._motion.last.end(self._end.body_q, self._motion.planes.end)
 
     def find_bodies(self) -> np.ndarray:
         """Returns the bodies of other entries that the certificate of the last step lacks, sorted, int32, shape [n].

@@ -3,14 +3,14 @@
 Before a step, the contacts of particles that fly on are detected. They and the proximities become constraints, planes
 at the times of impact, which Style3D gets in place of contacts of its own: forces that push, with friction, and their
 derivatives. The motion that Style3D predicts therefore nearly meets the contacts, and its whole step is in equilibrium
-with them. What is left, the stage detects and resolves as ever.
+with them. What remains, the stage detects and resolves as ever.
 
 On the CPU, where threads of the detection find contacts in any order, constraints are sorted once a step by a hash of
 all that their forces depend on: forces are added up in the same order in equal steps, bit for bit. On a GPU they are
 added up in any order, and so are the forces of Style3D itself.
 
 The springs are implicit, and add no energy. Multipliers in their place (an augmented Lagrangian) would meet the
-contacts closer, but those of the first iterations threw layers apart.
+contacts closer, but those of the first iterations threw sheets apart.
 """
 
 import functools
@@ -216,8 +216,8 @@ class Style3DContacts:
         mesh, device = work.mesh, work.device
         model = mesh.model
         self._work, self._model = work, model
-        self._flight = ModelMotion(mesh, work.motion.friction)
-        self._flight.last.begin()
+        self._flight = ModelMotion(mesh, work.motion.friction, last=work.motion.last)
+        self._ends = wp.zeros_like(work.vertices.x1)
         self._diagonal = wp.zeros(model.particle_count, dtype=wp.mat33, device=device)
         self._product = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
         self._keys: wp.array[wp.uint64] | None = None
@@ -228,7 +228,7 @@ class Style3DContacts:
         work, flight, model, start = self._work, self._flight, self._model, arrays_of(state)
         motion, work.motion, last = work.motion, flight, flight.last.positions
         try:
-            wp.copy(last, work.vertices.x1)
+            wp.copy(self._ends, last)
             flight.set_start(start)
             flight.set_end(start, dt)
             inputs = [start, state.particle_f, model.particle_world, model.gravity, dt]
@@ -236,7 +236,7 @@ class Style3DContacts:
             find_contacts(work)
             add_proximities(work)
             self._sort()
-            wp.copy(work.vertices.x1, last)  # where the step before ended
+            wp.copy(last, self._ends)  # which the response overwrites
         finally:
             work.motion = motion
 

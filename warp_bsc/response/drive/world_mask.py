@@ -158,6 +158,9 @@ class WorldMask:
         finally:
             vertices.inverse_mass, vertices.bodies.inverse_mass = masses, body_masses
             work.motion, work.active, work.unmasked = motion, work.can_move, None
+
+    def end(self, mask: wp.array[wp.bool]) -> None:
+        """Puts back where the last step ended, in worlds that take no part."""
         self._last.restore(mask)
 
 

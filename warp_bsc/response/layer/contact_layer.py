@@ -68,12 +68,12 @@ class ContactLayer(WrappedSolver):
     momentum, but angular momentum only to the first order of the step, as they act along directions at y (see above).
 
     Cloth rests on the layer, and should start outside of it: otherwise it is pushed out within a few steps, and thrown,
-    of which the layer warns in its first step. Elements that touch, at the start of a step or at its end, are left to
-    the stage.
+    of which the layer warns in its first step. Elements that touch, at the start of a step or at its end, are delegated
+    to the stage.
 
     Limitations:
         Only contacts within one step are seen: what a program moves between steps is passed on to the stage. Contacts
-        between bodies, and of bodies with infinite planes, are left to the inner solver and the stage; they make
+        between bodies, and of bodies with infinite planes, are delegated to the inner solver and the stage; they make
         results jump. So does what moves farther in a step than the layer is thick: behind the layer,
         ``report.gradient_counts.layer_passed_steps`` of the stage counts such steps.
 
@@ -162,8 +162,6 @@ class ContactLayer(WrappedSolver):
             self._poses = wp.zeros(body_count, dtype=wp.transform, device=device)
         self._layer, self._body_count = layer, body_count
         self.skipped, self._not_followed = (wp.zeros(1, dtype=wp.int64, device=device) for _ in range(2))
-        self._motion.set_start(arrays_of(self.model))
-        self._motion.set_end(arrays_of(self.model), 1.0)
         self._detect()  # allocates buffers, which a CUDA graph cannot
 
     @property

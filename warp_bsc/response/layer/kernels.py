@@ -95,7 +95,7 @@ def finish_shares(
     layer_overflows: wp.array[wp.int64],
 ):
     """Adds the shares of contacts with planes, and writes the sums; zeros if pairs are missing: then nothing pushes."""
-    vertex = wp.tid()  # or a body, whose contacts with planes are left to the inner solver
+    vertex = wp.tid()  # or a body, whose contacts with planes are delegated to the inner solver
     share = from_units(sums[vertex])
     sums[vertex] = wp.int64(0)
     if vertex < layer.motion.x0.shape[0]:

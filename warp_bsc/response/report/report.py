@@ -174,7 +174,7 @@ class SolverReport:
 
     @property
     def excluded(self) -> int:
-        """Contacts of the motion of the last step that were left to the inner solver.
+        """Contacts of the motion of the last step that were delegated to the inner solver.
 
         Their elements crossed or touched at the start of the step, or their vertex began in the solid of a plane.
         """
@@ -195,7 +195,7 @@ class SolverReport:
 
     @property
     def body_contacts(self) -> int:
-        """Contacts between bodies in the motion of the last step as it is stored, which were left to the inner solver.
+        """Contacts between bodies in the motion of the last step as it is stored, delegated to the inner solver.
 
         These are pairs of meshes that are to collide, of two bodies, or of a body and a static shape, without elements
         that crossed or touched at the start of the step. If it is 0, their motion is certified as well. It is also 0 if
@@ -230,8 +230,8 @@ class SolverReport:
     def inverted_at_start(self) -> int:
         """Tetrahedra whose volume at the start of the last step was 0 or negative, or not certainly positive.
 
-        No cut of a path changes that, and they are left to the inner solver. Those of which no vertex can be moved are
-        left out.
+        No cut of a path changes that, and they are delegated to the inner solver. Those of which no vertex can be moved
+        are left out.
 
         Raises:
             RuntimeError: If the stage was not asked to count them.
@@ -247,7 +247,7 @@ class SolverReport:
     def not_finite(self) -> int:
         """Particles whose position or velocity was not finite after the inner solver in the last step, or a substep.
 
-        They stood where they were at its start, and the step is not certified. Without a response they are left as the
+        They stood where they were at its start, and the step is not certified. Without a response they stay as the
         inner solver made them.
         """
         count = int(np.count_nonzero(self.outcomes.find(NOT_FINITE)[: self._mesh.model.particle_count]))

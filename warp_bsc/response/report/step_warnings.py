@@ -13,7 +13,7 @@ from ..tuning import MAX_STRAIN
 from .text import not_finite_warning, revoked_warning, set_bodies_warning, shape_name, uncertified_warning
 
 _CROSSINGS = (
-    "edges pass through faces at the start of a step, and their contacts are left to the solver: "
+    "edges pass through faces at the start of a step, and their contacts are delegated to the solver: "
     "warp_bsc.repair_state(model, state) moves them apart before the first step"
 )
 _INVERSIONS = (

@@ -65,7 +65,7 @@ def _divide_proximity(step: Step, dividing: DividingPlanes, status: SolveStatus,
 def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus, threads: int):
     """Adds dividing planes for proximities, of which those of vertices and faces then may change velocities.
 
-    In a stack, a vertex that is moved onto one side comes into the next layer, which would need an iteration for each.
+    In a stack, a vertex that is moved onto one side comes into the next sheet, which would need an iteration for each.
     """
     for i in range(wp.tid(), constraint_count(step), threads):
         _divide_proximity(step, dividing, status, i)
@@ -77,7 +77,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, 
 
     The vertices go straight here, but in an arc where the body turns: if one ends below its plane for that and
     collides, the next iteration cuts the path again. Where a contact has no plane, the path ends before that contact.
-    If the step is recorded, first contacts are left for :func:`record_body_truncations`.
+    If the step is recorded, first contacts are kept for :func:`record_body_truncations`.
     """
     motion, vertices = step.motion, step.vertices
     vertex = motion.bodies.particle_count + wp.tid()

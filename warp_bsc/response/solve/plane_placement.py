@@ -5,7 +5,7 @@ at all times of a linear motion: where along it the plane lies at the end is fre
 that it wants, and one that it has reached, at first its start. A pass places each plane between what its two elements
 have reached, as near as it may be to where they would meet, and then moves each vertex to the position above its planes
 that is nearest to what it wants. What it had reached is above them, so that a solution exists for all pairs at once,
-and each vertex finds it by itself, see :mod:`.vertex_projection`. Layers that fall together, even by more than they are
+and each vertex finds it by itself, see :mod:`.vertex_projection`. Sheets that fall together, even by more than they are
 apart, follow each other in a few passes. Elements that slide along a plane go on sliding.
 """
 
@@ -157,7 +157,7 @@ def move_to_sides(step: Step, planes: DividingPlanes, tolerance: wp.float64, sta
     reached = planes.reached[particle]
     wanted = planes.wanted[particle]
     end = reached
-    if passes == 1:  # later, when a plane has moved, what is left of the way is mostly across it
+    if passes == 1:  # later, when a plane has moved, what remains of the way is mostly across it
         exact, cut = position_on_sides(planes, particle, reached, wanted)
         end = exact
         planes.placed[particle] = wp.where(cut, CUT_SHORT, PLACED)

@@ -20,7 +20,7 @@ class CollisionFilter:
 
     Groups and masks are bits: integers in [0, 2^32), or -1 for all bits; NumPy or Warp arrays with one for each
     particle or shape of the model, or one for all. Edges and faces meet where all of their particles do. A pair that is
-    left out is left to the inner solver; the stage does not look at it, pushes nothing because of it, counts it in
+    left out is delegated to the inner solver; the stage does not look at it, pushes nothing because of it, counts it in
     ``report.filtered``, and does not certify it. A stage reads the arrays once, when it is made.
 
     Cloth that does not collide with itself, only with shapes: ``CollisionFilter(particle_group=2, particle_mask=1)``.

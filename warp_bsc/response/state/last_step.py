@@ -49,10 +49,9 @@ class LastStep:
     """Where the last step ended, and which worlds do not go on from there.
 
     Attributes:
-        positions: Positions of the vertices at its end [m], as the response left them.
-        planes: Infinite planes at its end, until the next step writes its own.
-        poses: Poses of the bodies at its end, until the next step writes the predicted ones.
-        interrupted: By world, then of any: 1 where the next step begins where its state is.
+        positions: Positions of the vertices at its end [m], until the response begins to move those of the next step.
+        planes, poses: Infinite planes, and poses of the bodies, at its end, until the next step ends.
+        interrupted: By world, then of any: 1 where the next step begins where its state is, until that step ends.
         starts: The positions, after :meth:`begin`; None if steps begin where their state is.
         arrays: All of them: to restore them lets a program repeat a step.
         worlds: The worlds of the elements of each, -1 for all worlds.
@@ -65,7 +64,6 @@ class LastStep:
         self.positions = wp.zeros(mesh.vertex_count, dtype=wp.vec3, device=device)
         self.planes = wp.zeros(len(planes.world), dtype=wp.vec4d, device=device)
         self.poses = wp.zeros(model.body_count, dtype=wp.transform, device=device)
-        self.end(model.body_q)
         self.interrupted = wp.zeros(worlds + 1, dtype=int, device=device)
         self.arrays: list[wp.array] = [self.positions, self.planes, self.poses, self.interrupted]
         each = wp.array([*range(worlds), -1], dtype=int, device=device)
@@ -87,10 +85,12 @@ class LastStep:
         self.planes.assign(planes)
         mesh.positions(model.particle_q, self.poses, self.positions)
 
-    def end(self, body_q: wp.array[wp.transform] | None) -> None:
-        """Copies the poses at the end of a step, after the response, which has written all else."""
+    def end(self, body_q: wp.array[wp.transform] | None, planes: wp.array[wp.vec4d]) -> None:
+        """Copies poses and planes at the end of a step, whose response has written the positions."""
         if body_q is not None:
             wp.copy(self.poses, body_q)
+        wp.copy(self.planes, planes)
+        self.interrupted.zero_()
 
     def interrupt(self, world_mask: wp.array[wp.bool] | None = None) -> None:
         """Makes the next step begin where its state is.

@@ -200,12 +200,12 @@ class ModelMesh(CollisionMesh):
             kept: The distances that pairs keep.
             reach: How much farther apart than their minimum distance the pairs of a proximity are at most [m].
         """
-        count, group = self.model.particle_count, np.full(self.vertex_count, -1)
+        count, rigid_id = self.model.particle_count, np.full(self.vertex_count, -1)
         half = 0.5 * kept.minimum
         every = half + np.concatenate([kept.radii, kept.margins[self.shape_vertices.shape]])
-        group[count:] = self.shape_vertices.body + 1
+        rigid_id[count:] = self.shape_vertices.body + 1
         return make_min_distances(
-            self, every, of_planes=half + kept.margins[self.planes.shape], reach=reach, group=group
+            self, every, of_planes=half + kept.margins[self.planes.shape], reach=reach, rigid_id=rigid_id
         )
 
     def _on_device(self, values: np.ndarray) -> wp.array:

@@ -126,8 +126,8 @@ def _write_bodies(
 ):
     """Writes poses, velocities and inverse masses of bodies at the end of the step.
 
-    A body whose pose or velocity is not finite is left to the inner solver, and so is one that is in all of several
-    worlds.
+    A body whose pose or velocity is not finite is delegated to the inner solver, and so is one that is in all of
+    several worlds.
     """
     body = wp.tid()
     pose = end.body_q[body]
@@ -147,6 +147,7 @@ def _write_end(
     particle_qd: wp.array[wp.vec3],
     dt: float,
     last: wp.array[wp.vec3],
+    last_planes: wp.array[wp.vec4d],
     # in and out
     motion: Motion,
     planes: MovingPlanes,
@@ -159,8 +160,8 @@ def _write_end(
     """
     i = wp.tid()
     if last and i < planes.end.shape[0] and not can_move(motion, place.plane_body[i]):
-        if continues(motion, planes.world[i]) and wp.isfinite(planes.end[i]):
-            planes.start[i] = planes.end[i]
+        if continues(motion, planes.world[i]) and wp.isfinite(last_planes[i]):
+            planes.start[i] = last_planes[i]
     _place_plane(place, i, planes.end)
     if i >= motion.x1.shape[0]:
         return
@@ -228,8 +229,9 @@ class ModelMotion:
         responds_to_bodies: bool = False,
         watches_turns: bool = False,
         has_adjoint: bool = True,
+        last: LastStep | None = None,
     ):
-        """Allocates buffers.
+        """Allocates buffers, with the model standing still.
 
         Args:
             mesh: The mesh.
@@ -238,14 +240,15 @@ class ModelMotion:
             responds_to_bodies: Whether it keeps bodies apart from each other and from static shapes.
             watches_turns: Whether the arcs of bodies that turn are to be known.
             has_adjoint: Whether steps may be recorded for the adjoint of the response, if the model requires gradients.
+            last: That of another motion, to share it; None for a new one.
         """
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
         self.differentiable = has_adjoint and model.requires_grad
         self.vertices = vertices = Motion()
         add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
-        self.last = last = LastStep(mesh)
-        vertices.interrupted = last.interrupted
+        self.last = last or LastStep(mesh)
+        vertices.interrupted = self.last.interrupted
         vertices.inverse_mass, vertices.world = mesh.inverse_masses, mesh.device_world
         vertices.friction, vertices.materials = friction.vertices, friction.materials
         vertices.pair_filter = mesh.pair_filter
@@ -257,17 +260,21 @@ class ModelMotion:
         planes.shape, planes.body, planes.shape_filter = of_planes.shape, of_planes.body, mesh.shape_filter
         of_worlds = members_of_worlds(mesh.planes.world, max(1, model.world_count))
         planes.of_worlds = wp.array(of_worlds, dtype=int, device=device)
-        planes.start, planes.end = wp.zeros_like(last.planes), last.planes
+        planes.start, planes.end = (wp.zeros_like(self.last.planes) for _ in range(2))
         self._size = max(mesh.vertex_count, len(friction.planes))
         self.moves_bodies = moves_bodies
         if moves_bodies:
             vertices.bodies = self._allocate_bodies()
             vertices.bodies.responds = int(responds_to_bodies)
         has_turns = watches_turns and (mesh.shape_vertices.body >= 0).any()
-        self.turns = BodyTurns(mesh, last.poses) if has_turns else None
+        self.turns = BodyTurns(mesh, self.last.poses) if has_turns else None
         self.keeps_poses = moves_bodies or bool(self.differentiable and model.body_count)
         if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
             add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
+        if last is None:
+            self.set_start(arrays_of(model))
+            self.set_end(arrays_of(model), 1.0)
+            self.last.end(model.body_q, planes.end)
 
     def _allocate_bodies(self):
         """Returns the bodies of the model, with buffers for their motion."""
@@ -296,6 +303,7 @@ class ModelMotion:
         inputs = [self.mesh.placed_shapes, self.last.poses, self.mesh.model.particle_count]
         outputs = [self.last.positions, self.last.planes]
         wp.launch(_jump, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+        wp.copy(self.planes.end, self.last.planes)
 
     def set_start(self, start: StateArrays) -> None:
         """Copies the positions at the start of a step, with errors as of :meth:`.state.mesh.ModelMesh.positions`."""
@@ -318,7 +326,7 @@ class ModelMotion:
             wp.copy(self.vertices.bodies.end, end.body_q)
         if self.turns is not None:
             self.turns.set_end(self.vertices, end.body_q, continues=self.last.starts is not None)
-        inputs = [place, end.particle_qd, dt, self.last.starts, self.vertices, self.planes]
+        inputs = [place, end.particle_qd, dt, self.last.starts, self.last.planes, self.vertices, self.planes]
         wp.launch(_write_end, self._size, inputs=inputs, device=self.mesh.device)
 
     def set_body_ends(self, end: StateArrays) -> None:

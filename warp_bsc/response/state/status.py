@@ -28,7 +28,7 @@ class Detection(IntEnum):
 
     HITS = 0  # contacts
     EXCLUDED = 1  # contacts of elements that crossed or touched at the start
-    OF_BODIES = 2  # contacts between bodies, which are left to the inner solver
+    OF_BODIES = 2  # contacts between bodies, which are delegated to the inner solver
     TOO_NEAR = 3  # 1 if a pair ends nearer than its separation, but not in contact
     FILTERED = 4  # contacts of shapes that do not collide by Newton's filters, and with planes that are filtered
 

@@ -31,7 +31,7 @@ class Pace(IntEnum):
 
 PROJECTED, DIVIDED, TRUNCATED, FROZEN, NOT_FINITE, UNCONSTRAINED = (wp.constant(bit) for bit in (1, 2, 4, 8, 16, 32))
 """Bits of the outcome of a vertex or a body: constraints moved it or may change its velocity; dividing planes moved it;
-its path was cut; it was frozen at its start; it was left there because its prediction was not finite; its velocity is
+its path was cut; it was frozen at its start; it stayed there because its prediction was not finite; its velocity is
 that of its path, as it was divided from contacts without constraints, or moved to prevent inversions."""
 UNCERTIFIED, INVALID = (wp.constant(bit) for bit in (64, 128))
 """Bits of the outcome of a vertex in a report: the certificate lacks it; and all elements that have it."""
@@ -99,7 +99,7 @@ class MovedBodies:
     moved: wp.array[int]  # 1 if its vertices follow
     delta_x: wp.array2d[wp.int64]  # changes of centre and turns summed over constraints, see bodies.add_body_delta
     delta_v: wp.array2d[wp.int64]  # changes of velocity summed over constraints
-    share: wp.array[wp.int64]  # of its path that is left before its contacts, in units, see division.find_body_shares
+    share: wp.array[wp.int64]  # of its path that remains before its contacts, in units, see division.find_body_shares
     first_contact: wp.array[wp.int64]  # of its vertices, packed by first_contact.packed_vertex
     loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN

@@ -84,26 +84,28 @@ def _write_turns(turns: Turns, motion: Motion, moved: MovedBodies):
 
 @wp.kernel
 def _write_arcs(turns: Turns, motion: Motion, x1: wp.array[wp.vec3], particles: int):
-    """Bounds the arcs of all vertices; pairs of two that nothing can move are of one group."""
+    """Bounds the arcs of all vertices; vertices that nothing can move have one rigid id."""
     vertex = wp.tid()
     bound_arc(turns.arcs, vertex, to_double(motion.x0[vertex]), to_double(x1[vertex]))
     body = turns.arcs.body[vertex]
-    group = int(-1)
+    rigid_id = int(-1)
     if vertex >= particles:
-        group = wp.where(can_move(motion, body), body + 1, 0)
+        rigid_id = wp.where(can_move(motion, body), body + 1, 0)
     elif motion.inverse_mass[vertex] == 0.0:
-        group = 0
-    turns.arcs.group[vertex] = group
+        rigid_id = 0
+    turns.arcs.rigid_id[vertex] = rigid_id
 
 
 @wp.kernel
-def _write_ends(motion: Motion, body_q: wp.array[wp.transform], continues: bool, turns: Turns):
+def _write_ends(
+    motion: Motion, body_q: wp.array[wp.transform], last_q: wp.array[wp.transform], continues: bool, turns: Turns
+):
     """Writes the predicted poses. A body that the response cannot move starts where the last step left it.
 
     So do its vertices, see :mod:`.motion`.
     """
     body = wp.tid()
-    before = turns.end[body]
+    before = last_q[body]
     world = turns.world[body]
     is_finite = wp.isfinite(wp.transform_get_translation(before)) and wp.isfinite(wp.transform_get_rotation(before))
     last = motion.interrupted.shape[0] - 1
@@ -120,14 +122,14 @@ class BodyTurns:
         turns: The poses and the arcs.
     """
 
-    def __init__(self, mesh: ModelMesh, poses: wp.array[wp.transform]):
-        """Allocates buffers for a model with bodies; ``poses`` are those at the end of the last step, then of this."""
-        self._mesh, model = mesh, mesh.model
+    def __init__(self, mesh: ModelMesh, last: wp.array[wp.transform]):
+        """Allocates buffers for a model with bodies, whose poses at the end of the last step are ``last``."""
+        self._mesh, self._last, model = mesh, last, mesh.model
         particles = np.full(model.particle_count, -1)
         self.turns = turns = Turns()
         count, device = model.body_count, mesh.device
         turns.arcs = allocate_arcs(np.concatenate([particles, mesh.shape_vertices.body]), count, device)
-        turns.start, turns.end = wp.zeros_like(poses), poses
+        turns.start, turns.end = wp.zeros_like(last), wp.zeros_like(last)
         turns.com, turns.world = model.body_com, model.body_world
 
     def set_start(self, body_q: wp.array[wp.transform]) -> None:
@@ -136,7 +138,7 @@ class BodyTurns:
 
     def set_end(self, motion: Motion, body_q: wp.array[wp.transform], *, continues: bool) -> None:
         """Copies the predicted poses at the end of a step, which ``continues`` the last one unless a world does not."""
-        inputs = [motion, body_q, continues, self.turns]
+        inputs = [motion, body_q, self._last, continues, self.turns]
         wp.launch(_write_ends, len(body_q), inputs=inputs, device=self._mesh.device)
 
     def write_arcs(self, motion: Motion, vertices: Vertices) -> None:

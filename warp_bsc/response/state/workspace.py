@@ -76,8 +76,6 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
             status.of_worlds.remaining[i] = 0
             status.of_worlds.left_out[i] = 0
             status.of_worlds.filtered[i] = 0
-    if i <= worlds:
-        motion.interrupted[i] = 0
     if i >= vertices.x1.shape[0]:
         return
     for axis in range(3):
@@ -326,7 +324,7 @@ class Workspace(Launches):
                 raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
             recorder.counts.zero_()
             self.record = recorder.record
-        size = max(len(self.vertices.x1), self.worlds + 1)
+        size = max(len(self.vertices.x1), self.worlds)
         self.launch(_begin, size, [self.step, self.worlds, self.dividing, self.status])
 
     def _if_distances(self, capacity):

@@ -1,1 +1,1 @@
-"""From prims of a stage to the positions of their meshes: schemas, instances, skinning, clips and topology."""
+"""From prims of a USD stage to the positions of their meshes: schemas, instances, skinning, clips and topology."""

@@ -10,10 +10,10 @@ __all__ = ["SceneFiles"]
 
 
 class SceneFiles:
-    """The files of all layers that a stage has opened so far, value clips included; and whether it was changed."""
+    """The files of all layers that a USD stage has opened so far, value clips included; and whether it was changed."""
 
     def __init__(self, stage: "Usd.Stage"):
-        """Records the versions of all files that a stage has opened so far, and listens to changes of the stage."""
+        """Records the versions of all files that a USD stage has opened so far, and listens to changes of the stage."""
         from pxr import Tf, Usd  # noqa: PLC0415 (slow)
 
         self._stage = stage

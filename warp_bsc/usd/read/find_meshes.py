@@ -50,10 +50,10 @@ def find_meshes(
                     continue
                 if found.instance is None:
                     mesh = UsdMesh(found, file)
-                elif first := first_instances.get(found.group):
+                elif first := first_instances.get(found.instanced_prim):
                     mesh = first.again(found)
                 else:
-                    mesh = first_instances[found.group] = UsdMesh(found, file)
+                    mesh = first_instances[found.instanced_prim] = UsdMesh(found, file)
         except UnreadableError as error:
             left_out.add(error)
             continue

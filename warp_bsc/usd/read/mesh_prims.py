@@ -26,7 +26,7 @@ class MeshPrim:
         name: The path, with the number of the instance if a point instancer places it.
         instance: That instance, None if no point instancer places it.
         binding: Its binding, see :func:`~warp_bsc.usd.read.skinning.find_bindings`, None if nothing deforms it.
-        group: The same value for all instances of a prim that one instancer places; empty without an instancer.
+        instanced_prim: The same for all instances of a prim that one instancer places; empty without an instancer.
     """
 
     def __init__(self, prim: Usd.Prim, instance: Instance | None, binding: tuple | None):
@@ -35,7 +35,7 @@ class MeshPrim:
         self.name = instance.name_of(prim.GetPath()) if instance else self.path
         self.instance = instance
         self.binding = binding
-        self.group = (id(instance.instancer), self.path) if instance else ()
+        self.instanced_prim = (id(instance.instancer), self.path) if instance else ()
 
     @cached_property
     def purpose(self) -> str:

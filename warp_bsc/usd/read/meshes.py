@@ -36,7 +36,7 @@ class UsdMesh:
         instance: The instance that it is, None for a mesh without an instancer.
         index: Number of the instance, 0 without an instancer.
         transforms: The transforms of all instances to the world.
-        group: The same value for all instances of a prim that one instancer places; empty without an instancer.
+        instanced_prim: The same for all instances of a prim that one instancer places; empty without an instancer.
         display_name: Display name in the file, empty if there is none.
         type_name: Type of the prim.
         is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.read.shapes.ShapePolygons`.
@@ -76,7 +76,7 @@ class UsdMesh:
         self._polygons: Polygons = self._strands or shaped(prim)
         self._skin = skin = Skin(*found.binding, where=f"{file}: {self.path}") if found.binding else None
         self.is_skinned = skin is not None
-        self.group = found.group
+        self.instanced_prim = found.instanced_prim
         self._last_points: dict[tuple, np.ndarray] = {}  # these two are shared by all instances
         self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
 
@@ -276,7 +276,7 @@ class UsdMesh:
             array = np.array(points)
             if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind != "f":
                 raise UnreadableError(f"{self._where}: attribute points holds {type(points).__name__}, not point3f[]")
-            if self.group:
+            if self.instanced_prim:
                 self._last_points.clear()
                 self._last_points[key] = array
             return array
@@ -335,7 +335,7 @@ class UsdMesh:
     def read_instances(
         self, time: float, instances: np.ndarray, point_count: int, *, before: bool = False
     ) -> np.ndarray | None:
-        """Returns the positions of all points in several instances of one :attr:`group` in world space, float64.
+        """Returns the positions of all points in instances of one :attr:`instanced_prim` in world space, float64.
 
         Args:
             time: Time code.
@@ -377,7 +377,7 @@ class UsdMesh:
         with reading(self._where, self.name, time):
             is_mirrored = bool(np.linalg.det(self._transform(time)[:3, :3]) < 0)
             code = self.time_code(time, False)
-            if not self.group:
+            if not self.instanced_prim:
                 return self._find_triangles(code, points, is_mirrored)
             if any(value != code.GetValue() for value, _ in self._last_triangles):
                 self._last_triangles.clear()

@@ -27,16 +27,16 @@ class PositionReader:
         self._rigid_parts = [part for part in parts if is_rigid(part[0])]
         self._rigid = RigidMeshes(self._rigid_parts, dtype)
         parts = [part for part in parts if not is_rigid(part[0])]
-        groups: dict[tuple, list] = {}
+        instanced: dict[tuple, list] = {}
         self._single = []
         for part in parts:
-            (groups.setdefault(part[0].group, []) if part[0].group else self._single).append(part)
-        self._groups = []
-        for members in groups.values():
+            (instanced.setdefault(part[0].instanced_prim, []) if part[0].instanced_prim else self._single).append(part)
+        self._instanced = []
+        for members in instanced.values():
             instances = np.array([mesh.index for mesh, *_ in members])
             rows = np.concatenate([np.arange(rows.start, rows.stop) for _, _, rows, _ in members])
             taken = np.concatenate([number * count + points for number, (_, count, _, points) in enumerate(members)])
-            self._groups.append((members, instances, rows, taken))
+            self._instanced.append((members, instances, rows, taken))
 
     def read(self, positions: np.ndarray, time: float, before: bool) -> None:
         """Writes the positions at a time, or just before it, to the rows of the meshes.
@@ -45,7 +45,7 @@ class PositionReader:
             UnreadableError: If a mesh is broken at that time.
         """
         singles = list(self._single)
-        for members, instances, rows, taken in self._groups:
+        for members, instances, rows, taken in self._instanced:
             first, count, *_ = members[0]
             together = first.read_instances(time, instances, count, before=before)
             found = None if together is None else together.reshape(-1, 3)[taken]

@@ -13,7 +13,7 @@ def is_rigid(mesh: UsdMesh) -> bool:
 
     False as well for instances of point instancers, which are read together otherwise.
     """
-    return not (mesh.deforms or mesh.is_skinned or mesh.may_jump or mesh.is_placed or mesh.group)
+    return not (mesh.deforms or mesh.is_skinned or mesh.may_jump or mesh.is_placed or mesh.instanced_prim)
 
 
 class RigidMeshes:

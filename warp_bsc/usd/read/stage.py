@@ -37,7 +37,7 @@ def given_stage(source: Any) -> Usd.Stage:
     if not isinstance(source, Usd.Stage):
         raise TypeError(f"source must be the path of a file, a Usd.Stage or an Sdf.Layer, not {given(source)}")
     if not source:
-        raise ValueError("source: the stage has been closed")
+        raise ValueError("source: the USD stage has been closed")
     return source
 
 

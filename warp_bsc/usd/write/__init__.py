@@ -1,1 +1,1 @@
-"""Layers with positions of points that a program computed."""
+"""USD layers with positions of points that a program computed."""

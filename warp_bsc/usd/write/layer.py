@@ -21,7 +21,7 @@ def layer_metadata(scene: Scene) -> dict[str, str | float]:
         ValueError: If the scene has no file.
     """
     if not scene.has_file:
-        raise ValueError(f"{scene.path}: a stage in memory has no file for a layer to be over: export it")
+        raise ValueError(f"{scene.path}: a USD stage in memory has no file for a layer to be over: export it")
     stage = scene.stage
     start, end = scene.times[0], scene.times[-1]
     if stage.HasAuthoredTimeCodeRange():

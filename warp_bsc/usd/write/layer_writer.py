@@ -14,8 +14,8 @@ import numpy as np
 __all__ = [
     "SHAPES",
     "LayerContent",
-    "LayerGroup",
     "LayerPrim",
+    "LayerScope",
     "PrimKind",
     "new_layer",
     "write_binary_layer",
@@ -33,7 +33,7 @@ _TEXT_ROWS = 4096  # rows of an array that are formatted at a time
 
 
 @dataclass(frozen=True)
-class LayerGroup:
+class LayerScope:
     """A prim of a layer that only has other prims below it.
 
     Attributes:
@@ -52,7 +52,7 @@ class LayerPrim:
     """A prim of a layer.
 
     Attributes:
-        name: Its name, after the name of its group and a slash.
+        name: Its name, after the name of its scope and a slash.
         kind: ``"Mesh"``, ``"PointInstancer"``, whose instances are octahedra, or ``"BasisCurves"``.
         attributes: Types of its attributes that have time samples, by their names.
         material: Name of its material, which prims of the same colour share.
@@ -75,15 +75,15 @@ class LayerContent:
     Attributes:
         metadata: Metadata of the layer, by name.
         documentation: Text for people.
-        custom: Name of a group of values for programs, and these by name; lists are of texts.
+        custom: Name of a dictionary of values for programs, and these by name; lists are of texts.
         asset: The ``assetInfo`` of the root prim.
         sublayer: Path of its sublayer, relative to its own folder. It is not read.
         root: Path of the prim above all prims, of purpose guide.
         strings: Attributes of that prim, lists of texts, by name.
-        groups: The prims below it.
+        scopes: The prims below it.
         prims: The prims below these.
         variant_set: Name of its variant set, whose first variant is selected.
-        hidden: Names of the groups and prims that each variant hides.
+        hidden: Names of the scopes and prims that each variant hides.
         samples: Yields the time samples of an attribute in order, given its prim and its name: time codes and arrays of
             :data:`SHAPES`.
     """
@@ -95,7 +95,7 @@ class LayerContent:
     sublayer: str
     root: str
     strings: dict[str, list[str]]
-    groups: list[LayerGroup]
+    scopes: list[LayerScope]
     prims: list[LayerPrim]
     variant_set: str
     hidden: dict[str, list[str]]
@@ -191,9 +191,9 @@ def _describe(layer, content):
     """Sets the metadata of a layer."""
     from pxr import Vt  # noqa: PLC0415 (slow)
 
-    group, values = content.custom
+    name, values = content.custom
     values = {name: Vt.StringArray(value) if isinstance(value, list) else value for name, value in values.items()}
-    layer.customLayerData = {group: values}
+    layer.customLayerData = {name: values}
     layer.documentation = content.documentation
     for name, value in content.metadata.items():
         layer.pseudoRoot.SetInfo(name, value)
@@ -209,10 +209,10 @@ def _define_prims(layer, content):
     root.CreatePurposeAttr(UsdGeom.Tokens.guide)
     root.GetPrim().SetAssetInfo(content.asset)
     _define_strings(root.GetPrim(), content.strings)
-    for group in content.groups:
-        prim = UsdGeom.Scope.Define(stage, f"{content.root}/{group.name}").GetPrim()
-        prim.SetDisplayName(group.label)
-        _define_strings(prim, group.strings)
+    for scope in content.scopes:
+        prim = UsdGeom.Scope.Define(stage, f"{content.root}/{scope.name}").GetPrim()
+        prim.SetDisplayName(scope.label)
+        _define_strings(prim, scope.strings)
     UsdGeom.Scope.Define(stage, f"{content.root}/Materials")
     for part in content.prims:
         prim = stage.DefinePrim(f"{content.root}/{part.name}", part.kind)

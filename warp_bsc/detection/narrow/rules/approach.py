@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ....kernels.arcs import Arcs, are_of_one_group, distance_at, impact_on_arcs
+from ....kernels.arcs import Arcs, distance_at, impact_on_arcs, move_as_one
 from ....kernels.ccd import impact_at_distance
 from ....kernels.min_distance import clears_at_once, closest_at
 from ....kernels.motion import doubles, motion_and_distance
@@ -20,9 +20,9 @@ from ....kernels.signs import FREE, ROUNDOFF
 from ....kernels.time_of_impact import Impact
 from ...mesh import CollisionMesh
 from ...run.launch import made_once
+from ...run.phase_timer import PhaseTimer
 from ...run.settings import TOLERANCE
-from ...run.stage_timer import StageTimer
-from ..narrow_phase import Phases, launch_culls, launch_decisions, stages_of
+from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions
 from ..pair_kernels import PairRule
 from ..rings import Rings, are_within_rings, make_rings
 
@@ -56,18 +56,18 @@ class MinDistances:
         of_planes: Radius of each infinite plane, half of the minimum distance included [m].
         reach: Largest distance of proximities beyond their minimum distance [m].
         rings: Vertices whose elements have no minimum distance.
-        group: Group of each vertex; pairs within a group are skipped. -1 for none.
+        rigid_id: Rigid body of each vertex, by any number; pairs within one are skipped. -1 for none.
     """
 
     radius: wp.array[wp.float64]
     of_planes: wp.array[wp.float64]
     reach: wp.float64
     rings: Rings
-    group: wp.array[int]
+    rigid_id: wp.array[int]
 
 
 def make_min_distances(
-    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, group: np.ndarray
+    mesh: CollisionMesh, radius: np.ndarray, *, of_planes: np.ndarray, reach: float, rigid_id: np.ndarray
 ) -> MinDistances:
     """Returns the minimum distances of a mesh on its device, see :class:`MinDistances`.
 
@@ -76,14 +76,14 @@ def make_min_distances(
         radius: Radius of each vertex, float64, shape [vertex_count].
         of_planes: Radius of each infinite plane, float64, shape [plane_count].
         reach: Largest distance of proximities beyond their minimum distance.
-        group: Group of each vertex, int, shape [vertex_count].
+        rigid_id: As of :class:`MinDistances`, int, shape [vertex_count].
     """
     distances = MinDistances()
     distances.radius = wp.array(radius, dtype=wp.float64, device=mesh.device)
     distances.of_planes = wp.array(of_planes, dtype=wp.float64, device=mesh.device)
     distances.reach = reach
     distances.rings = make_rings(mesh, _RINGS)
-    distances.group = wp.array(group, dtype=int, device=mesh.device)
+    distances.rigid_id = wp.array(rigid_id, dtype=int, device=mesh.device)
     return distances
 
 
@@ -145,11 +145,11 @@ def _rule(turning: bool) -> PairRule:
 
     @wp.func
     def excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
-        group = options.distances.group[v[0]]
-        if group >= 0 and options.distances.group[v[3]] == group:
+        body = options.distances.rigid_id[v[0]]
+        if body >= 0 and options.distances.rigid_id[v[3]] == body:
             return True
         if wp.static(turning):
-            return are_of_one_group(options.arcs, v)
+            return move_as_one(options.arcs, v)
         return False
 
     @wp.func
@@ -214,9 +214,9 @@ def run_approaches(
     proximities: bool,
     tolerance: float = TOLERANCE,
     arcs: "Arcs | None" = None,
-    timer: StageTimer,
+    timer: PhaseTimer,
 ) -> None:
-    """Launches all stages over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
+    """Launches all phases over the queued pairs, without synchronizing with a GPU; contacts are not sorted.
 
     The status of a proximity is FREE. Times of impact are those at which a pair comes nearer than it may, 2 if it does
     not. With ``proximities``, coordinates and normals are those at which the pair comes within reach, at the start if
@@ -232,10 +232,10 @@ def run_approaches(
     options.distances, options.proximities, options.tolerance = distances, proximities, tolerance
     if arcs is not None:
         options.arcs = arcs
-    stages = stages_of(phases)
-    with timer.stage("cull"):
+    buffers = buffers_of(phases)
+    with timer.phase("cull"):
         for rule in rules:
-            launch_culls(rule, stages, x0, x1, options)
-    with timer.stage("classify"):
+            launch_culls(rule, buffers, x0, x1, options)
+    with timer.phase("classify"):
         for rule in rules:
-            launch_decisions(rule, stages, x0, x1, options)
+            launch_decisions(rule, buffers, x0, x1, options)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from ....kernels.arcs import Arcs, arc_bounds, are_of_one_group, impact_on_arcs, sagitta_of_part
+from ....kernels.arcs import Arcs, arc_bounds, impact_on_arcs, move_as_one, sagitta_of_part
 from ....kernels.min_distance import clears_at_once
 from ....kernels.motion import motion_and_distance
 from ....kernels.pairs import distance_of_corners, ends_of, vertices_of_pair
@@ -17,10 +17,10 @@ from ....kernels.pipeline.batch_culling import BATCH
 from ....kernels.pipeline.queues import filled_entries, take_slots
 from ....kernels.signs import FREE, ROUNDOFF
 from ...run.launch import launch_over, made_once
+from ...run.phase_timer import PhaseTimer
 from ...run.settings import NO_FUSED_OPERATIONS, Count
-from ...run.stage_timer import StageTimer
-from ..narrow_phase import Phases, launch_culls, launch_decisions, stages_of
-from ..pair_kernels import PairRule, PairStages, add_contact
+from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions
+from ..pair_kernels import PairBuffers, PairRule, add_contact
 
 __all__ = ["allocate_arcs", "bound_arc", "run_arcs"]
 
@@ -42,7 +42,7 @@ def allocate_arcs(body: np.ndarray, bodies: int, device: wp.Device, *, tolerance
     arcs = Arcs()
     arcs.turning = wp.zeros(1, dtype=int, device=device)
     arcs.body = wp.array(body, dtype=int, device=device)
-    arcs.group = wp.array(body, dtype=int, device=device)
+    arcs.rigid_id = wp.array(body, dtype=int, device=device)
     arcs.centre = wp.zeros(bodies, dtype=wp.vec3d, device=device)
     arcs.turn = wp.zeros(bodies, dtype=wp.vec3d, device=device)
     arcs.bounds = wp.zeros(len(body), dtype=wp.vec3d, device=device)
@@ -84,7 +84,7 @@ class Options:
 
 @wp.func
 def _excludes(options: Options, kind: int, v: wp.vec4i) -> bool:
-    return are_of_one_group(options.arcs, v)
+    return move_as_one(options.arcs, v)
 
 
 @wp.func
@@ -119,24 +119,24 @@ def _batch_kernel(dtype: type) -> wp.Kernel:
         options: Options,
         kind: int,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
         i = BATCH * (first + wp.tid())
-        end = wp.min(i + BATCH, filled_entries(stages.queue, stages.counts, _QUEUED))
+        end = wp.min(i + BATCH, filled_entries(buffers.queue, buffers.counts, _QUEUED))
         begin = i
-        while i < end and stages.queue[i][0] >= 0:
-            pair = stages.queue[i]
-            v = vertices_of_pair(kind, stages.elements, pair)
+        while i < end and buffers.queue[i][0] >= 0:
+            pair = buffers.queue[i]
+            v = vertices_of_pair(kind, buffers.elements, pair)
             result, is_contact = _decide(options, kind, v, x0, x1)
             if is_contact:
-                add_contact(pair, result, stages)
+                add_contact(pair, result, buffers)
             i += 1
-        take_slots(stages.counts, _SURVIVORS, i - begin)
+        take_slots(buffers.counts, _SURVIVORS, i - begin)
 
     return decide_arc_batches
 
 
-def run_arcs(phases: Phases, x0: wp.array, x1: wp.array, arcs: Arcs, *, timer: StageTimer) -> None:
+def run_arcs(phases: Phases, x0: wp.array, x1: wp.array, arcs: Arcs, *, timer: PhaseTimer) -> None:
     """Adds the contacts of queued pairs with a turning body, after those of :mod:`.contact`, without synchronizing.
 
     Arguments are those of :func:`.run_contacts`. On a CPU, :func:`.batch_culling_kernel` has left the pairs in their
@@ -145,14 +145,14 @@ def run_arcs(phases: Phases, x0: wp.array, x1: wp.array, arcs: Arcs, *, timer: S
     device = x0.device
     if device.is_cpu and not arcs.turning.numpy()[0]:
         return
-    options, stages = Options(), stages_of(phases)
+    options, buffers = Options(), buffers_of(phases)
     options.arcs = arcs
-    with timer.stage("classify"):
+    with timer.phase("classify"):
         if not device.is_cpu:
-            launch_culls(_RULE, stages, x0, x1, options)
-            launch_decisions(_RULE, stages, x0, x1, options)
+            launch_culls(_RULE, buffers, x0, x1, options)
+            launch_decisions(_RULE, buffers, x0, x1, options)
             return
-        for kind, s in stages.items():
+        for kind, s in buffers.items():
             filled = min(len(s.queue), int(s.counts.numpy()[Count.QUEUED]))
             inputs = [x0, x1, options, int(kind)]
             batches = -(-filled // int(BATCH))

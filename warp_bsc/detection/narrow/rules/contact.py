@@ -1,6 +1,6 @@
-"""The narrow phase of contacts: culls -> certified classification -> times of impact -> exact stage.
+"""The narrow phase of contacts: culls -> certified classification -> times of impact -> exact phase.
 
-Every stage writes a compact queue for the next, so that no thread waits for a neighbour's harder pair.
+Every phase writes a compact queue for the next, so that no thread waits for a neighbour's harder pair.
 """
 
 import functools
@@ -22,13 +22,13 @@ from ....kernels.polynomials import VERTEX_FACE, Motion, coplanarity
 from ....kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
 from ....kernels.time_of_impact import Impact, impact
 from ...run.launch import launch_over, made_once
+from ...run.phase_timer import PhaseTimer
 from ...run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, Method
-from ...run.stage_timer import StageTimer
 from ..batch_kernels import batch_classification_kernel, batch_culling_kernel, batch_impact_kernel
-from ..narrow_phase import Phases, launch_culls, launch_decisions, launch_over_kinds, stages_of
+from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions, launch_over_kinds
 from ..pair_kernels import (
+    PairBuffers,
     PairRule,
-    PairStages,
     add_open_contact,
     count_found,
     entry_of_two,
@@ -95,14 +95,14 @@ _RULE = PairRule(Options, _excludes, _clears, _decide, add=add_open_contact, cul
 
 
 @wp.func
-def _finish(i: int, status: int, timed: bool, stages: PairStages):
-    """Writes and counts what is decided of a contact, and enqueues it for the exact stage if that is needed."""
-    write_decision(i, status, stages)
+def _finish(i: int, status: int, timed: bool, buffers: PairBuffers):
+    """Writes and counts what is decided of a contact, and enqueues it for the exact phase if that is needed."""
+    write_decision(i, status, buffers)
     if status == FREE:
         return
-    count_found(status, stages)
-    if status == UNSURE or (timed and not stages.contacts.within_tolerance[i]):
-        stages.for_exact[wp.int32(take_slot(stages.counts, _FOR_EXACT))] = i
+    count_found(status, buffers)
+    if status == UNSURE or (timed and not buffers.contacts.within_tolerance[i]):
+        buffers.for_exact[wp.int32(take_slot(buffers.counts, _FOR_EXACT))] = i
 
 
 @made_once
@@ -121,8 +121,8 @@ def _impact_kernel(dtype: type) -> wp.Kernel:
         tolerance: wp.float64,
         kinds: wp.vec2i,
         # in and out
-        one: PairStages,
-        other: PairStages,
+        one: PairBuffers,
+        other: PairBuffers,
     ):
         kind, i, v = entry_of_two(
             first + wp.tid(), kinds, one.contacts.pairs, other.contacts.pairs, one, other, _CONTACTS
@@ -160,9 +160,9 @@ def run_contacts(
     timed: bool = True,
     tolerance: float = TOLERANCE,
     arcs: "Arcs | None" = None,
-    timer: StageTimer,
+    timer: PhaseTimer,
 ) -> None:
-    """Launches all stages but the sorting over the queued pairs of both kinds, or of one.
+    """Launches all phases but the sorting over the queued pairs of both kinds, or of one.
 
     A GPU decides both kinds in the same launches, without synchronizing.
 
@@ -170,45 +170,45 @@ def run_contacts(
         phases: Narrow phases of different kinds, each with the vertex indices of its elements.
         x0: Positions at the start of the step, array of vec3 or vec3d.
         x1: Positions at its end, of the same type.
-        method: One of :data:`METHODS`; with "exact", pairs too wide for the device are left to
+        method: One of :data:`METHODS`; with "exact", pairs too wide for the device are delegated to
             :func:`.decide_on_host`.
         timed: Whether to find times of impact, coordinates and normals.
         tolerance: Of the times of impact, as a share of the step.
         arcs: Pairs with a turning vertex are left out, for :mod:`.arc`; None if nothing turns.
-        timer: Measures the stages.
+        timer: Measures the phases.
     """
     options = Options()
     options.roundoff = 0.0 if method == "float" else ROUNDOFF
     if arcs is not None:
         options.arcs = arcs
-    stages, is_cpu = stages_of(phases), x0.device.is_cpu
+    buffers, is_cpu = buffers_of(phases), x0.device.is_cpu
     motion = [x0, x1, options.roundoff]
 
     def launch_batches(kernel_of: Callable, others: list, buffer: str, count: Count, batch: int) -> None:
         """Launches the kernel of each kind over the filled entries of a buffer, many at a time, on a CPU."""
-        for kind, s in stages.items():
+        for kind, s in buffers.items():
             filled = min(getattr(s, buffer).shape[0], int(s.counts.numpy()[count]))
             kernel, inputs = kernel_of(kind, x0.dtype), [*motion, *others]
             launch_over(kernel, -(-filled // batch), inputs=inputs, outputs=[s], device=x0.device, chunk=16)
 
-    with timer.stage("cull"):
+    with timer.phase("cull"):
         if is_cpu:
             cull = functools.partial(batch_culling_kernel, on_arcs=arcs is not None)
             launch_batches(cull, [Arcs() if arcs is None else arcs], "queue", Count.QUEUED, CULLED)
         else:
-            launch_culls(_RULE, stages, x0, x1, options)
-    with timer.stage("classify"):
+            launch_culls(_RULE, buffers, x0, x1, options)
+    with timer.phase("classify"):
         if is_cpu:
             launch_batches(batch_classification_kernel, [], "survivors", Count.SURVIVORS, CLASSIFIED)
         else:
-            launch_decisions(_RULE, stages, x0, x1, options)
-    with timer.stage("time of impact"):
+            launch_decisions(_RULE, buffers, x0, x1, options)
+    with timer.phase("time of impact"):
         if is_cpu:
             launch_batches(batch_impact_kernel, [timed, tolerance], "for_exact", Count.CONTACTS, DECIDED)
         else:
             kernel, inputs = _impact_kernel(x0.dtype), [*motion, timed, tolerance]
-            launch_over_kinds(kernel, stages, "for_exact", Count.CONTACTS, inputs=inputs, block_dim=32)
+            launch_over_kinds(kernel, buffers, "for_exact", Count.CONTACTS, inputs=inputs, block_dim=32)
     if method == "exact":
-        with timer.stage("exact"):
+        with timer.phase("exact"):
             for phase, elements in phases:
                 phase.decide_exactly(x0, x1, elements, timed=timed, tolerance=tolerance)

@@ -1,4 +1,4 @@
-"""The narrow phase of pairs with a minimum distance: culls -> advancement -> subdivision -> exact stage.
+"""The narrow phase of pairs with a minimum distance: culls -> advancement -> subdivision -> exact phase.
 
 The host decides the rest exactly. The minimum distance of a pair is the sum of two radii, rounded to double precision:
 the radius of a vertex is its own, that of an edge or a face the largest one of its vertices.
@@ -15,11 +15,11 @@ from ....kernels.pipeline.queues import filled_entries, take_slot
 from ....kernels.polynomials import Motion
 from ....kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from ...run.launch import launch_over, made_once
+from ...run.phase_timer import PhaseTimer
 from ...run.settings import NO_FUSED_OPERATIONS, TOLERANCE, Count, DistanceKind, Method
-from ...run.stage_timer import StageTimer
-from ..exact_stage import launch_exact_distances
-from ..narrow_phase import Phases, launch_culls, stages_of
-from ..pair_kernels import PairRule, PairStages, count_found, take_contact, write_decision, write_impact
+from ..exact_phase import launch_exact_distances
+from ..narrow_phase import Phases, buffers_of, launch_culls
+from ..pair_kernels import PairBuffers, PairRule, count_found, take_contact, write_decision, write_impact
 from ..rings import Rings, are_within_rings
 
 __all__ = ["run_distances"]
@@ -85,16 +85,16 @@ class _PairSearch:
 
 
 @wp.func
-def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, stages: PairStages):
+def _decide_contact(k: int, kind: int, at: _PairSearch, timed: bool, buffers: PairBuffers):
     """Writes the result of a search to contact k, if that is not negative, and counts it if it is not free."""
     result = end_search(kind, at.motion, at.search)
     if result.status != FREE:
-        count_found(result.status, stages)
+        count_found(result.status, buffers)
     if result.status == UNSURE or (timed and result.status == HIT and result.within_tolerance == 0):
-        take_slot(stages.counts, _FOR_EXACT)
+        take_slot(buffers.counts, _FOR_EXACT)
     if k >= 0:
-        write_impact(k, result, stages)
-        write_decision(k, result.status, stages)
+        write_impact(k, result, buffers)
+        write_decision(k, result.status, buffers)
 
 
 @made_once
@@ -140,22 +140,22 @@ def _search_kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         kind: int,
         threads: wp.uint32,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
-        filled = wp.uint32(filled_entries(stages.survivors, stages.counts, _SURVIVORS))
+        filled = wp.uint32(filled_entries(buffers.survivors, buffers.counts, _SURVIVORS))
         i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
         # the threads of a warp advance together, each with a pair of its own
         while i < filled:
-            at = search_next(at, kind, x0, x1, stages.elements, stages.survivors, int(i), options)
+            at = search_next(at, kind, x0, x1, buffers.elements, buffers.survivors, int(i), options)
             at.search = advance(at.motion, at.distance, options.timed, at.search)
             if at.search.ended and at.search.status != FREE:
-                k = take_contact(stages.survivors[int(i)], stages)
+                k = take_contact(buffers.survivors[int(i)], buffers)
                 if not at.search.given_up:
-                    _decide_contact(k, kind, at, options.timed, stages)
+                    _decide_contact(k, kind, at, options.timed, buffers)
                 elif k >= 0:
-                    stages.for_exact[wp.int32(take_slot(stages.counts, _SUBDIVIDED))] = k
+                    buffers.for_exact[wp.int32(take_slot(buffers.counts, _SUBDIVIDED))] = k
             if at.search.ended:
                 i += threads
 
@@ -170,18 +170,18 @@ def _search_kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         kind: int,
         threads: wp.uint32,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
-        filled = wp.uint32(stages.counts[_SUBDIVIDED])
+        filled = wp.uint32(buffers.counts[_SUBDIVIDED])
         i = wp.uint32(first + wp.tid())
         at = _PairSearch()
         at.search.ended = True
         while i < filled:
-            k = stages.for_exact[int(i)]
-            at = search_next(at, kind, x0, x1, stages.elements, stages.contacts.pairs, k, options)
+            k = buffers.for_exact[int(i)]
+            at = search_next(at, kind, x0, x1, buffers.elements, buffers.contacts.pairs, k, options)
             at.search = visit_part(kind, at.motion, at.distance, options.timed, at.search)
             if at.search.ended:
-                _decide_contact(k, kind, at, options.timed, stages)
+                _decide_contact(k, kind, at, options.timed, buffers)
                 i += threads
 
     return advance_distances, subdivide_distances
@@ -198,27 +198,27 @@ def run_distances(
     body: wp.array | None = None,
     timed: bool = True,
     tolerance: float = TOLERANCE,
-    timer: StageTimer,
+    timer: PhaseTimer,
 ) -> None:
-    """Launches all stages but the sorting over the queued pairs, without synchronizing with a GPU.
+    """Launches all phases but the sorting over the queued pairs, without synchronizing with a GPU.
 
-    Arguments are those of :func:`.run_contacts` and the :class:`Options`. With "exact", pairs that stay UNSURE are left
-    to :func:`.decide_on_host`.
+    Arguments are those of :func:`.run_contacts` and the :class:`Options`. With "exact", pairs that stay UNSURE are
+    delegated to :func:`.decide_on_host`.
     """
     options = Options()
     options.radius, options.rings, options.body = radius, rings, body
     options.roundoff = 0.0 if method == "float" else ROUNDOFF
     options.timed, options.tolerance = timed, tolerance
-    stages, device = stages_of(phases), x0.device
-    with timer.stage("cull"):
-        launch_culls(_RULE, stages, x0, x1, options)
+    buffers, device = buffers_of(phases), x0.device
+    with timer.phase("cull"):
+        launch_culls(_RULE, buffers, x0, x1, options)
     advance_distances, subdivide_distances = _search_kernels(x0.dtype)
     for name, kernel, count, threads_of_multiprocessor in (
         ("classify", advance_distances, Count.SURVIVORS, _ADVANCING),
         ("time of impact", subdivide_distances, Count.SUBDIVIDED, _SUBDIVIDING),
     ):
-        with timer.stage(name):
-            for kind, s in stages.items():
+        with timer.phase(name):
+            for kind, s in buffers.items():
                 entries = threads = threads_of_multiprocessor * device.sm_count
                 if device.is_cpu:
                     entries = min(len(s.survivors), int(s.counts.numpy()[count]))
@@ -226,7 +226,7 @@ def run_distances(
                 inputs = [x0, x1, options, int(kind), threads]
                 launch_over(kernel, entries, inputs=inputs, outputs=[s], device=device, block_dim=_BLOCK)
     if method == "exact":
-        with timer.stage("exact"):
+        with timer.phase("exact"):
             of_times = {"timed": timed, "tolerance": tolerance}
-            for kind, s in stages.items():
-                launch_exact_distances(x0, x1, radius, DistanceKind(kind), **of_times, stages=s)
+            for kind, s in buffers.items():
+                launch_exact_distances(x0, x1, radius, DistanceKind(kind), **of_times, buffers=s)

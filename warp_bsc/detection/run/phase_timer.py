@@ -1,4 +1,4 @@
-"""Times of the stages of a detection."""
+"""Times of the phases of a detection."""
 
 import contextlib
 import time
@@ -7,30 +7,30 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["StageTimer", "StageTimers"]
+__all__ = ["PhaseTimer", "PhaseTimers"]
 
 
-class StageTimer:
-    """Measures stages that follow one another: by events on a GPU, without synchronizing, else by the clock.
+class PhaseTimer:
+    """Measures phases that follow one another: by events on a GPU, without synchronizing, else by the clock.
 
-    A stage lasts from the end of the stage before to its own. While a graph is captured nothing is measured.
+    A phase lasts from the end of the phase before to its own. While a graph is captured nothing is measured.
     """
 
     def __init__(self, device: wp.Device | None):
-        """Starts the first stage, on the device's current stream; without a device nothing is ever measured."""
+        """Starts the first phase, on the device's current stream; without a device nothing is ever measured."""
         self._device = device
         self._ends: list[tuple[str, Any]] = []
         self._start = None if self._is_idle() else self._now()
 
     @contextlib.contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Adds the time until the end of the context to a stage."""
+    def phase(self, name: str) -> Iterator[None]:
+        """Adds the time until the end of the context to a phase."""
         yield
         if not self._is_idle():
             self._ends.append((name, self._now()))
 
     def read(self) -> dict[str, float]:
-        """Returns the time by stage [ms]; waits for the end of the last on a GPU."""
+        """Returns the time by phase [ms]; waits for the end of the last on a GPU."""
         milliseconds: dict[str, float] = {}
         start = self._start
         for name, end in self._ends:
@@ -51,15 +51,15 @@ class StageTimer:
         return event
 
 
-class StageTimers:
+class PhaseTimers:
     """The times of several timers together."""
 
-    def __init__(self, *timers: "StageTimer | StageTimers"):
+    def __init__(self, *timers: "PhaseTimer | PhaseTimers"):
         """Takes the timers."""
         self._timers = timers
 
     def read(self) -> dict[str, float]:
-        """Returns the time by stage [ms], the sum of all timers."""
+        """Returns the time by phase [ms], the sum of all timers."""
         milliseconds: dict[str, float] = {}
         for timer in self._timers:
             for name, passed in timer.read().items():

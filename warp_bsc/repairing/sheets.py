@@ -1,4 +1,4 @@
-"""Puts layers of a surface on the sides that their order asks for, where they have changed places."""
+"""Puts sheets of a surface on the sides that their order asks for, where they have changed places."""
 
 import numpy as np
 
@@ -7,29 +7,29 @@ from .contours import connected_components
 from .elastic import Springs, near
 from .surface import Surface
 
-__all__ = ["separate_layers"]
+__all__ = ["separate_sheets"]
 
 _GAP = 0.5
-"""Distance from the layers inside at which a vertex is put, in edges."""
+"""Distance from the sheets inside at which a vertex is put, in edges."""
 _ALONG_NORMAL = 0.5
-"""Least cosine between the way to the closest point of a layer and its normal; less is beyond the border."""
+"""Least cosine between the way to the closest point of a sheet and its normal; less is beyond the border."""
 _RINGS = 12
 _SWEEPS = 12
 
 
-def separate_layers(surface: Surface, layer: np.ndarray) -> np.ndarray:
-    """Returns positions in which layers that cross are on their sides, nearly: contours may be left.
+def separate_sheets(surface: Surface, sheet: np.ndarray) -> np.ndarray:
+    """Returns positions in which sheets that cross are on their sides, nearly: contours may remain.
 
-    Parts of a layer that are behind the layers inside, bounded by contours, move in front of these: to the side to
-    which their faces point. Where the layer is fixed, the layers inside move back instead.
+    Parts of a sheet that are behind the sheets inside, bounded by contours, move in front of these: to the side to
+    which their faces point. Where the sheet is fixed, the sheets inside move back instead.
 
     Args:
         surface: The surface.
-        layer: Layer of each vertex from inside to outside, -1 for none, int, shape [n].
+        sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n].
     """
     x = surface.home
-    for outer in np.unique(layer[layer > layer[layer >= 0].min(initial=0)]):
-        inside, outside = (layer >= 0) & (layer < outer), layer == outer
+    for outer in np.unique(sheet[sheet > sheet[sheet >= 0].min(initial=0)]):
+        inside, outside = (sheet >= 0) & (sheet < outer), sheet == outer
         if (outside & ~surface.fixed).any():
             x = _put_on_side(surface, x, outside, inside, 1.0)
         else:
@@ -43,8 +43,8 @@ def _put_on_side(surface: Surface, x: np.ndarray, moving: np.ndarray, obstacle: 
     Args:
         surface: The surface.
         x: Positions, in units, shape [n, 3].
-        moving: Vertices of the layer that moves, bool, shape [n].
-        obstacle: Vertices of the layers that it leaves, bool, shape [n].
+        moving: Vertices of the sheet that moves, bool, shape [n].
+        obstacle: Vertices of the sheets that it leaves, bool, shape [n].
         side: 1 for the side to which the faces point, -1 for the other.
     """
     mesh = surface.mesh

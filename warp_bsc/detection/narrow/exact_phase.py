@@ -1,10 +1,10 @@
-"""The exact stage: wide integers decide, on the device, the contacts that floating point cannot.
+"""The exact phase: wide integers decide, on the device, the contacts that floating point cannot.
 
-Contacts that the previous stage has enqueued are decided in integers of one limb a coordinate, see
+Contacts that the previous phase has enqueued are decided in integers of one limb a coordinate, see
 :mod:`warp_bsc.kernels.exact.first_contact`. Those whose exponents are too far apart for that go to the next queue,
 for two limbs, on a CPU then to that for four, and at last to the queue for eight, which suffice for every query in
-single precision. Contacts that are too wide for eight limbs are counted and left to the host. Each width has its own
-kernel, so that the usual one stays small.
+single precision. Contacts that are too wide for eight limbs are counted and delegated to the host. Each width has its
+own kernel, so that the usual one stays small.
 
 Contacts with a minimum distance are decided as far as :mod:`warp_bsc.kernels.exact.distance` can. The host decides the
 others, and those that are too wide.
@@ -28,9 +28,9 @@ from ...kernels.time_of_impact import MIN_DIGITS
 from ..run.launch import launch_over_queue, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
 from .contact_buffer import make_contact_buffer
-from .pair_kernels import PairStages
+from .pair_kernels import PairBuffers
 
-__all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_stage"]
+__all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_phase"]
 
 _WIDTHS_ON_GPU = (1, 2, 8)
 """Limbs of the integers on a GPU, where a launch over an empty queue takes longer than four limbs would save."""
@@ -41,11 +41,11 @@ _REFUTED = wp.constant(int(Count.REFUTED))
 
 
 @wp.func
-def _refute(i: int, stages: PairStages):
+def _refute(i: int, buffers: PairBuffers):
     """Writes that a contact is none."""
-    stages.contacts.decided[i] = wp.int8(FREE)
-    stages.keys[i] = stages.last_key
-    take_slot(stages.counts, _REFUTED)
+    buffers.contacts.decided[i] = wp.int8(FREE)
+    buffers.keys[i] = buffers.last_key
+    take_slot(buffers.counts, _REFUTED)
 
 
 @made_once
@@ -67,23 +67,23 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
         filled: int,
         too_wide: int,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
         # out
         left: wp.array[int],
     ):
         slot = first + wp.tid()
-        if wp.int64(slot) >= stages.counts[filled]:
+        if wp.int64(slot) >= buffers.counts[filled]:
             return
         i = queue[slot]
-        contacts = stages.contacts
-        v = vertices_of_pair(kind, stages.elements, contacts.pairs[i])
+        contacts = buffers.contacts
+        v = vertices_of_pair(kind, buffers.elements, contacts.pairs[i])
         a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
         a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
         time = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
         if time == TOO_WIDE:
-            left[wp.int32(take_slot(stages.counts, too_wide))] = i
+            left[wp.int32(take_slot(buffers.counts, too_wide))] = i
         elif time == NONE:
-            _refute(i, stages)
+            _refute(i, buffers)
         else:
             contacts.decided[i] = wp.int8(HIT)
             if timed:
@@ -116,28 +116,28 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
         timed: bool,
         digits: int,
         # in and out
-        stages: PairStages,
+        buffers: PairBuffers,
     ):
         k = first + wp.tid()
-        contacts = stages.contacts
-        if k >= contacts.pairs.shape[0] or wp.int64(k) >= stages.counts[_CONTACTS]:
+        contacts = buffers.contacts
+        if k >= contacts.pairs.shape[0] or wp.int64(k) >= buffers.counts[_CONTACTS]:
             return
         known = int(contacts.decided[k])
         if known == FREE or (known == HIT and (contacts.within_tolerance[k] or not timed)):
             return
-        v = points_of_pair(kind, stages.elements, contacts.pairs[k])
+        v = points_of_pair(kind, buffers.elements, contacts.pairs[k])
         a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
         a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
         distance = distance_of_corners(kind, v, radius)
         status = decide(form_of(kind), a0, b0, c0, d0, a1, b1, c1, d1, distance, contacts.toi[k], digits, timed)
         if status == FREE:
-            _refute(k, stages)
+            _refute(k, buffers)
         elif status == HIT:
             # coordinates and normal are those at the time of impact already
             contacts.decided[k] = wp.int8(status)
             contacts.within_tolerance[k] = timed
         elif wp.static(is_last):
-            take_slot(stages.counts, _TOO_WIDE)
+            take_slot(buffers.counts, _TOO_WIDE)
 
     return decide_distances
 
@@ -155,19 +155,19 @@ def are_within_distance(
         distance: The distance, more than 0.
     """
     n, device = len(pairs), x.device
-    stages = PairStages()
-    stages.elements = elements
-    stages.counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
-    stages.counts[_CONTACTS : _CONTACTS + 1].fill_(n)
-    stages.contacts = make_contact_buffer(n, device)
-    stages.contacts.pairs.assign(pairs)
-    stages.contacts.decided.fill_(int(UNSURE))
-    stages.contacts.toi.zero_()
-    stages.keys = wp.empty(n, dtype=wp.int64, device=device)
+    buffers = PairBuffers()
+    buffers.elements = elements
+    buffers.counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
+    buffers.counts[_CONTACTS : _CONTACTS + 1].fill_(n)
+    buffers.contacts = make_contact_buffer(n, device)
+    buffers.contacts.pairs.assign(pairs)
+    buffers.contacts.decided.fill_(int(UNSURE))
+    buffers.contacts.toi.zero_()
+    buffers.keys = wp.empty(n, dtype=wp.int64, device=device)
     half = wp.full(len(x), 0.5 * distance, dtype=wp.float64, device=device)  # whose double is exact
     if 2.0 * (0.5 * distance) == distance:
-        launch_exact_distances(x, x, half, kind, timed=False, tolerance=1.0, stages=stages)
-    decided = stages.contacts.decided.numpy()
+        launch_exact_distances(x, x, half, kind, timed=False, tolerance=1.0, buffers=buffers)
+    decided = buffers.contacts.decided.numpy()
     return decided == HIT, decided != UNSURE
 
 
@@ -179,9 +179,9 @@ def launch_exact_distances(
     *,
     timed: bool,
     tolerance: float,
-    stages: PairStages,
+    buffers: PairBuffers,
 ) -> None:
-    """Decides contacts with a minimum distance exactly, and counts those left to the host; does not synchronize.
+    """Decides contacts with a minimum distance exactly, and counts those delegated to the host; does not synchronize.
 
     Args:
         x0: Positions at the start of the step, array of vec3 or vec3d.
@@ -190,36 +190,36 @@ def launch_exact_distances(
         kind: The kind of pair.
         timed: Whether to find times of impact.
         tolerance: Of the times of impact, as a share of the step.
-        stages: The buffers of the narrow phase.
+        buffers: The buffers of the narrow phase.
     """
     digits = 1 + max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
     for limbs in DISTANCE_BITS:
-        kernel, pairs = _distance_kernel(x0.dtype, limbs), stages.contacts.pairs
+        kernel, pairs = _distance_kernel(x0.dtype, limbs), buffers.contacts.pairs
         inputs = [x0, x1, radius, int(kind), timed, digits]
-        launch_over_queue(kernel, pairs, stages.counts, Count.CONTACTS, inputs=inputs, outputs=[stages], block_dim=64)
+        launch_over_queue(kernel, pairs, buffers.counts, Count.CONTACTS, inputs=inputs, outputs=[buffers], block_dim=64)
 
 
-def launch_exact_stage(
+def launch_exact_phase(
     kind: PairKind | DistanceKind,
     x0: wp.array,
     x1: wp.array,
     *,
     timed: bool,
     tolerance: float,
-    stages: PairStages,
+    buffers: PairBuffers,
     left: wp.array,
 ) -> None:
     """Decides contacts exactly, without synchronizing with a GPU.
 
     Arguments are those of :func:`launch_exact_distances`, and a queue for contacts that are too wide, as long as
-    ``stages.for_exact``, array of int; both are overwritten. Without times, of the contacts only ``pairs`` and
+    ``buffers.for_exact``, array of int; both are overwritten. Without times, of the contacts only ``pairs`` and
     ``decided`` are used.
     """
     digits = max(MIN_DIGITS, math.ceil(-math.log2(tolerance)))
-    queue, filled = stages.for_exact, Count.FOR_EXACT
+    queue, filled = buffers.for_exact, Count.FOR_EXACT
     for limbs in BITS if queue.device.is_cpu else _WIDTHS_ON_GPU:
         too_wide = Count[f"TOO_WIDE_{limbs}"]
         inputs = [x0, x1, int(kind), timed, digits, queue, int(filled), int(too_wide)]
-        kernel, outputs = _kernel(x0.dtype, limbs), [stages, left]
-        launch_over_queue(kernel, queue, stages.counts, filled, inputs=inputs, outputs=outputs, block_dim=64)
+        kernel, outputs = _kernel(x0.dtype, limbs), [buffers, left]
+        launch_over_queue(kernel, queue, buffers.counts, filled, inputs=inputs, outputs=outputs, block_dim=64)
         queue, left, filled = left, queue, too_wide
