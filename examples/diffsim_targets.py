@@ -1,4 +1,4 @@
-"""Base of the examples with gradients of SolverImplicit: particles that are to be at targets in the last steps."""
+"""Bases of the examples with gradients of SolverImplicit: a search in each world; particles that are to be at targets."""
 
 import numpy as np
 import warp as wp
@@ -55,9 +55,11 @@ class QuasiNewton:
             longest = self._first if self._inverse is None else self._longest
             length = np.linalg.norm(step)
             self._step = step * (longest / length if self._inverse is None else min(1.0, longest / length))
+        elif before is None:  # no gradient is known yet: to the other side of the start, a little farther each time
+            self._step = -1.5 * self._step if self._step.any() else np.full(self.x.shape, 0.1 * self._first)
         else:  # too far: less, to where a parabola with these slopes is least
             share = 0.5
-            if is_known and before is not None:
+            if is_known:
                 slope, end_slope = before @ self._step, gradient @ self._step
                 share = min(slope / min(slope - end_slope, slope), 0.5)
             self._step = max(share, 0.1) * self._step
@@ -75,36 +77,29 @@ class QuasiNewton:
         self._inverse = factor @ self._inverse @ factor.T + np.outer(step, step) / product
 
 
-class TargetExample(DiffsimExample):
-    """Cloths whose particles are to be at targets, in the format of Newton's examples.
+class SearchExample(DiffsimExample):
+    """A search in each world by gradients of ``SolverImplicit``, in the format of Newton's examples.
 
-    The loss is the mean of the squared distances, the distance from the mark its root. A step is one of 1/60 s.
+    The loss is a mean of squared distances, the distance from the mark its root. A step is one of 1/60 s. A derived
+    class calls :meth:`start_solver`, ``prepare_descent`` and :meth:`search_from`.
+
+    Attributes:
+        lost: Evaluations of each world so far that had a step without gradients, as it did not converge.
     """
 
-    def start_solver(self, model, camera):
+    def start_solver(self, model, camera, **options):
         """Makes the solver, without contacts if ``--no-ccd`` is given, and shows the model.
 
         Args:
             model: The model.
             camera: As for :meth:`.common.ExampleBase.start`.
+            options: Options of the solver.
         """
         self.sim_dt = self.frame_dt
         apart = None if self.ccd else bsc.CollisionFilter(particle_mask=0)
-        report = ["contacts"] if self.draws_contacts else []
-        solver = bsc.SolverImplicit(model, collision_filter=apart, max_iterations=MAX_ITERATIONS, report=report)
+        options |= {"report": ["contacts"] if self.draws_contacts else []}
+        solver = bsc.SolverImplicit(model, collision_filter=apart, max_iterations=MAX_ITERATIONS, **options)
         self.start(model, solver, camera)
-
-    def prepare_descent(self, parameters, steps, *, targets):
-        """Prepares the descent, which :meth:`search_from` begins.
-
-        Args:
-            parameters: The arrays to improve, an element for each world.
-            steps: How many steps a simulation has.
-            targets: Where the particles of each world are to be after each of the last n steps [m], shape
-                [n, particles, 3].
-        """
-        super().prepare_descent(parameters, None, steps)
-        self.targets = wp.array(np.asarray(targets, dtype=np.float32), dtype=wp.vec3, device=self.model.device)
 
     def search_from(self, starts, *, first, longest):
         """Begins a search in each world.
@@ -117,6 +112,7 @@ class TargetExample(DiffsimExample):
         self.sizes = [np.shape(start)[1] for start in starts]
         rows = np.concatenate(starts, axis=1)
         self.searches = [QuasiNewton(row, first, longest) for row in rows]
+        self.lost = np.zeros(self.worlds, dtype=int)
         self.set_parameters(rows)
 
     def set_parameters(self, rows):
@@ -127,6 +123,7 @@ class TargetExample(DiffsimExample):
     def improve(self):
         """Chooses the next parameters by losses and gradients."""
         gradients = np.concatenate([array.grad.numpy() for array in self.parameters], axis=1).astype(float)
+        self.lost += ~np.isfinite(gradients).all(axis=1)
         for search, loss, gradient in zip(self.searches, self.losses.numpy(), gradients, strict=True):
             search.take(float(loss), gradient)
         self.set_parameters(np.array([search.trial for search in self.searches]))
@@ -138,17 +135,8 @@ class TargetExample(DiffsimExample):
         self.forward()
         return self.solver.report.unconverged_steps - before
 
-    def add_losses(self):
-        """Computes the losses of all worlds, and their sum."""
-        model, targets = self.model, self.targets
-        self.losses.zero_()
-        share = self.worlds / (model.particle_count * len(targets))
-        for step, state in enumerate(self.states[-len(targets) :]):
-            inputs = [state.particle_q, targets, step, model.particle_world, share]
-            wp.launch(add_squares, model.particle_count, inputs=inputs, outputs=[self.losses, self.loss])
-
     def distances(self):
-        """Returns how far from their targets the particles of each world were, as root of the mean square [m]."""
+        """Returns the roots of the losses of all worlds [m]."""
         return np.sqrt(self.losses.numpy())
 
     def render(self):
@@ -166,6 +154,33 @@ class TargetExample(DiffsimExample):
         assert len(self.solver.report.intersections) == 0, self.solver.report.intersections
 
     def print_report(self):
-        """Prints what the solver did, and how far from the targets the cloths were."""
+        """Prints what the solver did, how far from the targets the cloths were, and what had no gradient."""
         super().print_report()
         print(f"{', '.join(f'{distance:.4f}' for distance in self.distance)} m from the targets")
+        evaluations = self.worlds * self.frame
+        print(f"{self.lost.sum()} of {evaluations} evaluations without a gradient, as a step did not converge")
+
+
+class TargetExample(SearchExample):
+    """Cloths whose particles are to be at targets: the loss is the mean of the squared distances from these."""
+
+    def prepare_descent(self, parameters, steps, *, targets):
+        """Prepares the descent, which :meth:`search_from` begins.
+
+        Args:
+            parameters: The arrays to improve, an element for each world.
+            steps: How many steps a simulation has.
+            targets: Where the particles of each world are to be after each of the last n steps [m], shape
+                [n, particles, 3].
+        """
+        super().prepare_descent(parameters, None, steps)
+        self.targets = wp.array(np.asarray(targets, dtype=np.float32), dtype=wp.vec3, device=self.model.device)
+
+    def add_losses(self):
+        """Computes the losses of all worlds, and their sum."""
+        model, targets = self.model, self.targets
+        self.losses.zero_()
+        share = self.worlds / (model.particle_count * len(targets))
+        for step, state in enumerate(self.states[-len(targets) :]):
+            inputs = [state.particle_q, targets, step, model.particle_world, share]
+            wp.launch(add_squares, model.particle_count, inputs=inputs, outputs=[self.losses, self.loss])
