@@ -3,7 +3,7 @@
     python examples/example_diffsim_real_to_sim.py
     python examples/example_diffsim_real_to_sim.py --worlds 64  # as many guesses at once, on a GPU
 
-A cloth falls on a bar, and slides off. A camera sees it in 25 frames: points of the surface that neither the cloth nor
+A cloth falls on a bar, and slides off. A camera sees it in 20 frames: points of the surface that neither the cloth nor
 the bar hides, with noise, other ones in each frame. Nothing says which point of the cloth a point is. Each world has a
 recording of its own, and a guess of the coefficient of friction, of the stiffness against stretching, ``tri_ke``, and
 of that against bending, ``edge_ke``, each two to three times too large or too small. The searches go on in all worlds
@@ -17,7 +17,7 @@ import trimesh
 import warp as wp
 from common import main
 from diffsim import build_worlds
-from diffsim_targets import SearchExample
+from diffsim_targets import FittedNewton, SearchExample
 
 import warp_bsc as bsc
 
@@ -116,7 +116,7 @@ class Example(SearchExample):
         seen: Mean share of the surface that is seen.
     """
 
-    num_frames = 25
+    num_frames = 18
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)
@@ -142,7 +142,7 @@ class Example(SearchExample):
         signs, factors = np.random.default_rng(args.seed + 1).uniform(size=(2, args.worlds, 3))
         self.starts = TRUTH * np.where(signs < 0.5, 2.0 + factors, 1.0 / (2.0 + factors))
         self.errors = []
-        self.search_from([np.log(self.starts)], first=0.3, longest=0.7)
+        self.search_from([np.log(self.starts)], first=1.0, longest=1.5, method=FittedNewton)
 
     def record(self, rng):
         """Simulates the truth, and records it for each world."""
