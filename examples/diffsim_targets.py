@@ -53,14 +53,14 @@ class QuasiNewton:
             self.x, self._value, self._gradient = self.trial, value, gradient
             step = -gradient if self._inverse is None else -self._inverse @ gradient
             longest = self._first if self._inverse is None else self._longest
-            length = np.linalg.norm(step)
+            length = max(np.linalg.norm(step), 1e-30)
             self._step = step * (longest / length if self._inverse is None else min(1.0, longest / length))
         elif before is None:  # no gradient is known yet: to the other side of the start, a little farther each time
             self._step = -1.5 * self._step if self._step.any() else np.full(self.x.shape, 0.1 * self._first)
         else:  # too far: less, to where a parabola with these slopes is least
-            share = 0.5
-            if is_known:
-                slope, end_slope = before @ self._step, gradient @ self._step
+            share, slope = 0.5, before @ self._step
+            if is_known and slope < 0.0:
+                end_slope = gradient @ self._step
                 share = min(slope / min(slope - end_slope, slope), 0.5)
             self._step = max(share, 0.1) * self._step
         self.trial = self.x + self._step
@@ -82,8 +82,8 @@ class FittedNewton:
 
     The Hessian is the symmetric matrix that fits best, by least squares, how gradients change from the best parameters
     to all others; the nearer, the more they count. A trust region limits the steps. In contrast to
-    :class:`QuasiNewton`, evaluations that were no better teach as much as others, and parameters of very different
-    influence hardly slow it down.
+    :class:`QuasiNewton`, evaluations that were no better count as much as others, and parameters of very different
+    influence slow it down little.
 
     Attributes:
         x: The best parameters so far.
@@ -109,14 +109,15 @@ class FittedNewton:
         if is_known:
             self._known.append((self.trial, gradient))
         if is_known and value < self._value:
-            share = (self._value - value) / self._decrease  # of what the model promised
-            if share > 0.5:
-                self._radius = min(max(self._radius, 2.0 * length), self._longest)
-            elif share < 0.2:
-                self._radius = 0.5 * length
+            if self._gradient is not None:
+                share = (self._value - value) / self._decrease  # of what the model predicts
+                if share > 0.5:
+                    self._radius = min(max(self._radius, 2.0 * length), self._longest)
+                elif share < 0.2:
+                    self._radius = 0.5 * length
             self.x, self._value, self._gradient = self.trial, value, gradient
         elif self._gradient is not None:  # too far, or no gradient: less
-            self._radius = 0.4 * length
+            self._radius = max(0.4 * length, 1e-12)
         if self._gradient is None:  # to the other side of the start, a little farther each time
             self._step = -1.5 * self._step if length else np.full(self.x.shape, 0.1 * self._radius)
         else:

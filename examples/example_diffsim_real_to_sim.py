@@ -108,7 +108,8 @@ class Example(SearchExample):
     """The scene, in the format of Newton's examples; a frame is an evaluation of the loss and its gradient.
 
     Attributes:
-        starts: The guesses, friction, tri_ke [N/m] and edge_ke [N], shape [worlds, 3].
+        truth: Friction, tri_ke [N/m] and edge_ke [N] of the cloth that is recorded.
+        starts: The guesses, shape [worlds, 3].
         found: The best of these in each world so far.
         errors: Relative errors of these after each evaluation, shape [worlds, 3] each.
         points: The recordings [m], shape [frames, worlds, POINTS].
@@ -117,6 +118,7 @@ class Example(SearchExample):
     """
 
     num_frames = 18
+    truth = TRUTH
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)
@@ -155,6 +157,11 @@ class Example(SearchExample):
         self.points.assign(np.float32(points))
         self.weights.assign(np.float32(weights))
         self.seen = seen.mean()
+
+    def take_recording(self, example, world):
+        """Takes the recording of a world of another example for all worlds."""
+        for own, other in ((self.points, example.points), (self.weights, example.weights)):
+            own.assign(np.repeat(other.numpy()[:, world : world + 1], self.worlds, axis=1))
 
     def forward(self):
         """Simulates the cloths, and computes their losses."""
