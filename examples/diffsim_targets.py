@@ -1,4 +1,4 @@
-"""Bases of the examples with gradients of SolverImplicit: a search in each world; particles that are to be at targets."""
+"""Bases of the examples with gradients of SolverImplicit: a search in each world; particles that have targets."""
 
 import numpy as np
 import warp as wp

@@ -100,7 +100,8 @@ def record(x, faces, rng):
     seen = seen.numpy()
     points, weights = np.zeros((POINTS, 3)), np.zeros(POINTS)
     visible = sampled[seen][:POINTS]
-    points[: len(visible)], weights[: len(visible)] = visible + rng.normal(scale=NOISE, size=visible.shape), 1.0 / POINTS
+    points[: len(visible)] = visible + rng.normal(scale=NOISE, size=visible.shape)
+    weights[: len(visible)] = 1.0 / POINTS
     return points, weights, seen.mean()
 
 
@@ -152,10 +153,11 @@ class Example(SearchExample):
         shape, device = (STEPS // EVERY, self.worlds, POINTS), self.model.device
         self.points, self.weights = wp.zeros(shape, dtype=wp.vec3, device=device), wp.zeros(shape, device=device)
         self.forward()
-        recorded = [[record(x, self.faces.numpy(), rng) for x in frame] for frame in self.positions()[EVERY::EVERY]]
-        points, weights, seen = (np.array(part) for part in zip(*(zip(*frame) for frame in recorded)))
-        self.points.assign(np.float32(points))
-        self.weights.assign(np.float32(weights))
+        frames = self.positions()[EVERY::EVERY].reshape(shape[0] * shape[1], -1, 3)
+        recorded = [record(x, self.faces.numpy(), rng) for x in frames]
+        points, weights, seen = (np.array(part, dtype=np.float32) for part in zip(*recorded, strict=True))
+        self.points.assign(points.reshape(*shape, 3))
+        self.weights.assign(weights.reshape(shape))
         self.seen = seen.mean()
 
     def take_recording(self, example, world):
@@ -204,8 +206,8 @@ class Example(SearchExample):
         super().print_report()
         print(f"{self.seen:.0%} of the surface is seen, with noise of {NOISE * 1e3:g} mm")
         for start, found, error in zip(self.starts, self.found, self.errors[-1], strict=True):
-            values = [f"{name} {a:.3g} to {b:.4g} ({c:+.1%})" for name, a, b, c in zip(NAMES, start, found, error)]
-            print(", ".join(values))
+            values = zip(NAMES, start, found, error, strict=True)
+            print(", ".join(f"{name} {a:.3g} to {b:.4g} ({c:+.1%})" for name, a, b, c in values))
         print(f"{self.share_within(0.02):.0%} of the worlds are within 2% of the truth")
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The chamfer distance of clouds from surfaces, against trimesh's closest points, and its gradients against differences."""
+"""The chamfer distance of clouds from surfaces against trimesh's closest points, its gradients against differences."""
 
 import numpy as np
 import pytest
@@ -93,7 +93,7 @@ def test_frames_add_up_and_weights_leave_out_points():
     out = wp.array([1.0, 2.0, 3.0], dtype=float, requires_grad=True)
     found, slopes = gradient(filled, x, weights=weights, out=out)
     expected, expected_slopes = gradient(points[:, :20], x)
-    np.testing.assert_allclose(found, expected + [1.0, 2.0, 3.0], rtol=1e-6)
+    np.testing.assert_allclose(found, expected + np.array([1.0, 2.0, 3.0]), rtol=1e-6)
     np.testing.assert_allclose(slopes, expected_slopes, rtol=1e-5, atol=1e-8)
 
 
@@ -160,9 +160,9 @@ def test_wrong_arguments():
     for message, arguments in bad.items():
         with pytest.raises(ValueError, match=message):
             bsc.chamfer_distance(**{"points": points, "x": x, "faces": faces} | arguments)
-    with pytest.raises(TypeError, match="^points must be a Warp array, not"):
+    with pytest.raises(TypeError, match=r"^points must be a Warp array, not"):
         bsc.chamfer_distance(points.numpy(), x, faces)
-    with pytest.raises(TypeError, match="^x must be an array of vec3"):
+    with pytest.raises(TypeError, match=r"^x must be an array of vec3"):
         bsc.chamfer_distance(points, wp.zeros((3, 42), dtype=wp.vec3d), faces)
-    with pytest.raises(TypeError, match="^weights must be an array of float32, not of float64"):
+    with pytest.raises(TypeError, match=r"^weights must be an array of float32, not of float64"):
         bsc.chamfer_distance(points, x, faces, weights=wp.zeros((3, POINTS), dtype=wp.float64))
