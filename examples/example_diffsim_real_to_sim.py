@@ -31,7 +31,7 @@ STEPS = 40
 EVERY = 2  # steps from one frame to the next
 POINTS = 300  # of a frame
 NOISE = 2.0e-3  # standard deviation of each coordinate [m]
-EYE = wp.vec3(1.3, -1.0, 0.9)  # of the camera [m]
+EYE = 1.3, -1.0, 0.9  # of the camera [m]
 
 
 @wp.kernel
@@ -68,10 +68,10 @@ def add(values: wp.array[float], total: wp.array[float]):
 
 
 @wp.kernel(enable_backward=False)
-def mark_seen(cloth: wp.uint64, points: wp.array[wp.vec3], seen: wp.array[bool]):
-    """Marks the points of a cloth that the camera sees: neither the cloth nor the bar is between them."""
+def mark_seen(cloth: wp.uint64, points: wp.array[wp.vec3], eye: wp.vec3, seen: wp.array[bool]):
+    """Marks the points of a cloth that a camera sees: neither the cloth nor the bar is between them."""
     point = points[wp.tid()]
-    way = EYE - point
+    way = eye - point
     length = wp.length(way)
     from_axis, way_from_axis = wp.vec2(point[0], point[2]), wp.vec2(way[0], way[2])
     share = wp.clamp(-wp.dot(from_axis, way_from_axis) / wp.length_sq(way_from_axis), 0.0, 1.0)
@@ -81,12 +81,13 @@ def mark_seen(cloth: wp.uint64, points: wp.array[wp.vec3], seen: wp.array[bool])
     seen[wp.tid()] = is_free and not hidden
 
 
-def record(x, faces, rng):
-    """Returns points of a cloth that the camera sees, with noise, and the share of the cloth that it sees.
+def record(x, faces, eye, rng):
+    """Returns points of a cloth that a camera sees, with noise, and the share of the cloth that it sees.
 
     Args:
         x: Positions of particles [m], shape [n, 3].
         faces: Triangles of the cloth, shape [m, 3].
+        eye: Position of the camera [m].
         rng: NumPy's random numbers.
 
     Returns:
@@ -96,7 +97,8 @@ def record(x, faces, rng):
     sampled, _ = trimesh.sample.sample_surface(trimesh.Trimesh(x, faces, process=False), 8 * POINTS, seed=rng)
     cloth = wp.Mesh(wp.array(x, dtype=wp.vec3), wp.array(faces.reshape(-1), dtype=int))
     seen = wp.empty(len(sampled), dtype=bool)
-    wp.launch(mark_seen, len(sampled), inputs=[cloth.id, wp.array(sampled, dtype=wp.vec3)], outputs=[seen])
+    inputs = [cloth.id, wp.array(sampled, dtype=wp.vec3), wp.vec3(*eye)]
+    wp.launch(mark_seen, len(sampled), inputs=inputs, outputs=[seen])
     seen = seen.numpy()
     points, weights = np.zeros((POINTS, 3)), np.zeros(POINTS)
     visible = sampled[seen][:POINTS]
@@ -141,20 +143,20 @@ class Example(SearchExample):
         self.start_solver(model, (wp.vec3(0.0, -2.2, 0.0), -5.0, 90.0), friction=self.friction)
         self.logarithms = wp.zeros(args.worlds, dtype=wp.vec3, device=model.device, requires_grad=True)
         self.prepare_descent([self.logarithms], None, STEPS)
-        self.record(np.random.default_rng(args.seed))
+        self.record(args.eye, np.random.default_rng(args.seed))
         signs, factors = np.random.default_rng(args.seed + 1).uniform(size=(2, args.worlds, 3))
         self.starts = TRUTH * np.where(signs < 0.5, 2.0 + factors, 1.0 / (2.0 + factors))
         self.errors = []
         self.search_from([np.log(self.starts)], first=1.0, longest=1.5, method=FittedNewton)
 
-    def record(self, rng):
+    def record(self, eye, rng):
         """Simulates the truth, and records it for each world."""
         self.logarithms.assign(np.tile(np.float32(np.log(TRUTH)), (self.worlds, 1)))
         shape, device = (STEPS // EVERY, self.worlds, POINTS), self.model.device
         self.points, self.weights = wp.zeros(shape, dtype=wp.vec3, device=device), wp.zeros(shape, device=device)
         self.forward()
         frames = self.positions()[EVERY::EVERY].reshape(shape[0] * shape[1], -1, 3)
-        recorded = [record(x, self.faces.numpy(), rng) for x in frames]
+        recorded = [record(x, self.faces.numpy(), eye, rng) for x in frames]
         points, weights, seen = (np.array(part, dtype=np.float32) for part in zip(*recorded, strict=True))
         self.points.assign(points.reshape(*shape, 3))
         self.weights.assign(weights.reshape(shape))
@@ -216,6 +218,7 @@ class Example(SearchExample):
         parser = super().create_parser()
         worlds = 64 if wp.get_preferred_device().is_cuda else 6
         parser.add_argument("--worlds", type=int, default=worlds, help="Guesses, and recordings, at once.")
+        parser.add_argument("--eye", type=float, nargs=3, default=EYE, metavar=tuple("XYZ"), help="Camera [m].")
         parser.add_argument("--seed", type=int, default=1, help="Seed of the recordings and of the guesses.")
         return parser
 

@@ -12,6 +12,12 @@ def start(*options):
     return program.Example(ViewerNull(), args)
 
 
+def record(mesh):
+    """What the camera records of a mesh."""
+    x, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
+    return program.record(x, faces, program.EYE, np.random.default_rng(1))
+
+
 def sheet(centre, side):
     """A level square."""
     mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -23,8 +29,7 @@ def test_the_camera_sees_what_neither_the_cloth_nor_the_bar_hides(monkeypatch):
     below_another, behind_the_bar, free = (0.4, -0.3, 0.2), (-0.5, 0.0, -0.35), (-0.5, 1.0, 0.1)
     scene = [sheet((0.5, -0.3, 0.4), 0.8), sheet(below_another, 0.05), sheet(behind_the_bar, 0.1), sheet(free, 0.1)]
     mesh = trimesh.util.concatenate(scene)
-    rng = np.random.default_rng(1)
-    points, weights, seen = program.record(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), rng)
+    points, weights, seen = record(mesh)
     assert set(np.unique(points[:, 2].round(4))) == {0.1, 0.4}
     assert (weights == 1.0 / program.POINTS).all()
     areas = [part.area for part in scene]
@@ -34,8 +39,7 @@ def test_the_camera_sees_what_neither_the_cloth_nor_the_bar_hides(monkeypatch):
 def test_recordings_with_too_few_points_are_filled_up(monkeypatch):
     monkeypatch.setattr(program, "POINTS", 50)
     mesh = trimesh.util.concatenate([sheet((0.3, -0.3, 0.4), 0.03), sheet((-0.5, 0.0, -0.35), 0.3)])
-    rng = np.random.default_rng(1)
-    points, weights, seen = program.record(mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), rng)
+    points, weights, seen = record(mesh)
     assert 0 < (weights > 0.0).sum() < 50
     assert seen == pytest.approx(0.01, abs=0.015)
     assert (points[weights == 0.0] == 0.0).all()
