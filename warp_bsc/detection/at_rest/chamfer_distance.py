@@ -97,18 +97,17 @@ def chamfer_distance(
 ) -> wp.array[wp.float32]:
     """Computes the one-sided chamfer distance of point clouds from surfaces: the mean of squared distances.
 
-    Each point counts with its exact distance from its surface, without correspondences; what no point has seen of the
-    surface does not count, so that clouds may be partial. On a :class:`warp.Tape`, the result has gradients by ``x``,
-    ``points`` and ``weights``. Noise that moves points beyond a border pulls it outwards, by some two standard
-    deviations where nothing else holds it. All is on the device, also in graphs; sums have the same order in each run.
-    No tree is built: a call takes surfaces times points times faces, in double precision.
+    Each point counts with its exact distance from its surface. What no point has seen does not count: clouds may be
+    partial. Noise that moves points beyond a border pulls it outwards, by some two standard deviations where nothing
+    else holds it. On a :class:`warp.Tape`, ``x``, ``points`` and ``weights`` get gradients. No tree is built: a call
+    takes surfaces times points times faces, in double precision on the device, also in graphs; where clouds are not
+    shared, each run has the same bits.
 
     Args:
         points: A cloud for each surface, or one for all, shape [clouds, n].
         x: Vertices of surfaces, shape [surfaces, vertex_count]: of worlds, ``state.particle_q.reshape((worlds, -1))``.
         faces: Vertices of the triangles of each surface, shape [face_count, 3].
-        weights: Weight of each point, default 1 / n, shape [clouds, n]. What has a weight of 0 may have any
-            coordinates: clouds with different numbers of points are filled up with it.
+        weights: Weight of each point, default 1 / n, shape [clouds, n]; 0 for what fills up clouds, of any coordinates.
         out: Array to which the distances are added, such as those of other frames, shape [surfaces].
 
     Returns:
@@ -121,18 +120,17 @@ def chamfer_distance(
     """
     _check(x, "x", wp.vec3, (-1, -1), x)
     _check(points, "points", wp.vec3, (-1, -1), x)
-    (surfaces, _), shape = x.shape, points.shape
-    if shape[0] != 1:
-        _check(points, "points", wp.vec3, (surfaces, -1), x)
+    surfaces, shape, device = x.shape[0], points.shape, x.device
+    _check(points, "points", wp.vec3, (surfaces if shape[0] != 1 else 1, -1), x)
     if weights is None:
-        weights = wp.full(shape, 1.0 / shape[1], dtype=float, device=x.device)
+        weights = wp.full(shape, 1.0 / shape[1], dtype=float, device=device)
     if out is None:
-        out = wp.zeros(surfaces, dtype=float, device=x.device, requires_grad=x.requires_grad)
+        out = wp.zeros(surfaces, dtype=float, device=device, requires_grad=x.requires_grad)
     _check(faces, "faces", wp.int32, (-1, 3), x)
     _check(weights, "weights", wp.float32, shape, x)
     _check(out, "out", wp.float32, (surfaces,), x)
-    dim, device = (surfaces, shape[1]), x.device
-    found = [wp.empty(dim, dtype=int, device=device), wp.empty(dim, dtype=wp.vec3, device=device)]
+    dim = surfaces, shape[1]
+    found = [wp.empty(dim, dtype=dtype, device=device) for dtype in (int, wp.vec3)]
     inputs = [points, weights, x, faces]
     launch(_find_closest, dim, inputs=inputs, outputs=found, device=device, record_tape=False)
     launch(_add_distances, surfaces, inputs=[*inputs, *found], outputs=[out], device=device)
@@ -146,5 +144,5 @@ def _check(array: Any, name: str, dtype: Any, shape: tuple[int, ...], like: wp.a
         raise TypeError(f"{name} must be an array of {dtype.__name__}, not of {array.dtype.__name__}")
     fits = array.ndim == len(shape) and all(a == b or b < 0 < a for a, b in zip(array.shape, shape, strict=False))
     if not fits or array.device != like.device:
-        given = f"{array.shape} on {array.device}"
-        raise ValueError(f"{name} must have shape {shape}, -1 for any but 0, on {like.device}, not {given}")
+        wanted = f"have shape {shape}, -1 for any but 0, on {like.device}"
+        raise ValueError(f"{name} must {wanted}, not {array.shape} on {array.device}")
