@@ -120,7 +120,7 @@ class Example(SearchExample):
         seen: Mean share of the surface that is seen.
     """
 
-    num_frames = 18
+    num_frames = 24
     truth = TRUTH
 
     def __init__(self, viewer, args):

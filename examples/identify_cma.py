@@ -1,7 +1,7 @@
 """Counts the simulations that CMA-ES needs where the examples of identification follow gradients.
 
     python examples/identify_cma.py
-    python examples/identify_cma.py --example real_to_sim --gradients 18 --samples 350
+    python examples/identify_cma.py --example real_to_sim --gradients 24 --samples 420
 
 Both see the same noisy frames and begin at the same guesses. An evaluation is one simulation of one cloth; with
 gradients it also goes back. The count is that after which the best parameters found so far are within two percent of

@@ -77,7 +77,7 @@ def draw(example, first):
     titles = "relative errors in the world that is drawn", f"largest error in each of {example.worlds} worlds"
     for axes, title in zip(rows[:, 4], titles, strict=True):
         axes.axhline(0.02, color="#888888", linewidth=0.8, linestyle=":")
-        axes.set(yscale="log", ylim=(1e-4, 6.0), xticks=range(2, len(errors) + 1, 2))
+        axes.set(yscale="log", ylim=(1e-4, 6.0), xticks=range(4, len(errors) + 1, 4))
         axes.set_title(title, fontsize=8)
         axes.tick_params(labelsize=7, which="both")
     rows[1, 4].set_xlabel("evaluations of the loss and its gradient; dotted: 2%", fontsize=8)

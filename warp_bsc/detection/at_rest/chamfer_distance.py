@@ -100,8 +100,8 @@ def chamfer_distance(
     Each point counts with its exact distance from its surface. What no point has seen does not count: clouds may be
     partial. Noise that moves points beyond a border pulls it outwards, by some two standard deviations where nothing
     else holds it. On a :class:`warp.Tape`, ``x``, ``points`` and ``weights`` get gradients. No tree is built: a call
-    takes surfaces times points times faces, in double precision on the device, also in graphs; where clouds are not
-    shared, each run has the same bits.
+    takes surfaces times points times faces, in double precision on the device, also in graphs. Each run has the same
+    bits, except in gradients of a cloud that surfaces share.
 
     Args:
         points: A cloud for each surface, or one for all, shape [clouds, n].
@@ -124,17 +124,16 @@ def chamfer_distance(
     _check(points, "points", wp.vec3, (surfaces if shape[0] != 1 else 1, -1), x)
     if weights is None:
         weights = wp.full(shape, 1.0 / shape[1], dtype=float, device=device)
-    if out is None:
-        out = wp.zeros(surfaces, dtype=float, device=device, requires_grad=x.requires_grad)
+    total: wp.array = wp.zeros(surfaces, device=device, requires_grad=x.requires_grad) if out is None else out
     _check(faces, "faces", wp.int32, (-1, 3), x)
     _check(weights, "weights", wp.float32, shape, x)
-    _check(out, "out", wp.float32, (surfaces,), x)
+    _check(total, "out", wp.float32, (surfaces,), x)
     dim = surfaces, shape[1]
     found = [wp.empty(dim, dtype=dtype, device=device) for dtype in (int, wp.vec3)]
     inputs = [points, weights, x, faces]
     launch(_find_closest, dim, inputs=inputs, outputs=found, device=device, record_tape=False)
-    launch(_add_distances, surfaces, inputs=[*inputs, *found], outputs=[out], device=device)
-    return out
+    launch(_add_distances, surfaces, inputs=[*inputs, *found], outputs=[total], device=device)
+    return total
 
 
 def _check(array: Any, name: str, dtype: Any, shape: tuple[int, ...], like: wp.array) -> None:
