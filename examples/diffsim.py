@@ -123,10 +123,9 @@ class DiffsimExample(ExampleBase):
         return positions.reshape(len(positions), self.worlds, -1, 3)
 
     def test_final(self):
-        """Checks that the stage certified all steps, and that all have gradients."""
+        """Checks that all steps are certified."""
         if self.ccd:
-            report = self.solver.report
-            assert report.totals.uncertified_steps + report.gradient_counts.lost_steps == 0, report
+            assert self.solver.report.totals.uncertified_steps == 0, self.solver.report
 
 
 class MarkExample(DiffsimExample):
@@ -180,9 +179,10 @@ class MarkExample(DiffsimExample):
         self.viewer.end_frame()
 
     def test_final(self):
-        """Checks that all cloths end within two centimetres of the mark, if there is a stage."""
+        """Checks that all cloths end within two centimetres of the mark, and that all steps have gradients."""
         super().test_final()
         if self.ccd:
+            assert self.solver.report.gradient_counts.lost_steps == 0, self.solver.report
             assert self.distance.max() < 0.02, self.distance
 
     def print_report(self):
