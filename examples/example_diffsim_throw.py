@@ -10,7 +10,6 @@ step. Without contacts it flies through the sheet, and ends far from the mark, w
 """
 
 import newton
-import numpy as np
 import warp as wp
 from common import main
 from diffsim import MarkExample, add_cloth, add_cube, build_worlds

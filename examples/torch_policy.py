@@ -1,13 +1,13 @@
-"""Trains a small PyTorch policy to steer thrown cloths, by gradients through their impacts on the ground.
+"""Trains a small PyTorch policy to steer thrown soft cubes, by gradients through their bounces.
 
     python examples/torch_policy.py
 
-A cloth is thrown at the ground, and wind of at most four times its weight is to bring it to a mark in the air 0.2 s
-later, after it has hit the ground, on which it slides with friction. The policy, a network of 355 weights, sees the
-centre of the cloth, its velocity and the time, and sets the wind ten times. ``warp_bsc.torch.rollout`` takes the steps
-of ``SolverImplicit`` between two of its decisions, so that the gradient of the loss goes back through flight, impact,
-friction and all decisions. Each iteration takes eight random throws, in eight worlds; at the end, eight others tell how
-far from the mark cloths end, with the policy and without wind. Needs the extra ``torch``.
+A soft cube is thrown at the ground, and wind of at most four times its weight is to bring it to a mark in the air 0.2 s
+later, after it has bounced. The policy, a network of 355 weights, sees the centre of the cube, its velocity and the
+time, and sets the wind ten times. ``warp_bsc.torch.rollout`` takes the steps of ``SolverImplicit`` between two of its
+decisions, so that the gradient of the loss goes back through flight, bounce, friction and all decisions. Each iteration
+takes eight random throws, in eight worlds; at the end, eight others tell how far from the mark cubes end, with the
+policy and without wind. Needs the extra ``torch``; takes two minutes on two cores, and ends about 1 cm from the mark.
 """
 
 import argparse
@@ -26,13 +26,13 @@ WORLDS = 8
 DECISIONS = 10
 STEPS_PER_DECISION = 4
 DT = 1.0 / 200.0
-MARK = (0.15, 0.05, 0.06)  # [m]
+MARK = (0.15, 0.05, 0.1)  # [m]
 MOST_WIND = 40.0  # acceleration [m/s^2]
-ITERATIONS = 60
+ITERATIONS = 40
 
 
 def make_solver():
-    """Returns a solver of a small cloth above the ground in each world."""
+    """Returns a solver of a soft cube above the ground in each world."""
     world = newton.ModelBuilder()
     add_cube(world, 2, 0.03, wp.vec3(0.0, 0.0, 0.1), wp.vec3(1.0, 0.4, 0.0), 0.15, stiffness=2.0e3)
     world.add_ground_plane()
@@ -41,11 +41,11 @@ def make_solver():
 
 
 class Throws:
-    """Throws of cloths that a policy steers.
+    """Throws of soft cubes that a policy steers.
 
     Attributes:
         solver: The solver.
-        lost: How often the gradient of a throw stopped at a step that did not converge.
+        lost: How many gradients of wind, positions and velocities of a throw were NaN, and count as 0.
     """
 
     def __init__(self, seed):
@@ -56,7 +56,7 @@ class Throws:
         self._mass = wp.to_torch(model.particle_mass, requires_grad=False).clone().reshape(WORLDS, -1, 1)
 
     def states(self):
-        """Returns random throws: cloths that fly to the ground."""
+        """Returns random throws: cubes that fly to the ground."""
         shifts = self._random.uniform((-0.05, -0.05, 0.0), (0.05, 0.05, 0.03), (WORLDS, 1, 3))
         velocities = self._random.uniform((0.0, -0.5, -1.8), (1.0, 0.5, -1.2), (WORLDS, 1, 3))
         shifts, velocities = (
@@ -67,7 +67,7 @@ class Throws:
         return {"particle_q": positions.reshape(-1, 3), "particle_qd": velocities.reshape(-1, 3).contiguous()}
 
     def distances(self, state, policy):
-        """Returns how far from the mark the cloths end [m], shape [worlds]; without wind if there is no policy."""
+        """Returns how far from the mark the cubes end [m], shape [worlds]; without wind if there is no policy."""
         mark = torch.tensor(MARK, device=self._start.device)
         for decision in range(DECISIONS):
             centres, velocities = (self._means(state[name]) for name in ("particle_q", "particle_qd"))
@@ -81,7 +81,10 @@ class Throws:
         return torch.linalg.vector_norm(self._means(state["particle_q"]) - mark, dim=1)
 
     def _guarded(self, vectors):
-        """Returns vectors whose gradient is 0 in worlds in which it is NaN, as a later step did not converge."""
+        """Returns vectors of particles whose gradient is 0 in worlds in which it is NaN.
+
+        That is where a later step, or the solve of its gradient, did not converge. Decisions after it still count.
+        """
 
         def stop(gradient):
             is_known = gradient.reshape(WORLDS, -1).isfinite().all(dim=1)
@@ -103,11 +106,12 @@ def train(iterations, seed=0):
 
     Returns:
         The mean distance from the mark in each iteration [m], the distances of other throws with the policy and those
-        without wind, each of shape [worlds], and the report of the solver.
+        without wind, each of shape [worlds], and the throws.
     """
     torch.manual_seed(seed)
     throws = Throws(seed)
     policy = torch.nn.Sequential(torch.nn.Linear(7, 32), torch.nn.Tanh(), torch.nn.Linear(32, 3))
+    torch.nn.init.zeros_(policy[-1].weight)  # no wind at first, so that no cube is held on the ground
     policy.to(wp.device_to_torch(throws.solver.model.device))
     optimizer = torch.optim.Adam(policy.parameters(), lr=0.03)
     rates = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations, eta_min=0.001)
@@ -128,14 +132,14 @@ def train(iterations, seed=0):
 
 
 def main():
-    """Trains with the options of the command line, and prints how far from the mark cloths end."""
+    """Trains with the options of the command line, and prints how far from the mark cubes end."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     start = time.perf_counter()
     _, steered, free, throws = train(args.iterations, args.seed)
-    print(f"{time.perf_counter() - start:.0f} s; {throws.solver.report}; gradients stopped {throws.lost} times")
+    print(f"{time.perf_counter() - start:.0f} s; {throws.solver.report}; {throws.lost} gradients of throws NaN")
     for what, distances in (("with the policy", steered), ("without wind", free)):
         print(f"other throws end {distances.mean():.4f} m from the mark {what}, at most {distances.max():.4f} m")
 
