@@ -17,9 +17,9 @@ sys.path += [str(Path(__file__).parents[1]), str(Path(__file__).parent)]  # for 
 import film
 from example_diffsim_throw import MARK, STARTS, Example
 
-_SIZE = 640, 440
+_SIZE = 600, 412
 _EVALUATIONS = 1, 2, 5, 10  # which are shown
-_EVERY = 9  # steps from one frame to the next
+_EVERY = 12  # steps from one frame to the next
 _COLORS = film.BLUE, film.ORANGE, "#3a9a5b"
 
 
@@ -57,7 +57,7 @@ def make():
         film.dots(picture, studio.pixels(np.array([MARK])), film.RED, 5.0)  # also where a cube hides it
         return film.beside([picture], [f"evaluation {_EVALUATIONS[evaluation]}"], band=52)
 
-    return film.Film(len(_EVALUATIONS) * frames, draw, duration=55, part=frames)
+    return film.Film(len(_EVALUATIONS) * frames, draw, duration=70, part=frames)
 
 
 def main():
