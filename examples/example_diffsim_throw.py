@@ -34,7 +34,7 @@ def throw(
 class Example(MarkExample):
     """The scene, in the format of Newton's examples; a frame is an evaluation of the loss and its gradient."""
 
-    num_frames = 10
+    num_frames = 12
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)

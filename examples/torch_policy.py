@@ -7,7 +7,7 @@ later, after it has bounced. The policy, a network of 355 weights, sees the cent
 time, and sets the wind ten times. ``warp_bsc.torch.rollout`` takes the steps of ``SolverImplicit`` between two of its
 decisions, so that the gradient of the loss goes back through flight, bounce, friction and all decisions. Each iteration
 takes eight random throws, in eight worlds; at the end, eight others tell how far from the mark cubes end, with the
-policy and without wind. Needs the extra ``torch``; takes two minutes on two cores, and ends about 1 cm from the mark.
+policy and without wind. Needs the extra ``torch``; takes a minute on two cores, and ends about 1 cm from the mark.
 """
 
 import argparse

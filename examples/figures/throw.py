@@ -62,13 +62,14 @@ def main():
             "with them: a bounce" if ccd else "without contacts: the cube flies through the sheet", fontsize=10
         )
         losses = np.array(example.loss_history)
+        losses[losses == 0.0] = np.nan  # nothing is left in float32
         for world, color in enumerate(_COLORS):
             start = ", ".join(f"{v:g}" for v in STARTS[world])
             label = f"begins at ({start}) m/s" if ccd else None
             line = {"color": color, "linestyle": "-" if ccd else "--", "linewidth": 1.5, "label": label}
             axes[2].plot(1 + np.arange(len(losses)), losses[:, world], **line)
     axes[2].plot([], [], color="#555555", linestyle="--", label="without contacts")
-    axes[2].set(xlabel="evaluation", ylabel="loss", yscale="log", ylim=(1e-6, 4.0))
+    axes[2].set(xlabel="evaluation", ylabel="loss", yscale="log", ylim=(1e-9, 4.0))
     axes[2].legend(fontsize=7, frameon=False, loc="lower left")
     axes[2].set_title("loss: 0 on the mark, 1 far from it", fontsize=10)
     figure.tight_layout()
