@@ -16,8 +16,8 @@ import numpy as np
 import trimesh
 import warp as wp
 from common import main
-from diffsim import build_worlds
-from diffsim_targets import FittedNewton, SearchExample
+from diffsim import DiffsimExample, build_worlds
+from searches import FittedNewton
 
 import warp_bsc as bsc
 
@@ -107,7 +107,7 @@ def record(x, faces, eye, rng):
     return points, weights, seen.mean()
 
 
-class Example(SearchExample):
+class Example(DiffsimExample):
     """The scene, in the format of Newton's examples; a frame is an evaluation of the loss and its gradient.
 
     Attributes:
@@ -142,7 +142,7 @@ class Example(SearchExample):
         self.faces = model.tri_indices[: world.tri_count]
         self.start_solver(model, (wp.vec3(0.0, -2.2, 0.0), -5.0, 90.0), friction=self.friction)
         self.logarithms = wp.zeros(args.worlds, dtype=wp.vec3, device=model.device, requires_grad=True)
-        self.prepare_descent([self.logarithms], None, STEPS)
+        self.prepare_descent([self.logarithms], STEPS)
         self.record(args.eye, np.random.default_rng(args.seed))
         signs, factors = np.random.default_rng(args.seed + 1).uniform(size=(2, args.worlds, 3))
         self.starts = TRUTH * np.where(signs < 0.5, 2.0 + factors, 1.0 / (2.0 + factors))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from diffsim_targets import FittedNewton, QuasiNewton
+from searches import FittedNewton, QuasiNewton
 
 CURVATURES = np.array([[900.0, 60.0, -6.0], [60.0, 12.0, 1.5], [-6.0, 1.5, 1.0]])
 GOAL = np.array([0.3, -0.4, 0.5])
