@@ -58,11 +58,7 @@ def build_worlds(world, count):
     """Returns a model of this many copies of a world, with gradients."""
     builder = newton.ModelBuilder()
     builder.replicate(world, count)
-    model = builder.finalize(requires_grad=True)
-    # the solver's own contacts between particles are penalties, and not needed here
-    model.particle_ke = model.particle_kd = model.particle_kf = 0.0
-    model.particle_grid = None
-    return model
+    return builder.finalize(requires_grad=True)
 
 
 class DiffsimExample(ExampleBase):

@@ -51,7 +51,6 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .repairing.state import StateRepairResult, repair_state
     from .response.captured_steps import CapturedSteps
     from .response.contact_sensor import ContactSensor
-    from .response.layer.contact_layer import ContactLayer
     from .response.monitor import CollisionMonitor
     from .response.report.report import SolverReport
     from .response.solver_ccd import SolverCCD
@@ -75,7 +74,6 @@ _MODULES = {
     "CollisionMesh": "detection.mesh",
     "CollisionMonitor": "response.monitor",
     "Collisions": "detection.results.collisions",
-    "ContactLayer": "response.layer.contact_layer",
     "ContactSensor": "response.contact_sensor",
     "DetectionStats": "detection.results.collisions",
     "FrameRange": "usd.frames",
@@ -117,7 +115,6 @@ __all__ = [
     "CollisionMesh",
     "CollisionMonitor",
     "Collisions",
-    "ContactLayer",
     "ContactSensor",
     "DetectionStats",
     "DeviceQueryResult",

@@ -42,8 +42,8 @@ def rollout(
     clears the gradients of arrays of the model. Second derivatives raise an error.
 
     Args:
-        solver: A solver that is differentiable, such as a :class:`.SolverCCD` around one; its model must be finalized
-            with ``requires_grad=True``.
+        solver: A solver that is differentiable, such as a :class:`.SolverImplicit`; its model must be finalized with
+            ``requires_grad=True``.
         state: Tensors by name: ``particle_q`` [m] and ``particle_qd`` [m/s], shape [particle_count, 3], ``body_q``,
             shape [body_count, 7], and ``body_qd`` [m/s, rad/s], shape [body_count, 6]. Others are those of the model.
         controls: Tensors by name, each with a row for a step, or for an equal number of steps, which hold it. Forces

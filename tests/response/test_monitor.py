@@ -130,7 +130,7 @@ def test_the_monitor_reports_the_same_from_a_graph(device):
     assert sum(row[0] for row in rows[0]) > 100
 
 
-@pytest.mark.parametrize("option", ["separation", "friction", "restitution", "substeps", "bodies", "contact_layer"])
+@pytest.mark.parametrize("option", ["separation", "friction", "restitution", "substeps", "bodies"])
 def test_arguments_of_a_response_are_refused(option, device):
     model = bullet(10.0, device=device)
     with pytest.raises(TypeError, match=option):

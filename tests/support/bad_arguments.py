@@ -546,7 +546,6 @@ def calls_of_solvers() -> dict[str, Call]:
                 "min_distance": without(DISTANCES, "None"),
                 "particle_radius": radii,
                 "collision_filter": filters,
-                "contact_layer": FLAGS,
             },
             raises=bsc.SolverCCD.__init__,
         ),
@@ -561,21 +560,6 @@ def calls_of_solvers() -> dict[str, Call]:
                 "report": reported,
             },
             raises=bsc.CollisionMonitor.__init__,
-        ),
-        "ContactLayer": Call(
-            bsc.ContactLayer,
-            {"solver": inner},
-            {
-                "solver": solvers,
-                "thickness": without(POSITIVE, "None"),
-                "friction": coefficient | {"huge": 1e39} | tables,
-                "restitution": coefficient | {"above 1": 1.5},
-                "min_distance": without(DISTANCES, "None"),
-                "particle_radius": radii,
-                "collision_filter": filters,
-                "bodies": {"unknown": "moved", "flag": True, "None": None},
-            },
-            raises=bsc.ContactLayer.__init__,
         ),
         "SolverImplicit": Call(
             bsc.SolverImplicit,
@@ -641,13 +625,11 @@ def calls_of_solvers() -> dict[str, Call]:
         ("SolverCCD", stage),
         ("SolverImplicit", bsc.SolverImplicit(inner.model)),
         ("CollisionMonitor", bsc.CollisionMonitor(inner)),
-        ("ContactLayer", bsc.ContactLayer(inner)),
     ):
-        bad = {"dt": lengths}
         found[f"{name}.step"] = Call(
             cls.step,
             states,
-            bad | {"world_mask": masks} if name in ("SolverCCD", "SolverImplicit", "CollisionMonitor") else bad,
+            {"dt": lengths, "world_mask": masks},
             exempt=frozenset({"state_in", "state_out", "control", "contacts", "options"}),
         )
     return found
@@ -672,7 +654,7 @@ RESULTS = {
 """Classes of results, which users read and do not make; their methods take slices of rows."""
 
 PASSED_ON = re.compile(
-    r"(SolverCCD|SolverImplicit|CollisionMonitor|ContactLayer)\.(coupling_\w+|"
+    r"(SolverCCD|SolverImplicit|CollisionMonitor)\.(coupling_\w+|"
     r"notify_model_changed|observables|reset|"
     r"set_collision_frequency|update_contacts|validate_observables)$"
 )

@@ -24,7 +24,7 @@ import warp_bsc as bsc
 STEPS = 8
 KINDS = 17
 VARYING_ON_GPU = 5, 12, 13, 16
-"""Kinds of scenes in which ``SolverSemiImplicit`` adds up the forces on a particle in any order."""
+"""Kinds of scenes in which ``SolverSemiImplicit`` adds up forces on a particle, or a tape gradients, in any order."""
 COUNTS = "steps", "uncertified_steps", "truncated_steps", "frozen_steps", "total_remaining", "total_excluded"
 COUNTS += "predicted_contacts", "remaining", "excluded", "crossings", "body_contacts", "truncated", "frozen"
 
@@ -138,15 +138,13 @@ def make_scene(seed):
         inner = "given"
         options = {"min_distance": 1e-3} if seed == 27 else {}
         options["max_iterations"] = 3
-    elif kind in (12, 13):  # gradients
+    elif kind in (12, 13):  # a model that requires gradients, and gradients
         add_cloth(builder, rng, z=0.06, vel=(2.0, 0.0, -6.0), tri_ke=50.0, tri_ka=50.0, cells=4)
+        inner, recorded, dt = "implicit", True, 1.0 / 120.0
         if kind == 12:
             body = add_body(builder, rng, 0.25)
             builder.body_qd[body] = wp.spatial_vector(0.0, 0.0, -3.0, 1.0, 0.0, 1.0)
-        inner, recorded, dt = "semi", True, 1.0 / 600.0
-        options = {"friction": 0.3, "restitution": 0.1}
-        if kind == 13:
-            options["contact_layer"] = 0.012
+            inner, recorded, dt, options = "semi", False, 1.0 / 600.0, {"friction": 0.3, "restitution": 0.1}
     elif kind == 14:
         add_cloth(builder, rng, z=0.1, vel=(0.0, 0.0, -10.0))
         add_cloth(builder, rng, z=0.15, vel=(0.0, 0.0, -25.0))
@@ -154,14 +152,13 @@ def make_scene(seed):
     elif kind == 15:  # animated
         add_cloth(builder, rng, z=0.3, fixed=True, vel=(0.0, 0.0, 0.0))
         add_body(builder, rng, 0.6, kinematic=True)
-    else:  # layer, without gradients
+    else:  # what bounces
         add_cloth(builder, rng, z=0.05, vel=(0.0, 0.0, -3.0))
         add_cloth(builder, rng, z=0.10, vel=(0.0, 0.0, -5.0))
-        options = {"contact_layer": 0.01, "restitution": 0.5}
-        inner = "semi"
+        options, inner = {"restitution": 0.5}, "semi"
         dt = 1.0 / 1000.0
     builder.color()
-    model = builder.finalize(requires_grad=recorded)
+    model = builder.finalize(requires_grad=kind in (12, 13))
     if inner == "semi":
         model.particle_ke = model.particle_kd = model.particle_kf = 0.0
     solvers = {
@@ -169,19 +166,16 @@ def make_scene(seed):
         "xpbd": lambda: newton.solvers.SolverXPBD(model, iterations=5),
         "semi": lambda: newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
         "given": lambda: moved_at_random(model, seed, 0.02 if seed % 2 else 0.1),
+        "implicit": lambda: bsc.SolverImplicit(model, friction=0.3),
     }
     return model, make_stage(solvers[inner](), options), dt, recorded
 
 
 def make_stage(inner, options):
     """Returns the stage with options of these names."""
-    options = dict(options)
-    if options.pop("monitor", False):
-        return bsc.CollisionMonitor(inner)
-    if "contact_layer" in options:
-        physics = {name: options[name] for name in ("friction", "restitution") if name in options}
-        inner = bsc.ContactLayer(inner, thickness=options.pop("contact_layer"), **physics)
-    return bsc.SolverCCD(inner, contact_layer=False, **options)
+    if isinstance(inner, bsc.SolverImplicit):
+        return inner
+    return bsc.CollisionMonitor(inner) if "monitor" in options else bsc.SolverCCD(inner, **options)
 
 
 def count(report, name):

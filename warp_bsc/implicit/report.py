@@ -39,7 +39,8 @@ class ImplicitStepReport(SolverReport):
     def gradient_counts(self) -> GradientCounts:
         """Totals over all gradients that went back through steps so far, as of this access."""
         self.of_gradients.copy_counts()
-        return self.of_gradients.totals(self._read_totals()["ambiguous_moves"])
+        self.warn()
+        return self.of_gradients.totals()
 
     @property
     def gradient_norms(self) -> np.ndarray:
@@ -91,4 +92,5 @@ class ImplicitStepReport(SolverReport):
 
     def __str__(self) -> str:
         """Returns the line of the stage, and how many steps did not converge."""
-        return f"{super().__str__()}, {self.unconverged_steps} whose Newton steps did not converge"
+        line = f"{super().__str__()}{self.gradient_counts.text()}"
+        return f"{line}, {self.unconverged_steps} whose Newton steps did not converge"

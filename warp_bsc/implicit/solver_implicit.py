@@ -1,5 +1,6 @@
 """The solver with contact inside: inertia, elasticity, contact and friction in one solve of each step."""
 
+import contextlib
 import weakref
 from collections.abc import Callable, Collection, Mapping
 from typing import Literal
@@ -28,6 +29,7 @@ from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.results import StepResults
+from .gradients.between_steps import BetweenSteps
 from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
 from .report import ImplicitStepReport
 
@@ -132,8 +134,8 @@ class SolverImplicit(SolverCCD):
     theorem makes them of each converged step, with friction and closest points as they move, by one linear solve, see
     :mod:`.gradients.equations`. They are NaN, and counted, in worlds whose step did not converge. Such a model is
     solved closer, in some two Newton steps more. Two things count as constant: which pairs are near, and by how much
-    barriers are stiffer where solids and taut elements press. :mod:`.response.adjoint.between_steps` says where
-    gradients of kinematic particles and bodies are.
+    barriers are stiffer where solids and taut elements press. :mod:`.gradients.between_steps` says where gradients of
+    kinematic particles and bodies are that a program moves between steps.
 
     Limitations:
         Restitution does not exist: contacts are without bounce, and implicit steps damp.
@@ -150,7 +152,6 @@ class SolverImplicit(SolverCCD):
         work: The buffers of a step, ``response.state.workspace.Workspace``.
     """
 
-    _has_adjoint = False  # gradients go through the solve
     _near = 0.0  # no constraints for near pairs: barriers keep them apart
     _has_few_contacts = True
     report: ImplicitStepReport
@@ -179,8 +180,8 @@ class SolverImplicit(SolverCCD):
                 solver, puts them.
             min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it. Without this and
                 ``particle_radius``, springs and particles without faces, such as ropes and grains, collide by their
-                radii, as they have no other surface; cloth and shapes keep no distance. Where those radii are 0, and
-                with ``requires_grad``, they take no part, and a warning says so.
+                radii, as they have no other surface; cloth and shapes keep no distance. Where those radii are 0, they
+                take no part, and a warning says so.
             particle_radius: Radius of each particle [m], or one for all.
             collision_filter: Groups and masks of particles and shapes.
             inversions: What happens to tetrahedra that invert: ``"allowed"``, ``"reported"`` or ``"prevented"``.
@@ -225,7 +226,6 @@ class SolverImplicit(SolverCCD):
         super().__init__(
             _Inertia(model, moves_bodies=moves),
             bodies="separated" if moves and _dynamic_bodies(model).any() else "ignored",
-            contact_layer=False,
             restitution=0.0,
             friction=friction,
             min_distance=min_distance,
@@ -244,8 +244,10 @@ class SolverImplicit(SolverCCD):
         if self._forces is not None:
             method.keeps_contacts, self._forces.more = True, method.publish
         self.gradients: StepGradients | None = None
+        self._between_steps: BetweenSteps | None = None
         if model.requires_grad:
             method.keeps_contacts = True
+            self._between_steps = BetweenSteps(model, self.report.of_gradients.ambiguous_moves)
             self.gradients = StepGradients(self.work, method, self.report.results.converged, self.report.of_gradients)
         if self._counter is not None:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
@@ -261,6 +263,15 @@ class SolverImplicit(SolverCCD):
             raise ValueError("on a tape, state_out must not be state_in")
         if not self.model.particle_count:
             raise NotImplementedError("steps of a model without particles carry no gradients: step outside the tape")
+
+    @contextlib.contextmanager
+    def _entered(self, step):
+        """Keeps gradients of the step apart from those of what a program moves before it, and after it."""
+        watched = contextlib.nullcontext()
+        if self._between_steps is not None and step.is_recorded:
+            watched = self._between_steps.watched(step.tape, step.state_in, step.state_out)
+        with super()._entered(step), watched:
+            yield
 
     def _record(self, step, end):
         """Solves a step; the tape records its adjoint."""
@@ -315,16 +326,18 @@ class SolverImplicit(SolverCCD):
             arrays += [attached.body_point, attached.stiffness, attached.damping]
         return [array for array in arrays if array is not None and len(array) and array.requires_grad]
 
-    def _resolve(self, step):
-        super()._resolve(step)
-        if not step.is_recorded:  # gradients of what starts where this one ended go no further
-            self._last_recorded = (lambda: None), (lambda: None)
+    def _resolve_end(self, step, end):
+        if step.is_recorded:
+            self._record(step, end)
+            return
+        super()._resolve_end(step, end)
+        self._last_recorded = (lambda: None), (lambda: None)  # gradients of what starts here go no further
 
-    def _solve(self, step, end, recorder):
+    def _solve(self, step, end):
         """Solves with contact from the inertial prediction, and detects what the solve left.
 
         Worlds in which it left contacts end the step earlier on their way, where there are none; what still collides is
-        resolved as behind any solver. No tape records the step, so that there is no ``recorder``.
+        resolved as behind any solver.
         """
         work = self.work
         begin(work)
@@ -353,4 +366,6 @@ class SolverImplicit(SolverCCD):
     def notify_model_changed(self, flags: int) -> None:
         """Reads masses, materials, gravity and shapes again, see :class:`warp_bsc.SolverCCD`."""
         super().notify_model_changed(flags)
+        if self._between_steps is not None:
+            self._between_steps.refresh()
         self.newton_method.read_materials()

@@ -1,4 +1,4 @@
-"""Steps on a tape that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
+"""Steps that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
 
 from collections.abc import Callable, Sequence
 
@@ -9,21 +9,17 @@ from newton.solvers import SolverBase
 from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
 from .drive.snapshot import Snapshot
-from .layer.contact_layer import ContactLayer
 from .stage import CollisionStage
 
 
 class CapturedSteps:
-    """Runs a function that steps a solver on a tape, on a GPU from a CUDA graph.
+    """Runs a function that steps a solver, on a GPU from a CUDA graph.
 
-    The record of a step, from which its gradients come, has buffers that cannot grow in a graph. A step on a tape that
-    needs larger ones freezes all particles or loses its gradients, and the report counts it. Such a run is taken back:
-    the state and the totals of the report become those before it, the function runs outside the graph, where buffers
-    grow, and is captured anew. So is the first run. Other solvers have nothing to take back, and on the CPU the
-    function runs as it is.
-
-    Without a tape no step of a :class:`.solver_ccd.SolverCCD` needs this: it completes detections for which a graph is
-    too small, and any graph will do. Such steps may run here as well, and none is taken back.
+    The first run is outside the graph, where buffers grow, and is captured then. A later run in which a step says that
+    its detection was incomplete (``report.totals.undetected_steps``) is taken back: the state and the totals of the
+    report become those before it, and the function runs outside the graph, and is captured anew. No step of a
+    :class:`.solver_ccd.SolverCCD` needs that: it completes detections for which a graph is too small. Other solvers
+    have nothing to take back, and on the CPU the function runs as it is.
 
     Example::
 
@@ -63,14 +59,7 @@ class CapturedSteps:
         self._lock = Occupied("CapturedSteps")
         self._steps, self._device = steps, solver.model.device
         self._report = solver.report if isinstance(solver, CollisionStage) else None
-        layer = solver.solver if isinstance(solver, CollisionStage) else solver
-        self._layer = layer if isinstance(layer, ContactLayer) else None
-        restored = [] if self._report is None and self._layer is None else list(state)
-        if self._report is not None:
-            restored.append(self._report.total_values)
-        if self._layer is not None:
-            restored.append(self._layer.skipped)
-        self._before = Snapshot(restored)
+        self._before = Snapshot([] if self._report is None else [*state, self._report.total_values])
         self.graph = None
         self.retaken = 0
 
@@ -95,22 +84,18 @@ class CapturedSteps:
 
     def _launch(self):
         """Launches the graph; if its buffers were too small, restores the state and returns False."""
+        report = self._report
+        if report is None:
+            wp.capture_launch(self.graph)
+            return True
         self._before.save()
-        lost = self._count_lost()
+        lost = report.count_lost()
         wp.capture_launch(self.graph)
-        if self._count_lost() == lost:
-            if self._report is not None:
-                self._report.warn()
+        if report.count_lost() == lost:
+            report.warn()
             return True
         self._before.restore()
-        if self._report is not None:
-            self._report.copy_totals()
-            wp.synchronize_device(self._device)  # so that the next step does not warn of one that was taken back
+        report.copy_totals()
+        wp.synchronize_device(self._device)  # so that the next step does not warn of one that was taken back
         self.retaken += 1
         return False
-
-    def _count_lost(self):
-        """Returns the steps so far for which the buffers of a graph may have been too small."""
-        report, layer = self._report, self._layer
-        lost = 0 if layer is None else layer.skipped_steps
-        return lost if report is None else lost + report.count_lost()

@@ -9,8 +9,7 @@ The first detection tells slow worlds from fast ones::
     n = 40 .. 71     divide                          divide
     then             freeze what still collides
 
-A recorded step, one on a tape, projects slow contacts like fast ones up to n = 39, and truncates both for n = 40 .. 47.
-Where a contact has no dividing plane, its paths are truncated too. In the iteration that follows detection ``n``,
+Where a contact has no dividing plane, its paths are truncated. In the iteration that follows detection ``n``,
 ``Loop.ITERATION`` is ``n`` + 1.
 
 When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
@@ -19,8 +18,7 @@ more. It ends: vertices that stood apart at the start and stand still do not col
 When is a vertex frozen, that is, kept at its start? If it still collides in the last row, and with all others if the
 last detection was incomplete. One whose prediction is not finite stays at its start as well, and is counted apart.
 A detection is incomplete if a queue was too small, and queues cannot grow in a CUDA graph. :mod:`.contacts.search` then
-finds contacts without queues, and all worlds go to the third row. Recorded steps cannot be searched, and freeze at
-once.
+finds contacts without queues, and all worlds go to the third row.
 
 What makes a step uncertified? Contacts that remain, a last detection that was incomplete, or start positions that are
 not finite, see :func:`decide`; predictions that are not finite; contacts on arcs; tetrahedra that still invert where
@@ -44,7 +42,7 @@ from ..kernels.pipeline.queues import has_overflowed
 from .state.certificate import certify
 from .state.status import Detection, Loop, Result, SolveStatus, clear_detection
 from .state.structs import Step
-from .tuning import MAX_CUTS
+from .tuning import MAX_CUTS, MAX_DIVISIONS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,7 +57,7 @@ _LARGEST_COUNT = wp.constant(wp.int64(2**31 - 1))
 
 @wp.func
 def divides_after(status: SolveStatus, world: int, iteration: int) -> bool:
-    """Returns whether contacts found after ``iteration`` iterations are divided, or truncated, and not projected."""
+    """Returns whether contacts found after ``iteration`` iterations are divided, and not projected."""
     if iteration >= status.max_iterations:
         return True
     return iteration >= status.max_slow_iterations and status.is_fast[world] == 0
@@ -94,7 +92,7 @@ def divides_now(status: SolveStatus, world: int) -> bool:
 @wp.func
 def is_freezing(status: SolveStatus) -> bool:
     """Returns whether this iteration freezes what still collides."""
-    return status.loop[Loop.ITERATION] > status.max_iterations + status.max_truncations
+    return status.loop[Loop.ITERATION] > status.max_iterations + MAX_DIVISIONS
 
 
 @wp.func
@@ -222,7 +220,7 @@ def begin_prevention(status: SolveStatus):
     """
     results, loop = status.results, status.loop
     if results[Result.INVERTING] > 0 and results[Result.UNDETECTED] == 0:
-        after = wp.where(results[Result.REMAINING] > 0, status.max_truncations, 0)
+        after = wp.where(results[Result.REMAINING] > 0, MAX_DIVISIONS, 0)
         loop[Loop.ITERATION] = status.max_iterations + after + 1
         loop[Loop.ACTIVE] = 1
         results[Result.ITERATIONS] = results[Result.ITERATIONS] + 1

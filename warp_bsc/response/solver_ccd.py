@@ -8,16 +8,13 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverBase, SolverStyle3D, SolverVBD
 
-from .._arguments import checked_choice, checked_flag, checked_integer
+from .._arguments import checked_choice, checked_integer
 from .._one_thread import one_at_a_time
-from .._private_names.of_newton import body_q_prev, has_external_rigid_solver
+from .._private_names.of_newton import body_q_prev
 from ..detection.run.host_function import run_on_host
-from .adjoint.adjoint import RecordedStep, StepAdjoint
-from .contacts.arc_check import check_arcs
 from .drive.inner_steps import InnerSteps, WholeSteps
 from .drive.style3d_springs import SpringSteps
 from .drive.substeps import Substeps
-from .layer.contact_layer import ContactLayer
 from .options import (
     MAX_SUBSTEPS,
     Bodies,
@@ -32,7 +29,6 @@ from .options import (
     friction_of,
     moves_bodies,
 )
-from .report.count_steps import count_record
 from .report.forces.contact_forces import ContactForces
 from .report.forces.contact_report import ContactReport
 from .report.strain import StrainMeter
@@ -42,10 +38,9 @@ from .state.friction_table import FrictionTable
 from .state.kept_distances import KeptDistances
 from .state.mesh import ModelMesh
 from .state.motion import ModelMotion, arrays_of
-from .state.record import StepRecorder
 from .state.status import Loop
 from .step import resolve, resolve_inversions
-from .tuning import MAX_ITERATIONS, MAX_SWEEPS_PER_STEP
+from .tuning import MAX_ITERATIONS
 from .wrapped_solver import innermost
 from .write_back import write_back
 
@@ -70,30 +65,22 @@ class SolverCCD(CollisionStage):
     A kinematic particle or body that a program moves between two steps takes that way in the second step: it starts
     where the last step ended, and in the first step where the model puts it (``particle_q``, ``body_q``). If a movable
     particle has been moved as well, its world was set to another state, and starts there. So does everything after
-    :meth:`reset`, and with ``requires_grad``. A body that ``joint_q`` of the model puts elsewhere than ``body_q``
-    starts the first step where the state has it.
+    :meth:`reset`. A body that ``joint_q`` of the model puts elsewhere than ``body_q`` starts the first step where the
+    state has it.
 
     The certificate covers the motion from the stored state at the start to the stored state at the end, of a step with
     ``substeps`` the motion in each of them: particles move straight, and bodies turn evenly, the shorter way, so that
     their vertices move on arcs, see ``state.turns``. A body that the response can move turns about its centre of mass,
-    others about the axis of their screw. With ``requires_grad`` the response resolves contacts of straight paths, and a
-    step in which only an arc collides is not certified. A body whose predicted pose or velocity is not finite is
-    delegated to the inner solver, and the step is not certified.
+    others about the axis of their screw. A body whose predicted pose or velocity is not finite is delegated to the
+    inner solver, and the step is not certified.
 
     With ``min_distance`` or ``particle_radius`` the certificate is of distances: a pair that started farther apart
     stays at its minimum distance, and one that started closer comes no closer, beyond rounding (2^-20 of that distance
     and 2^-38 of the largest difference of coordinates of the pair). Pairs that touch at the start are excluded, and
     elements that an edge of the mesh joins only do not touch.
 
-    On a :class:`warp.Tape`, a step carries gradients if the model was finalized with ``requires_grad=True`` and the
-    inner solver is differentiable: from positions and velocities of particles and poses and velocities of bodies at its
-    end to the predicted ones, to positions and poses at its start, to ``particle_inv_mass``, ``body_inv_mass``,
-    ``body_inv_inertia``, ``body_mass``, ``body_inertia`` and ``shape_material_mu`` of the model, and to coefficients of
-    friction, also of pairs, and restitution that are arrays. The set of contacts is constant; everything else is
-    differentiated as it was computed, see :mod:`.adjoint.adjoint`. With ``requires_grad`` all sweeps are made, so that
-    results do not jump, and the stage puts a :class:`.layer.contact_layer.ContactLayer` around the inner solver, see
-    ``contact_layer``. :mod:`.adjoint.between_steps` says where gradients of kinematic particles and bodies are that a
-    program moves between steps.
+    A step carries no gradients: on a :class:`warp.Tape`, with a model that requires them, it raises
+    NotImplementedError. Steps of :class:`warp_bsc.SolverImplicit` do.
 
     A step builds on the one before. A second thread that calls the stage while one is in it gets a RuntimeError: use
     one stage for each thread. Warp and Newton load their kernels in the first steps that need them, which two threads
@@ -106,7 +93,7 @@ class SolverCCD(CollisionStage):
         or ``substeps``, stretch them less; ``report.strain`` says by how much they do.
 
     Attributes:
-        solver: The inner solver, or the contact layer around it.
+        solver: The inner solver.
         mesh: The triangles that collide, :class:`.state.mesh.ModelMesh`.
         report: What the stage found and did, :class:`.report.SolverReport`.
         separation: Distance that contacts are moved apart [m].
@@ -117,7 +104,6 @@ class SolverCCD(CollisionStage):
         work: The buffers of a step, ``state.workspace.Workspace``.
     """
 
-    _has_adjoint = True  # of the response, for steps on a tape
     _near = 1.0  # share of the separation within which pairs near their distance are moved apart like contacts
 
     def __init__(
@@ -133,7 +119,6 @@ class SolverCCD(CollisionStage):
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         inversions: Inversions = "allowed",
-        contact_layer: bool = True,
         max_iterations: int = MAX_ITERATIONS,
         report: Collection[Reported] | Mapping[Reported, int] = (),
     ):
@@ -144,9 +129,8 @@ class SolverCCD(CollisionStage):
             separation: Distance that contacts are moved apart [m]; default: 0.005 of the median edge length.
             friction: Coefficient of particles, at least 0; default: the model's ``particle_mu``. Shapes have that of
                 their material, contacts the geometric mean. May be an array of float32, of length 1 or
-                [particle_count]: each step reads it, and the coefficients of shapes, again; it may require gradients.
-                Negative values count as 0. A :class:`.state.friction_table.FrictionTable` has coefficients by pair of
-                materials.
+                [particle_count]: each step reads it, and the coefficients of shapes, again. Negative values
+                count as 0. A :class:`.state.friction_table.FrictionTable` has coefficients by pair of materials.
             restitution: Share of the approaching velocity that comes back, in [0, 1]; default: the model's
                 ``soft_contact_restitution``. May be an array of float32 of length 1, like friction.
             substeps: Number of smaller steps of equal length in a step, 1 to 1024, each a step of the inner solver with
@@ -182,9 +166,6 @@ class SolverCCD(CollisionStage):
                 stored. ``"prevented"``: the paths of their vertices are cut as well, as they are for collisions, and a
                 step with one that remains is not certified. Tetrahedra that were inverted at the start remain so, and
                 are counted apart (``report.inverted_at_start``).
-            contact_layer: Whether to put a :class:`.layer.contact_layer.ContactLayer` of default thickness around the
-                inner solver if the model requires gradients; ``report.layer_thickness`` says how thick it is. Without a
-                layer, results jump where a contact comes or goes, and gradients miss those jumps.
             max_iterations: Iterations of detect and project, 0 to 40; what still collides then is divided, see
                 :mod:`.schedule`. Fewer bound the time of a step, and leave more vertices with cut paths.
             report: What the report of a step has beside its results. ``"contacts"``: contacts and their impulses, see
@@ -205,7 +186,6 @@ class SolverCCD(CollisionStage):
         self.substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)
         self.max_iterations = checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS)
         inversions = checked_choice(inversions, "inversions", get_args(Inversions))
-        contact_layer = checked_flag(contact_layer, "contact_layer")
         distances = KeptDistances.of(self.model, min_distance, particle_radius)
         collision_filter = checked_filter(collision_filter, self.model)
         listed_contacts, counts_worlds = checked_report(report, self.model, self.substeps)
@@ -218,24 +198,10 @@ class SolverCCD(CollisionStage):
         integrator = innermost(solver)
         moves, responds = moves_bodies(bodies, mesh, integrator), bodies == "separated"
         coefficients = friction_of(mesh, self.friction, table=table)
-        moving = {"moves_bodies": moves, "responds_to_bodies": responds, "has_adjoint": self._has_adjoint}
+        moving = {"moves_bodies": moves, "responds_to_bodies": responds}
         motion = ModelMotion(mesh, coefficients, watches_turns=True, **moving)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         self.work.watch_inversions(inversions)
-        if contact_layer and self.model.requires_grad and not isinstance(solver, ContactLayer):
-            self.solver = ContactLayer(
-                solver,
-                friction=self.friction if table is None else friction,
-                restitution=self.restitution,
-                min_distance=min_distance,
-                particle_radius=particle_radius,
-                collision_filter=collision_filter,
-                bodies=bodies,
-            )
-        if isinstance(self.solver, ContactLayer):
-            self.report.layer_overflows, self.report.thickness = self.solver.skipped, self.solver.thickness_values
-        self._watch_between_steps(bodies=not has_external_rigid_solver(integrator))
-        self._recorder = StepRecorder(mesh.device, max_sweeps=MAX_SWEEPS_PER_STEP)
         self._meter = StrainMeter(self.work)
         self._inner = self._choose_steps(integrator)
         self._forces: ContactForces | None = None
@@ -248,12 +214,10 @@ class SolverCCD(CollisionStage):
         self._prepare_entry()
 
     def _choose_steps(self, integrator):
-        """Returns how the inner solver takes steps; with gradients Style3D has its own contacts."""
+        """Returns how the inner solver takes steps."""
         steps: InnerSteps = WholeSteps(self)
-        if isinstance(self.solver, SolverStyle3D) and not self.model.requires_grad:
+        if isinstance(self.solver, SolverStyle3D):
             steps = SpringSteps(self, self.work)
-        elif isinstance(self.solver, ContactLayer):
-            steps.pushes_before = "the contact layer pushes before the stage"
         elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
             steps.pushes_before = "SolverVBD has self-contact"
         if self.substeps == 1:
@@ -261,18 +225,10 @@ class SolverCCD(CollisionStage):
         return Substeps(steps, self._motion, self.substeps, integrator=integrator)
 
     def _check_tape(self, state_in, state_out, mask):
-        super()._check_tape(state_in, state_out, mask)
-        if state_in is state_out:
-            raise ValueError("on a tape, state_out must not be state_in")
-        if self.work.detector.points:
-            raise NotImplementedError(
-                "on a tape, particles without faces and springs that keep a distance carry no gradients: "
-                "omit min_distance and particle_radius"
-            )
-        if self.work.ends is not None:
-            raise NotImplementedError(
-                "inversions='prevented' has no gradients: on a tape, pass 'reported' or 'allowed'"
-            )
+        raise NotImplementedError(
+            "steps of SolverCCD carry no gradients, and the model requires them: take SolverImplicit, whose steps do, "
+            "or step outside the tape"
+        )
 
     def coupling_notify_iteration_restarts(self, enabled: bool) -> None:
         """Prepares for a coupled simulation, see :class:`.drive.coupling.CouplingHooks`.
@@ -290,58 +246,29 @@ class SolverCCD(CollisionStage):
     def _resolve(self, step):
         has_some = step.contacts is not None and step.contacts.soft_contact_max > 0
         self.report.impulses_elsewhere = self._inner.pushes_before or (_PASSED_ON if has_some else None)
-        end = arrays_of(step.state_out)
-        if step.is_recorded:
-            self._record(step, end)
-        else:
-            run_on_host(lambda: self._resolve_motion(step, end), self.mesh.device)
+        self._resolve_end(step, arrays_of(step.state_out))
 
-    def _record(self, step, end):
-        """Resolves the motion of a step, and changes its end; the tape records the adjoint."""
-        device, model, friction, start = self.mesh.device, self.model, self._motion.friction, arrays_of(step.state_in)
-        arrays = [start.particle_q, end.particle_q, end.particle_qd]
-        if model.body_count:
-            arrays += [start.body_q, end.body_q, end.body_qd]
-        read = [*friction.inputs, self.restitution, model.particle_inv_mass]
-        read += [model.body_inv_mass, model.body_inv_inertia, model.body_mass, model.body_inertia, model.body_com]
-        read = [array for array in read if array is not None and len(array) and array.requires_grad]
-        recorded: RecordedStep | None = None
-
-        def forward():
-            nonlocal recorded
-            self._resolve_motion(step, end, self._recorder)
-            recorded = None
-            if device.is_capturing or self.work.has_changed():
-                recorded = RecordedStep(self.work, step.dt)
-                self.work.launch(count_record, 1, [recorded.counts], [self.report.device_totals])
-
-        def backward():
-            with self._lock:
-                if recorded is not None:
-                    StepAdjoint(recorded).backward(*(array.grad for array in arrays))
-
-        run_on_host(forward, device)
-        step.tape.record_func(lambda: run_on_host(backward, device), [*arrays, *read])
+    def _resolve_end(self, step, end):
+        run_on_host(lambda: self._resolve_motion(step, end), self.mesh.device)
 
     @one_at_a_time
-    def _resolve_motion(self, step, end, recorder=None):
+    def _resolve_motion(self, step, end):
         """Resolves the motion from the start of a step to its end, as it was predicted, and changes the end."""
         if self._reads_friction:
             self._motion.friction.read()
         if self._forces is not None:
             self._forces.end(end, step.mask)
         with self._prepared(step, end):
-            self._solve(step, end, recorder)
+            self._solve(step, end)
             if step.is_first:
                 self.report.last_strain.zero_()
             self._measure_strain()
             resolve_inversions(self.work, step.dt)
-            check_arcs(self.work)
             self._write_end(step, end)
 
-    def _solve(self, step, end, recorder):
+    def _solve(self, step, end):
         """Makes the motion free of its contacts, see :func:`.step.resolve`."""
-        resolve(self.work, step.dt, recorder)
+        resolve(self.work, step.dt)
 
     def _measure_strain(self):
         """Measures the strain by contacts of a whole step, for the report."""

@@ -14,12 +14,11 @@ from .._one_thread import one_at_a_time
 from .._private_names.of_newton import SHAPES_CHANGE
 from .._private_names.of_warp import paused_tape
 from .._warnings import warn_caller
-from .adjoint.between_steps import BetweenSteps
 from .drive.coupled_check import CoupledCheck, has_elements_of_other_entries, unseen_shapes
 from .drive.coupling import CouplingHooks
 from .drive.inner_steps import InnerSteps, StepCall
 from .drive.world_mask import WorldMask, checked_mask
-from .report.count_steps import count_layer_passed, count_step, merge_step, note_crossings
+from .report.count_steps import count_step, merge_step, note_crossings
 from .report.count_worlds import WorldCounter
 from .report.report import SolverReport
 from .report.text import unseen_warning
@@ -40,7 +39,6 @@ class CollisionStage(CouplingHooks):
     report: SolverReport
     _report_type: type[SolverReport] = SolverReport
     _has_few_contacts = False  # of a solver that leaves hardly any
-    _between_steps: BetweenSteps | None = None  # of a stage whose steps carry gradients
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _inner: InnerSteps  # how the inner solver takes a step
 
@@ -55,14 +53,13 @@ class CollisionStage(CouplingHooks):
     ):
         """Allocates the workspace of steps, and makes the report."""
         self.mesh, self._motion, self._responds = motion.mesh, motion, responds
-        options = {"max_iterations": max_iterations, "responds": responds, "has_few_contacts": self._has_few_contacts}
+        options = {"max_iterations": max_iterations, "has_few_contacts": self._has_few_contacts}
         self.work = Workspace(motion, separation=separation, restitution=restitution, **options)
         prepare(self.work)
         self._recount_crossings()
-        if not motion.differentiable:
-            motion.last.begin()
+        motion.last.begin()
         self.report = self._report_type(self.work, responds=responds)
-        self._watches_bodies = motion.moves_bodies and not motion.differentiable
+        self._watches_bodies = motion.moves_bodies
         coupled: Any = innermost(self.solver)
         if isinstance(coupled, SolverCoupled):
             for stage in map(coupled.solver, coupled.entry_names()):
@@ -73,17 +70,11 @@ class CollisionStage(CouplingHooks):
         """Warns of springs and particles that take no part, unless the program chose that by a number."""
         unseen = None if distances.any or distances.is_chosen else unseen_strands(mesh)
         if unseen is not None:
-            but = ", which steps on a tape do not take" if self.model.requires_grad else ""
             warn_caller(
                 f"{unseen} take no part: faces and springs do not stop them, and certificates do not cover them. Pass "
-                f"min_distance='model', for the radii of particles and the margins of shapes, or a number{but}; "
+                f"min_distance='model', for the radii of particles and the margins of shapes, or a number; "
                 "min_distance=0 leaves them out without this warning"
             )
-
-    def _watch_between_steps(self, *, bodies: bool):
-        """Keeps gradients apart of what a program moves between steps; ``bodies`` as of :class:`BetweenSteps`."""
-        if self.model.requires_grad:
-            self._between_steps = BetweenSteps(self.model, self.report.device_totals.ambiguous_moves, bodies=bodies)
 
     def _make_check(self):
         unseen = unseen_shapes(self.model)
@@ -120,7 +111,6 @@ class CollisionStage(CouplingHooks):
         A step is taken as a whole unless ``substeps=`` of :class:`.solver_ccd.SolverCCD` divides it: each substep is
         then solved, detected and resolved by itself, and the report has them together.
         :class:`.solver_ccd.SolverCCD` then changes positions and velocities of the particles and bodies that collide.
-        What is said of tapes holds for it alone.
 
         Args:
             state_in: The state at the start; the inner solver may change it.
@@ -138,12 +128,11 @@ class CollisionStage(CouplingHooks):
 
         Raises:
             TypeError: If ``dt`` is no number, or ``world_mask`` no array of bool.
-            ValueError: If ``dt`` is not finite or not more than 0, if ``world_mask`` has another shape or device, or if
-                a tape records gradients of the response, and ``state_out`` is ``state_in``.
-            NotImplementedError: If a tape records gradients where particles without faces keep a distance, or in a
-                part of the worlds.
-            RuntimeError: If another thread is using this stage, or if a tape records gradients in a CUDA graph, and it
-                recorded no step outside one before, or if the first ``world_mask`` is given in a graph.
+            ValueError: If ``dt`` is not finite or not more than 0, or if ``world_mask`` has another shape or device; on
+                a tape, also if ``state_out`` is ``state_in``.
+            NotImplementedError: If a tape is active and the model requires gradients, and the step carries none: that
+                of a :class:`.solver_ccd.SolverCCD`, or of a part of the worlds.
+            RuntimeError: If another thread is using this stage, or if the first ``world_mask`` is given in a graph.
         """
         call = self._checked_call(state_in, state_out, control, contacts, dt, world_mask, options)
         for step in self._inner.parts(call):  # the step itself, or its substeps
@@ -156,7 +145,7 @@ class CollisionStage(CouplingHooks):
             self.report.warn()
 
     def _checked_call(self, state_in, state_out, control, contacts, dt, world_mask, options):
-        """Returns the arguments of a step, checked, with the tape that records its gradients."""
+        """Returns the arguments of a step, checked, with the active tape if the model requires gradients."""
         checked_number(dt, "dt", 0.0, above=True)
         mask = checked_mask(world_mask, self.model)
         with paused_tape() as active:
@@ -166,16 +155,13 @@ class CollisionStage(CouplingHooks):
         return StepCall(state_in, state_out, control, contacts, dt, options, mask, tape)
 
     def _check_tape(self, state_in, state_out, mask):
-        """Raises an error if a tape cannot record the gradients of a step."""
+        """Raises an error if a tape would record a step that carries no gradients."""
         if mask is not None:
             raise NotImplementedError("world_mask: steps on a tape are of all worlds; omit it")
 
     @contextlib.contextmanager
     def _entered(self, step):
-        """Keeps where a step starts, and after it where it ended.
-
-        Gradients of the step stay apart from those of what a program moves before it, and after it.
-        """
+        """Keeps where a step starts, and after it where it ended."""
         with paused_tape():
             start = step.state_in if self._coupled is None else self._coupled.start_of(step.state_in)
             self._motion.set_start(arrays_of(start))  # now: some solvers overwrite it
@@ -183,11 +169,7 @@ class CollisionStage(CouplingHooks):
                 self._find_set_bodies(start)
             if step.mask is not None:
                 self._world_mask.begin(start)
-        watched = contextlib.nullcontext()
-        if self._between_steps is not None and step.is_recorded:
-            watched = self._between_steps.watched(step.tape, step.state_in, step.state_out)
-        with watched:
-            yield
+        yield
         with paused_tape():
             self._motion.last.end(step.state_out.body_q, self._motion.planes.end)
             if step.mask is not None:
@@ -247,8 +229,6 @@ class CollisionStage(CouplingHooks):
         if self._counter is not None:
             self._counter.count(first=first)
         if step.is_last:
-            if report.thickness is not None:
-                work.launch(count_layer_passed, 1, [found.results], [report.device_totals])
             work.launch(count_step, 1, [found.results, report.last_strain], [report.device_totals])
         wp.copy(work.last_crossings, work.crossings_of_edges)
         report.copy_totals()
@@ -286,8 +266,6 @@ class CollisionStage(CouplingHooks):
         self.mesh.refresh_inverse_masses()
         if flags & SHAPES_CHANGE:
             self._follow_shapes()
-        if self._between_steps is not None:
-            self._between_steps.refresh()
         self._recount_crossings()
 
     def _follow_shapes(self):

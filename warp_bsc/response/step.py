@@ -17,29 +17,24 @@ from .contacts.inversions import find_inversions
 from .schedule import begin_prevention, decide_cut
 from .solve import division, positions, velocities
 from .solve.bodies import begin_bodies
-from .state.record import StepRecorder
 from .state.status import Loop
 from .state.workspace import Workspace
 
 
-def resolve(work: Workspace, dt: float, recorder: StepRecorder | None = None) -> None:
+def resolve(work: Workspace, dt: float) -> None:
     """Makes the predicted motion free of its contacts, except for those that cannot be resolved.
 
     Args:
         work: The motion, which is only read, and buffers, which hold the result until the next step.
         dt: Length of the step [s].
-        recorder: Records the step for its adjoint; None to record nothing.
-
-    Raises:
-        RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
     """
-    find_contacts(work, recorder)
+    find_contacts(work)
     resolve_contacts(work, dt)
 
 
-def find_contacts(work: Workspace, recorder: StepRecorder | None = None) -> None:
-    """Detects the contacts of the motion, as the first half of :func:`resolve`, with the same arguments and errors."""
-    begin(work, recorder)
+def find_contacts(work: Workspace) -> None:
+    """Detects the contacts of the motion, as the first half of :func:`resolve`."""
+    begin(work)
     detect_contacts(work)
 
 
@@ -49,10 +44,8 @@ def detect_contacts(work: Workspace) -> None:
     if work.max_penetrations:
         work.reserve(work.max_contacts)
         detect.detect_penetrations(work, ahead=True)
-        work.record_offsets()
         positions.leave_planes(work)
     detect.detect(work)  # contacts become constraints; without any the motion is certified, and the step is done
-    work.record_offsets(after=1)
 
 
 def resolve_contacts(work: Workspace, dt: float) -> None:
@@ -63,14 +56,12 @@ def resolve_contacts(work: Workspace, dt: float) -> None:
 def _resolve_contacts(work, dt):
     add_proximities(work)
     wp.capture_while(work.loop[Loop.ACTIVE], _iterate, work=work, dt=dt)
-    work.record_offsets(after=1)
     wp.capture_if(work.constraints.count, velocities.project, work=work, dt=dt)
     division.freeze_if_undetected(work)
 
 
 def _iterate(work, dt):
     """Projects worlds, and divides those that are past their projections; then detects what has changed."""
-    work.record_offsets()
     positions.project(work)
     division.divide(work, dt)
     detect.detect(work, only_changed=True)
@@ -129,8 +120,8 @@ def prepare(work: Workspace) -> None:
 
 
 @phase("begin")
-def begin(work: Workspace, recorder: StepRecorder | None = None) -> None:
+def begin(work: Workspace) -> None:
     """Initializes vertices and bodies by their prediction, and counts what crosses at the start, which is excluded."""
-    work.begin(recorder)
+    work.begin()
     work.launch_over_bodies(begin_bodies)
     detect.detect_crossings(work)

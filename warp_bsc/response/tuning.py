@@ -89,17 +89,6 @@ PLANE_APPROACH = wp.constant(wp.float64(0.25))
 PLANE_DEPTH = wp.constant(wp.float64(0.05))
 """Most that a vertex of a body goes deeper into a solid in a step, as a share of the separation: poses are rounded."""
 
-# contact layer
-LAYER_THICKNESS = 0.25, 0.45
-"""Thickness, as a share of the median edge length, and its limit as a share of the shortest edge length."""
-PATHS_IN_LAYER = wp.constant(2.0)
-"""Paths of a step that a layer should hold, see :mod:`.layer.thickness`; with a quarter less, gradients fail."""
-START_DEPTH = 0.1
-"""Depth at the start, as a share of the thickness, of which a layer warns: what rests on it may be as deep."""
-PARALLEL_IN_LAYER = wp.constant(wp.float64(0.03))
-"""Squared sine of the angle of two edges at which their depth counts half: where they are parallel, their closest
-points jump, and vertices hold them."""
-
 # strain
 MAX_STRAIN = wp.constant(0.2)
 """Largest strain by contacts of which the stage does not warn."""
@@ -129,8 +118,6 @@ DIVIDING_PLANES, DIVIDING_PLANES_IF_FEW = 32, 8
 behind a solver that leaves none."""
 ITERATIONS_RESERVED, ITERATIONS_RESERVED_IF_FEW = 3, 1
 """Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
-MIN_ENTRIES = 4096
-"""Least capacity of a record for active constraints, summed over sweeps."""
 CONTACTS_PER_PARTICLE, MIN_CONTACTS = 8, 4096
 """Contacts that a report lists, for each particle, and at least."""
 THREADS = 2048
@@ -141,19 +128,15 @@ MAX_ITERATIONS = 40
 """Iterations of detect and project, after which vertices that still collide are divided."""
 MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
-MAX_DIVISIONS = 32
+MAX_DIVISIONS = wp.constant(32)
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
 MAX_PASSES = wp.constant(4)
 """Passes over dividing planes in each division: sheets that fall together by more than they are apart need several."""
 MAX_CUTS = wp.constant(64)
 """Sweeps over tetrahedra that cut paths, before a detection looks for what collides for that."""
-MAX_TRUNCATIONS = wp.constant(8)
-"""Iterations of detect and truncate of a recorded step, after which vertices that still collide are frozen."""
 MAX_SWEEPS, SWEEPS_PER_BATCH = wp.constant(40), wp.constant(4)
 """Sweeps over constraints, in each iteration on positions, and at the end on velocities; and the sweeps over one active
 set, after which the device checks whether a constraint is still active."""
 SLOW_POSITION_SWEEPS = 4
 """Sweeps on positions over constraints that move no body in worlds without fast contacts: division resolves what they
 leave. Velocities need more, as a sweep passes an impulse on by a sheet."""
-MAX_SWEEPS_PER_STEP = 1 + (MAX_ITERATIONS + 1) * int(MAX_SWEEPS)
-"""Sweeps of a step: one ahead of the detection, those of all iterations, and those on velocities."""

@@ -325,19 +325,3 @@ def test_steps_in_a_graph_are_those_without():
         ends.append([states[0].particle_q.numpy().tobytes(), states[0].particle_qd.numpy().tobytes(), counts])
     assert ends[0] == ends[1]
     assert any(truncated for truncated, _ in counts) and not any(inversions for _, inversions in counts)
-
-
-def test_a_step_on_a_tape_counts_but_does_not_prevent(device):
-    builder = newton.ModelBuilder()
-    add_block(builder, (0.0, 0.0, 0.0))
-    model = builder.finalize(device=device, requires_grad=True)
-    start, end = model.state(), model.state()
-    solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), inversions="reported")
-    with wp.Tape():
-        solver.step(start, end, None, None, 1e-4)
-    assert (solver.report.inverting, solver.report.inverted_at_start) == (0, 0)
-    solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), inversions="prevented")
-    with wp.Tape(), pytest.raises(NotImplementedError, match="inversions"):
-        solver.step(start, end, None, None, 1e-4)
-    solver.step(start, end, None, None, 1e-4)  # without a tape it may
-    assert solver.report.certified

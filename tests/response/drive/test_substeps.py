@@ -287,18 +287,6 @@ def test_a_coupled_solver_takes_no_substeps_of_the_stage(device):
         solver.coupling_notify_iteration_restarts(False)
 
 
-def test_bodies_that_another_solver_moves_have_no_gradients_in_substeps(device):
-    builder = newton.ModelBuilder()
-    builder.add_shape_box(builder.add_body(is_kinematic=True), hx=0.1, hy=0.1, hz=0.1)
-    add_patch(builder, 2, 0.05, (0.0, 0.0, 0.5))
-    builder.color()
-    model = builder.finalize(device=device, requires_grad=True)
-    inner = newton.solvers.SolverVBD(model, integrate_with_external_rigid_solver=True)
-    solver = bsc.SolverCCD(inner, substeps=2)
-    with wp.Tape(), pytest.raises(NotImplementedError, match="bodies that another solver moves"):
-        solver.step(model.state(), model.state(), None, None, DT)
-
-
 @pytest.mark.slow
 def test_friction_holds_and_slides_in_substeps(device):
     """Cloth on a ramp slides as a rigid body would, without friction and with it."""

@@ -40,7 +40,7 @@ def test_a_step_warns_at_the_line_that_takes_it(substeps, requires_grad, device)
     check_origin(said, "solver." if device.is_cuda else "solver.step(")
 
 
-READS = ["certified", "predicted_contacts", "strain", "frozen", "totals", "gradient_counts", "uncertified_vertices"]
+READS = ["certified", "predicted_contacts", "strain", "frozen", "totals", "uncertified_vertices"]
 
 
 @pytest.mark.parametrize("read", READS)

@@ -89,22 +89,6 @@ def test_a_monitor_does_not_watch_filtered_pairs(device):
     assert hits[0] > 10 and hits[1] == 0
 
 
-def test_a_contact_layer_does_not_push_filtered_pairs(device):
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-    builder.add_ground_plane()
-    builder.add_shape_box(-1, xform=wp.transform((1.0, 0.0, 0.1), wp.quat_identity()), hx=0.1, hy=0.1, hz=0.1)
-    for at in ((0.0, 0.0, 0.008), (1.0, 0.0, 0.208)):
-        add_patch(builder, 2, 0.05, at, velocity=(0.0, 0.0, -1.0))
-    model = finalized(builder, device)
-    speeds = []
-    for shape_mask in (-1, [0, -1], [-1, 0], 0):
-        layer = bsc.ContactLayer(Changed(model), collision_filter=bsc.CollisionFilter(shape_mask=shape_mask))
-        start, end = model.state(), model.state()
-        layer.step(start, end, None, None, DT)
-        speeds.append(end.particle_qd.numpy()[:, 2].reshape(2, 9).min(axis=1) > -0.9)
-    assert np.array(speeds).tolist() == [[True, True], [False, True], [True, False], [False, False]]
-
-
 def test_filtered_solids_hold_nothing(device):
     builder = newton.ModelBuilder()
     builder.add_ground_plane()

@@ -1,4 +1,4 @@
-"""Friction by pair of materials: each pair slides as its coefficient says, in graphs, in the layer, and on tapes."""
+"""Friction by pair of materials: each pair slides as its coefficient says, in graphs, and on tapes."""
 
 import itertools
 
@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 from body_scenes import add_body, free
 from body_scenes import finalize as finalize_bodies
-from newton_scenes import DT, SOLVERS, add_patch, semi_implicit
+from newton_scenes import DT, SOLVERS, add_patch
 from style3d_scenes import drape
 
 import warp_bsc as bsc
@@ -110,7 +110,7 @@ def falling(device, mu, requires_grad=False):
     return builder.finalize(device=device, requires_grad=requires_grad)
 
 
-@pytest.mark.parametrize("inner", ["vbd", "contact layer", "style3d"])
+@pytest.mark.parametrize("inner", ["vbd", "style3d"])
 def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
     """Bit for bit, as its geometric mean with itself is itself."""
     if inner == "style3d" and device.is_cuda:
@@ -127,8 +127,6 @@ def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
             solver.collision = None  # its own contacts, which need those of Newton
         else:
             solver = SOLVERS["vbd"](model)
-        if inner == "contact layer":
-            solver = bsc.ContactLayer(solver, thickness=0.01, **options)
         solver, states = bsc.SolverCCD(solver, **options), [model.state(), model.state()]
         for _ in range(10):
             solver.step(*states, model.control(), None, 1.0 / 60.0 if inner == "style3d" else DT)
@@ -142,22 +140,18 @@ def test_a_table_of_one_coefficient_is_that_coefficient(inner, device):
         assert (apart[:27].reshape(3, 9).max(axis=1) > 0.1).all()
 
 
-@pytest.mark.filterwarnings("ignore:contacts")
-@pytest.mark.parametrize("contact_layer", [False, True])
-def test_gradients_reach_the_table(contact_layer, device):
+def test_gradients_reach_the_table(device):
     """That of one material is the sum of those of the coefficients of all sides, whose geometric mean it stands for."""
     gradients = []
     for mu in (0.25, 0.0):
         model = falling(device, mu, requires_grad=True)
         numbers = {"dtype": float, "device": device, "requires_grad": True}
         friction, table = wp.array([mu], **numbers), wp.array([[0.25]], **numbers)
-        options = {"friction": friction, "contact_layer": contact_layer}
-        if mu == 0.0:
-            options["friction"] = bsc.FrictionTable(table, particle_mu=friction)
-        solver, states = bsc.SolverCCD(semi_implicit(model), **options), [model.state() for _ in range(5)]
+        given = bsc.FrictionTable(table, particle_mu=friction) if mu == 0.0 else friction
+        solver, states = bsc.SolverImplicit(model, friction=given), [model.state() for _ in range(5)]
         with wp.Tape() as tape:
             for start, end in itertools.pairwise(states):
-                solver.step(start, end, model.control(), None, 1e-3)
+                solver.step(start, end, None, None, 1e-3)
         states[-1].particle_q.grad.fill_(wp.vec3(1.0, -2.0, 0.5))
         tape.backward()
         assert solver.report.totals.uncertified_steps == 0

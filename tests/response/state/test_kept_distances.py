@@ -1,6 +1,5 @@
 """A stage with a minimum distance: exact queries say of each step, as stored, what came nearer than it may."""
 
-import contextlib
 import warnings
 
 import newton
@@ -300,23 +299,6 @@ def test_bad_distances_are_refused(options, message, device):
     model = strands(device)
     with pytest.raises(ValueError, match=message):
         bsc.SolverCCD(newton.solvers.SolverXPBD(model), **options)
-
-
-@pytest.mark.parametrize("ends, refused", [(0, False), (2, False), (1, True)])
-def test_single_particles_that_keep_a_distance_are_not_differentiated(ends, refused, device):
-    """A tape refuses them, but neither cloth nor a spring; without a tape it steps."""
-    builder = newton.ModelBuilder()
-    add_patch(builder, 2, 0.04, (0.0, 0.0, 0.0))
-    particles = [builder.add_particle(wp.vec3(0.05 * i, 0.0, 0.2), wp.vec3(), 0.001) for i in range(ends)]
-    if ends == 2:
-        builder.add_spring(*particles, ke=10.0, kd=0.0, control=0.0)
-    model = builder.finalize(device=device, requires_grad=True)
-    solver = bsc.SolverCCD(newton.solvers.SolverSemiImplicit(model), min_distance=0.01)
-    raises = pytest.raises(NotImplementedError, match="particles without faces and springs that keep a distance carry")
-    with raises if refused else contextlib.nullcontext(), wp.Tape():
-        solver.step(model.state(), model.state(), model.control(), None, DT)
-    solver.step(model.state(), model.state(), model.control(), None, DT)
-    assert solver.report.totals.steps == (1 if refused else 2)
 
 
 def test_bodies_alone(device):

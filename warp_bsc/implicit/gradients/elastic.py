@@ -5,13 +5,13 @@ import numpy as np
 import warp as wp
 
 from ..._private_names.of_warp import struct_fields
-from ...response.adjoint.arrays import launch_adjoint
 from ..contact.rows import Rows, make_rows
 from ..elasticity.bending import bend, edge_corners
 from ..elasticity.derivatives import store_hessian
 from ..elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, has_energy, kind_of
 from ..elasticity.matrices import cross_matrix, identity, mat43d
 from . import energies
+from .arrays import launch_adjoint
 from .element_kernels import gather
 
 wp.set_module_options({"enable_backward": False})

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import warp as wp
 
 from ..._private_names.of_warp import empty_struct, struct_fields, struct_type
-from ...response.adjoint.arrays import launch_adjoint
 from . import element_kernels
+from .arrays import launch_adjoint
 
 
 class Elements:

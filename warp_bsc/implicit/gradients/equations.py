@@ -13,12 +13,12 @@ import numpy as np
 import warp as wp
 
 from ..._private_names.of_newton import attachment_arrays
-from ...response.adjoint.arrays import launch_adjoint
 from ...response.state.planes import MovingPlanes
 from ...response.state.structs import Motion
 from ..contact.newton_method import NewtonMethod
 from ..contact.pairs import BarrierSettings
 from . import energies, kernels
+from .arrays import launch_adjoint
 from .bodies import ContactsOnBodies, find_arms, inertial_forces_on_bodies
 from .contact_forces import RecordedContacts, contact_forces, contact_jacobians
 from .elastic import Elastic

@@ -21,9 +21,10 @@ class Count(IntEnum):
     UNSOLVED = 1
     FAILED_SOLVES = 2
     GROWING = 3
-    STEP = 4
+    AMBIGUOUS_MOVES = 4
+    STEP = 5
     """Number on its tape of the first step in which a gradient grew."""
-    PARTICLE = 5
+    PARTICLE = 6
     """The particle that had most of it then."""
 
 

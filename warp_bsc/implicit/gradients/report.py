@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from .between_steps import AMBIGUOUS_MOVES
 from .kernels import GROWTH, Count
 
 
@@ -21,7 +22,7 @@ class GradientCounts:
             whose gradients were NaN before do not count.
         growing: Worlds of these steps within which the norm of the gradient grew by more than 1,000.
         ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps, and of which it
-            cannot be known what they are of: they are NaN, see :mod:`..response.adjoint.between_steps`.
+            cannot be known what they are of: they are NaN, see :mod:`.between_steps`.
     """
 
     steps: int
@@ -62,6 +63,11 @@ class GradientReport:
         wp.copy(self._host, self.counts)
 
     @property
+    def ambiguous_moves(self) -> wp.array:
+        """The count of :attr:`GradientCounts.ambiguous_moves`, int64, shape [1]."""
+        return self.counts[Count.AMBIGUOUS_MOVES : Count.AMBIGUOUS_MOVES + 1]
+
+    @property
     def norms(self) -> np.ndarray:
         """Norm at the start of each step of the last tape, then at the end of the last, shape [steps + 1, worlds]."""
         if not self._norms:
@@ -69,10 +75,9 @@ class GradientReport:
         found = [norms.numpy() for norms in self._norms]
         return np.array([*(both[1] for both in found), found[-1][0]])
 
-    def totals(self, ambiguous_moves: int) -> GradientCounts:
+    def totals(self) -> GradientCounts:
         """Returns the totals."""
-        steps, unsolved, failed, growing = self.counts.numpy()[: int(Count.STEP)].tolist()
-        return GradientCounts(steps, unsolved, failed, growing, ambiguous_moves)
+        return GradientCounts(*self.counts.numpy()[: int(Count.STEP)].tolist())
 
     def warnings(self) -> dict[str, str]:
         """Returns what to warn of, as far as the host knows it, by subject."""
@@ -92,4 +97,6 @@ class GradientReport:
                 f"a tape, most of it at particle {counts[Count.PARTICLE]}: where cloth buckles, the end of a step "
                 "jumps by tiny changes of its start (see report.gradient_norms)"
             )
+        if counts[Count.AMBIGUOUS_MOVES]:
+            found["moves"] = f"{AMBIGUOUS_MOVES} (see report.gradient_counts.ambiguous_moves)"
         return found

@@ -10,17 +10,11 @@ from typing import Any
 import newton
 import warp as wp
 
-from ...response.adjoint.arrays import (
-    copied,
-    copied_materials,
-    launch_adjoint,
-    materials_with_gradients,
-    with_gradients,
-)
 from ...response.state.motion import StateArrays
 from ...response.state.workspace import Workspace
 from ..contact.newton_method import NewtonMethod
 from . import energies, kernels
+from .arrays import copied, copied_materials, launch_adjoint, materials_with_gradients, with_gradients
 from .bodies import end_bodies, find_solved, leave_out_solved, predict_goals
 from .contact_forces import RecordedContacts
 from .elements import with_gradient

@@ -11,7 +11,6 @@ from ...kernels.polynomials import EDGE_EDGE
 from ...kernels.signs import FREE
 from ..schedule import count_contact, count_filtered, divides_after, widened
 from ..state.planes import MovingPlanes, is_filtered_by_plane, signed_distance, time_of_entry
-from ..state.record import StepRecord, is_recording
 from ..state.status import Detection, Loop, Result, SolveStatus
 from ..state.structs import ContactKind, DividingPlanes, Motion, Pace, Step, Vertices, body_of
 from ..state.vectors import ONE, ZERO, relative
@@ -173,8 +172,6 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         added.normal = wp.vec3d(plane[0], plane[1], plane[2])
         if divides_after(status, world, status.loop[Loop.ITERATION]):
             update_first_contact(vertices, vertex, time_of_entry(before, after), ContactKind.PLANE, i)
-            if not dividing.first:
-                continue
             stays, _error_stays = signed_distance(plane, motion.x0[vertex])
             stays = wp.max(stays - kept, ZERO)
             # what is pressed would come nearer by a share in each step, down to 0
@@ -194,7 +191,6 @@ def collect_penetrations(step: Step, planes: MovingPlanes, ahead: bool, dividing
         added.friction = constraints.friction_on_plane(motion, planes, i, vertex)
         added.kind = ContactKind.PLANE
         added.plane = i
-        added.within_tolerance = True
         added.pace = Pace.SLOW
         constraints.add_constraint(step, added)
 
@@ -261,8 +257,6 @@ def _collect_contact(
             return
         for j in range(4):
             update_first_contact(vertices, corners[j], toi, added.kind, i)
-        if not dividing.first:
-            return
         add_dividing_plane(step, corners, kind, added.min_distance, dividing, True)
         added.multiplier = TOUCH * added.normal
     else:
@@ -271,7 +265,7 @@ def _collect_contact(
         if iteration == 0 and kind == EDGE_EDGE:
             time = wp.where(near, ZERO, toi)
             skipped = rules.are_occluded(step, contacts.pairs[i], corners, added.normal, time)
-            if dividing.first and added.pace == Pace.SLOW:  # in recorded steps a turn would let results jump
+            if added.pace == Pace.SLOW:
                 skipped = skipped or rules.are_parallel(motion, corners)
             if skipped:
                 return  # the next detection finds it, if it is still there
@@ -288,7 +282,6 @@ def _collect_contact(
         status.contact_iteration[world] = iteration
     added.separation = target
     added.friction = constraints.pair_friction(motion, corners)
-    added.within_tolerance = contacts.within_tolerance[i]
     added.toi = toi
     constraints.add_constraint(step, added)
 
@@ -323,9 +316,7 @@ def collect_contacts(
 
 
 @wp.kernel
-def drop_if_full(step: Step, record: StepRecord, needed: int):
+def drop_if_full(step: Step, needed: int):
     """Drops all constraints if fewer than ``needed`` more fit, which a detection might add."""
     if step.constraints.count[0] > step.constraints.vertices.shape[0] - needed:
         step.constraints.count[0] = 0
-        if is_recording(record):
-            record.counts.dropped[0] = 1

@@ -34,7 +34,6 @@ class Constraint:
     friction: float
     kind: int
     plane: int
-    within_tolerance: bool
     toi: wp.float64
     pace: int
     multiplier: wp.vec3d
@@ -221,7 +220,6 @@ def add_constraint(step: Step, added: Constraint):
         constraints.friction[i] = added.friction
         constraints.kind[i] = added.kind
         constraints.plane[i] = added.plane
-        constraints.within_tolerance[i] = added.within_tolerance
         constraints.toi[i] = added.toi
         constraints.approach[i] = approach_of(step, added.vertices, added.weights, added.normal, added.separation)
         constraints.pace[i] = added.pace

@@ -9,7 +9,6 @@ from ..state.certificate import revoke_if_not_finite
 from ..state.status import Loop, Result, SolveStatus
 from ..state.workspace import Workspace
 from .collect import collect_contacts, collect_penetrations, count_crossings, count_new_crossings, drop_if_full
-from .impacts import count_grazing
 from .queue import queues_of
 from .search import find_contacts_without_queues
 
@@ -34,7 +33,7 @@ def inspect(work: Workspace) -> None:
 
     ``remaining`` of the status counts them.
     """
-    work.begin(None)
+    work.begin()
     detect_crossings(work)
     detect(work)
     inputs = [work.vertices.outcome, work.particle_count]
@@ -71,8 +70,7 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     """
     detector, vertices = work.detector, work.vertices
     changed = vertices.changed if only_changed else work.active
-    if work.on_arcs:
-        work.write_arcs()
+    work.write_arcs()
 
     def find():
         ends = work.step.motion.x0, vertices.x1
@@ -83,14 +81,12 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
     if only_changed:  # before, nothing has changed, and there is always enough
         vertices.changed.zero_()
         if not keeps_constraints:
-            work.launch(drop_if_full, 1, [work.step, work.record, work.max_contacts])
+            work.launch(drop_if_full, 1, [work.step, work.max_contacts])
     queues = queues_of(detector)
-    can_search = not work.differentiable and isinstance(detector.broad_phase, BroadPhaseHierarchy)
+    can_search = isinstance(detector.broad_phase, BroadPhaseHierarchy)
     overflow = [detector.counters.array, detector.capacities, can_search]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
         work.launch_over_entries(collect_contacts, [*pair, *overflow, work.arcs, work.step, work.dividing, work.status])
-    if work.recorder is not None:
-        work.launch_over_entries(count_grazing, [work.step, *queues[:2], work.record])
     _decide(work, overflow)
     if can_search:
         wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow)

@@ -7,21 +7,16 @@ from ..tuning import SHARE_OF_PATH
 
 TIME_UNITS = wp.constant(wp.float64(2.0**30))
 """Units of time in a step; packed contacts hold whole units."""
-_BELOW_TIME = wp.constant(wp.int64(0xFFFFFFFF))
-"""Bits of a packed contact below its time: the lowest three are its kind, the others its index."""
 
 
 @wp.func
 def packed_contact(time: wp.float64, kind: int, i: int) -> wp.int64:
-    """Returns contact ``i`` of a ContactKind as one number, which orders contacts by time, then by index and kind."""
+    """Returns contact ``i`` of a ContactKind as one number, which orders contacts by time, then by index and kind.
+
+    The lowest three bits are its kind, those below the time its index.
+    """
     units = wp.int64(wp.floor(TIME_UNITS * time))
     return (units << wp.int64(32)) | (wp.int64(8) * wp.int64(i) + wp.int64(kind))
-
-
-@wp.func
-def packed_vertex(packed: wp.int64, vertex: int) -> wp.int64:
-    """Returns a number that orders the first contacts of the vertices of a body by time, then by vertex."""
-    return ((packed >> wp.int64(32)) << wp.int64(32)) | wp.int64(vertex)
 
 
 @wp.func
@@ -34,12 +29,6 @@ def contact_time(packed: wp.int64) -> wp.float64:
 def contact_kind(packed: wp.int64) -> int:
     """Returns the ContactKind of a packed contact."""
     return int(packed & wp.int64(7))
-
-
-@wp.func
-def contact_index(packed: wp.int64) -> int:
-    """Returns the index of a packed contact among those of its kind."""
-    return int((packed & _BELOW_TIME) >> wp.int64(3))
 
 
 @wp.func

@@ -70,8 +70,6 @@ def has_planes(planes: DividingPlanes, vertex: int):
 
     Contacts of elements that touch at the start have none, nor do those whose plane did not fit.
     """
-    if not planes.first:
-        return False, False
     has_any = planes.first[vertex] >= 0
     return has_any, has_any and planes.lacks[vertex] == 0
 

@@ -65,7 +65,6 @@ def _add_proximity(
     added.friction = constraints.pair_friction(motion, corners)
     of_faces, of_edges = int(ContactKind.VERTEX_FACE_PROXIMITY), int(ContactKind.EDGE_EDGE_PROXIMITY)
     added.kind = wp.where(kind == EDGE_EDGE, of_edges, of_faces)
-    added.within_tolerance = True
     added.pace = wp.where(path <= RESTING_PATH * separation, int(Pace.RESTING), int(Pace.SLOW))
     constraints.add_constraint(step, added)
 
@@ -79,7 +78,7 @@ def _consider(
     weights, normal, distance = weights_across(kind, a, b, c, d)
     if distance == ZERO:
         return
-    if nearest and status.crossings[step.motion.world[corners[0]]] == 0:
+    if status.crossings[step.motion.world[corners[0]]] == 0:
         if is_behind(corners, kind, normal, distance, nearest):
             return
     _add_proximity(step, kind, pair, corners, weights, normal, distance, status)
@@ -155,14 +154,12 @@ def add_proximities(work: Workspace) -> None:
 
     In a CUDA graph, none are added if not all fit.
     """
-    nearest, ends = work.nearest, work.vertices.x1
+    nearest, ends = work.nearest, work.clipped
     wp.copy(work.kept, work.constraints.count)
-    if nearest is not None:
-        nearest.fill_(np.inf)
-        _find_nearest(work)
-        work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
-        ends = work.clipped
-        work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
+    nearest.fill_(np.inf)
+    _find_nearest(work)
+    work.launch_over_constraints(disable_contacts_behind, nearest, work.status)
+    work.launch(clip_paths, len(ends), [work.step, nearest, work.status, ends])
     _collect(work, ends)
     inputs = [work.step, work.kept, work.max_contacts, work.detector.counters.array, work.detector.capacities]
     work.launch(drop_proximities, 1, inputs)

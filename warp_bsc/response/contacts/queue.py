@@ -18,7 +18,6 @@ class PairQueue:
     pairs: wp.array[wp.vec2i]
     counts: wp.array[wp.int64]
     status: wp.array[wp.int8]
-    within_tolerance: wp.array[wp.bool]
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
@@ -53,7 +52,7 @@ def queues_of(detector: DetectionPipeline, *, candidates: bool = False) -> list[
         if candidates:
             queue.pairs = narrow_phase.queue
         else:
-            for name in ("pairs", "status", "within_tolerance", "toi", "coordinates", "normal"):
+            for name in ("pairs", "status", "toi", "coordinates", "normal"):
                 setattr(queue, name, getattr(found, name))
         queues.append(queue)
     return queues

@@ -162,7 +162,7 @@ class CoupledCheck:
         self._of_stage, self._results, self._totals, self._worlds = work, results, totals, worlds
         self.mesh, model, device = work.mesh, work.mesh.model, work.device
         self._motion = motion = ModelMotion(self.mesh, work.motion.friction, watches_turns=True)
-        options = {"separation": work.step.separation, "restitution": work.step.restitution, "responds": False}
+        options = {"separation": work.step.separation, "restitution": work.step.restitution}
         self._work = Workspace(motion, **options)
         if worlds is not None:
             self._work.count_worlds()

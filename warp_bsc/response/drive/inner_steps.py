@@ -18,7 +18,7 @@ class StepCall:
         state_in, state_out, control, contacts, dt: As of :meth:`.stage.CollisionStage.step`.
         options: More for the inner solver.
         mask: Which worlds take part, None for all.
-        tape: That which records the gradients of the step; None if none does.
+        tape: The active tape if the model requires gradients, else None.
         number, count: The number of the substep, from 0, and how many there are.
     """
 

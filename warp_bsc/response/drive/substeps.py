@@ -2,7 +2,7 @@
 
 A step of length dt becomes n steps of length dt / n. Control and contacts of the program are the same in all of them,
 and so are its forces on particles and bodies. What a program moves, particles and bodies that are kinematic, goes an
-equal share of its way in each. A tape records what each of them does; the state between two is a new one then.
+equal share of its way in each.
 """
 
 from collections.abc import Iterator
@@ -109,7 +109,7 @@ class Substeps:
     """
 
     def __init__(self, steps: InnerSteps, motion: ModelMotion, number: int, *, integrator: SolverBase):
-        """Allocates the states between steps that no tape records.
+        """Allocates the states between the smaller steps.
 
         Args:
             steps: How the inner solver takes each of the smaller steps.
@@ -120,8 +120,7 @@ class Substeps:
         """
         self.number, self._steps, self._motion, self._model = number, steps, motion, motion.mesh.model
         self.pushes_before = steps.pushes_before
-        self._leaves_bodies_on_tape = has_external_rigid_solver(integrator)
-        leaves_bodies = self._leaves_bodies_on_tape or isinstance(integrator, SolverStyle3D)
+        leaves_bodies = has_external_rigid_solver(integrator) or isinstance(integrator, SolverStyle3D)
         model, device = self._model, self._model.device
         self._states = [model.state(requires_grad=False) for _ in range(2)]
         self._forces = {n: wp.clone(array, requires_grad=False) for n, array in _forces_of(self._states[0]).items()}
@@ -140,32 +139,19 @@ class Substeps:
         self._steps.take(call)
 
     def parts(self, call: StepCall) -> Iterator[StepCall]:
-        """Yields the smaller steps.
-
-        Raises:
-            NotImplementedError: If a tape records them, and another solver moves bodies.
-        """
-        on_tape = call.tape is not None
-        if on_tape and self._model.body_count and self._leaves_bodies_on_tape:
-            raise NotImplementedError(
-                "on a tape, a step with substeps has no gradients with respect to bodies that another solver moves"
-            )
-        forces = self._copy_forces(call.state_in, on_tape)
-        start = call.state_in
-        if not on_tape:
-            start = self._states[1]
-            self._begin(call.state_in, call.state_out, start, call.mask)
+        """Yields the smaller steps."""
+        for name, array in _forces_of(call.state_in).items():  # before the inner solver adds its own
+            wp.copy(self._forces[name], array)
+        start = self._states[1]
+        self._begin(call.state_in, call.state_out, start, call.mask)
         for i in range(self.number):
-            end = call.state_out
-            if i < self.number - 1:
-                end = self._new_state() if on_tape else self._states[i % 2]
-            if not on_tape:
-                self._launch(_go_on, [self._way, i, self.number], [arrays_of(start), arrays_of(end)])
+            end = self._states[i % 2] if i < self.number - 1 else call.state_out
+            self._launch(_go_on, [self._way, i, self.number], [arrays_of(start), arrays_of(end)])
             dt = call.dt / self.number
             yield replace(call, state_in=start, state_out=end, dt=dt, number=i, count=self.number)
             if end is not call.state_out:
-                for name, array in forces.items():  # the inner solver adds its own to those of the start
-                    wp.copy(getattr(end, name), array)
+                for name in _forces_of(call.state_in):
+                    wp.copy(getattr(end, name), self._forces[name])
             start = end
 
     def _begin(self, state_in, state_out, start, mask):
@@ -182,18 +168,6 @@ class Substeps:
         size = max(model.particle_count, model.body_count)
         with paused_tape():
             wp.launch(kernel, size, inputs=[motion, *inputs], outputs=outputs, device=model.device)
-
-    def _new_state(self):
-        with paused_tape():  # which would record that it begins as a copy of the model
-            return self._model.state()
-
-    def _copy_forces(self, state, on_tape):
-        """Returns copies of the forces of the program, before the inner solver adds its own."""
-        if on_tape:
-            return {name: wp.clone(array) for name, array in _forces_of(state).items()}
-        for name, array in _forces_of(state).items():
-            wp.copy(self._forces[name], array)
-        return self._forces
 
 
 def _forces_of(state):

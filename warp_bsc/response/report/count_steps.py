@@ -3,7 +3,6 @@
 import warp as wp
 
 from ..state.certificate import is_certified
-from ..state.record import RecordCounts
 from ..state.status import Loop, Result, SolveStatus
 from ..state.structs import INVALID, UNCERTIFIED, Step
 from ..tuning import MAX_STRAIN
@@ -91,16 +90,3 @@ def count_step(results: wp.array[int], strain: wp.array[float], totals: StepTota
         totals.crossing_steps[0] += wp.int64(1)
     if results[Result.REMAINING] > 0 or results[Result.NEW_CROSSINGS] > 0:
         totals.penetrated_steps[0] += wp.int64(1)
-
-
-@wp.kernel
-def count_record(counts: RecordCounts, totals: StepTotals):
-    """Adds the record of a step to the totals."""
-    totals.grazing[0] += wp.int64(counts.grazing[0])
-    totals.lost_gradients[0] += wp.int64(1 - counts.complete[0])
-
-
-@wp.kernel
-def count_layer_passed(results: wp.array[int], totals: StepTotals):
-    """Counts a step in which a contact layer left contacts to the stage."""
-    totals.layer_passed_steps[0] += wp.int64(wp.min(results[Result.FIRST_HITS], 1))

@@ -21,7 +21,7 @@ from .inside import Inside, InsideFinder
 from .outcomes import Outcomes
 from .step_warnings import StepWarnings
 from .text import line_of
-from .totals import GradientTotals, Penetrated, StepTotals, Totals
+from .totals import Penetrated, StepTotals, Totals
 from .worlds import Worlds
 
 _NOT_DRAWN = 'report.draw draws contacts only if a stage keeps them: SolverCCD(solver, report=["contacts"])'
@@ -36,7 +36,7 @@ class SolverReport:
 
     Of steps that are not certified, are not finite, strain, cross or invert something it warns once each.
 
-    :attr:`totals` and :attr:`gradient_counts` are sums over all steps so far; all others are of the last step. In a
+    :attr:`totals` are sums over all steps so far; all others are of the last step. In a
     step with substeps, numbers are sums over these, but for :attr:`crossings` and :attr:`inverted_at_start`, the most
     at the start of one. It is certified if all of them are; a vertex counts as truncated, frozen, not finite or
     uncertified if it is in any.
@@ -74,8 +74,6 @@ class SolverReport:
         self._warnings = StepWarnings(self)
         self._forces: ContactReport | None = None
         self._worlds: Worlds | None = None
-        self.layer_overflows: wp.array[wp.int64] | None = None  # of a contact layer around the inner solver
-        self.thickness: wp.array[wp.float64] | None = None  # of that layer [m]
         self.coupled: Any = None  # the check of steps in the state of the program, of an entry of a coupled solver
         self.spans: list[tuple] = []  # start and end of each substep of the last step, in seconds, or events on a GPU
 
@@ -84,14 +82,13 @@ class SolverReport:
         wp.copy(self._host_totals, self.total_values)
 
     def count_lost(self) -> int:
-        """Returns the steps on a tape so far that the buffers of a graph were too small for; warns of nothing."""
-        totals = self._totals_by_name()
-        return totals["undetected_steps"] + totals["lost_gradients"]
+        """Returns the steps so far that the buffers of a graph were too small for; warns of nothing."""
+        return self._totals_by_name()["undetected_steps"]
 
     def warn(self) -> None:
         """Warns once each of steps with predictions that are not finite, and of others that are not certified.
 
-        So it does of strain above 0.2, crossings, inversions, dynamic bodies that a program moves, and wrong gradients.
+        So it does of strain above 0.2, crossings, inversions and dynamic bodies that a program moves.
 
         Known is what the host knows already; the device is only waited for to warn. A step on a GPU may end before the
         host knows of it: then the next one warns, or the first number that is read, which waits for the device.
@@ -289,8 +286,8 @@ class SolverReport:
     def detection_incomplete(self) -> bool:
         """Whether the last step froze all vertices because its detection was incomplete.
 
-        This only happens to a step on a tape in a CUDA graph whose buffers were too small, see
-        :class:`.captured_steps.CapturedSteps`. Without a tape, a search without buffers completes the detection.
+        It is not known to happen: a search without buffers completes detections for which those of a CUDA graph are too
+        small.
         """
         return bool(self._read_result(Result.UNDETECTED))
 
@@ -385,30 +382,9 @@ class SolverReport:
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        totals = self._read_totals()
-        return Totals(**{field.name: totals[field.name] for field in fields(Totals)})
-
-    @property
-    def gradient_counts(self) -> GradientTotals:
-        """Totals over all steps on a tape so far, as of this access."""
-        totals = self._read_totals()
-        return GradientTotals(
-            grazing=totals["grazing"],
-            lost_steps=totals["lost_gradients"],
-            layer_overflows=0 if self.layer_overflows is None else self._read(self.layer_overflows),
-            layer_passed_steps=totals["layer_passed_steps"],
-            ambiguous_moves=totals["ambiguous_moves"],
-        )
-
-    @property
-    def layer_thickness(self) -> float | None:
-        """Thickness of the contact layer around the inner solver [m], see :mod:`.layer.thickness`; None without one."""
-        return None if self.thickness is None else float(self.thickness.numpy()[0])
-
-    def _read_totals(self):
         totals = self._totals_by_name()
         self.warn()
-        return totals
+        return Totals(**{field.name: totals[field.name] for field in fields(Totals)})
 
     def _totals_by_name(self):
         return dict(zip(StepTotals.vars, self.total_values.numpy().tolist(), strict=True))

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from ..._warnings import warn_caller
-from ..adjoint.between_steps import AMBIGUOUS_MOVES
 from ..state.motion import SET_STEPS
 from ..state.structs import NOT_FINITE
 from ..tuning import MAX_STRAIN
@@ -24,8 +23,6 @@ _NOT_FOLLOWED = (
     "has changed in what the stage does not follow at run time, such as type, source, body, margin or flags of "
     "collision: it collides as it was, at its new pose; put a new stage behind the solver"
 )
-_LAYER = "contacts passed the contact layer in one step: results jump there, gradients miss it"
-_MOVES = f"{AMBIGUOUS_MOVES} (see report.gradient_counts.ambiguous_moves)"
 
 
 class StepWarnings:
@@ -62,15 +59,11 @@ class StepWarnings:
             self.once("crossings", lambda: _CROSSINGS)
         if known["inverting_steps"] and not report.prevents_inversions:
             self.once("inversions", lambda: _INVERSIONS)
-        if known["layer_passed_steps"] and model.requires_grad:
-            self.once("layer", lambda: f"{_LAYER}; {report.shorter_steps}")
         if known["shape_not_followed"]:
             shape = shape_name(model, known["shape_not_followed"] - 1)
             self.once("shapes", lambda: f"{shape} {_NOT_FOLLOWED}")
         if known["set_bodies"]:
             self.once("set_bodies", self._of_set_bodies)
-        if known["ambiguous_moves"]:
-            self.once("moves", lambda: _MOVES)
 
     def _of_not_finite(self):
         model = self._report.model

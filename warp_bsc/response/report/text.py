@@ -156,7 +156,4 @@ def line_of(report: Any) -> str:
         line += f"; {report.filtered} filtered pairs in the last step, which are not certified"
     if totals.not_finite_steps:
         line += f", {totals.not_finite_steps} steps with positions that are not finite"
-    line += report.gradient_counts.text()
-    if report.layer_thickness is not None:
-        line += f"; contact layer of {1e3 * report.layer_thickness:.3g} mm"
     return line

@@ -25,10 +25,6 @@ class StepTotals:
     unseen_steps: wp.array[wp.int64]
     revoked_steps: wp.array[wp.int64]
     shape_not_followed: wp.array[wp.int64]  # the last shape with a change that the stage does not follow, from 1
-    grazing: wp.array[wp.int64]
-    lost_gradients: wp.array[wp.int64]
-    layer_passed_steps: wp.array[wp.int64]
-    ambiguous_moves: wp.array[wp.int64]
 
 
 @dataclass(frozen=True)
@@ -97,38 +93,3 @@ class Penetrated:
 
     def __bool__(self) -> bool:
         return self.steps > 0 or self.inside > 0
-
-
-@dataclass(frozen=True)
-class GradientTotals:
-    """Totals over all steps on a tape so far.
-
-    Attributes:
-        grazing: Contacts whose gradients are clamped. The derivatives of features that slide along each other, or have
-            no plane, are unbounded; finite ones replace them, see :mod:`warp_bsc.kernels.gradients`.
-        lost_steps: Steps in a CUDA graph whose record did not fit in its buffers. Gradients through such a step are
-            NaN, see :class:`.captured_steps.CapturedSteps`.
-        layer_overflows: Steps whose contact layer pushed nothing, because a queue of a CUDA graph was too small.
-            Contacts then act where they hit, and results are not continuous.
-        layer_passed_steps: Steps in which a contact layer left contacts to the stage: they passed it in one step, or
-            are between bodies. Results are not continuous there.
-        ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps on a tape, and
-            that are NaN, as it cannot be known what they are of, see :mod:`.adjoint.between_steps`.
-    """
-
-    grazing: int
-    lost_steps: int
-    layer_overflows: int
-    layer_passed_steps: int
-    ambiguous_moves: int
-
-    def text(self) -> str:
-        """Returns what a line of a report says of them, if anything."""
-        text = ""
-        if self.grazing or self.lost_steps:
-            text += f"; gradients: {self.grazing} grazing contacts, {self.lost_steps} steps lost"
-        if self.layer_passed_steps:
-            text += f"; contacts passed the contact layer in {self.layer_passed_steps} steps"
-        if self.layer_overflows:
-            text += f"; {self.layer_overflows} steps without their contact layer"
-        return text

@@ -10,7 +10,7 @@ import warp as wp
 
 from ..state.fixed_sum import add_to_sum, sums_of
 from ..state.poses import centre_of, in_world, turned_pose, velocity_on_body
-from ..state.structs import NEVER, PROJECTED, Bodies, Motion, MovedBodies, Step, body_of, can_move, has_final_velocity
+from ..state.structs import PROJECTED, Bodies, Motion, MovedBodies, Step, body_of, can_move, has_final_velocity
 from ..state.vectors import ONE, ZERO, to_double, to_single
 
 wp.set_module_options({"enable_backward": False})
@@ -138,35 +138,25 @@ def begin_bodies(step: Step):
     moved.active[body] = 0
     moved.moved[body] = 0
     moved.share[body] = WHOLE_PATH
-    moved.first_contact[body] = NEVER
     moved.loose[body] = 0
     moved.outcome[body] = 0
-
-
-@wp.func
-def move_body(step: Step, body: int) -> bool:
-    """Moves a body by the sum of its changes by constraints, if it has active ones; returns whether it has."""
-    bodies, moved = step.motion.bodies, step.vertices.bodies
-    moves = moved.active[body] != 0 and bodies.inverse_mass[body] > 0.0
-    if moves:
-        pose = bodies.end[body]
-        shift, turn = sums_of(moved.delta_x, body)
-        if wp.length_sq(shift) + wp.length_sq(turn) > ZERO:  # else it keeps every bit of its pose
-            pose = turned_pose(bodies, body, pose, shift, turn)
-        moved.pose[body] = pose
-    return moves
 
 
 @wp.kernel
 def move_bodies(step: Step, last: bool):
     """Moves each body by the sum of its changes by constraints; the ``last`` sweep empties its active set."""
     body = wp.tid()
-    moved = step.vertices.bodies
-    moves = move_body(step, body)
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    moves = moved.active[body] != 0 and bodies.inverse_mass[body] > 0.0
     moved.moved[body] = wp.where(moves, 1, 0)
     if last:
         moved.active[body] = 0
     if moves:
+        pose = bodies.end[body]
+        shift, turn = sums_of(moved.delta_x, body)
+        if wp.length_sq(shift) + wp.length_sq(turn) > ZERO:  # else it keeps every bit of its pose
+            pose = turned_pose(bodies, body, pose, shift, turn)
+        moved.pose[body] = pose
         moved.outcome[body] = moved.outcome[body] | PROJECTED
 
 
@@ -189,28 +179,19 @@ def move_to_end(step: Step):
         _set_centre(step.motion.bodies, step.vertices.bodies, body)
 
 
-@wp.func
-def change_body_velocity(step: Step, body: int) -> bool:
-    """Changes the velocity of a body as :func:`.velocities.change_velocity` that of a vertex."""
-    bodies, moved = step.motion.bodies, step.vertices.bodies
-    is_free = bodies.inverse_mass[body] > 0.0 and not has_final_velocity(moved.outcome[body])
-    if is_free:
-        linear, angular = sums_of(moved.delta_v, body)
-        linear += to_double(wp.spatial_top(bodies.velocity[body]))
-        angular += to_double(wp.spatial_bottom(bodies.velocity[body]))
-        moved.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
-    return is_free
-
-
 @wp.kernel
 def change_body_velocities(step: Step, last: bool):
     """Changes the velocity of each body that was not truncated; ``last`` empties its active set."""
     body = wp.tid()
-    active = step.vertices.bodies.active
-    if active[body] != 0:
-        change_body_velocity(step, body)
+    bodies, moved = step.motion.bodies, step.vertices.bodies
+    is_free = bodies.inverse_mass[body] > 0.0 and not has_final_velocity(moved.outcome[body])
+    if is_free and moved.active[body] != 0:
+        linear, angular = sums_of(moved.delta_v, body)
+        linear += to_double(wp.spatial_top(bodies.velocity[body]))
+        angular += to_double(wp.spatial_bottom(bodies.velocity[body]))
+        moved.velocity[body] = wp.spatial_vector(to_single(linear), to_single(angular))
     if last:
-        active[body] = 0
+        moved.active[body] = 0
 
 
 @wp.kernel

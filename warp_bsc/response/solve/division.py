@@ -1,7 +1,7 @@
 """Division and truncation of paths that projection did not free of contacts; what still collides then is frozen.
 
 A vertex is moved onto its sides of dividing planes, and a body back along its path until its vertices are. Where a
-contact has no plane, and in recorded steps, the path is cut before the first contact. Frozen vertices end at their
+contact has no plane, the path is cut before the first contact. Frozen vertices end at their
 start. Paths of vertices are also cut before a tetrahedron of theirs inverts, where that is prevented.
 """
 
@@ -12,10 +12,8 @@ from ..contacts import first_contact
 from ..contacts.constraints import NEVER_VIOLATED, TOUCH, has_pushed, kind_of_pair, min_distance_of, moves_body
 from ..contacts.first_contact import TIME_UNITS
 from ..contacts.planes_between import add_dividing_plane, has_planes
-from ..contacts.queue import PairQueue, queues_of, vertices_of
 from ..schedule import divides_now, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
-from ..state.record import NO_CONTACT, StepRecord, is_recording
 from ..state.status import Loop, Result, SolveStatus
 from ..state.structs import (
     CUT_SHORT,
@@ -72,12 +70,11 @@ def divide_proximities(step: Step, dividing: DividingPlanes, status: SolveStatus
 
 
 @wp.kernel
-def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, record: StepRecord):
+def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus):
     """Finds the share of the path of each body up to which its vertices are above their dividing planes.
 
     The vertices go straight here, but in an arc where the body turns: if one ends below its plane for that and
     collides, the next iteration cuts the path again. Where a contact has no plane, the path ends before that contact.
-    If the step is recorded, first contacts are kept for :func:`record_body_truncations`.
     """
     motion, vertices = step.motion, step.vertices
     vertex = motion.bodies.particle_count + wp.tid()
@@ -85,10 +82,7 @@ def find_body_shares(step: Step, dividing: DividingPlanes, status: SolveStatus, 
     body = motion.bodies.of_vertex[vertex]
     if packed == NEVER or body < 0:
         return
-    if is_recording(record):
-        wp.atomic_min(vertices.bodies.first_contact, body, first_contact.packed_vertex(packed, vertex))
-    else:
-        vertices.first_contact[vertex] = NEVER
+    vertices.first_contact[vertex] = NEVER
     if motion.bodies.inverse_mass[body] == 0.0:
         return
     if is_freezing(status):
@@ -121,7 +115,6 @@ def cut_bodies(step: Step, status: SolveStatus, dt: wp.float64):
     bodies, moved = step.motion.bodies, step.vertices.bodies
     share = moved.share[body]
     moved.share[body] = WHOLE_PATH
-    moved.first_contact[body] = NEVER
     frozen = moved.outcome[body] & FROZEN != 0
     moved.moved[body] = wp.where(share < WHOLE_PATH and not frozen, 1, 0)
     if moved.moved[body] == 0:
@@ -139,48 +132,6 @@ def cut_bodies(step: Step, status: SolveStatus, dt: wp.float64):
         return
     moved.velocity[body] = velocity_between(bodies, body, start, end, dt)
     moved.outcome[body] = (outcome | DIVIDED) - DIVIDED
-
-
-@wp.func
-def _record_truncation(
-    step: Step,
-    vertex: int,
-    body: int,
-    cuts: bool,
-    packed: wp.int64,
-    vertex_face: PairQueue,
-    edge_edge: PairQueue,
-    record: StepRecord,
-):
-    """Records the end of the path of a vertex, or of its body if that is not -1, before it is truncated or frozen."""
-    entry = wp.atomic_add(record.counts.truncations, 0, 1)
-    if entry >= record.vertex.shape[0]:
-        return
-    record.vertex[entry] = wp.where(body < 0, vertex, -1)
-    record.end[entry] = step.vertices.x1[vertex]
-    record.body[entry] = body
-    if body >= 0:
-        record.pose[entry] = step.vertices.bodies.pose[body]
-    if first_contact.contact_kind(packed) == ContactKind.EDGE_EDGE:
-        _record_contact(vertex, cuts, packed, edge_edge, entry, record)
-    else:
-        _record_contact(vertex, cuts, packed, vertex_face, entry, record)
-
-
-@wp.func
-def _record_contact(vertex: int, cuts: bool, packed: wp.int64, contacts: PairQueue, entry: int, record: StepRecord):
-    """Records the contact that a path is truncated before."""
-    kind = wp.where(cuts, first_contact.contact_kind(packed), NO_CONTACT)
-    i = first_contact.contact_index(packed)
-    record.kind[entry] = kind
-    record.contact[entry] = wp.vec4i(vertex, i, 0, 0)
-    record.toi[entry] = first_contact.contact_time(packed)
-    if kind != ContactKind.PLANE and kind != NO_CONTACT:
-        record.contact[entry] = vertices_of(contacts, i)
-        record.within_tolerance[entry] = contacts.within_tolerance[i]
-        record.toi[entry] = contacts.toi[i]
-        record.coordinates[entry] = contacts.coordinates[i]
-        record.normal[entry] = contacts.normal[i]
 
 
 @wp.func
@@ -216,30 +167,17 @@ def _freeze_vertex(step: Step, dividing: DividingPlanes, vertex: int):
 
 
 @wp.kernel
-def truncate_vertices(
-    # in and out
-    step: Step,
-    # in
-    vertex_face: PairQueue,
-    edge_edge: PairQueue,
-    # in and out
-    dividing: DividingPlanes,
-    status: SolveStatus,
-    record: StepRecord,
-    # in
-    dt: wp.float64,
-):
+def truncate_vertices(step: Step, dividing: DividingPlanes, status: SolveStatus, dt: wp.float64):
     """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
 
-    Paths are truncated where the step is recorded, and where contacts have no dividing planes. After
-    ``max_truncations`` iterations vertices that still collide are frozen.
+    Paths are truncated where contacts have no dividing planes. After ``MAX_DIVISIONS`` iterations vertices that still
+    collide are frozen.
     """
     vertex = wp.tid()
     motion, vertices = step.motion, step.vertices
     packed = vertices.first_contact[vertex]
     if packed == NEVER:
-        if dividing.first:
-            _keep_on_sides(step, dividing, status, vertex)
+        _keep_on_sides(step, dividing, status, vertex)
         return
     vertices.first_contact[vertex] = NEVER
     if motion.inverse_mass[vertex] == 0.0:
@@ -248,8 +186,6 @@ def truncate_vertices(
     outcome = vertices.outcome[vertex]
     if not cuts and outcome & FROZEN != 0:
         return
-    if is_recording(record):
-        _record_truncation(step, vertex, -1, cuts, packed, vertex_face, edge_edge, record)
     vertices.changed[vertex] = 1
     if not cuts:
         _freeze_vertex(step, dividing, vertex)
@@ -315,23 +251,6 @@ def take_velocities_of_paths(step: Step, ends: wp.array[wp.vec3], dt: wp.float64
 
 
 @wp.kernel
-def record_body_truncations(step: Step, vertex_face: PairQueue, edge_edge: PairQueue, record: StepRecord):
-    """Records the pose of each body whose path is truncated next, before the first contact of its vertices."""
-    bodies, moved = step.motion.bodies, step.vertices.bodies
-    vertex = bodies.particle_count + wp.tid()
-    packed = step.vertices.first_contact[vertex]
-    if packed == NEVER:
-        return
-    step.vertices.first_contact[vertex] = NEVER
-    body = bodies.of_vertex[vertex]
-    if body < 0 or bodies.inverse_mass[body] == 0.0 or moved.outcome[body] & FROZEN != 0:
-        return
-    if moved.first_contact[body] == first_contact.packed_vertex(packed, vertex):
-        cuts = moved.share[body] != FREEZES
-        _record_truncation(step, vertex, body, cuts, packed, vertex_face, edge_edge, record)
-
-
-@wp.kernel
 def freeze_undetected(step: Step, dividing: DividingPlanes, particles: int, bodies: int, status: SolveStatus):
     """Freezes all particles and bodies if the last detection was incomplete; thread i has one of each."""
     i = wp.tid()
@@ -348,17 +267,12 @@ def freeze_undetected(step: Step, dividing: DividingPlanes, particles: int, bodi
 @phase("divide")
 def divide(work: Workspace, dt: float) -> None:
     """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
-    work.reserve_truncations()
-    contacts, changed = queues_of(work.detector)[:2], [work.dividing, work.status]
-    if not work.differentiable:
-        work.launch_over_constraints(divide_proximities, *changed)
-        particles, worlds = work.particle_count, work.worlds
-        work.launch(begin_passes, max(particles, worlds), [work.step, work.dividing, particles, worlds, work.status])
-        wp.capture_while(work.loop[Loop.MORE_PASSES], _pass_over_planes, work=work)
-    work.launch_over_particles(truncate_vertices, *contacts, *changed, work.record, dt)
-    work.launch_over_shape_vertices(find_body_shares, *changed, work.record)
-    if work.recorder is not None:
-        work.launch_over_shape_vertices(record_body_truncations, *contacts, work.record)
+    particles, worlds, changed = work.particle_count, work.worlds, [work.dividing, work.status]
+    work.launch_over_constraints(divide_proximities, *changed)
+    work.launch(begin_passes, max(particles, worlds), [work.step, work.dividing, particles, worlds, work.status])
+    wp.capture_while(work.loop[Loop.MORE_PASSES], _pass_over_planes, work=work)
+    work.launch_over_particles(truncate_vertices, *changed, dt)
+    work.launch_over_shape_vertices(find_body_shares, *changed)
     work.launch_over_bodies(cut_bodies, work.status, dt)
     work.launch_over_shape_vertices(place_vertices)
 
@@ -369,7 +283,7 @@ def _pass_over_planes(work):
 
 
 def freeze_if_undetected(work: Workspace) -> None:
-    """Freezes everything if the last detection was incomplete: a recorded step whose CUDA graph is too small."""
+    """Freezes everything if the last detection was incomplete."""
     particles, bodies = work.particle_count, work.body_count
     work.launch(freeze_undetected, max(particles, bodies), [work.step, work.dividing, particles, bodies, work.status])
     work.launch_over_shape_vertices(place_vertices)

@@ -26,9 +26,8 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def want(planes: DividingPlanes, vertex: int, end: wp.vec3):
     """Makes the end of a path that was cut or frozen the one that a vertex wants."""
-    if planes.first:
-        planes.placed[vertex] = PLACED
-        planes.wanted[vertex] = end
+    planes.placed[vertex] = PLACED
+    planes.wanted[vertex] = end
 
 
 @wp.kernel

@@ -9,7 +9,6 @@ from ..contacts.constraints import gap, min_distance_of, moves_body
 from ..schedule import divides_after, is_reversible, projects_now
 from ..state.cluster import BLOCK, wait_for_others
 from ..state.fixed_sum import with_delta
-from ..state.record import StepRecord
 from ..state.status import Loop, SolveStatus, start_sweeps
 from ..state.structs import PROJECTED, ContactKind, Incidence, Pace, Step, constraint_at, constraint_count
 from ..state.vectors import ONE, ZERO, relative
@@ -83,7 +82,7 @@ def activate_position_constraints(step: Step, status: SolveStatus, tolerance: wp
 
 
 @wp.func
-def _project_constraint(step: Step, status: SolveStatus, sweep: int, record: StepRecord, place: int):
+def _project_constraint(step: Step, status: SolveStatus, sweep: int, place: int):
     """Updates the position multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
     i = constraints.active_set[place]
@@ -94,40 +93,32 @@ def _project_constraint(step: Step, status: SolveStatus, sweep: int, record: Ste
         momentum = wp.where(violated, wp.min(momentum, PUSHING_MOMENTUM), ZERO)
     multiplier = sweeps.position_multiplier_after(step, i, pushes_only)
     old = constraints.position_multiplier[i]
-    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, i, multiplier, momentum)
     constraints.position_multiplier[i] = new
     sweeps.add_delta(step, i, new - old, step.motion.x1, vertices.particle_delta_x, vertices.bodies.delta_x)
 
 
 @wp.kernel
-def project_positions(step: Step, status: SolveStatus, record: StepRecord, threads: int):
+def project_positions(step: Step, status: SolveStatus, threads: int):
     """Updates the position multipliers of the active set, in one Jacobi sweep."""
     for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):
-        _project_constraint(step, status, status.loop[Loop.SWEEP], record, place)
-
-
-@wp.func
-def move_vertex(step: Step, vertex: int) -> bool:
-    """Moves a vertex by the sum of its changes by constraints, if it can be moved; returns whether it can."""
-    moves = step.motion.inverse_mass[vertex] > 0.0
-    if moves:
-        step.vertices.x1[vertex] = with_delta(step.motion.x1[vertex], step.vertices.particle_delta_x, vertex)
-    return moves
+        _project_constraint(step, status, status.loop[Loop.SWEEP], place)
 
 
 @wp.func
 def _update_vertex(step: Step, vertex: int):
-    """Moves a vertex by the sum of what its constraints did to it."""
-    if move_vertex(step, vertex):
+    """Moves a vertex by the sum of what its constraints did to it, if it can be moved."""
+    if step.motion.inverse_mass[vertex] > 0.0:
+        step.vertices.x1[vertex] = with_delta(step.motion.x1[vertex], step.vertices.particle_delta_x, vertex)
         step.vertices.changed[vertex] = 1
         step.vertices.outcome[vertex] = step.vertices.outcome[vertex] | PROJECTED
 
 
 @wp.kernel
-def update_positions(step: Step, status: SolveStatus, record: StepRecord, last: bool):
+def update_positions(step: Step, status: SolveStatus, last: bool):
     """Moves each vertex by the sum of what its constraints did to it, and finishes the sweep."""
     vertex = wp.tid()
-    if sweeps.finish_sweep(step, status, record, last, vertex):
+    if sweeps.finish_sweep(step, status, last, vertex):
         _update_vertex(step, vertex)
 
 
@@ -153,7 +144,6 @@ def _sweep(cluster: int) -> wp.Kernel:
         constraints = step.constraints
         first = int(constraints.first[world])
         end = first + constraints.number[world]
-        record = StepRecord()  # which records nothing
         sweep = int(wp.where(status.loop[Loop.MORE_SWEEPS] == 1 and end > first, 0, most))
         while sweep < most:
             if thread == 0:
@@ -169,7 +159,7 @@ def _sweep(cluster: int) -> wp.Kernel:
                 break
             for i_of_batch in range(batch):
                 for place in range(first + thread, active_end, threads):
-                    _project_constraint(step, status, sweep, record, place)
+                    _project_constraint(step, status, sweep, place)
                 wait_for_others()
                 for k in range(particles.first[world] + thread, particles.first[world + 1], threads):
                     if sweeps.takes_changes(step, i_of_batch == batch - 1, particles.items[k]):
@@ -207,6 +197,6 @@ def _activate(work):
 
 
 def _update(work, last):
-    work.launch_over_particles(update_positions, work.status, work.record, last, at_least_once=True)
+    work.launch_over_particles(update_positions, work.status, last, at_least_once=True)
     work.launch_over_bodies(move_bodies, last)
     work.launch_over_shape_vertices(place_vertices)

@@ -10,7 +10,6 @@ import warp as wp
 from ...kernels.pipeline.queues import take_slot
 from ..contacts.constraints import TOUCH, gap, moves_body
 from ..state.fixed_sum import add_to_sum
-from ..state.record import StepRecord, end_sweep, is_recording, record_entry
 from ..state.status import Loop, SolveStatus
 from ..state.structs import Step
 from ..state.vectors import ONE, ZERO, relative
@@ -196,12 +195,6 @@ def momentum_of(step: Step, sweep: int, i: int, most: int) -> wp.float64:
 
 
 @wp.func
-def with_momentum(multiplier: wp.vec3d, previous: wp.vec3d, momentum: wp.float64) -> wp.vec3d:
-    """Returns a multiplier after a sweep moved on by a share of its step from the previous one."""
-    return multiplier + momentum * (multiplier - previous)
-
-
-@wp.func
 def add_delta(
     step: Step,
     i: int,
@@ -221,20 +214,15 @@ def add_delta(
 
 
 @wp.func
-def after_sweep(
-    step: Step, record: StepRecord, place: int, old: wp.vec3d, multiplier: wp.vec3d, momentum: wp.float64
-) -> wp.vec3d:
-    """Returns a multiplier of the active set moved on by its momentum, and records what it was before the sweep."""
-    i = step.constraints.active_set[place]
+def after_sweep(step: Step, i: int, multiplier: wp.vec3d, momentum: wp.float64) -> wp.vec3d:
+    """Returns a multiplier after a sweep moved on by its momentum, a share of its step from the previous one."""
     previous = step.constraints.previous_multiplier[i]
-    if is_recording(record):
-        record_entry(record, place, i, old, previous, momentum)
     step.constraints.previous_multiplier[i] = multiplier
-    return with_momentum(multiplier, previous, momentum)
+    return multiplier + momentum * (multiplier - previous)
 
 
 @wp.func
-def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool, vertex: int) -> bool:
+def finish_sweep(step: Step, status: SolveStatus, last: bool, vertex: int) -> bool:
     """Returns whether constraints of a sweep act on a vertex; vertex 0 counts the sweep, and decides on another batch.
 
     The ``last`` sweep over an active set empties it.
@@ -244,8 +232,6 @@ def finish_sweep(step: Step, status: SolveStatus, record: StepRecord, last: bool
         count = int(step.constraints.active_count[0])
         status.loop[Loop.SWEEP] = sweep
         status.loop[Loop.MORE_SWEEPS] = wp.where(count > 0 and sweep < MAX_SWEEPS, 1, 0)
-        if is_recording(record):
-            end_sweep(record, count)
         if last:
             step.constraints.active_count[0] = wp.int64(0)
     return takes_changes(step, last, vertex)

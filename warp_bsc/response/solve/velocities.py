@@ -8,7 +8,6 @@ from ..._profiling import phase
 from ..contacts.constraints import NEVER_SWEPT, gap, has_pushed, min_distance_of, moves_body
 from ..state.cluster import BLOCK, wait_for_others
 from ..state.fixed_sum import with_delta
-from ..state.record import StepRecord
 from ..state.status import Loop, SolveStatus
 from ..state.structs import Incidence, Step, constraint_at, constraint_count, has_final_velocity
 from ..state.vectors import ONE, ZERO, relative
@@ -86,41 +85,39 @@ def activate_velocity_constraints(step: Step, tolerance: wp.float64, threads: in
 
 
 @wp.func
-def _project_constraint(step: Step, sweep: int, record: StepRecord, place: int):
+def _project_constraint(step: Step, sweep: int, place: int):
     """Updates the velocity multiplier of an element of the active set."""
     vertices, constraints = step.vertices, step.constraints
     i = constraints.active_set[place]
     momentum = sweeps.momentum_of(step, sweep, i, MAX_SWEEPS)
     multiplier = sweeps.velocity_multiplier_after(step, i)
     old = constraints.velocity_multiplier[i]
-    new = sweeps.after_sweep(step, record, place, old, multiplier, momentum)
+    new = sweeps.after_sweep(step, i, multiplier, momentum)
     constraints.velocity_multiplier[i] = new
     sweeps.add_delta(step, i, new - old, vertices.x1, vertices.particle_delta_v, vertices.bodies.delta_v)
 
 
 @wp.kernel
-def project_velocities(step: Step, status: SolveStatus, record: StepRecord, threads: int):
+def project_velocities(step: Step, status: SolveStatus, threads: int):
     """Updates the velocity multipliers of the active set, in one Jacobi sweep."""
     for place in range(wp.tid(), int(step.constraints.active_count[0]), threads):
-        _project_constraint(step, status.loop[Loop.SWEEP], record, place)
+        _project_constraint(step, status.loop[Loop.SWEEP], place)
 
 
 @wp.func
-def change_velocity(step: Step, vertex: int) -> bool:
-    """Changes a velocity by the sum of its changes by constraints, if they may change it; returns whether they may."""
+def _change_velocity(step: Step, vertex: int):
+    """Changes a velocity by the sum of its changes by constraints, if they may change it."""
     motion, vertices = step.motion, step.vertices
-    is_free = motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex])
-    if is_free:
+    if motion.inverse_mass[vertex] > 0.0 and not has_final_velocity(vertices.outcome[vertex]):
         vertices.velocity[vertex] = with_delta(motion.velocity[vertex], vertices.particle_delta_v, vertex)
-    return is_free
 
 
 @wp.kernel
-def update_velocities(step: Step, status: SolveStatus, record: StepRecord, last: bool):
+def update_velocities(step: Step, status: SolveStatus, last: bool):
     """Changes the velocity of each vertex that was not truncated, and finishes the sweep."""
     vertex = wp.tid()
-    if sweeps.finish_sweep(step, status, record, last, vertex):
-        change_velocity(step, vertex)
+    if sweeps.finish_sweep(step, status, last, vertex):
+        _change_velocity(step, vertex)
 
 
 @wp.func
@@ -128,7 +125,7 @@ def _update_world(step: Step, particles: Incidence, world: int, last: bool, thre
     """Changes the velocities of the vertices of a world that were not truncated."""
     for k in range(particles.first[world] + thread, particles.first[world + 1], threads):
         if sweeps.takes_changes(step, last, particles.items[k]):
-            change_velocity(step, particles.items[k])
+            _change_velocity(step, particles.items[k])
 
 
 @functools.cache
@@ -152,7 +149,6 @@ def _sweep(cluster: int) -> wp.Kernel:
         end = first + constraints.number[world]
         if end == first:
             return
-        record = StepRecord()  # which records nothing
         for column in range(thread, sums.shape[1], threads):
             sums[world, column] = wp.int64(0)
         for place in range(first + thread, end, threads):
@@ -175,7 +171,7 @@ def _sweep(cluster: int) -> wp.Kernel:
                 break
             for i_of_batch in range(batch):
                 for place in range(first + thread, active_end, threads):
-                    _project_constraint(step, sweep, record, place)
+                    _project_constraint(step, sweep, place)
                 wait_for_others()
                 _update_world(step, particles, world, i_of_batch == batch - 1, thread, threads)
                 wait_for_others()
@@ -210,7 +206,7 @@ def project(work: Workspace, dt: float) -> None:
 
 
 def _update(work, last):
-    work.launch_over_particles(update_velocities, work.status, work.record, last, at_least_once=True)
+    work.launch_over_particles(update_velocities, work.status, last, at_least_once=True)
     work.launch_over_bodies(change_body_velocities, last)
     work.launch_over_shape_vertices(set_vertex_velocities)
 

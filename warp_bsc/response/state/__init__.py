@@ -1,1 +1,1 @@
-"""The data of a step: structs, motion, mesh, friction, planes, poses and the record for the adjoint."""
+"""The data of a step: structs, motion, mesh, friction, planes and poses."""

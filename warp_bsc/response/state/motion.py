@@ -215,9 +215,6 @@ class ModelMotion:
         friction: The coefficients of its vertices and planes.
         moves_bodies: Whether the response can move bodies.
         turns: How bodies turn, None if nothing asks for it or no body has a shape.
-        differentiable: Whether steps may be recorded for the adjoint of the response.
-        keeps_poses: Whether ``vertices.bodies`` has the poses of bodies at the start and end: if the response can move
-            bodies, or if it is differentiable.
     """
 
     def __init__(
@@ -228,7 +225,6 @@ class ModelMotion:
         moves_bodies: bool = False,
         responds_to_bodies: bool = False,
         watches_turns: bool = False,
-        has_adjoint: bool = True,
         last: LastStep | None = None,
     ):
         """Allocates buffers, with the model standing still.
@@ -239,12 +235,10 @@ class ModelMotion:
             moves_bodies: Whether the response can move bodies.
             responds_to_bodies: Whether it keeps bodies apart from each other and from static shapes.
             watches_turns: Whether the arcs of bodies that turn are to be known.
-            has_adjoint: Whether steps may be recorded for the adjoint of the response, if the model requires gradients.
             last: That of another motion, to share it; None for a new one.
         """
         self.mesh, self.friction = mesh, friction
         device, model = mesh.device, mesh.model
-        self.differentiable = has_adjoint and model.requires_grad
         self.vertices = vertices = Motion()
         add_zeros(vertices, ("x0", "x1", "velocity", "is_not_finite"), mesh.vertex_count, device)
         self.last = last or LastStep(mesh)
@@ -268,9 +262,6 @@ class ModelMotion:
             vertices.bodies.responds = int(responds_to_bodies)
         has_turns = watches_turns and (mesh.shape_vertices.body >= 0).any()
         self.turns = BodyTurns(mesh, self.last.poses) if has_turns else None
-        self.keeps_poses = moves_bodies or bool(self.differentiable and model.body_count)
-        if self.keeps_poses:  # the adjoint needs those of bodies that nothing pushes too
-            add_zeros(vertices.bodies, ("start", "end"), model.body_count, device)
         if last is None:
             self.set_start(arrays_of(model))
             self.set_end(arrays_of(model), 1.0)
@@ -291,7 +282,7 @@ class ModelMotion:
         bodies.position = mesh.device_shape_vertices.position
         bodies.com, bodies.world, bodies.mass = model.body_com, model.body_world, model.body_mass
         bodies.inertia, bodies.inverse_inertia = model.body_inertia, model.body_inv_inertia
-        add_zeros(bodies, ("inverse_mass", "velocity"), model.body_count, device)
+        add_zeros(bodies, ("inverse_mass", "start", "end", "velocity"), model.body_count, device)
         return bodies
 
     def follow_shapes(self, not_followed: wp.array[wp.int64]) -> None:
@@ -309,7 +300,7 @@ class ModelMotion:
         """Copies the positions at the start of a step, with errors as of :meth:`.state.mesh.ModelMesh.positions`."""
         inputs = [self.mesh.place(start.particle_q, start.body_q), self.last.starts, self.vertices, self.planes]
         wp.launch(_write_start, self._size, inputs=inputs, device=self.mesh.device)
-        if self.keeps_poses:
+        if self.moves_bodies:
             wp.copy(self.vertices.bodies.start, start.body_q)
         if self.turns is not None:
             self.turns.set_start(start.body_q)
@@ -322,8 +313,6 @@ class ModelMotion:
         place = self.mesh.place(end.particle_q, end.body_q)
         if self.moves_bodies:
             self.set_body_ends(end)
-        elif self.keeps_poses:
-            wp.copy(self.vertices.bodies.end, end.body_q)
         if self.turns is not None:
             self.turns.set_end(self.vertices, end.body_q, continues=self.last.starts is not None)
         inputs = [place, end.particle_qd, dt, self.last.starts, self.last.planes, self.vertices, self.planes]

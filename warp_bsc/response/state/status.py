@@ -81,7 +81,6 @@ class SolveStatus:
     of_worlds: WorldCounts
     max_iterations: int
     max_slow_iterations: int
-    max_truncations: int  # or divisions
     slow_position_sweeps: int
 
 
@@ -119,7 +118,7 @@ def clear_status(status: SolveStatus):
 
 @wp.func
 def begin_sweeps(status: SolveStatus):
-    """Clears the count of sweeps; there is none in an iteration that divides, or truncates."""
+    """Clears the count of sweeps; there is none in an iteration that divides."""
     loop = status.loop
     loop[Loop.SWEEP] = 0
     loop[Loop.MORE_SWEEPS] = wp.where(loop[Loop.ACTIVE] == 0 or loop[Loop.PROJECTING] == 1, 1, 0)

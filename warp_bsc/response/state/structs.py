@@ -100,7 +100,6 @@ class MovedBodies:
     delta_x: wp.array2d[wp.int64]  # changes of centre and turns summed over constraints, see bodies.add_body_delta
     delta_v: wp.array2d[wp.int64]  # changes of velocity summed over constraints
     share: wp.array[wp.int64]  # of its path that remains before its contacts, in units, see division.find_body_shares
-    first_contact: wp.array[wp.int64]  # of its vertices, packed by first_contact.packed_vertex
     loose: wp.array[int]  # 1 if a contact that cuts its path has no constraint or no dividing plane
     outcome: wp.array[int]  # bits of PROJECTED, DIVIDED, TRUNCATED, FROZEN
 
@@ -163,7 +162,6 @@ class Constraints:
     friction: wp.array[float]  # coefficient
     kind: wp.array[int]  # a ContactKind
     plane: wp.array[int]  # of a contact with a plane
-    within_tolerance: wp.array[wp.bool]  # whether its contact is certain to come within the tolerance after toi
     toi: wp.array[wp.float64]  # time of impact
     approach: wp.array[wp.float64]  # over the whole step, as a share of its violation, in [0, 1]
     pace: wp.array[int]  # a Pace

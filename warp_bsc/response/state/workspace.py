@@ -16,12 +16,8 @@ from ..tuning import (
     DIVIDING_PLANES_IF_FEW,
     ITERATIONS_RESERVED,
     ITERATIONS_RESERVED_IF_FEW,
-    MAX_DIVISIONS,
     MAX_ITERATIONS,
     MAX_SLOW_ITERATIONS,
-    MAX_SWEEPS,
-    MAX_TRUNCATIONS,
-    MIN_ENTRIES,
     PAIRS_PER_FACE,
     PAIRS_PER_STATIC_FACE,
     SLOW_POSITION_SWEEPS,
@@ -33,7 +29,6 @@ from .cluster import BLOCK, begin_worlds, count_constraints, list_constraints, t
 from .launches import Launches
 from .mesh import ModelMesh, grouped_by_world
 from .motion import ModelMotion, takes_part
-from .record import StepRecord, StepRecorder, record_offsets
 from .status import Detection, Loop, Result, SolveStatus, WorldCounts, clear_status, single_elements, start_sweeps
 from .structs import (
     NEVER,
@@ -65,8 +60,7 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
     if i == 0:
         clear_status(status)
         step.constraints.count[0] = 0
-        if dividing.count:
-            dividing.count[0] = 0
+        dividing.count[0] = 0
     if i < worlds:
         status.contact_iteration[i] = -1
         status.is_fast[i] = 0
@@ -89,10 +83,9 @@ def _begin(step: Step, worlds: int, dividing: DividingPlanes, status: SolveStatu
     vertices.first_contact[i] = NEVER
     vertices.changed[i] = 0
     vertices.outcome[i] = wp.where(motion.is_not_finite[i] != 0, NOT_FINITE, 0)
-    if dividing.first:
-        dividing.first[i] = NO_NODE
-        dividing.lacks[i] = 0
-        dividing.placed[i] = NOT_PLACED
+    dividing.first[i] = NO_NODE
+    dividing.lacks[i] = 0
+    dividing.placed[i] = NOT_PLACED
 
 
 @wp.kernel
@@ -114,20 +107,16 @@ def pairs_of(mesh: ModelMesh, can_move: np.ndarray) -> int:
     return PAIRS_PER_FACE * moving + PAIRS_PER_STATIC_FACE * (count - moving)
 
 
-def _allocate_status(worlds: int, device: wp.Device, *, max_iterations: int, recorded: bool) -> SolveStatus:
-    """Returns a cleared status.
-
-    Where steps may be ``recorded``, all sweeps are made, and paths are truncated, not divided.
-    """
+def _allocate_status(worlds: int, device: wp.Device, max_iterations: int) -> SolveStatus:
+    """Returns a cleared status."""
     status = SolveStatus()
     for name, fields in (("loop", Loop), ("detection", Detection), ("results", Result)):
         setattr(status, name, wp.zeros(len(fields), dtype=int, device=device))
     for name in ("contact_iteration", "is_fast", "crossings"):
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
     status.max_iterations = max_iterations
-    status.max_slow_iterations = MAX_ITERATIONS if recorded else MAX_SLOW_ITERATIONS
-    status.max_truncations = int(MAX_TRUNCATIONS) if recorded else MAX_DIVISIONS
-    status.slow_position_sweeps = int(MAX_SWEEPS) if recorded else SLOW_POSITION_SWEEPS
+    status.max_slow_iterations = MAX_SLOW_ITERATIONS
+    status.slow_position_sweeps = SLOW_POSITION_SWEEPS
     return status
 
 
@@ -136,32 +125,26 @@ class Workspace(Launches):
 
     Attributes:
         step: The elements; the motion, which is only read; vertices and bodies as they are moved; the constraints.
-        dividing: The dividing planes; without arrays if steps may be recorded.
+        dividing: The dividing planes.
         loop: Views of single elements of ``status.loop``, by :class:`.status.Loop`, for conditions on the device.
         results: The same of ``status.results``, by :class:`.status.Result`.
-        recorder: Records the step for its adjoint, or None.
-        record: The record, which may be empty.
         tolerance: Tolerance of constraints on positions [m].
         crossings_of_edges: Faces that each edge crosses at the start of the step.
         last_crossings: The same of the step before; very many in a first step, whose start is as a program made it.
         nearest: How far each vertex is from the nearest face in each of six directions [m], see
-            :mod:`.contacts.occluders`; None if steps may be recorded.
+            :mod:`.contacts.occluders`.
         clipped: Where paths end that are clipped there.
-        differentiable: Whether steps may be recorded: all sweeps are made then, and paths are truncated, not divided,
-            as whether a constraint is active would otherwise depend on tiny changes, and results jump.
         worlds: Number of worlds.
         can_move: 1 of each vertex that is not of a static shape: pairs without one are not looked for.
         active: The same, 0 of those that take no part in the step.
         turns: How bodies turn, None if no body has a shape.
         arcs: The arcs of vertices; without arrays if no body has a shape.
-        on_arcs: Whether contacts are those on arcs. Steps that may be recorded are resolved by chords, and checked by
-            :mod:`.contacts.arc_check`.
         tetrahedra: The tetrahedra whose inversions are looked for, None if nobody asks.
         ends: Where particles ended before inversions were prevented; None if they are not.
         unmasked: Inverse masses of vertices and bodies while those that take no part have none.
         particles: The particles of each world.
         sweeping_threads: Threads of each world that make all its sweeps in one launch; 0 if each is launched, as those
-            of bodies and of steps that may be recorded are.
+            of bodies are.
     """
 
     def __init__(
@@ -171,7 +154,6 @@ class Workspace(Launches):
         separation: float,
         restitution: wp.array[float],
         max_iterations: int = MAX_ITERATIONS,
-        responds: bool = True,
         has_few_contacts: bool = False,
     ):
         """Allocates buffers.
@@ -181,13 +163,11 @@ class Workspace(Launches):
             separation: As of :class:`.Step` [m].
             restitution: As of :class:`.Step`.
             max_iterations: Iterations of detect and project, see :mod:`.schedule`.
-            responds: Whether contacts are resolved, and not only counted.
             has_few_contacts: Whether few contacts are to be expected, which takes less memory.
         """
         self.mesh = mesh = motion.mesh
         self.device, vertices = mesh.device, mesh.vertex_count
-        self.differentiable = differentiable = motion.differentiable
-        self.tolerance = 0.0 if differentiable else TOLERANCE * separation
+        self.tolerance = TOLERANCE * separation
         self.worlds = max(1, mesh.model.world_count)
         self.particle_count, device = mesh.model.particle_count, mesh.device
         self.body_count = mesh.model.body_count if motion.moves_bodies else 0
@@ -196,7 +176,6 @@ class Workspace(Launches):
         pairs = None if device.is_cpu else pairs_of(mesh, can_move)
         self.turns = motion.turns
         self.arcs = Arcs() if self.turns is None else self.turns.turns.arcs
-        self.on_arcs = self.turns is not None and not (differentiable and responds)
         arcs = None if self.turns is None else self.arcs
         self.detector = DetectionPipeline(mesh, pairs=pairs, min_distances=mesh.distances, arcs=arcs)
         self.crossing_candidates = CrossingCandidates(mesh)
@@ -217,24 +196,18 @@ class Workspace(Launches):
             size = self.body_count, 6
             step.vertices.bodies = allocate(MovedBodies, self.body_count, device, delta_x=size, delta_v=size)
         self.particles = self._find_particles()
-        at_once = not self.body_count and not differentiable
         largest = int(np.diff(self.particles.first.numpy()).max())
-        self.sweeping_threads = threads_of_world(device, self.worlds, largest) if at_once else 0
+        self.sweeping_threads = 0 if self.body_count else threads_of_world(device, self.worlds, largest)
         self._iterations_reserved = ITERATIONS_RESERVED_IF_FEW if has_few_contacts else ITERATIONS_RESERVED
         step.constraints = self._allocate_constraints(0)
         self._retired: list[wp.array] = []
-        self.dividing = DividingPlanes()
-        if not differentiable:
-            capacity = (DIVIDING_PLANES_IF_FEW if has_few_contacts else DIVIDING_PLANES) * self.particle_count
-            sizes = {"count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
-            sizes |= dict.fromkeys(("first", "lacks", "placed", "wanted", "reached"), vertices)
-            self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
-        limits = {"max_iterations": max_iterations, "recorded": differentiable}
-        self.status = _allocate_status(self.worlds, device, **limits)
+        capacity = (DIVIDING_PLANES_IF_FEW if has_few_contacts else DIVIDING_PLANES) * self.particle_count
+        sizes = {"count": 1, "next": 4 * capacity, "moved": self.worlds, "missed": self.worlds}
+        sizes |= dict.fromkeys(("first", "lacks", "placed", "wanted", "reached"), vertices)
+        self.dividing = allocate(DividingPlanes, capacity, device, **sizes, half=self._if_distances(capacity))
+        self.status = _allocate_status(self.worlds, device, max_iterations)
         self.loop, self.results = single_elements(self.status.loop), single_elements(self.status.results)
-        self.recorder: StepRecorder | None = None
-        self.record = StepRecord()
-        self.nearest = None if differentiable else wp.empty((vertices, 6), dtype=float, device=device)
+        self.nearest = wp.empty((vertices, 6), dtype=float, device=device)
         self.clipped = wp.empty(vertices, dtype=wp.vec3, device=device)
         plane_worlds = mesh.planes.world
         planes_of_a_world = np.bincount(plane_worlds[plane_worlds >= 0], minlength=1).max() + (plane_worlds < 0).sum()
@@ -274,11 +247,6 @@ class Workspace(Launches):
         else:
             self.launch(_forget_crossings, len(self.last_crossings), [world_mask, self.step, self.last_crossings])
 
-    def has_changed(self) -> bool:
-        """Returns whether the response changed a particle or a body. Synchronizes with the device."""
-        outcomes = [self.vertices.outcome, self.vertices.bodies.outcome]
-        return any(outcome.numpy().any() for outcome in outcomes if outcome is not None)
-
     @contextlib.contextmanager
     def all_worlds(self) -> Iterator[None]:
         """Gives the worlds that take no part in the step their masses."""
@@ -310,20 +278,8 @@ class Workspace(Launches):
         """The constraints."""
         return self.step.constraints
 
-    def begin(self, recorder: StepRecorder | None) -> None:
-        """Initializes everything for a step.
-
-        Raises:
-            RuntimeError: If a recorded step is captured in a CUDA graph, and there was none outside one.
-        """
-        self.recorder = recorder
-        self.record = StepRecord()  # which records nothing
-        if recorder is not None:
-            recorder.reserve("entries", MIN_ENTRIES)
-            if not len(recorder.record.constraint):
-                raise RuntimeError("the record of steps has no capacity: step once on a tape before capturing")
-            recorder.counts.zero_()
-            self.record = recorder.record
+    def begin(self) -> None:
+        """Initializes everything for a step."""
         size = max(len(self.vertices.x1), self.worlds)
         self.launch(_begin, size, [self.step, self.worlds, self.dividing, self.status])
 
@@ -374,21 +330,6 @@ class Workspace(Launches):
         self.reserve(self.max_contacts + capacity_for(found - kept, "proximities"))
         return True
 
-    def record_offsets(self, after: int = 0) -> None:
-        """Records, if the step is recorded, where an iteration begins or, with 1, where the last ended."""
-        if self.recorder is not None:
-            self.launch(record_offsets, 1, [self.step, self.status, self.record, after])
-
-    def reserve_entries(self, sweeps: int) -> None:
-        """Reserves entries for sweeps, if the step is recorded; does nothing in a CUDA graph."""
-        if self.recorder is not None and not self.device.is_capturing:
-            self.recorder.reserve("entries", sweeps * int(self.constraints.count.numpy()[0]))
-
-    def reserve_truncations(self) -> None:
-        """Reserves a truncation for each particle and body, if the step is recorded; does nothing in a CUDA graph."""
-        if self.recorder is not None:
-            self.recorder.reserve("truncations", self.particle_count + self.body_count)
-
     def sweep_by_world(self, kernel: Callable[[int], wp.Kernel], inputs: Sequence) -> None:
         """Launches a kernel that makes all sweeps over each world, of a number of blocks, see :mod:`.cluster`.
 
@@ -414,10 +355,9 @@ class Workspace(Launches):
 
         The kernel ``project`` updates multipliers; then ``update(work, last)`` changes vertices and bodies.
         """
-        self.reserve_entries(number)
         activate()
         for i in range(number):
-            self.launch_over_constraints(project, self.status, self.record)
+            self.launch_over_constraints(project, self.status)
             update(self, i == number - 1)
 
     def repeat_sweeps(self, activate: Callable[[], None], project: wp.Kernel, update: Callable) -> None:

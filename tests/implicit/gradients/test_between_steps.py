@@ -7,19 +7,13 @@ import numpy as np
 import pytest
 import warp as wp
 from gradient_reference import ReferenceSteps
-from newton.solvers import SolverSemiImplicit
+from gradient_scenes import DT
 
 import warp_bsc as bsc
 from warp_bsc._private_names.of_warp import paused_tape
 
 WAY = np.array([0.004, 0.002, 0.003])  # of what is held, from a step to the next [m]
 STEPS = 3
-
-SOLVERS = {
-    "implicit": bsc.SolverImplicit,
-    "stage": lambda model: bsc.SolverCCD(SolverSemiImplicit(model)),
-    "layer": lambda model: bsc.SolverCCD(bsc.ContactLayer(SolverSemiImplicit(model), thickness=0.02)),
-}
 
 
 def held_cloth(device):
@@ -79,14 +73,13 @@ def copy_on_tape(scene, state, k):
 class Scene:
     """Steps of a cloth; a function moves what is held of it before each step but the first.
 
-    Those of SolverImplicit are solved in float64 where ``is_exact``: it ends them where differences are too rough.
+    They are solved in float64 where ``is_exact``: the solver ends them where differences are too rough.
     """
 
-    def __init__(self, solver, device, move=write_outside, *, is_exact=True):
+    def __init__(self, device, move=write_outside, *, is_exact=True):
         model = self.model = held_cloth(device)
-        self.solver, self.move = SOLVERS[solver](model), move
-        self.reference = ReferenceSteps(self.solver) if is_exact and solver == "implicit" else None
-        self.dt = 1.0 / 60.0 if solver == "implicit" else 2e-3
+        self.solver, self.move = bsc.SolverImplicit(model), move
+        self.reference = ReferenceSteps(self.solver) if is_exact else None
         n = model.particle_count
         self.held = np.flatnonzero(model.particle_inv_mass.numpy() == 0.0)
         self.index = wp.array(self.held, dtype=int, device=device)
@@ -110,7 +103,7 @@ class Scene:
         for k, (begin, end) in enumerate(itertools.pairwise(states)):
             if k:
                 self.move(self, begin, k)
-            self.solver.step(begin, end, None, None, self.dt)
+            self.solver.step(begin, end, None, None, DT)
 
     def backward(self):
         with wp.Tape() as tape:
@@ -130,9 +123,8 @@ class Scene:
         assert gradient @ direction == pytest.approx((losses[0] - losses[1]) / (2.0 * h), rel=0.01)
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_what_a_program_writes_gets_the_gradient_in_its_array(solver, device):
-    scene = Scene(solver, device)
+def test_what_a_program_writes_gets_the_gradient_in_its_array(device):
+    scene = Scene(device)
     of_states = scene.backward()
     scene.assert_gradient(sum(k * of_states[k] for k in range(1, STEPS)), "way", WAY)
     scene.assert_gradient(of_states[0], "start", 0.0)
@@ -140,7 +132,7 @@ def test_what_a_program_writes_gets_the_gradient_in_its_array(solver, device):
 
 @pytest.mark.parametrize("move", [write_on_tape, shift_on_tape, copy_on_tape])
 def test_what_the_tape_moves_it_differentiates(move, device):
-    scene = Scene("implicit", device, move)
+    scene = Scene(device, move)
     of_states = scene.backward()
     scene.assert_gradient(scene.way.grad.numpy()[0], "way", WAY)
     scene.assert_gradient(of_states[0], "start", 0.0)
@@ -151,7 +143,7 @@ def stay(scene, state, k):
 
 
 def test_at_rest_gradients_go_on_and_are_not_known_between_steps(device):
-    scene = Scene("implicit", device, stay)
+    scene = Scene(device, stay)
     of_states = scene.backward()
     scene.assert_gradient(of_states[0], "start", 0.0)
     assert np.isnan(of_states[1:STEPS]).all()  # a program may have written the same positions
@@ -160,10 +152,7 @@ def test_at_rest_gradients_go_on_and_are_not_known_between_steps(device):
 
 def test_a_loss_between_steps_may_be_of_either_position(device):
     """It reads what the program moves before the next step, or has moved already."""
-    scene, total = (
-        Scene("implicit", device, is_exact=False),
-        wp.zeros(1, dtype=float, device=device, requires_grad=True),
-    )
+    scene, total = Scene(device, is_exact=False), wp.zeros(1, dtype=float, device=device, requires_grad=True)
 
     def move(scene, state, k):
         inputs = [state.particle_q, int(scene.held[0]), total]
@@ -174,28 +163,25 @@ def test_a_loss_between_steps_may_be_of_either_position(device):
     with wp.Tape() as tape:
         scene.run()
     free = np.setdiff1d(np.arange(scene.model.particle_count), scene.held)
-    tape.backward(total)
+    with pytest.warns(UserWarning, match="kinematic particles or bodies were moved between steps on a tape"):
+        tape.backward(total)
+        assert scene.solver.report.gradient_counts.ambiguous_moves == 1  # the second step passes it on to the first
     first, second = (scene.states[k].particle_q.grad.numpy() for k in (0, 1))
     for gradient in (first, second):
         assert np.isnan(gradient[scene.held[0]]).all()
         assert np.isfinite(gradient[scene.held[1:]]).all()
         assert np.isfinite(gradient[free]).all()
-    with pytest.warns(UserWarning, match="kinematic particles or bodies were moved between steps on a tape"):
-        assert scene.solver.report.gradient_counts.ambiguous_moves == 1  # the second step passes it on to the first
-        scene.run()
-        with wp.Tape():
-            scene.run()
 
 
 def test_two_states_that_take_turns_have_no_array_for_each_gradient(device):
-    scene = Scene("implicit", device, is_exact=False)
+    scene = Scene(device, is_exact=False)
     states = [scene.model.state() for _ in range(2)]
     with wp.Tape() as tape:
         for k in range(STEPS):
             begin, end = states[k % 2], states[(k + 1) % 2]
             if k:
                 write_outside(scene, begin, k)
-            scene.solver.step(begin, end, None, None, scene.dt)
+            scene.solver.step(begin, end, None, None, DT)
     seed = wp.array(scene.weights, dtype=wp.vec3, device=device)
     tape.backward(grads={states[STEPS % 2].particle_q: seed})
     assert np.isnan(states[0].particle_q.grad.numpy()[scene.held]).all()
@@ -207,7 +193,7 @@ def test_in_a_graph_as_without(device):
         with paused_tape():
             write_on_tape(scene, state, k)
 
-    scene = Scene("implicit", device, move, is_exact=False)
+    scene = Scene(device, move, is_exact=False)
     scene.backward()  # contacts come in another order in the first run of a solver
     expected, states = scene.backward(), [scene.model.state() for _ in range(STEPS + 1)]
     scene.solver.reset(states[0])

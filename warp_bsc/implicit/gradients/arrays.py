@@ -3,29 +3,15 @@
 import warp as wp
 
 from ..._private_names.of_warp import empty_struct, struct_type
-from ..state.structs import Materials
+from ...response.state.structs import Materials
 
 
-def filled(array: wp.array, counts: wp.array, place: int = 0) -> int:
-    """Returns how many elements of an array one of ``counts`` says are in use; in a CUDA graph, all of them."""
-    return len(array) if array.device.is_capturing else min(len(array), int(counts.numpy()[place]))
-
-
-def copied(struct, lengths=()):
-    """Returns a struct with copies of some arrays, and all other fields those of ``struct``.
-
-    Args:
-        struct: The struct.
-        lengths: Names of the arrays to copy; a dictionary says how many elements, None for all.
-    """
+def copied(struct, names=()):
+    """Returns a struct with copies of the arrays of these names, and all other fields those of ``struct``."""
     into = struct_type(struct)()
     into.assign(struct)
-    for name, length in lengths.items() if isinstance(lengths, dict) else dict.fromkeys(lengths).items():
-        array = getattr(struct, name)
-        if length == 0:  # Warp makes no empty slices
-            setattr(into, name, wp.empty(0, dtype=array.dtype, device=array.device))
-        else:
-            setattr(into, name, wp.clone(array if length is None else array[:length]))
+    for name in names:
+        setattr(into, name, wp.clone(getattr(struct, name)))
     return into
 
 

@@ -42,9 +42,6 @@ AMBIGUOUS_MOVES = (
 )
 """What to say of gradients that are NaN."""
 
-_WATCHED: weakref.WeakSet[wp.Tape] = weakref.WeakSet()
-"""Tapes that are recording a step that is watched."""
-
 GOES_ON, RESTS, STAYS, LOST, UNKNOWN = (wp.constant(i) for i in range(5))
 """Where the gradient of an array between two steps is written: to the start of the step (GOES_ON); there, with NaN in
 the array (RESTS); to the array (STAYS); nowhere, with NaN in the array (LOST); or nowhere, NaN in both (UNKNOWN)."""
@@ -234,15 +231,14 @@ class _End:
 class BetweenSteps:
     """Watches the kinematic particles and bodies of a model between the steps of a tape, see :mod:`.between_steps`."""
 
-    def __init__(self, model: newton.Model, counts: wp.array[wp.int64], *, bodies: bool):
-        """Reads which particles, and with ``bodies`` which bodies, are kinematic.
+    def __init__(self, model: newton.Model, counts: wp.array[wp.int64]):
+        """Reads which particles and bodies are kinematic.
 
         Args:
             model: The model.
             counts: Gradients of moved particles and bodies that are NaN are added to its first element.
-            bodies: Whether poses at the end of a step are those at its start, for kinematic bodies.
         """
-        self._model, self._counts, self._bodies = model, counts, bodies
+        self._model, self._counts = model, counts
         self._tape: Callable[[], object] = lambda: None  # a weak reference
         self._hook: Callable[[], None] | None = None
         self._seen, self._used = 0, set[int]()  # entries of the tape, and pointers of their arrays
@@ -258,7 +254,7 @@ class BetweenSteps:
             assert model.particle_inv_mass is not None and model.particle_flags is not None
             active = model.particle_flags.numpy() & int(ParticleFlags.ACTIVE) != 0
             self._add("particle_q", ~active | (model.particle_inv_mass.numpy() == 0.0))
-        if model.body_count and self._bodies:
+        if model.body_count:
             assert model.body_inv_mass is not None and model.body_flags is not None
             kinematic = model.body_flags.numpy() & int(BodyFlags.KINEMATIC) != 0
             self._add("body_q", kinematic | (model.body_inv_mass.numpy() == 0.0))
@@ -269,22 +265,15 @@ class BetweenSteps:
 
     @contextlib.contextmanager
     def watched(self, tape: wp.Tape, state_in: newton.State, state_out: newton.State) -> Iterator[None]:
-        """Watches a step, all of which the tape records within the context.
-
-        Does nothing if it is a part of a step that is watched: of an inner solver, whose end the stage changes.
-        """
-        if not self._kinematic or tape in _WATCHED:
+        """Watches a step, all of which the tape records within the context."""
+        if not self._kinematic:
             yield
             return
-        _WATCHED.add(tape)
-        try:
-            with paused_tape():
-                self._begin(tape, state_in, state_out)
-            yield
-            with paused_tape():
-                self._end(tape)
-        finally:
-            _WATCHED.discard(tape)
+        with paused_tape():
+            self._begin(tape, state_in, state_out)
+        yield
+        with paused_tape():
+            self._end(tape)
 
     def _begin(self, tape, state_in, state_out):
         if self._tape() is not tape or self._has_lost(tape):

@@ -1,1 +1,0 @@
-"""The adjoint of a step: goes back through its record."""

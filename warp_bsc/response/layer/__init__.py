@@ -1,1 +1,0 @@
-"""A layer around surfaces in which contacts push gradually."""
