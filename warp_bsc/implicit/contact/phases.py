@@ -118,9 +118,7 @@ def publish(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, setting
     if at.thread == 0:
         p.contacts.count[at.world] = 0
     phase = wp.where(listed_count(p.candidates, at.world) >= 0, int(Phase.FIND_NEAR), int(Phase.BEGIN_LIST))
-    if p.progress.steps[at.world] == 0:
-        phase = int(Phase.END)
-    return _to_pairs(at, phase, Phase.END)
+    return _to_pairs(at, wp.where(p.progress.steps[at.world] == 0, int(Phase.END), phase), Phase.END)
 
 
 @wp.func
@@ -343,8 +341,7 @@ def bound(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings:
 @wp.func
 def hold(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Keeps the first solution, before pairs that would meet are held in another solve."""
-    w = at.world
-    for u in range(p.unknowns.of_worlds[w] + at.thread, p.unknowns.of_worlds[w + 1], at.threads):
+    for u in range(p.unknowns.of_worlds[at.world] + at.thread, p.unknowns.of_worlds[at.world + 1], at.threads):
         if at.solves == 0:
             p.first[u] = p.vectors.solution[u]
     return wp.vec4i(int(Phase.RELEASE_HELD), at.then, at.passes, at.solves + 1)
@@ -449,8 +446,7 @@ def find_energy(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
 @wp.func
 def begin_release(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Goes back to the first solution."""
-    w = at.world
-    for u in range(p.unknowns.of_worlds[w] + at.thread, p.unknowns.of_worlds[w + 1], at.threads):
+    for u in range(p.unknowns.of_worlds[at.world] + at.thread, p.unknowns.of_worlds[at.world + 1], at.threads):
         p.vectors.solution[u] = p.first[u]
     return _to_pairs(at, Phase.DISPLACE, Phase.RELEASED)
 
@@ -458,8 +454,8 @@ def begin_release(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, s
 @wp.func
 def begin_cuts(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Begins to cut single vertices in place of their world, where energies are lower then."""
-    w = at.world
-    for k in range(p.worlds.first_vertex[w] + at.thread, _end_of_vertices(p.worlds, p.progress, w), at.threads):
+    first, end = p.worlds.first_vertex[at.world] + at.thread, _end_of_vertices(p.worlds, p.progress, at.world)
+    for k in range(first, end, at.threads):
         steps.begin_truncation(p.worlds.vertices[k], p.unknowns, p.lower, p.upper, p.trial)
     return _to(at, Phase.CUT)  # the first time by the bounds of the displacements, which are known
 
@@ -502,9 +498,9 @@ def choose_cuts(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, set
 @wp.func
 def undo_cuts(at: Place, p: Problem, motion: Motion, planes: MovingPlanes, settings: BarrierSettings) -> wp.vec4i:
     """Takes back cuts that were not chosen."""
-    w = at.world
-    for k in range(p.worlds.first_vertex[w] + at.thread, _end_of_vertices(p.worlds, p.progress, w), at.threads):
-        if p.progress.cuts[w] == 0:
+    first, end = p.worlds.first_vertex[at.world] + at.thread, _end_of_vertices(p.worlds, p.progress, at.world)
+    for k in range(first, end, at.threads):
+        if p.progress.cuts[at.world] == 0:
             p.trial.share[p.worlds.vertices[k]] = 1.0
     return _to(at, Phase.TAKE)
 
