@@ -10,6 +10,7 @@ those of ``SolverImplicit``.
 """
 
 import copy
+import functools
 import itertools
 
 import newton
@@ -18,6 +19,7 @@ import warp as wp
 from common import main
 from diffsim import build_worlds
 from diffsim_targets import TargetExample
+from searches import FittedNewton
 
 CELLS = 8
 CELL = 0.05  # [m]
@@ -81,7 +83,7 @@ class Example(TargetExample):
         folded = np.where(rest[:, :1] > 0.0, rest * [-1.0, 1.0, 1.0] + [0.0, 0.0, HEIGHT], rest)
         self.start_solver(model, (wp.vec3(0.0, -1.2, 0.4), -15.0, 90.0))
         self.prepare_descent(points, STEPS, targets=[folded])
-        self.search_from(starts, first=0.1, longest=0.2)
+        self.search_from(starts, first=0.1, longest=0.2, method=functools.partial(FittedNewton, off=0.3))
 
     def forward(self):
         """Simulates the folds, and computes their losses."""

@@ -14,6 +14,7 @@ import warp as wp
 from common import main
 from diffsim import build_worlds
 from diffsim_targets import TargetExample
+from searches import FittedNewton
 
 CELLS = 10, 5
 CELL = 0.06  # [m]
@@ -66,7 +67,7 @@ class Example(TargetExample):
         self.throws = wp.array(np.zeros_like(STARTS), dtype=wp.vec3, device=model.device, requires_grad=True)
         self.rest = world.particle_q - np.array(START)
         self.prepare_descent([self.throws], STEPS, targets=[hang(self.rest, 0.05 * CELL)] * LAST)
-        self.search_from([STARTS], first=0.3, longest=0.6)
+        self.search_from([STARTS], first=0.3, longest=0.6, method=FittedNewton)
 
     def forward(self):
         """Simulates the throws, and computes their losses."""

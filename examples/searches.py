@@ -71,12 +71,14 @@ class FittedNewton:
 
     NEAR = 0.02  # distance below which differences count no more than farther ones
     PRIOR = 0.1  # weight of the first guess of the Hessian
-    OFF = 0.9  # by how much all parameters are off at the start, which that guess says
 
-    def __init__(self, x, first, longest):
-        """Takes the parameters at the start, and lengths of the first step and of the longest."""
+    def __init__(self, x, first, longest, off=0.9):
+        """Takes the parameters at the start, and lengths of the first step and of the longest.
+
+        The first guess of the Hessian is that all parameters are ``off`` by so much.
+        """
         self.trial = self.x = np.array(x)
-        self._radius, self._longest = first, longest
+        self._radius, self._longest, self._off = first, longest, off
         self._value, self._gradient, self._first_hessian = np.inf, None, None
         self._known = []  # parameters and gradients of all evaluations that have one
         self._step, self._decrease = np.zeros_like(self.x), np.inf
@@ -106,7 +108,7 @@ class FittedNewton:
     def _fit(self):
         """Returns the Hessian."""
         if self._first_hessian is None:
-            self._first_hessian = np.diag(np.abs(self._gradient) / self.OFF)
+            self._first_hessian = np.diag(np.abs(self._gradient) / self._off)
         row, column = np.triu_indices(len(self.x))
         basis = np.zeros((len(row), *self._first_hessian.shape))
         basis[np.arange(len(row)), row, column] = basis[np.arange(len(row)), column, row] = 1.0
