@@ -1,15 +1,17 @@
-"""Bases of the examples with gradients: gradient descent from several starts; cloth that is to end on a mark."""
+"""Bases of the examples with gradients: a search from several starts; particles whose centre is to end on a mark."""
 
 import itertools
 
 import newton
 import numpy as np
 import warp as wp
-import warp.optim
 from common import ExampleBase
+from searches import QuasiNewton
 
-RADIUS = 0.3  # distance from the mark at which the loss grows fastest [m]
-RATE_DECAY = 0.94  # factor of the learning rate per iteration
+import warp_bsc as bsc
+
+MAX_ITERATIONS = 100  # so that more steps converge: others carry no gradients
+RADIUS = 0.25  # distance from the mark at which the loss grows fastest [m]
 
 
 @wp.kernel
@@ -40,6 +42,18 @@ def add_cloth(builder, cells, cell, centre, axis, angle, **options):
     builder.add_cloth_grid(pos=corner, rot=rotation, **cloth | options)
 
 
+def add_cube(builder, cells, cell, centre, axis, angle, *, stiffness, density=200.0):
+    """Adds a soft cube with ``cells`` cells of width ``cell`` [m] along each side, turned about an axis.
+
+    Its stiffness [Pa] is that against shear and that against a change of volume; its density is in kg/m^3.
+    """
+    rotation = wp.quat_from_axis_angle(wp.normalize(axis), angle)
+    corner = centre - wp.quat_rotate(rotation, wp.vec3(0.5 * cells * cell))
+    cube = {f"dim_{axis}": cells for axis in "xyz"} | {f"cell_{axis}": cell for axis in "xyz"}
+    cube |= {"density": density, "k_mu": stiffness, "k_lambda": stiffness, "k_damp": 0.0}
+    builder.add_soft_grid(pos=corner, rot=rotation, vel=wp.vec3(), **cube)
+
+
 def build_worlds(world, count):
     """Returns a model of this many copies of a world, with gradients."""
     builder = newton.ModelBuilder()
@@ -52,38 +66,74 @@ def build_worlds(world, count):
 
 
 class DiffsimExample(ExampleBase):
-    """Gradient descent in several worlds at once, in the format of Newton's examples; a frame is an iteration.
+    """A search by gradients of SolverImplicit in several worlds at once, in the format of Newton's examples.
 
-    A derived class calls :meth:`start` and :meth:`prepare_descent` at the end of its ``__init__``, and makes its
-    ``forward`` depend on the parameters. It adds the losses of all worlds in ``add_losses``, and says in ``distances``
-    how far from their marks they ended.
+    A frame is an evaluation of the loss and its gradient. A derived class calls :meth:`start_solver`,
+    :meth:`prepare_descent` and :meth:`search_from` at the end of its ``__init__``, and makes its ``forward`` depend on
+    the parameters. It adds the losses of all worlds in ``add_losses``, and says in ``distances`` how far from their
+    marks they ended.
 
     Attributes:
-        loss_history: The losses of all worlds in each iteration so far.
+        loss_history: The losses of all worlds in each evaluation so far.
         distance: Least distance from the mark so far, at which each world ended [m].
-        motion: Positions of particles in that iteration [m], shape [steps + 1, worlds, particles, 3].
+        motion: Positions of particles in that evaluation [m], shape [steps + 1, worlds, particles, 3].
+        lost: Evaluations of each world so far that had a step without gradients, as it did not converge.
     """
 
-    def prepare_descent(self, parameters, rate, steps):
-        """Prepares gradient descent.
+    def __init__(self, viewer, args):
+        super().__init__(viewer, args)
+        self.sim_dt = self.frame_dt
+
+    def start_solver(self, model, camera, **options):
+        """Makes the solver, without contacts if ``--no-ccd`` is given, and shows the model.
+
+        Args:
+            model: The model.
+            camera: As for :meth:`.common.ExampleBase.start`.
+            options: Options of the solver.
+        """
+        apart = None if self.ccd else bsc.CollisionFilter(particle_mask=0)
+        options |= {"report": ["contacts"] if self.draws_contacts else []}
+        solver = bsc.SolverImplicit(model, collision_filter=apart, max_iterations=MAX_ITERATIONS, **options)
+        self.start(model, solver, camera)
+
+    def prepare_descent(self, parameters, steps):
+        """Prepares the descent, which :meth:`search_from` begins.
 
         Args:
             parameters: The arrays to improve, an element for each world.
-            rate: Learning rate of the first iteration; None if ``improve`` is not that of Adam.
             steps: How many steps a simulation has.
         """
         model, device = self.model, self.model.device
-        self.parameters, self.rate = parameters, rate
+        self.parameters = parameters
         self.states = [self.state_0, *(model.state() for _ in range(steps - 1)), self.state_1]
         self.worlds = model.world_count
         self.losses = wp.zeros(self.worlds, dtype=float, device=device, requires_grad=True)
         self.loss = wp.zeros(1, dtype=float, device=device, requires_grad=True)
-        if rate is not None:
-            self.optimizer = warp.optim.Adam(parameters, lr=rate)
         self.tape = None
         self.loss_history = []
         self.distance = np.full(self.worlds, np.inf)
         self.motion = self.positions()
+
+    def search_from(self, starts, *, first, longest, method=QuasiNewton):
+        """Begins a search in each world.
+
+        Args:
+            starts: First values of each of the parameters, shape [worlds, n] each.
+            first: Length of the first step.
+            longest: Length of the longest step.
+            method: Class of the searches.
+        """
+        self.sizes = [np.shape(start)[1] for start in starts]
+        rows = np.concatenate(starts, axis=1)
+        self.searches = [method(row, first, longest) for row in rows]
+        self.lost = np.zeros(self.worlds, dtype=int)
+        self.set_parameters(rows)
+
+    def set_parameters(self, rows):
+        """Sets the parameters of the worlds, shape [worlds, n]."""
+        for array, values in zip(self.parameters, np.split(rows, np.cumsum(self.sizes)[:-1], axis=1), strict=True):
+            array.assign(values.astype(np.float32))
 
     def forward(self):
         """Simulates all worlds, and computes their losses."""
@@ -97,7 +147,7 @@ class DiffsimExample(ExampleBase):
         """Simulates all worlds, and computes the gradient of their loss."""
         self.former, self.tape = self.tape, wp.Tape()
         if self.former is not None:  # it stays, as a CUDA graph of this function clears its gradients again
-            self.former.zero()  # of the last iteration; or NaN, of a graph whose buffers were too small
+            self.former.zero()  # of the last evaluation; or NaN, of a graph whose buffers were too small
         with self.tape:
             self.forward()
         self.tape.backward(self.loss)
@@ -113,45 +163,62 @@ class DiffsimExample(ExampleBase):
         self.improve()
 
     def improve(self):
-        """Improves the parameters by their gradients, in a step of Adam."""
-        self.optimizer.lr = self.rate * RATE_DECAY ** (self.frame - 1)
-        self.optimizer.step([array.grad for array in self.parameters])
+        """Chooses the next parameters by losses and gradients, which are NaN where a step did not converge."""
+        gradients = np.concatenate([array.grad.numpy() for array in self.parameters], axis=1).astype(float)
+        self.lost += ~np.isfinite(gradients).all(axis=1)
+        for search, loss, gradient in zip(self.searches, self.losses.numpy(), gradients, strict=True):
+            search.take(float(loss), gradient)
+        self.set_parameters(np.array([search.trial for search in self.searches]))
+
+    def run_best(self):
+        """Simulates all worlds again with the best parameters; returns how many steps did not converge."""
+        before = self.solver.report.unconverged_steps
+        self.set_parameters(self.best())
+        self.forward()
+        return self.solver.report.unconverged_steps - before
+
+    def best(self):
+        """Returns the best parameters of each world so far, shape [worlds, n]."""
+        return np.array([search.x for search in self.searches])
 
     def positions(self):
         """Returns all positions of the last simulation [m], shape [steps + 1, worlds, particles, 3]."""
         positions = np.array([state.particle_q.numpy() for state in self.states])
         return positions.reshape(len(positions), self.worlds, -1, 3)
 
+    def print_report(self):
+        """Prints what the solver did, and what had no gradient."""
+        super().print_report()
+        evaluations = self.worlds * self.frame
+        print(f"{self.lost.sum()} of {evaluations} evaluations without a gradient, as a step did not converge")
+
     def test_final(self):
-        """Checks that the stage certified all steps, and that all have gradients."""
+        """Checks that all steps are certified, and that the best ones converge, so that they have gradients."""
         if self.ccd:
-            report = self.solver.report
-            assert report.totals.uncertified_steps + report.gradient_counts.lost_steps == 0, report
+            assert self.solver.report.totals.uncertified_steps == 0, self.solver.report
+        unconverged = self.run_best()
+        assert unconverged == 0, f"{unconverged} steps did not converge"
+        assert len(self.solver.report.intersections) == 0, self.solver.report.intersections
 
 
 class MarkExample(DiffsimExample):
-    """Cloths that are to end on a mark, behind the semi-implicit solver."""
+    """Particles whose centre is to end on a mark."""
 
-    def __init__(self, viewer, args):
-        super().__init__(viewer, args)
-        self.sim_dt = 1.0 / 600.0
-
-    def prepare_descent(self, parameters, rate, steps, *, cloth_count, mark):
-        """Prepares gradient descent.
+    def prepare_descent(self, parameters, steps, *, count, mark):
+        """Prepares the descent, which :meth:`search_from` begins.
 
         Args:
             parameters: The arrays to improve, an element for each world.
-            rate: Learning rate of the first iteration.
             steps: How many steps a simulation has.
-            cloth_count: Particles of the cloth that is to end on the mark, the first ones of each world.
-            mark: Where its centre is to end [m].
+            count: How many particles are to end on the mark, the first ones of each world.
+            mark: Where their centre is to end [m].
         """
-        super().prepare_descent(parameters, rate, steps)
+        super().prepare_descent(parameters, steps)
         model, device = self.model, self.model.device
-        self.cloth_count, self.mark = cloth_count, mark
-        is_cloth = np.arange(model.particle_count) % (model.particle_count // self.worlds) < cloth_count
-        # of each particle in the centre of the cloth of its world
-        self.shares = wp.array(is_cloth / cloth_count, dtype=float, device=device)
+        self.count, self.mark = count, mark
+        is_meant = np.arange(model.particle_count) % (model.particle_count // self.worlds) < count
+        # of each particle in the centre of its world
+        self.shares = wp.array(is_meant / count, dtype=float, device=device)
         self.centres = wp.zeros(self.worlds, dtype=wp.vec3, device=device, requires_grad=True)
 
     def add_losses(self):
@@ -162,16 +229,16 @@ class MarkExample(DiffsimExample):
         wp.launch(add_loss, self.worlds, inputs=[self.centres, self.mark, RADIUS], outputs=[self.losses, self.loss])
 
     def distances(self):
-        """Returns how far from the mark the cloth of each world ended [m]."""
+        """Returns how far from the mark the centre of each world ended [m]."""
         return np.linalg.norm(self.centres.numpy() - np.array(self.mark), axis=1)
 
     def path(self):
-        """Returns the path of the centre of each cloth in its best iteration [m], shape [steps + 1, worlds, 3]."""
-        return self.motion[:, :, : self.cloth_count].mean(axis=2)
+        """Returns the path of the centre in each world in its best evaluation [m], shape [steps + 1, worlds, 3]."""
+        return self.motion[:, :, : self.count].mean(axis=2)
 
     def render(self):
-        """Shows where the cloths end, and their paths."""
-        paths = self.positions()[::8, :, : self.cloth_count].mean(axis=2)
+        """Shows where the particles end, and the paths of the centres."""
+        paths = self.positions()[::4, :, : self.count].mean(axis=2)
         starts, ends = (wp.array(part.reshape(-1, 3), dtype=wp.vec3) for part in (paths[:-1], paths[1:]))
         self.viewer.begin_frame(float(self.frame))
         self.viewer.log_state(self.states[-1])
@@ -180,12 +247,12 @@ class MarkExample(DiffsimExample):
         self.viewer.end_frame()
 
     def test_final(self):
-        """Checks that all cloths end within two centimetres of the mark, if there is a stage."""
+        """Checks that all end within a centimetre of the mark; without contacts, that nothing better was found."""
         super().test_final()
         if self.ccd:
-            assert self.distance.max() < 0.02, self.distance
+            assert self.distance.max() < 0.01, self.distance
 
     def print_report(self):
-        """Prints what the stage did, and how far from the mark the cloths end."""
+        """Prints what the solver did, and how far from the mark the centres end."""
         super().print_report()
-        print(f"the cloths end {', '.join(f'{distance:.3f}' for distance in self.distance)} m from the mark")
+        print(f"they end {', '.join(f'{distance:.4f}' for distance in self.distance)} m from the mark")

@@ -4,10 +4,6 @@ import numpy as np
 import warp as wp
 from diffsim import DiffsimExample
 
-import warp_bsc as bsc
-
-MAX_ITERATIONS = 100  # so that more steps converge: others carry no gradients
-
 
 @wp.kernel
 def add_squares(
@@ -29,70 +25,11 @@ def add_squares(
     wp.atomic_add(loss, 0, value)
 
 
-class QuasiNewton:
-    """Minimises a function of a few parameters by the method of Broyden, Fletcher, Goldfarb and Shanno (BFGS).
-
-    Attributes:
-        x: The best parameters so far.
-        trial: Parameters to evaluate next.
-    """
-
-    def __init__(self, x, first, longest):
-        """Takes the parameters at the start, and lengths of the first step and of the longest."""
-        self.trial = self.x = np.array(x)
-        self._first, self._longest = first, longest
-        self._value, self._gradient, self._inverse = np.inf, None, None
-        self._step = np.zeros_like(self.x)
-
-    def take(self, value, gradient):
-        """Takes value and gradient at the trial, and chooses the next one."""
-        is_known, before = np.isfinite(gradient).all(), self._gradient
-        if is_known and value < self._value:
-            if before is not None:
-                self._learn(self.trial - self.x, gradient - before)
-            self.x, self._value, self._gradient = self.trial, value, gradient
-            step = -gradient if self._inverse is None else -self._inverse @ gradient
-            longest = self._first if self._inverse is None else self._longest
-            length = np.linalg.norm(step)
-            self._step = step * (longest / length if self._inverse is None else min(1.0, longest / length))
-        else:  # too far: less, to where a parabola with these slopes is least
-            share = 0.5
-            if is_known and before is not None:
-                slope, end_slope = before @ self._step, gradient @ self._step
-                share = min(slope / min(slope - end_slope, slope), 0.5)
-            self._step = max(share, 0.1) * self._step
-        self.trial = self.x + self._step
-
-    def _learn(self, step, change):
-        """Updates the inverse of the Hessian by the change of the gradient in a step."""
-        product = step @ change
-        if product <= 0.0:  # no curvature that a minimum could have
-            return
-        one = np.eye(len(step))
-        if self._inverse is None:
-            self._inverse = product / (change @ change) * one
-        factor = one - np.outer(step, change) / product
-        self._inverse = factor @ self._inverse @ factor.T + np.outer(step, step) / product
-
-
 class TargetExample(DiffsimExample):
     """Cloths whose particles are to be at targets, in the format of Newton's examples.
 
-    The loss is the mean of the squared distances, the distance from the mark its root. A step is one of 1/60 s.
+    The loss is the mean of the squared distances, the distance from the mark its root.
     """
-
-    def start_solver(self, model, camera):
-        """Makes the solver, without contacts if ``--no-ccd`` is given, and shows the model.
-
-        Args:
-            model: The model.
-            camera: As for :meth:`.common.ExampleBase.start`.
-        """
-        self.sim_dt = self.frame_dt
-        apart = None if self.ccd else bsc.CollisionFilter(particle_mask=0)
-        report = ["contacts"] if self.draws_contacts else []
-        solver = bsc.SolverImplicit(model, collision_filter=apart, max_iterations=MAX_ITERATIONS, report=report)
-        self.start(model, solver, camera)
 
     def prepare_descent(self, parameters, steps, *, targets):
         """Prepares the descent, which :meth:`search_from` begins.
@@ -103,40 +40,8 @@ class TargetExample(DiffsimExample):
             targets: Where the particles of each world are to be after each of the last n steps [m], shape
                 [n, particles, 3].
         """
-        super().prepare_descent(parameters, None, steps)
+        super().prepare_descent(parameters, steps)
         self.targets = wp.array(np.asarray(targets, dtype=np.float32), dtype=wp.vec3, device=self.model.device)
-
-    def search_from(self, starts, *, first, longest):
-        """Begins a search in each world.
-
-        Args:
-            starts: First values of each of the parameters, shape [worlds, n] each.
-            first: Length of the first step.
-            longest: Length of the longest step.
-        """
-        self.sizes = [np.shape(start)[1] for start in starts]
-        rows = np.concatenate(starts, axis=1)
-        self.searches = [QuasiNewton(row, first, longest) for row in rows]
-        self.set_parameters(rows)
-
-    def set_parameters(self, rows):
-        """Sets the parameters of the worlds, shape [worlds, n]."""
-        for array, values in zip(self.parameters, np.split(rows, np.cumsum(self.sizes)[:-1], axis=1), strict=True):
-            array.assign(values.astype(np.float32))
-
-    def improve(self):
-        """Chooses the next parameters by losses and gradients."""
-        gradients = np.concatenate([array.grad.numpy() for array in self.parameters], axis=1).astype(float)
-        for search, loss, gradient in zip(self.searches, self.losses.numpy(), gradients, strict=True):
-            search.take(float(loss), gradient)
-        self.set_parameters(np.array([search.trial for search in self.searches]))
-
-    def run_best(self):
-        """Simulates all worlds again with the best parameters; returns how many steps did not converge."""
-        before = self.solver.report.unconverged_steps
-        self.set_parameters(np.array([search.x for search in self.searches]))
-        self.forward()
-        return self.solver.report.unconverged_steps - before
 
     def add_losses(self):
         """Computes the losses of all worlds, and their sum."""
@@ -157,13 +62,6 @@ class TargetExample(DiffsimExample):
         self.viewer.log_state(self.states[-1])
         self.draw_contacts()
         self.viewer.end_frame()
-
-    def test_final(self):
-        """Checks that all steps are certified, and that the best ones converge, so that they have gradients."""
-        super().test_final()
-        unconverged = self.run_best()
-        assert unconverged == 0, f"{unconverged} steps did not converge"
-        assert len(self.solver.report.intersections) == 0, self.solver.report.intersections
 
     def print_report(self):
         """Prints what the solver did, and how far from the targets the cloths were."""

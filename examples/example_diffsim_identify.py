@@ -46,11 +46,14 @@ class Example(TargetExample):
     """The scene, in the format of Newton's examples; a frame is an evaluation of the loss and its gradient.
 
     Attributes:
+        truth: tri_ke [N/m] and edge_ke [N] of the cloth that is known.
+        starts: The guesses.
         found: The best stiffness in each world so far, tri_ke [N/m] and edge_ke [N], shape [worlds, 2].
         errors: Relative errors of these after each evaluation, shape [worlds, 2] each.
     """
 
     num_frames = 9
+    truth = TRUTH
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)
@@ -71,7 +74,7 @@ class Example(TargetExample):
         self.forward()
         frames = self.positions()[1:, 0]
         self.targets.assign(frames + np.random.default_rng(7).normal(scale=NOISE, size=frames.shape))
-        self.errors = []
+        self.starts, self.errors = STARTS[: args.starts], []
         self.search_from([starts], first=0.5, longest=0.5)
 
     def forward(self):
@@ -81,6 +84,10 @@ class Example(TargetExample):
         outputs = [model.tri_materials, model.edge_bending_properties]
         wp.launch(set_stiffness, max(model.tri_count, model.edge_count), inputs=inputs, outputs=outputs)
         super().forward()
+
+    def take_recording(self, example, world):
+        """Takes the frames of another example, which are those of all worlds."""
+        self.targets.assign(example.targets)
 
     def improve(self):
         """Chooses the next stiffness, and notes the errors of the best one."""

@@ -30,6 +30,7 @@ if not (Path(__file__).parent / "kernels").is_dir():
 if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from . import checker
     from .detection.arcs.rigid_motion import RigidMotion
+    from .detection.at_rest.chamfer_distance import chamfer_distance
     from .detection.at_rest.proximities import distances
     from .detection.detector import CollisionDetector
     from .detection.mesh import CollisionMesh, leave_out
@@ -93,6 +94,7 @@ _MODULES = {
     "SolverReport": "response.report.report",
     "StateRepairResult": "repairing.state",
     "UnresolvedContour": "repairing.results",
+    "chamfer_distance": "detection.at_rest.chamfer_distance",
     "distances": "detection.at_rest.proximities",
     "leave_out": "detection.mesh",
     "query_edge_edge": "detection.queries.query",
@@ -134,6 +136,7 @@ __all__ = [
     "SolverReport",
     "StateRepairResult",
     "UnresolvedContour",
+    "chamfer_distance",
     "checker",
     "distances",
     "leave_out",

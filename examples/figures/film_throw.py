@@ -1,4 +1,4 @@
-"""Films the throws of the example Diffsim Throw, as gradient descent improves them.
+"""Films the throws of the example Diffsim Throw, as a search by gradients improves them.
 
     python examples/figures/film_throw.py throw.webp
 
@@ -17,46 +17,47 @@ sys.path += [str(Path(__file__).parents[1]), str(Path(__file__).parent)]  # for 
 import film
 from example_diffsim_throw import MARK, STARTS, Example
 
-_SIZE = 640, 440
-_ITERATIONS = 1, 5, 12, 40  # which are shown
-_EVERY = 10  # steps from one frame to the next
+_SIZE = 600, 412
+_EVALUATIONS = 1, 2, 5, 10  # which are shown
+_EVERY = 12  # steps from one frame to the next
 _COLORS = film.BLUE, film.ORANGE, "#3a9a5b"
 
 
 def record():
-    """Returns faces of a world, and positions in the shown iterations, shape [iterations, frames, worlds, n, 3]."""
+    """Returns faces of a world, and positions in the shown evaluations, shape [evaluations, frames, worlds, n, 3]."""
     example = Example(newton.viewer.ViewerNull(), Example.create_parser().parse_args(["--viewer", "null"]))
     shown = []
-    for iteration in track(range(max(_ITERATIONS)), "Learning"):
+    for evaluation in track(range(max(_EVALUATIONS)), "Learning"):
         example.step()
-        if iteration + 1 in _ITERATIONS:
+        if evaluation + 1 in _EVALUATIONS:
             shown.append(example.positions()[::_EVERY])
     faces = example.model.tri_indices.numpy()
-    return faces[: len(faces) // len(STARTS)], example.cloth_count, np.array(shown)
+    return faces[: len(faces) // len(STARTS)], example.count, np.array(shown)
 
 
 def make():
     """Returns the film."""
     faces, count, shown = record()
-    studio = film.Studio(_SIZE, (-0.9, -4.2, 1.5), (-0.12, 0.0, 0.2), lens=62.0, light=(-0.5, -0.6, 0.9))
+    studio = film.Studio(_SIZE, (-0.9, -4.2, 1.5), (-0.25, 0.0, 0.0), lens=62.0, light=(-0.5, -0.6, 0.9))
     sheet = studio.add("sheet", faces[(faces >= count).all(axis=1)] - count, "#8a97a6", smooth=False)
     studio.move(sheet, shown[0, 0, 0, count:])
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.035)
     studio.move(studio.add("mark", ball.faces, film.RED, sheen=0.0), ball.vertices + np.array(MARK))
-    cloths = [studio.add("cloth", faces[(faces < count).all(axis=1)], color) for color in _COLORS]
+    cubes = [studio.add("cube", faces[(faces < count).all(axis=1)], color, smooth=False) for color in _COLORS]
     paths = shown[:, :, :, :count].mean(axis=3)
     frames = shown.shape[1]
 
     def draw(frame):
-        iteration, moment = divmod(frame, frames)
-        for world, cloth in enumerate(cloths):
-            studio.move(cloth, shown[iteration, moment, world, :count])
+        evaluation, moment = divmod(frame, frames)
+        for world, cube in enumerate(cubes):
+            studio.move(cube, shown[evaluation, moment, world, :count])
         picture = studio.shoot()
         for world, color in enumerate(_COLORS):
-            film.dots(picture, studio.pixels(paths[iteration, : moment + 1, world]), color, 2.5)
-        return film.beside([picture], [f"iteration {_ITERATIONS[iteration]}"], band=52)
+            film.dots(picture, studio.pixels(paths[evaluation, : moment + 1, world]), color, 2.5)
+        film.dots(picture, studio.pixels(np.array([MARK])), film.RED, 5.0)  # also where a cube hides it
+        return film.beside([picture], [f"evaluation {_EVALUATIONS[evaluation]}"], band=52)
 
-    return film.Film(len(_ITERATIONS) * frames, draw, duration=55, part=frames)
+    return film.Film(len(_EVALUATIONS) * frames, draw, duration=70, part=frames)
 
 
 def main():

@@ -374,6 +374,15 @@ def calls() -> dict[str, Call]:
             "device": without(DEVICES),
         },
     )
+    arrays = {name: wp.zeros(shape, dtype=wp.vec3, device="cpu") for name, shape in (("points", (1, 4)), ("x", (2, 6)))}
+    arrays["faces"] = wp.array(FACES, dtype=int, device="cpu")
+    others = {"numpy": np.zeros((2, 3)), "type": wp.zeros((2, 3), dtype=wp.float64, device="cpu"), "string": "x"}
+    others |= {"number": 3, "shape": wp.zeros((1, 1, 1), dtype=float, device="cpu"), "object": object()}
+    found["chamfer_distance"] = Call(
+        bsc.chamfer_distance,
+        arrays,
+        dict.fromkeys(("weights", "out"), others) | dict.fromkeys(arrays, others | {"None": None}),
+    )
     part = bad_arrays(np.zeros(6, int), index=True)
     found["leave_out"] = Call(
         bsc.leave_out,

@@ -9,6 +9,7 @@ import warp as wp
 from gradient_scenes import DT, SCENES, add_cloth, marks_of
 
 import warp_bsc as bsc
+from warp_bsc.implicit.contact.rows import make_rows
 from warp_bsc.implicit.gradients.contact_forces import RecordedContacts, contact_forces, contact_jacobians
 from warp_bsc.implicit.gradients.elements import Elements
 from warp_bsc.implicit.gradients.linear import LinearSolver
@@ -177,3 +178,15 @@ def test_iterations_are_limited(name, device):
     x, solver = SYSTEMS[name](device).solve(max_iterations=3)
     assert solver.failed.numpy().all()
     assert np.isnan(x).all()
+
+
+def test_rows_of_many_unknowns_are_those_of_few(device):
+    """Of springs in a ring of more unknowns than have a product that fits into 32 bits."""
+    count, springs = 50_000, [np.zeros((0, n), dtype=np.int32) for n in (3, 4, 4)]
+    ring = np.arange(count, dtype=np.int32)
+    springs.append(np.stack([ring, np.roll(ring, -1)], axis=1))
+    rows = make_rows(springs, ring, count, device)
+    np.testing.assert_array_equal(rows.first.numpy(), 3 * np.arange(count + 1))
+    columns = rows.column.numpy().reshape(-1, 3)
+    np.testing.assert_array_equal(columns[:, 0], ring)
+    np.testing.assert_array_equal(columns[1:-1, 1:], np.stack([ring[1:-1] - 1, ring[1:-1] + 1], axis=1))

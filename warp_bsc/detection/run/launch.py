@@ -74,7 +74,7 @@ def _loading(kernel: wp.Kernel, device: wp.Device, block_dim: int) -> Iterator[N
     loaded.add(key)
 
 
-def launch(kernel: wp.Kernel, dim: int, *, device: wp.DeviceLike, **options: Any) -> None:
+def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], *, device: wp.DeviceLike, **options: Any) -> None:
     """Launches a kernel as :func:`warp.launch` does, from any thread; does nothing for a dimension of 0."""
     device = wp.get_device(device)
     if dim:

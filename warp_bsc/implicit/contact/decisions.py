@@ -13,6 +13,8 @@ PATH = wp.constant(8)
 """Newton steps of which positions are kept."""
 _LEAST_DAMPING, _GROWTH = wp.constant(float(2.0**-4)), wp.constant(float(1.1))
 """Least share of displacements that a world takes where it goes to and fro, and factor by which that grows again."""
+_DAMPED_FROM = wp.constant(10)
+"""Newton steps that are not damped: most steps end before, and would end later if they were."""
 _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
@@ -130,7 +132,7 @@ def _damp(w: int, progress: Progress):
     lags = energy > reached + _NOISE * wp.abs(reached)
     falls_fast = damping == 1.0 and wp.float64(4.0) * now <= before
     progress.damping[w] = most
-    if lags and not falls_fast and before > ZERO and changed > ZERO:
+    if lags and not falls_fast and progress.steps[w] >= _DAMPED_FROM and before > ZERO and changed > ZERO:
         share = progress.scale_before[w] * float((before - product) / changed)
         progress.damping[w] = wp.clamp(share, _LEAST_DAMPING, most)
 

@@ -44,7 +44,7 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
         count: Number of unknowns.
         device: Where to put them.
     """
-    diagonal = np.arange(count, dtype=np.int64)
+    unknown, diagonal = np.asarray(unknown, dtype=np.int64), np.arange(count, dtype=np.int64)  # keys exceed 32 bits
     keys, sources = [diagonal * (count + 1)], [np.full(count, _OF_NONE)]
     corner_rows, corners, first_corner, first_block = [], [], 0, 0
     for kind, (v, size) in enumerate(zip(vertices, SIZES, strict=True)):
