@@ -42,7 +42,7 @@ from ..kernels.pipeline.queues import has_overflowed
 from .state.certificate import certify
 from .state.status import Detection, Loop, Result, SolveStatus, clear_detection
 from .state.structs import Step
-from .tuning import MAX_CUTS, MAX_DIVISIONS
+from .tuning import MAX_CUTS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -92,7 +92,7 @@ def divides_now(status: SolveStatus, world: int) -> bool:
 @wp.func
 def is_freezing(status: SolveStatus) -> bool:
     """Returns whether this iteration freezes what still collides."""
-    return status.loop[Loop.ITERATION] > status.max_iterations + MAX_DIVISIONS
+    return status.loop[Loop.ITERATION] > status.max_iterations + status.max_divisions
 
 
 @wp.func
@@ -220,7 +220,7 @@ def begin_prevention(status: SolveStatus):
     """
     results, loop = status.results, status.loop
     if results[Result.INVERTING] > 0 and results[Result.UNDETECTED] == 0:
-        after = wp.where(results[Result.REMAINING] > 0, MAX_DIVISIONS, 0)
+        after = wp.where(results[Result.REMAINING] > 0, status.max_divisions, 0)
         loop[Loop.ITERATION] = status.max_iterations + after + 1
         loop[Loop.ACTIVE] = 1
         results[Result.ITERATIONS] = results[Result.ITERATIONS] + 1

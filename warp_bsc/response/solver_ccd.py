@@ -198,8 +198,7 @@ class SolverCCD(CollisionStage):
         integrator = innermost(solver)
         moves, responds = moves_bodies(bodies, mesh, integrator), bodies == "separated"
         coefficients = friction_of(mesh, self.friction, table=table)
-        moving = {"moves_bodies": moves, "responds_to_bodies": responds}
-        motion = ModelMotion(mesh, coefficients, watches_turns=True, **moving)
+        motion = ModelMotion(mesh, coefficients, moves_bodies=moves, responds_to_bodies=responds, watches_turns=True)
         self._allocate(motion, self.separation, self.restitution, max_iterations=self.max_iterations)
         self.work.watch_inversions(inversions)
         self._meter = StrainMeter(self.work)

@@ -128,7 +128,7 @@ MAX_ITERATIONS = 40
 """Iterations of detect and project, after which vertices that still collide are divided."""
 MAX_SLOW_ITERATIONS = 1
 """The same in worlds without fast contacts: division hardly moves slow elements, and costs no sweeps."""
-MAX_DIVISIONS = wp.constant(32)
+MAX_DIVISIONS = 32
 """Iterations of detect and divide, after which vertices that still collide are frozen, see :mod:`.solve.division`."""
 MAX_PASSES = wp.constant(4)
 """Passes over dividing planes in each division: sheets that fall together by more than they are apart need several."""

@@ -162,6 +162,23 @@ def test_gradients_in_a_graph_are_those_without():
         np.testing.assert_array_equal(program.model.tri_materials.grad.numpy(), expected["tri_materials"])
 
 
+@pytest.mark.slow
+def test_many_tapes_take_no_more_memory(device):
+    resource = pytest.importorskip("resource")  # of POSIX
+    program = cloth_on_edge(device)
+
+    def used():
+        if wp.get_device(device).is_cuda:
+            return wp.get_mempool_used_mem_current(device)
+        return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+    for i in range(160):
+        program.gradients()
+        if i == 80:
+            before = used()
+    assert used() - before < 2**20
+
+
 def falling(heights, device, **options):
     """A tape of three steps of a cloth over a box in each world, and the gradient of weighted ends."""
     builder = newton.ModelBuilder()

@@ -164,7 +164,7 @@ def test_cut_vertices_have_the_velocity_of_their_path(device):
 def test_where_cuts_do_not_suffice_vertices_are_frozen(device):
     model = shaken_model(device)
     solver = bsc.SolverCCD(Changed(model, shaken(0, 0.1)), inversions="prevented")
-    solver.work.status.max_truncations = 0  # so that no iteration cuts
+    solver.work.status.max_divisions = 0  # so that no iteration cuts
     rollout = Inverting(model, solver)
     rollout.step()
     report = solver.report

@@ -175,7 +175,7 @@ def test_a_body_that_projection_does_not_stop_is_put_back_as_one(freezes, device
     model = ball_and_sheet(device, fixed=True, n=8)
     rollout = Rollout(model, bsc.SolverCCD(free(model), max_iterations=0))
     if freezes:
-        rollout.solver.work.status.max_truncations = 0
+        rollout.solver.work.status.max_divisions = 0
     outcomes = []
     for _ in range(4):
         before = rollout.states[0].body_q.numpy()[0]

@@ -170,7 +170,7 @@ def _freeze_vertex(step: Step, dividing: DividingPlanes, vertex: int):
 def truncate_vertices(step: Step, dividing: DividingPlanes, status: SolveStatus, dt: wp.float64):
     """Moves each vertex that has planes onto its sides, or truncates its path before its first contact.
 
-    Paths are truncated where contacts have no dividing planes. After ``MAX_DIVISIONS`` iterations vertices that still
+    Paths are truncated where contacts have no dividing planes. After ``max_divisions`` iterations vertices that still
     collide are frozen.
     """
     vertex = wp.tid()

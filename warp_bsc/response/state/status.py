@@ -81,6 +81,7 @@ class SolveStatus:
     of_worlds: WorldCounts
     max_iterations: int
     max_slow_iterations: int
+    max_divisions: int
     slow_position_sweeps: int
 
 

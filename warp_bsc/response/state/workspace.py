@@ -16,6 +16,7 @@ from ..tuning import (
     DIVIDING_PLANES_IF_FEW,
     ITERATIONS_RESERVED,
     ITERATIONS_RESERVED_IF_FEW,
+    MAX_DIVISIONS,
     MAX_ITERATIONS,
     MAX_SLOW_ITERATIONS,
     PAIRS_PER_FACE,
@@ -116,6 +117,7 @@ def _allocate_status(worlds: int, device: wp.Device, max_iterations: int) -> Sol
         setattr(status, name, wp.zeros(worlds, dtype=int, device=device))
     status.max_iterations = max_iterations
     status.max_slow_iterations = MAX_SLOW_ITERATIONS
+    status.max_divisions = MAX_DIVISIONS
     status.slow_position_sweeps = SLOW_POSITION_SWEEPS
     return status
 
