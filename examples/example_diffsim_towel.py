@@ -49,7 +49,7 @@ def hang(rest, thickness):
 class Example(TargetExample):
     """The scene, in the format of Newton's examples; a frame is an iteration of the optimisation."""
 
-    num_frames = 12
+    num_frames = 16
 
     def __init__(self, viewer, args):
         super().__init__(viewer, args)

@@ -70,27 +70,6 @@ def test_gradients_are_those_of_central_differences(states, device):
         torch.testing.assert_close(given[argument][name].grad, 2.0 * first[argument][name])
 
 
-def test_gradients_reach_arrays_of_a_control(device):
-    """Of two rows that six steps each hold: activations of the triangles, which pull them together."""
-    solver = rollouts.bouncing_patch(device)
-    rng = np.random.default_rng(2)
-    count = solver.model.tri_count
-    weights, direction = rng.normal(size=(solver.model.particle_count, 3)), rng.normal(size=(2, count))
-
-    def positions(activations):
-        controls = tensors({"tri_activations": activations}, device)
-        result = warp_bsc.torch.rollout(solver, {}, controls, dt=DT, steps=STEPS)["particle_q"]
-        return result, controls["tri_activations"]
-
-    h = 3e-3
-    sides = [(positions(sign * h * direction)[0].detach().cpu().numpy() * weights).sum() for sign in (1.0, -1.0)]
-    result, activations = positions(np.zeros((2, count)))
-    (result * tensors({"weights": weights}, device, False)["weights"]).sum().backward()
-    gradient = activations.grad.cpu().numpy()
-    expected = (sides[0] - sides[1]) / (2.0 * h)
-    np.testing.assert_allclose((gradient * direction).sum(), expected, atol=0.005 * np.linalg.norm(gradient))
-
-
 def test_gradients_are_those_of_a_tape_around_the_solver(device):
     solver = rollouts.bouncing_patch(device)
     model = solver.model
