@@ -143,6 +143,18 @@ def test_meshes_that_cross_at_first_are_repaired_if_asked(tmp_path, capsys):
     assert main(["replay", output, "--device", "cpu", "--fail-on", "collisions,intersections"]) == 0
 
 
+def test_a_first_frame_that_cannot_be_freed_says_why(tmp_path, capsys, monkeypatch):
+    def repair(mesh, x, **options):
+        return SimpleNamespace(x=x, crossings=7, unresolved=[SimpleNamespace(reason="no side of it is right")])
+
+    monkeypatch.setattr("warp_bsc.repairing.shot.repair_shot.repair", repair)
+    repaired(overlapping_sheets(tmp_path), "--include-initial", "--json")
+    found = json.loads(capsys.readouterr().out)
+    (reason, *_) = found["stretches"][0]["reasons"]
+    assert reason.startswith("the frame at time 0 crosses itself, with 7 edges through faces, of ")
+    assert reason.endswith(": no side of it is right")
+
+
 def meshes_of(count):
     """Stands in for a segment of meshes with one vertex each, and one that the first two share."""
     meshes = [SimpleNamespace(name=f"/M{number}") for number in range(count)]

@@ -211,10 +211,10 @@ class _Shot:
         result = repair(self._follower.mesh, given, fixed=fixed, min_distance=distance)
         if result.unresolved:
             pairs = sorted({" and ".join(dict.fromkeys(names)) for names in self._findings[first].crossing_meshes})
-            reasons = "; ".join(dict.fromkeys(contour.reason for contour in result.unresolved))
+            why = "; ".join(dict.fromkeys(contour.reason for contour in result.unresolved))
             reasons.append(
                 f"the frame at time {interval.start:g} crosses itself, with {result.crossings} edges through faces, of "
-                f"{', '.join(pairs)}: {reasons}"
+                f"{', '.join(pairs)}: {why}"
             )
         x = np.asarray(result.x)
         return ShotFrame(given, x, x - given)
