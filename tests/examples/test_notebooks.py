@@ -107,7 +107,7 @@ def test_repair_and_replay(monkeypatch):
     (hits, starts, ends, *positions), text, pictures, pages = execute("repair_and_replay", 247, values, monkeypatch)
     assert (hits, starts, ends) == ([[1], [0]], [[33], [0]], [[30], [0]])
     assert positions[0] > 100 and positions[1:] == [0, True]
-    assert "Collisions: 1 before, 0 left." in text and "\x1b" not in text
+    assert "Collisions: 1 before, 0 remain." in text and "\x1b" not in text
     assert pictures == 2
     assert ["Collisions in cloth_twist.usd" in page for page in pages] == [True, False]
     assert ["Repair of cloth_twist.usd" in page for page in pages] == [False, True]
