@@ -1,4 +1,4 @@
-"""Forces of barriers and friction as a kernel over contacts, which Warp differentiates.
+"""Forces of barriers and friction as a kernel over contacts, which Warp differentiates, and their Jacobians by hand.
 
 The form is that of :mod:`.elements`. An element is a pair of :mod:`..contact.pairs`, or a particle near an infinite
 plane. All follows from positions at both ends of the step as in the solve, in float64: the closest points, the reach of

@@ -1,4 +1,4 @@
-"""Forces over elements of one kind, such as contacts, evaluated and differentiated by Warp.
+"""Forces over elements of one kind, such as contacts, evaluated and differentiated by Warp, or by a kernel by hand.
 
 Every kernel of them has the same form. Thread (e, row) reads the positions of the particles of element e at the end and
 at the start of the step, ``x1[e, row]`` and ``x0[e, row]``, and writes ``forces[e, row]``. There is one row to compute
@@ -79,12 +79,12 @@ class Elements:
 
     def differentiate(self, dt: float) -> None:
         """Computes the Jacobian."""
-        shape = self.count, 3 * self._size, self._size
-        x1, x0, units = (_repeated(array, shape) for array in (self._x1, self._x0, self._units))
         if self._jacobians is not None:
             inputs = [self._x1, self._x0, *self.parameters]
             self._launch(self._jacobians, (self.count, self._size), inputs, [self.jacobian])
             return
+        shape = self.count, 3 * self._size, self._size
+        x1, x0, units = (_repeated(array, shape) for array in (self._x1, self._x0, self._units))
         self.jacobian.zero_()
         constants = [without_gradients(value) for value in self.parameters]
         adjoints = [None, self.jacobian, None, *(empty_struct(value) for value in constants)]

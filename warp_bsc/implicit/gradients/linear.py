@@ -27,7 +27,7 @@ _AIM = wp.constant(wp.float64(0.25))
 The residual that iterations update drifts from the true one, which decides.
 """
 _ATTEMPTS = wp.constant(6)
-"""Solves that are tried, each from the solution of the one before: its residual is computed anew."""
+"""Residuals that are computed anew, each but the last for a solve from the solution of the one before."""
 
 
 class Vector(IntEnum):
