@@ -348,6 +348,15 @@ class DetectionPipeline:
         if self.mesh.device.is_cpu:
             self._launch_count_not_finite(x0, x1)
 
+    def find_edges_with_faces(self, x: wp.array) -> None:
+        """Enqueues the pairs (edge, face) of one configuration whose boxes overlap, in the queue of edge-edge pairs.
+
+        Args:
+            x: Positions, Warp array of vec3 or vec3d on the mesh's device.
+        """
+        self.counters.array.zero_()
+        self.broad_phase.pair_edges_with_faces(x, self.edge_edge.counts, self.edge_edge.queue)
+
     def find_overlapping(self, x0: wp.array, x1: wp.array) -> None:
         """Enqueues all pairs whose swept boxes overlap in the queues of the narrow phases, which do not run.
 
@@ -390,6 +399,12 @@ class DetectionPipeline:
     def _host_capacities(self) -> Counts:
         pairs = {phase.kind.label: phase.capacities for phase in self.narrow_phases}
         return Counts(0, self.broad_phase.capacity, **pairs)
+
+    def allocate_contacts(self, candidates_of_contact: int) -> None:
+        """Replaces the buffers of contacts, with room for one of so many candidates."""
+        for narrow_phase in self.narrow_phases:
+            narrow_phase.allocate_contacts(len(narrow_phase.queue) // candidates_of_contact)
+        self.update_capacities()
 
     def update_capacities(self) -> None:
         """Makes ``capacities`` anew, after a buffer was replaced."""

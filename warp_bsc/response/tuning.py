@@ -113,9 +113,11 @@ PAIRS_PER_FACE, PAIRS_PER_STATIC_FACE = 96, 2
 """Capacity of the detector's queues on a GPU, for each face that can move, and for others, which have pairs with those
 alone: queues of a CUDA graph cannot grow. Four sheets of cloth that lie on each other have some 50, and up to 160 in a
 Newton step in which they land."""
+CANDIDATES_OF_CONTACT_IF_FEW = 32
+"""Candidates for each contact for which there is room on a GPU where contacts are few, as behind a solver that leaves
+none."""
 DIVIDING_PLANES, DIVIDING_PLANES_IF_FEW = 32, 8
-"""Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9. The second where contacts are few, as
-behind a solver that leaves none."""
+"""Capacity for dividing planes, for each particle: a pile of 30 sheets takes 9. The second where contacts are few."""
 ITERATIONS_RESERVED, ITERATIONS_RESERVED_IF_FEW = 3, 1
 """Iterations for whose contacts constraints are reserved. In a CUDA graph, proximities use those of all but one."""
 CONTACTS_PER_PARTICLE, MIN_CONTACTS = 8, 4096

@@ -46,12 +46,13 @@ def detect_crossings(work: Workspace) -> None:
 
 
 def _count_crossings(work):
-    candidates, crossings, of_edges = work.crossing_candidates, work.results[Result.CROSSINGS], work.crossings_of_edges
+    detector, crossings, of_edges = work.detector, work.results[Result.CROSSINGS], work.crossings_of_edges
     for counts in (crossings, work.results[Result.NEW_CROSSINGS], work.status.crossings, of_edges):
         counts.zero_()
-    retry_until_fits(lambda: candidates.find(work.step.motion.x0), candidates, work.device)
+    retry_until_fits(lambda: detector.find_edges_with_faces(work.step.motion.x0), detector, work.device)
+    pairs = detector.edge_edge
     with work.all_worlds():
-        inputs = [work.step, candidates.pairs, candidates.counts, crossings, work.status.crossings, of_edges]
+        inputs = [work.step, pairs.queue, pairs.counts, crossings, work.status.crossings, of_edges]
         work.launch_over_entries(count_crossings, inputs)
     work.launch(count_new_crossings, len(of_edges), [of_edges, work.last_crossings, work.status])
 

@@ -7,11 +7,11 @@ from typing import Literal
 import numpy as np
 import warp as wp
 
-from ...detection.at_rest.intersections import CrossingCandidates
 from ...detection.pipeline import DetectionPipeline
 from ...detection.run.settings import capacity_for
 from ...kernels.arcs import Arcs
 from ..tuning import (
+    CANDIDATES_OF_CONTACT_IF_FEW,
     DIVIDING_PLANES,
     DIVIDING_PLANES_IF_FEW,
     ITERATIONS_RESERVED,
@@ -180,7 +180,8 @@ class Workspace(Launches):
         self.arcs = Arcs() if self.turns is None else self.turns.turns.arcs
         arcs = None if self.turns is None else self.arcs
         self.detector = DetectionPipeline(mesh, pairs=pairs, min_distances=mesh.distances, arcs=arcs)
-        self.crossing_candidates = CrossingCandidates(mesh)
+        if has_few_contacts and device.is_cuda:
+            self.detector.allocate_contacts(CANDIDATES_OF_CONTACT_IF_FEW)
         edges = len(mesh.edges)
         self.crossings_of_edges = wp.zeros(edges, dtype=int, device=device)
         self.last_crossings = wp.full(edges, _VERY_MANY, dtype=int, device=device)
