@@ -23,7 +23,7 @@ from ..results.collisions import Collisions
 from ..run.launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-__all__ = ["CrossingCandidates", "IntersectionFinder", "Intersections", "find_intersections", "points_on_faces"]
+__all__ = ["IntersectionFinder", "Intersections", "find_intersections", "points_on_faces"]
 
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
@@ -165,60 +165,6 @@ def points_on_faces(mesh: CollisionMesh, x: np.ndarray, points: np.ndarray, face
     return on_face
 
 
-class CrossingCandidates:
-    """The pairs (edge, face) whose boxes overlap.
-
-    Attributes:
-        pairs: Queue of the pairs, array of vec2i.
-        counts: Counts of the pairs by :class:`Count`, on the device, array of int64.
-        count: Number of pairs that the last :meth:`grow` has read.
-        lock: That of the broad phase, held by all that find candidates while they use them.
-    """
-
-    def __init__(self, mesh: CollisionMesh, broad_phase: BroadPhase | None = None):
-        """Allocates the buffers on the mesh's device.
-
-        Args:
-            mesh: The mesh.
-            broad_phase: A broad phase that is shared if it has no queue of its own; otherwise a new one is made.
-        """
-        self._counters = Counters(mesh.device)
-        if broad_phase is None or broad_phase.capacity < UNLIMITED:
-            broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
-        self.lock = broad_phase.lock
-        self._broad_phase = broad_phase
-        # the counts of edge-edge pairs serve for those of edges with faces
-        self.counts = self._counters.edge_edge
-        self.pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
-        self.count = 0
-
-    def find(self, x: wp.array, *, is_end: bool = False) -> None:
-        """Launches the broad phase; options are those of :meth:`.BroadPhase.pair_edges_with_faces`."""
-        self._counters.array.zero_()
-        self._broad_phase.pair_edges_with_faces(x, self.counts, self.pairs, is_end=is_end)
-
-    def enqueue(self, pairs: np.ndarray) -> None:
-        """Enqueues given pairs, int32, shape [n, 2], in place of those that the broad phase finds."""
-        self._counters.array.zero_()
-        self.counts[Count.QUEUED : Count.QUEUED + 1].fill_(len(pairs))
-        if len(pairs) > len(self.pairs):
-            self.pairs = wp.empty(len(pairs), dtype=wp.vec2i, device=self.pairs.device)
-        if len(pairs):
-            wp.copy(self.pairs, wp.array(pairs, dtype=wp.vec2i, device=self.pairs.device), count=len(pairs))
-
-    def grow(self) -> bool:
-        """Enlarges the queues that were too small, and returns whether any was; synchronizes with the device."""
-        counts = self._counters.read()
-        self.count = counts.edge_edge.queued
-        if counts.face_pairs <= self._broad_phase.capacity and self.count <= len(self.pairs):
-            return False
-        self._broad_phase.grow(counts.face_pairs)
-        if self.count > len(self.pairs):
-            capacity = capacity_for(self.count, "edge-face pairs")
-            self.pairs = wp.empty(capacity, dtype=wp.vec2i, device=self.pairs.device)
-        return True
-
-
 @dataclass(frozen=True, eq=False)
 class Intersections:
     """The edges that meet faces in one configuration, exactly.
@@ -248,12 +194,15 @@ class IntersectionFinder:
 
         Args:
             mesh: The mesh.
-            broad_phase: As of :class:`CrossingCandidates`.
+            broad_phase: A broad phase that is shared if it has no queue of its own; otherwise a new one is made.
         """
         check_instance(mesh, "mesh", CollisionMesh, "a CollisionMesh")
-        self._mesh = mesh
-        self._candidates = CrossingCandidates(mesh, broad_phase)
-        self._lock = self._candidates.lock
+        self._mesh, self._counters = mesh, Counters(mesh.device)
+        if broad_phase is None or broad_phase.capacity < UNLIMITED:
+            broad_phase = make_broad_phase(mesh, self._counters.face_pairs)
+        self._broad_phase, self._lock = broad_phase, broad_phase.lock
+        self._counts = self._counters.edge_edge  # serves for pairs (edge, face)
+        self._pairs = wp.empty(2 * len(mesh.faces), dtype=wp.vec2i, device=mesh.device)
         self._allocate(len(mesh.faces))
 
     def find(self, x: ArrayLike | wp.array, *, is_end: bool = False) -> Intersections:
@@ -269,7 +218,8 @@ class IntersectionFinder:
             TypeError: If the positions are no array of numbers.
             ValueError: If they have another shape or type, or are not finite.
         """
-        return self._find(x, lambda positions: self._candidates.find(positions, is_end=is_end))
+        options = {"counts": self._counts, "is_end": is_end}
+        return self._find(x, lambda x: self._broad_phase.pair_edges_with_faces(x, pairs=self._pairs, **options))
 
     def find_at_end(self, x: ArrayLike | wp.array, start: Intersections, collisions: Collisions) -> Intersections:
         """Returns the intersections at the end of a motion: those of :meth:`find`, on a CPU in less time.
@@ -293,7 +243,15 @@ class IntersectionFinder:
         if is_slower or not collisions.certified or not self._has_sides:
             return self.find(x, is_end=True)
         pairs = self._pairs_that_may_meet(start, collisions)
-        return self._find(x, lambda _: self._candidates.enqueue(pairs))
+        return self._find(x, lambda _: self._enqueue(pairs))
+
+    def _enqueue(self, pairs: np.ndarray) -> None:
+        """Enqueues given pairs, int32, shape [n, 2]."""
+        self._counts[Count.QUEUED : Count.QUEUED + 1].fill_(len(pairs))
+        if len(pairs) > len(self._pairs):
+            self._pairs = wp.empty(len(pairs), dtype=wp.vec2i, device=self._pairs.device)
+        if len(pairs):
+            wp.copy(self._pairs, wp.array(pairs, dtype=wp.vec2i, device=self._pairs.device), count=len(pairs))
 
     @one_at_a_time
     def _find(self, x: ArrayLike | wp.array, enqueue: Callable[[wp.array], None]) -> Intersections:
@@ -304,6 +262,7 @@ class IntersectionFinder:
         check_finite(positions, "x", mesh.vertices)
 
         def launch() -> None:
+            self._counters.array.zero_()
             enqueue(x)
             self._keep_crossings(x)
 
@@ -329,28 +288,28 @@ class IntersectionFinder:
 
     def grow(self) -> bool:
         """Enlarges the buffers that were too small, and returns whether any was; synchronizes with the device."""
-        grown = self._candidates.grow()
-        counts = self._candidates.counts.numpy()
-        self._count, self._filtered = int(counts[Count.FOUND]), int(counts[Count.FILTERED])
-        if self._count > len(self._kept):
-            self._allocate(capacity_for(self._count, "intersections"))
+        counts = self._counters.read()
+        queued, found = counts.edge_edge.queued, counts.edge_edge.found
+        self._count, self._filtered = found, counts.edge_edge.filtered
+        grows = counts.face_pairs > self._broad_phase.capacity or queued > len(self._pairs)
+        self._broad_phase.grow(counts.face_pairs)
+        if queued > len(self._pairs):
+            capacity = capacity_for(queued, "edge-face pairs")
+            self._pairs = wp.empty(capacity, dtype=wp.vec2i, device=self._pairs.device)
+        if found > len(self._kept):
+            self._allocate(capacity_for(found, "intersections"))
             return True
-        return grown
+        return grows
 
     def _allocate(self, capacity: int) -> None:
         self._kept = wp.empty(capacity, dtype=wp.vec2i, device=self._mesh.device)
         self._status = wp.empty(capacity, dtype=wp.int8, device=self._mesh.device)
 
     def _keep_crossings(self, x: wp.array) -> None:
-        candidates, mesh = self._candidates, self._mesh
-        launch_over_queue(
-            _keep_crossings(x.dtype),
-            candidates.pairs,
-            candidates.counts,
-            Count.QUEUED,
-            inputs=[x, mesh.device_edges, mesh.device_faces, candidates.pairs],
-            outputs=[candidates.counts, self._kept, self._status],
-        )
+        inputs = [x, self._mesh.device_edges, self._mesh.device_faces, self._pairs]
+        outputs = [self._counts, self._kept, self._status]
+        kernel, pairs, counts = _keep_crossings(x.dtype), self._pairs, self._counts
+        launch_over_queue(kernel, pairs, counts, Count.QUEUED, inputs=inputs, outputs=outputs)
 
     def _pairs_that_may_meet(self, start: Intersections, collisions: Collisions) -> np.ndarray:
         """Returns the pairs (edge, face) that met at the start, or that a collision of their parts implies may meet.
