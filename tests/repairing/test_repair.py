@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,6 +19,13 @@ from warp_bsc.repairing.surface import Surface
 def crossings(faces, x):
     mesh = bsc.CollisionMesh(faces, len(x), device="cpu")
     return len(bsc.CollisionDetector(mesh).find_intersections(x))
+
+
+def grid_faces(n, m):
+    """Returns the faces of a grid of n by m vertices."""
+    i = np.arange(n * m).reshape(n, m)
+    a, b, c, d = (corners.ravel() for corners in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def repair(scene, x, **options):
@@ -101,6 +109,29 @@ def test_what_is_fixed_and_crosses_is_named():
     result = bsc.repair(scene.faces, scene.x, fixed=np.ones(len(scene.x), bool), device="cpu")
     assert result.crossings == result.crossings_before > 0
     assert {contour.reason for contour in result.unresolved} == {"both of its sides are fixed"}
+
+
+def test_a_sheet_leaves_fixed_bodies_that_cross_each_other():
+    ball = trimesh.creation.icosphere(3)
+    bodies = trimesh.util.concatenate([ball.copy().apply_translation([x, 0.0, 0.0]) for x in (-0.6, 0.6)])
+    u, v = np.stack(np.meshgrid(np.linspace(-1.9, 1.9, 31), np.linspace(-1.3, 1.3, 21), indexing="ij")).reshape(2, -1)
+    heights = [np.sqrt(np.maximum(1.0 - (u - x) ** 2 - v**2, 0.09)) for x in (-0.6, 0.6)]
+    dip = 0.08 * np.exp(-(u * u + v * v) / 0.12**2)
+    x = np.concatenate([bodies.vertices, np.stack([u, v, np.max(heights, axis=0) + 0.03 - dip], axis=1)])
+    faces = np.concatenate([bodies.faces, grid_faces(31, 21) + len(bodies.vertices)])
+    result = bsc.repair(faces, x, fixed=np.arange(len(bodies.vertices)), device="cpu")
+    assert result.crossings_before > result.crossings == crossings(bodies.faces, bodies.vertices) > 0
+    assert {contour.reason for contour in result.unresolved} == {"both of its sides are fixed"}
+
+
+@pytest.mark.parametrize("name", ["sheets", "folded"])
+def test_what_may_stay_at_its_place_stays_there(name):
+    scene = KNOWN[name]()
+    result = repair(scene, scene.x)
+    edges = np.linalg.norm(scene.x[scene.faces] - scene.x[np.roll(scene.faces, 1, axis=1)], axis=2)
+    little = (result.moved > 0.0) & (result.moved < 0.02 * np.median(edges))
+    home = np.where(little[:, None], scene.x, result.x)
+    assert not little.any() or crossings(scene.faces, home)
 
 
 def test_seams_stay_closed():

@@ -10,7 +10,7 @@ from .surface import Surface
 __all__ = ["approach"]
 
 _ROUNDS = 24
-_SWEEPS, _MORE_SWEEPS = 40, 160
+_SWEEPS, _MORE_SWEEPS = 40, 640
 """Sweeps of a round in which strains are below the limit at its start, and above it."""
 _RINGS = 10
 """Edges around vertices in contact within which springs move others."""
@@ -20,6 +20,8 @@ _PROGRESS = 0.98
 """Share of the strain above the limit, or of the moves once there is none, to which a round must come down."""
 _PATIENCE = 4
 """Rounds that do not, after which the approach ends; one if strains are below the limit."""
+_SMALL = 0.03
+"""Move, in edges, that in the end is taken back where that meets nothing."""
 _SOUGHT = 0.5
 """Strain that springs leave, as a share of the limit."""
 
@@ -59,7 +61,14 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
             best, best_score = x, score
         if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1):
             break
-    return best
+    goes_home = surface.moves(best) < _SMALL * surface.edge
+    while True:
+        goal = surface.rounded(np.where(goes_home[:, None], surface.home, best))
+        strained = surface.strained(goal, max_strain)
+        if not goes_home[strained].any():
+            sent, _ = move_freely(surface, best, goal, slides=False)
+            return sent if _score(surface, sent, max_strain) < best_score else best
+        goes_home[strained] = False
 
 
 def _are_near(start: np.ndarray, end: np.ndarray, edge: float) -> bool:

@@ -50,7 +50,7 @@ def restore_parts(
 ) -> np.ndarray:
     """Returns positions in which parts that still have most of their faults are as in the input.
 
-    A part is connected by vertices that have moved and by crossings.
+    A part is connected by vertices that have moved and by crossings. What is fixed on both sides is no fault of a part.
 
     Args:
         surface: The surface.
@@ -61,6 +61,7 @@ def restore_parts(
     mesh = surface.mesh
     moved = differ(x, surface.home)
     links, counts = [surface.edges[moved[surface.edges].all(axis=1)]], []
+    crossings = crossings[0][~surface.are_fixed(crossings[0])], crossings[1][~surface.are_fixed(crossings[1])]
     for pairs in crossings:
         ends, corners = mesh.edges[pairs[:, 0]], mesh.faces[pairs[:, 1]]
         links += [np.stack([ends[:, i], other], axis=1) for i in (0, 1) for other in corners.T]

@@ -23,7 +23,9 @@ _PATIENCE = 4
 """Pushes without fewer near pairs after which the search ends."""
 
 
-def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, Contacts]:
+def move_freely(
+    surface: Surface, start: np.ndarray, goal: np.ndarray, *, slides: bool = True
+) -> tuple[np.ndarray, Contacts]:
     """Returns positions on the way to a goal that are reached without a collision, and the contacts on the way.
 
     At first contacts are projected: they slide, and leave a gap. Later each vertex stops before its first contact.
@@ -33,6 +35,7 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
         surface: The surface.
         start: Positions, in units, shape [n, 3].
         goal: Likewise, as rounded to the type of the input.
+        slides: Whether contacts slide at first.
     """
     known = [Contacts.none()]
     near = near_pairs(surface, start)
@@ -41,7 +44,7 @@ def move_freely(surface: Surface, start: np.ndarray, goal: np.ndarray) -> tuple[
         if not len(contacts.toi):
             return goal, Contacts.joined(known)
         known.append(contacts)
-        if detection < _PROJECTIONS:
+        if slides and detection < _PROJECTIONS:
             goal = projected(surface.fixed, goal, Contacts.joined(known), device=surface.device)
         else:
             kept = np.ones(len(start))

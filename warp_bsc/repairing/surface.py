@@ -127,10 +127,19 @@ class Surface:
 
     def strain(self, x: np.ndarray) -> float:
         """Returns the largest change of the length of an edge, as a share of its length in the input."""
+        return float(self._strains(x)[1].max(initial=0.0))
+
+    def strained(self, x: np.ndarray, limit: float) -> np.ndarray:
+        """Returns the vertices of edges that are strained by more than a limit, int, shape [2 m]."""
+        rows, strains = self._strains(x)
+        return self.ends[:, rows[strains > limit]].ravel()
+
+    def _strains(self, x):
+        """Returns the edges that have moved, and how much they are strained."""
         moved = differ(x, self.home)
         (rows,) = np.nonzero(moved[self.ends[0]] | moved[self.ends[1]])
         change = np.abs(self._lengths_of(x, rows) - self.lengths[rows])
-        return float((change / np.where(self.lengths[rows] > 0.0, self.lengths[rows], np.inf)).max(initial=0.0))
+        return rows, change / np.where(self.lengths[rows] > 0.0, self.lengths[rows], np.inf)
 
     def _lengths_of(self, x: np.ndarray, rows: np.ndarray | slice) -> np.ndarray:
         """Returns the lengths of some edges at positions in units."""
