@@ -39,8 +39,9 @@ class ImplicitStepReport(SolverReport):
     def gradient_counts(self) -> GradientCounts:
         """Totals over all gradients that went back through steps so far, as of this access."""
         self.of_gradients.copy_counts()
+        totals = self.of_gradients.totals()  # waits for the copy
         self.warn()
-        return self.of_gradients.totals()
+        return totals
 
     @property
     def gradient_norms(self) -> np.ndarray:
