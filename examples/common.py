@@ -40,14 +40,13 @@ class ExampleBase:
         self.sim_time = 0.0
         self.frame = 0
 
-    def start(self, model, solver, camera, clocks=(), **options):
+    def start(self, model, solver, camera, **options):
         """Puts the collision stage behind a solver, unless ``--no-ccd`` is given, and shows the model.
 
         Args:
             model: The model.
             solver: The inner solver, which needs no contacts; or a stage, which stays as it is.
             camera: Position [m], pitch and yaw [degrees].
-            clocks: Arrays on the device, besides the states, that a step reads and advances.
             options: Options of the stage.
         """
         self.model = model
@@ -56,7 +55,7 @@ class ExampleBase:
         self.solver = bsc.SolverCCD(solver, **options) if self.ccd and not isinstance(solver, bsc.SolverCCD) else solver
         self.state_0, self.state_1 = model.state(), model.state()
         self.control = model.control()
-        self.run_frame = bsc.CapturedSteps(self.simulate, self.solver, [self.state_0, *clocks])
+        self.run_frame = bsc.CapturedSteps(self.simulate, self.solver)
         self.viewer.set_model(model)
         position, pitch, yaw = camera
         self.viewer.set_camera(pos=position, pitch=pitch, yaw=yaw)
@@ -119,8 +118,7 @@ class ExampleBase:
     def print_report(self):
         """Prints what the stage did."""
         if self.ccd:
-            repeated = f"; frames simulated again: {self.run_frame.retaken}" if self.run_frame.retaken else ""
-            print(f"{self.solver.report}{repeated}")
+            print(self.solver.report)
 
     @classmethod
     def create_parser(cls):

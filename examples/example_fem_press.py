@@ -80,7 +80,7 @@ class Example(ExampleBase):
             model, iterations=10, particle_enable_self_contact=False, integrate_with_external_rigid_solver=True
         )
         self.time = wp.zeros(1, dtype=float)  # on the device, so that a CUDA graph finds it advanced
-        self.start(model, solver, camera=(wp.vec3(1.1, -1.1, 0.5), -12.0, 135.0), clocks=[self.time])
+        self.start(model, solver, camera=(wp.vec3(1.1, -1.1, 0.5), -12.0, 135.0))
         self.lowest_height = self.height()
 
     def simulate(self):

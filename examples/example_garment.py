@@ -98,7 +98,7 @@ class Example(ExampleBase):
         solver = SolverTurningVBD(
             model, self.angle, ANGULAR_FREQUENCY, iterations=10, particle_enable_self_contact=False
         )
-        self.start(model, solver, camera=(wp.vec3(0.0, -1.7, 1.3), -5.0, 90.0), clocks=[solver.time])
+        self.start(model, solver, camera=(wp.vec3(0.0, -1.7, 1.3), -5.0, 90.0))
 
     def find_angle(self, time):
         """Returns the angle by which the mannequin is turned at a time [s], in rad."""

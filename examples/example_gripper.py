@@ -118,7 +118,7 @@ class Example(ExampleBase):
         self.coupled = SolverCoupledProxy(model, [robot, cloth], SolverCoupledProxy.Config(proxies=[proxy]))
         self.time = wp.zeros(1, dtype=float)  # on the device, so that a CUDA graph finds it advanced
         self.weight = 9.81 * (CARRIAGE_MASS + 2.0 * FINGER_MASS)
-        self.start(model, self.coupled, camera=(wp.vec3(0.35, -0.35, 0.25), -18.0, 135.0), clocks=[self.time])
+        self.start(model, self.coupled, camera=(wp.vec3(0.35, -0.35, 0.25), -18.0, 135.0))
         newton.eval_fk(model, model.joint_q, model.joint_qd, self.state_0)
         self.most_crossings = 0
 

@@ -70,7 +70,7 @@ class Example(ExampleBase):
 
         solver = newton.solvers.SolverVBD(model, iterations=5, particle_enable_self_contact=False)
         self.angle = wp.zeros(1, dtype=float)  # on the device, so that a CUDA graph finds it advanced
-        self.start(model, solver, camera=(wp.vec3(0.9, -0.9, 0.7), -28.0, 135.0), clocks=[self.angle])
+        self.start(model, solver, camera=(wp.vec3(0.9, -0.9, 0.7), -28.0, 135.0))
         self.highest, self.fastest = -np.inf, 0.0
 
     def simulate(self):

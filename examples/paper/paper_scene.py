@@ -130,7 +130,7 @@ class PaperScene(ExampleBase):
         model = builder.finalize()
         solver = SolverDrivenVBD(model, self.motion, self.motion_inputs, self.carried, iterations=self.iterations)
         # as recorded: the steps of a frame are many, and each is resolved as a whole
-        self.start(model, solver, self.camera, clocks=[solver.time])
+        self.start(model, solver, self.camera)
 
     def count_substeps(self, triangles):
         """Returns the steps per frame of a mesh of about ``triangles`` triangles, an even number.

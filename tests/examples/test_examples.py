@@ -320,46 +320,6 @@ def test_scene_has_to_become_what_it_is_called(name):
         run(path_of(name), 1, "--triangles", "2000").test_final()
 
 
-def test_frame_that_does_not_fit_into_a_graph_is_repeated(monkeypatch, capsys):
-    expected, example = (run(path_of("dancer"), frames, "--triangles", "1000") for frames in (3, 2))
-
-    def spoil(graph):
-        totals = example.solver.report.device_totals
-        for array in (totals.steps, totals.uncertified_steps, totals.undetected_steps):
-            array.fill_(9)
-        example.state_0.assign(example.model.state())
-        example.solver.time.zero_()
-
-    monkeypatch.setattr(wp, "capture_launch", spoil)
-    example.run_frame.graph = "a graph"
-    example.step()
-    assert (expected.positions() == example.positions()).all()
-    assert (example.solver.time.numpy() == expected.solver.time.numpy()).all()
-    assert str(example.solver.report) == str(expected.solver.report)
-    example.print_report()
-    assert "0 not certified; frames simulated again: 1\n" in capsys.readouterr().out
-    with pytest.raises(AssertionError, match="hem"):  # only
-        example.test_final()
-
-
-@pytest.mark.slow
-def test_iteration_whose_gradients_do_not_fit_into_a_graph_is_repeated(monkeypatch):
-    expected, example = (run(PUSH, frames) for frames in (3, 2))
-
-    def spoil(graph):
-        example.solver.report.device_totals.undetected_steps.fill_(1)
-        for array in (*example.parameters, example.states[0].particle_q, example.states[9].particle_qd):
-            array.grad.fill_(wp.nan)
-
-    monkeypatch.setattr(wp, "capture_launch", spoil)
-    example.run_frame.graph = "a graph"
-    example.step()
-    assert example.run_frame.retaken == 1
-    assert example.solver.report.device_totals.undetected_steps.numpy() == 0
-    for found, wanted in zip(example.parameters, expected.parameters, strict=True):
-        np.testing.assert_allclose(found.numpy(), wanted.numpy(), rtol=1e-4)
-
-
 @pytest.mark.slow
 def test_funnel_is_passed(capsys):
     example = run(path_of("funnel"), 46, "--triangles", "1352")  # of fewer, how many are in by then is chance

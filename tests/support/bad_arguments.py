@@ -583,7 +583,6 @@ def calls_of_solvers() -> dict[str, Call]:
             {
                 "steps": {**FUNCTIONS, "None": None},
                 "solver": solvers,
-                "state": {"None": None, "state": start, "numbers": [3], "string": "state"},
             },
             raises=bsc.CapturedSteps.__init__,
         ),

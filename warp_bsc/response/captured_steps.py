@@ -1,25 +1,20 @@
-"""Steps that run from a CUDA graph, and outside it where the buffers of the graph are too small."""
+"""Steps that run from a CUDA graph on a GPU, and as they are on the CPU."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
-import newton
 import warp as wp
 from newton.solvers import SolverBase
 
 from .._arguments import check_instance, given
 from .._one_thread import Occupied, one_at_a_time
-from .drive.snapshot import Snapshot
 from .stage import CollisionStage
 
 
 class CapturedSteps:
     """Runs a function that steps a solver, on a GPU from a CUDA graph.
 
-    The first run is outside the graph, where buffers grow, and is captured then. A later run in which a step says that
-    its detection was incomplete (``report.totals.undetected_steps``) is taken back: the state and the totals of the
-    report become those before it, and the function runs outside the graph, and is captured anew. No step of a
-    :class:`.solver_ccd.SolverCCD` needs that: it completes detections for which a graph is too small. Other solvers
-    have nothing to take back, and on the CPU the function runs as it is.
+    The first run is outside the graph, where buffers grow, and is captured then; later ones launch the graph. On the
+    CPU the function runs as it is.
 
     Example::
 
@@ -28,16 +23,15 @@ class CapturedSteps:
                 start.clear_forces()
                 solver.step(start, end, control, None, dt)
 
-        frame = CapturedSteps(simulate, solver, [state_0])
+        frame = CapturedSteps(simulate, solver)
         for _ in range(frames):
             frame()
 
     Attributes:
-        graph: The CUDA graph of the last capture; None before, and on the CPU.
-        retaken: Runs so far that were taken back.
+        graph: The CUDA graph; None before the first run, and on the CPU.
     """
 
-    def __init__(self, steps: Callable[[], object], solver: SolverBase, state: Sequence[newton.State | wp.array] = ()):
+    def __init__(self, steps: Callable[[], object], solver: SolverBase):
         """Captures nothing yet.
 
         Args:
@@ -45,7 +39,6 @@ class CapturedSteps:
                 that it does. If it goes back through a tape, it also has to clear the gradients of the tape before
                 first, and to keep that tape: a graph clears them again.
             solver: The solver.
-            state: All states and arrays that ``steps`` both reads and changes.
 
         Raises:
             TypeError: If an argument has another type.
@@ -53,49 +46,26 @@ class CapturedSteps:
         if not callable(steps):
             raise TypeError(f"steps must be a function, not {given(steps)}")
         check_instance(solver, "solver", SolverBase, "a solver of Newton")
-        check_instance(state, "state", (list, tuple), "a list of states and arrays")
-        for x in state:
-            check_instance(x, "state", (newton.State, wp.array), "a list of states and arrays")
         self._lock = Occupied("CapturedSteps")
-        self._steps, self._device = steps, solver.model.device
-        self._report = solver.report if isinstance(solver, CollisionStage) else None
-        self._before = Snapshot([] if self._report is None else [*state, self._report.total_values])
+        self._steps, self._solver = steps, solver
         self.graph = None
-        self.retaken = 0
 
     @one_at_a_time
     def __call__(self) -> None:
-        """Runs the steps once. Synchronizes with the device where a run may have to be taken back.
+        """Runs the steps once.
 
         Raises:
             RuntimeError: If another thread is running them; if CUDA makes no graph of them, for example because they
                 write to memory of a tape that is gone.
         """
-        if self.graph is None or not self._launch():
-            self._steps()
-            self._capture()
-
-    def _capture(self):
-        self.graph = None
-        if self._device.is_cuda:
-            with wp.ScopedCapture(self._device) as capture:
+        if self.graph is not None:
+            wp.capture_launch(self.graph)
+            if isinstance(self._solver, CollisionStage):
+                self._solver.report.warn()
+            return
+        self._steps()
+        device = self._solver.model.device
+        if device.is_cuda:
+            with wp.ScopedCapture(device) as capture:
                 self._steps()
             self.graph = capture.graph
-
-    def _launch(self):
-        """Launches the graph; if its buffers were too small, restores the state and returns False."""
-        report = self._report
-        if report is None:
-            wp.capture_launch(self.graph)
-            return True
-        self._before.save()
-        lost = report.count_lost()
-        wp.capture_launch(self.graph)
-        if report.count_lost() == lost:
-            report.warn()
-            return True
-        self._before.restore()
-        report.copy_totals()
-        wp.synchronize_device(self._device)  # so that the next step does not warn of one that was taken back
-        self.retaken += 1
-        return False

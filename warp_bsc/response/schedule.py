@@ -15,14 +15,13 @@ Where a contact has no dividing plane, its paths are truncated. In the iteration
 When does a step end? When a detection finds no contact and no pair that is too near, or when freezing changes nothing
 more. It ends: vertices that stood apart at the start and stand still do not collide.
 
-When is a vertex frozen, that is, kept at its start? If it still collides in the last row, and with all others if the
-last detection was incomplete. One whose prediction is not finite stays at its start as well, and is counted apart.
-A detection is incomplete if a queue was too small, and queues cannot grow in a CUDA graph. :mod:`.contacts.search` then
-finds contacts without queues, and all worlds go to the third row.
+When is a vertex frozen, that is, kept at its start? If it still collides in the last row. One whose prediction is not
+finite stays at its start as well, and is counted apart. Where a queue is too small, which cannot grow in a CUDA graph,
+:mod:`.contacts.search` finds contacts without queues, and all worlds go to the third row.
 
-What makes a step uncertified? Contacts that remain, a last detection that was incomplete, or start positions that are
-not finite, see :func:`decide`; predictions that are not finite; contacts on arcs; tetrahedra that still invert where
-that is prevented; and an end that a coupled solver has not shown yet: ``state/certificate.py`` has it all.
+What makes a step uncertified? Contacts that remain, or start positions that are not finite, see :func:`decide`;
+predictions that are not finite; contacts on arcs; tetrahedra that still invert where that is prevented; and an end that
+a coupled solver has not shown yet: ``state/certificate.py`` has it all.
 
 Where inversions are prevented, the resolved motion goes through the last two rows once more. Each iteration divides
 what collides, then cuts paths until no tetrahedron inverts, at most ``MAX_CUTS`` times; in the last row it freezes the
@@ -144,7 +143,7 @@ def _count_in_32_bits(count: wp.int64) -> int:
 
 
 @wp.kernel
-def decide_worlds(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus):
+def decide_worlds(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], status: SolveStatus):
     """Takes over what a detection found and left out in each world, before :func:`decide` does so for all."""
     world = wp.tid()
     of_worlds = status.of_worlds
@@ -152,7 +151,7 @@ def decide_worlds(counts: wp.array[wp.int64], capacities: wp.array[wp.int64], ca
     left_out = of_worlds.left_out[world]
     of_worlds.found[world] = 0
     of_worlds.left_out[world] = 0
-    if can_search and status.results[Result.UNDETECTED] == 0 and has_overflowed(counts, capacities):
+    if status.loop[Loop.SEARCHING] == 0 and has_overflowed(counts, capacities):
         return  # a search finds them again
     if status.results[Result.COUNTED] == 0:
         of_worlds.hits[world] += found
@@ -170,24 +169,20 @@ def _count_filtered(counts: wp.array[wp.int64], contacts: int) -> int:
 
 
 @wp.kernel
-def decide(
-    step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64], can_search: bool, status: SolveStatus
-):
+def decide(step: Step, counts: wp.array[wp.int64], capacities: wp.array[wp.int64], status: SolveStatus):
     """Decides from the contacts counted whether the motion is certified, and whether another iteration is needed.
 
-    If a queue overflowed, the detection is incomplete. With ``can_search`` it is to be completed by
-    :mod:`.contacts.search`, and decided upon by another launch.
+    If a queue overflowed, :mod:`.contacts.search` has to find the contacts, and another launch decides.
     """
     loop = status.loop
     detection = status.detection
     results = status.results
-    overflowed = has_overflowed(counts, capacities)
-    if can_search and overflowed and results[Result.UNDETECTED] == 0:
-        results[Result.UNDETECTED] = 1
+    if loop[Loop.SEARCHING] == 0 and has_overflowed(counts, capacities):
+        loop[Loop.SEARCHING] = 1
         clear_detection(status)
         loop[Loop.ITERATION] = wp.max(loop[Loop.ITERATION], status.max_iterations)
         return
-    overflowed = overflowed and not can_search
+    loop[Loop.SEARCHING] = 0
     hits = detection[Detection.HITS]
     inverting = results[Result.INVERTING]
     finished = hits == 0 and detection[Detection.TOO_NEAR] == 0 and inverting == 0
@@ -203,23 +198,21 @@ def decide(
         results[Result.FIRST_HITS] = results[Result.FIRST_HITS] + hits
         results[Result.COUNTED] = 1
     are_finite = counts[Counter.NOT_FINITE] == wp.int64(0)
-    certify(results, hits == 0 and inverting == 0 and are_finite and not overflowed)
-    results[Result.UNDETECTED] = wp.where(overflowed, 1, 0)
-    loop[Loop.ACTIVE] = wp.where(finished or overflowed or stuck, 0, 1)
+    certify(results, hits == 0 and inverting == 0 and are_finite)
+    loop[Loop.ACTIVE] = wp.where(finished or stuck, 0, 1)
     loop[Loop.ITERATION] = loop[Loop.ITERATION] + loop[Loop.ACTIVE]
     results[Result.ITERATIONS] = results[Result.ITERATIONS] + loop[Loop.ACTIVE]
-    loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or overflowed or step.constraints.count[0] > 0, 1, 0)
+    loop[Loop.UNFINISHED] = wp.where(loop[Loop.ACTIVE] == 1 or step.constraints.count[0] > 0, 1, 0)
 
 
 @wp.kernel
 def begin_prevention(status: SolveStatus):
     """Begins to cut paths if the resolved motion inverts tetrahedra.
 
-    Where contacts remain, it begins with the iterations that freeze. It leaves a step whose detection was incomplete
-    as it is, with all vertices at their start.
+    Where contacts remain, it begins with the iterations that freeze.
     """
     results, loop = status.results, status.loop
-    if results[Result.INVERTING] > 0 and results[Result.UNDETECTED] == 0:
+    if results[Result.INVERTING] > 0:
         after = wp.where(results[Result.REMAINING] > 0, status.max_divisions, 0)
         loop[Loop.ITERATION] = status.max_iterations + after + 1
         loop[Loop.ACTIVE] = 1

@@ -57,7 +57,6 @@ def _resolve_contacts(work, dt):
     add_proximities(work)
     wp.capture_while(work.loop[Loop.ACTIVE], _iterate, work=work, dt=dt)
     wp.capture_if(work.constraints.count, velocities.project, work=work, dt=dt)
-    division.freeze_if_undetected(work)
 
 
 def _iterate(work, dt):
@@ -85,7 +84,6 @@ def resolve_inversions(work: Workspace, dt: float) -> None:
 def _prevent_inversions(work, dt):
     wp.copy(work.ends, work.vertices.x1, count=work.particle_count)
     wp.capture_while(work.loop[Loop.ACTIVE], _iterate_cuts, work=work, dt=dt)
-    division.freeze_if_undetected(work)
     work.launch_over_particles(division.take_velocities_of_paths, work.ends, dt)
     find_inversions(work)  # those that remain
 

@@ -408,32 +408,6 @@ def test_proxies_start_where_a_program_sets_them_first(resets, device):
     np.testing.assert_allclose(end.particle_q.numpy(), model.particle_q.numpy(), rtol=0.0, atol=1e-8)
 
 
-def test_captured_steps_take_back_states_of_the_whole_model(device, monkeypatch):
-    """A stage that is an entry of a coupled solver has a view of the model, of which states have fewer bodies."""
-    model, runs = two_balls_over_sheet(device), []
-    solver, stage = with_proxy(model)
-    start, end = model.state(), model.state()
-    names = "body_q", "body_qd", "particle_q", "particle_qd"
-
-    def step():
-        if not wp.get_device(device).is_capturing:
-            runs.append([getattr(start, name).numpy() for name in names])
-        solver.step(start, end, None, None, DT)
-
-    def spoil(graph):
-        stage.report.device_totals.undetected_steps.fill_(1)
-        for name in names:
-            getattr(start, name).fill_(wp.nan)
-
-    captured = bsc.CapturedSteps(step, stage, [start])
-    monkeypatch.setattr(wp, "capture_launch", spoil)
-    captured.graph = "a graph"
-    captured()
-    assert captured.retaken == 1 and model.body_count > stage.model.body_count
-    for name, found in zip(names, runs[0], strict=True):
-        np.testing.assert_array_equal(found, getattr(model, name).numpy())
-
-
 def test_hooks_are_those_of_the_inner_solver(device):
     calls = []
     hooks = [name for name in dir(CouplingInterface) if name.startswith("coupling_")]

@@ -77,7 +77,7 @@ def test_a_replay_of_captured_steps_warns_where_it_is_called(device):
     model = lost_patch(device)
     solver = bsc.SolverCCD(SOLVERS["vbd"](model))
     states = model.state(), model.state()
-    steps = bsc.CapturedSteps(lambda: solver.step(*states, None, None, DT), solver, [states[0]])
+    steps = bsc.CapturedSteps(lambda: solver.step(*states, None, None, DT), solver)
     with pytest.warns(UserWarning, match="not certified") as said:
         steps()
         wp.synchronize_device(device)

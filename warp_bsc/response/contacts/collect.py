@@ -293,7 +293,6 @@ def collect_contacts(
     second: PairQueue,
     counts: wp.array[wp.int64],
     capacities: wp.array[wp.int64],
-    can_search: bool,
     arcs: Arcs,
     # in and out
     step: Step,
@@ -306,7 +305,7 @@ def collect_contacts(
     Then it finds the first contact of each vertex as well. Does nothing if :mod:`.search` is to find all contacts
     because a queue overflowed: which contacts are among those that fit depends on the order of threads.
     """
-    if can_search and has_overflowed(counts, capacities):
+    if has_overflowed(counts, capacities):
         return
     for i in range(wp.tid(), wp.max(pair_count(first), pair_count(second)), threads):
         number = int(0)

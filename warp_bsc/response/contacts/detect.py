@@ -84,18 +84,17 @@ def detect(work: Workspace, *, only_changed: bool = False, keeps_constraints: bo
         if not keeps_constraints:
             work.launch(drop_if_full, 1, [work.step, work.max_contacts])
     queues = queues_of(detector)
-    can_search = isinstance(detector.broad_phase, BroadPhaseHierarchy)
-    overflow = [detector.counters.array, detector.capacities, can_search]
+    overflow = [detector.counters.array, detector.capacities]
     for pair in (queues[:2], queues[2:]) if queues[2:] else (queues[:2],):
         work.launch_over_entries(collect_contacts, [*pair, *overflow, work.arcs, work.step, work.dividing, work.status])
     _decide(work, overflow)
-    if can_search:
-        wp.capture_if(work.results[Result.UNDETECTED], _search, work=work, overflow=overflow)
+    wp.capture_if(work.loop[Loop.SEARCHING], _search, work=work, overflow=overflow)
 
 
 def _search(work, overflow):
-    """Completes a detection whose queues were too small: all contacts that remain are divided from here on."""
+    """Finds contacts again where queues were too small: all that remain are divided from here on."""
     broad_phase = work.detector.broad_phase
+    assert isinstance(broad_phase, BroadPhaseHierarchy)  # on the CPU queues always grow
     broad_phase.fit(work.step.motion.x0, work.vertices.x1)
     find_contacts_without_queues(broad_phase, work.step, work.arcs, work.dividing, work.status)
     _decide(work, overflow)

@@ -131,7 +131,7 @@ def _conclude(
     i = wp.tid()
     if i < worlds.shape[0]:
         free = seen.of_worlds.remaining[i] == 0 and seen.crossings[i] <= crossings[i] and step.lost[i] == 0
-        worlds[i] = step.certified_worlds[i] and free and seen.results[Result.UNDETECTED] == 0
+        worlds[i] = step.certified_worlds[i] and free
     if i == 0:
         is_lost = step.lost[step.lost.shape[0] - 1] == 1
         is_free = is_certified(seen.results)

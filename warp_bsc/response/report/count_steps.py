@@ -25,7 +25,7 @@ def _merged(result: int, before: int, found: int) -> int:
     """Returns a result of substeps so far, given that before a substep, and that of the substep."""
     if result == Result.CERTIFIED:
         return wp.min(before, found)
-    if result == Result.CROSSINGS or result == Result.INVERTED or result == Result.UNDETECTED:
+    if result == Result.CROSSINGS or result == Result.INVERTED:
         return wp.max(before, found)
     return before + found
 
@@ -36,7 +36,7 @@ def _marks(step: Step, status: SolveStatus, vertex: int, is_particle: bool, resp
     motion, vertices = step.motion, step.vertices
     bits = int(0)
     replaced = motion.is_not_finite[vertex] != 0
-    if vertices.changed[vertex] != 0 or replaced or (is_particle and status.results[Result.UNDETECTED] == 1):
+    if vertices.changed[vertex] != 0 or replaced:
         bits = int(UNCERTIFIED)
     finite = wp.isfinite(motion.x0[vertex]) and wp.isfinite(vertices.x1[vertex])
     if not finite or (replaced and not (is_particle and responds)):  # a response leaves particles where they were
@@ -74,7 +74,6 @@ def count_step(results: wp.array[int], strain: wp.array[float], totals: StepTota
     """Adds a step to the totals."""
     totals.steps[0] += wp.int64(1)
     totals.uncertified_steps[0] += wp.int64(1 - results[Result.CERTIFIED])
-    totals.undetected_steps[0] += wp.int64(results[Result.UNDETECTED])
     totals.truncated_steps[0] += wp.int64(wp.min(results[Result.TRUNCATED], 1))
     totals.frozen_steps[0] += wp.int64(wp.min(results[Result.FROZEN], 1))
     totals.not_finite_steps[0] += wp.int64(wp.min(results[Result.NOT_FINITE], 1))

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from ..state.status import Result, SolveStatus
+from ..state.status import SolveStatus
 from ..state.structs import FROZEN, NOT_FINITE, TRUNCATED, Step, allocate
 from ..state.workspace import Workspace
 from .count_steps import StepResults
@@ -44,7 +44,7 @@ def _begin(status: SolveStatus, prevents_inversions: bool, first: bool, out: _Ar
         out.remaining[world] = 0
         out.filtered[world] = 0
         out.crossings[world] = 0
-    if status.results[Result.UNDETECTED] != 0 or found.remaining[world] > 0:
+    if found.remaining[world] > 0:
         out.certified[world] = False
     out.predicted_contacts[world] += found.hits[world]
     out.remaining[world] += found.remaining[world]

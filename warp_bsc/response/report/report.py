@@ -81,10 +81,6 @@ class SolverReport:
         """Copies the totals to the host, without waiting for the device, also in a CUDA graph."""
         wp.copy(self._host_totals, self.total_values)
 
-    def count_lost(self) -> int:
-        """Returns the steps so far that the buffers of a graph were too small for; warns of nothing."""
-        return self._totals_by_name()["undetected_steps"]
-
     def warn(self) -> None:
         """Warns once each of steps with predictions that are not finite, and of others that are not certified.
 
@@ -144,7 +140,7 @@ class SolverReport:
 
     @property
     def certified(self) -> bool:
-        """Whether a complete detection found the motion of the last step, as stored, to be free of collisions.
+        """Whether detection found the motion of the last step, as stored, to be free of collisions.
 
         With minimum distances, a collision is a pair that comes nearer than it may, here and in what follows.
 
@@ -256,10 +252,9 @@ class SolverReport:
         """Particles that the certificate of the last step lacks, sorted, int32, shape [n]; empty if it is certified.
 
         They are the particles of contacts that remain, of tetrahedra that invert where that is prevented, of elements
-        with a start position that is not finite, and those that :attr:`not_finite` counts. If
-        :attr:`detection_incomplete` is true, they are all particles. Vertices of rigid shapes are not listed, so that
-        the array is also empty if nothing but the position of a body is not finite. Gathered on the host, on each
-        access.
+        with a start position that is not finite, and those that :attr:`not_finite` counts. Vertices of rigid shapes
+        are not listed, so that the array is also empty if nothing but the position of a body is not finite. Gathered on
+        the host, on each access.
         """
         listed = self.outcomes.find_uncertified()[: self._mesh.model.particle_count]
         self.warn()
@@ -281,15 +276,6 @@ class SolverReport:
         if self.coupled is not None:
             bodies = np.union1d(bodies, self.coupled.find_bodies())
         return bodies[bodies >= 0].astype(np.int32)
-
-    @property
-    def detection_incomplete(self) -> bool:
-        """Whether the last step froze all vertices because its detection was incomplete.
-
-        It is not known to happen: a search without buffers completes detections for which those of a CUDA graph are too
-        small.
-        """
-        return bool(self._read_result(Result.UNDETECTED))
 
     @property
     def iterations(self) -> int:
@@ -382,12 +368,9 @@ class SolverReport:
     @property
     def totals(self) -> Totals:
         """Totals over all steps so far, as of this access."""
-        totals = self._totals_by_name()
+        totals = dict(zip(StepTotals.vars, self.total_values.numpy().tolist(), strict=True))
         self.warn()
         return Totals(**{field.name: totals[field.name] for field in fields(Totals)})
-
-    def _totals_by_name(self):
-        return dict(zip(StepTotals.vars, self.total_values.numpy().tolist(), strict=True))
 
     def draw(self, viewer: ViewerBase, *, impulse_scale: float | None = None) -> None:
         """Draws the last step in a frame of a viewer: call it between ``begin_frame`` and ``end_frame``.

@@ -11,7 +11,6 @@ class StepTotals:
 
     steps: wp.array[wp.int64]
     uncertified_steps: wp.array[wp.int64]
-    undetected_steps: wp.array[wp.int64]
     truncated_steps: wp.array[wp.int64]
     frozen_steps: wp.array[wp.int64]
     not_finite_steps: wp.array[wp.int64]
@@ -34,8 +33,6 @@ class Totals:
     Attributes:
         steps: Steps. One that is taken in substeps is one step, of which its substeps count together.
         uncertified_steps: Steps that were not certified.
-        undetected_steps: Steps that froze all vertices because their detection was incomplete, see
-            :attr:`.report.SolverReport.detection_incomplete`.
         truncated_steps: Steps in which a path was truncated.
         frozen_steps: Steps in which a vertex or a body was frozen.
         not_finite_steps: Steps with positions or velocities of particles that were not finite.
@@ -57,7 +54,6 @@ class Totals:
 
     steps: int
     uncertified_steps: int
-    undetected_steps: int
     truncated_steps: int
     frozen_steps: int
     not_finite_steps: int

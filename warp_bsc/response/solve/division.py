@@ -14,7 +14,7 @@ from ..contacts.first_contact import TIME_UNITS
 from ..contacts.planes_between import add_dividing_plane, has_planes
 from ..schedule import divides_now, divides_proximities, is_freezing
 from ..state.poses import pose_between, velocity_between
-from ..state.status import Loop, Result, SolveStatus
+from ..state.status import Loop, SolveStatus
 from ..state.structs import (
     CUT_SHORT,
     DIVIDED,
@@ -250,20 +250,6 @@ def take_velocities_of_paths(step: Step, ends: wp.array[wp.vec3], dt: wp.float64
         vertices.outcome[particle] = vertices.outcome[particle] | UNCONSTRAINED
 
 
-@wp.kernel
-def freeze_undetected(step: Step, dividing: DividingPlanes, particles: int, bodies: int, status: SolveStatus):
-    """Freezes all particles and bodies if the last detection was incomplete; thread i has one of each."""
-    i = wp.tid()
-    undetected = status.results[Result.UNDETECTED] == 1
-    if i < particles and undetected and step.motion.inverse_mass[i] > 0.0:
-        _freeze_vertex(step, dividing, i)
-    if i < bodies:
-        frozen = undetected and step.motion.bodies.inverse_mass[i] > 0.0
-        step.vertices.bodies.moved[i] = wp.where(frozen, 1, 0)
-        if frozen:
-            _freeze_body(step, i)
-
-
 @phase("divide")
 def divide(work: Workspace, dt: float) -> None:
     """Moves vertices of worlds past their projections onto their sides; else cuts their paths, else freezes them."""
@@ -280,10 +266,3 @@ def divide(work: Workspace, dt: float) -> None:
 def _pass_over_planes(work):
     work.launch_over_entries(place_planes, [work.step, work.dividing, work.status])
     work.launch_over_particles(move_to_sides, work.dividing, work.tolerance, work.status)
-
-
-def freeze_if_undetected(work: Workspace) -> None:
-    """Freezes everything if the last detection was incomplete."""
-    particles, bodies = work.particle_count, work.body_count
-    work.launch(freeze_undetected, max(particles, bodies), [work.step, work.dividing, particles, bodies, work.status])
-    work.launch_over_shape_vertices(place_vertices)

@@ -1,6 +1,6 @@
 """The certificate of a step: who gives it, and the one function that revokes it.
 
-A step is certified if a complete detection found its motion, as it is stored, to be free of contacts, and of inversions
+A step is certified if detection found its motion, as it is stored, to be free of contacts, and of inversions
 where those are prevented (:func:`certify`). What is found out later revokes it (:func:`revoke`): a position or velocity
 that was not finite, a contact on an arc, and, behind a coupled solver, an end that has not been seen yet in the state
 of the program.
@@ -14,7 +14,7 @@ from .structs import NOT_FINITE
 
 @wp.func
 def certify(results: wp.array[int], is_free: bool):
-    """Writes whether a complete detection found the motion to be free, to the results of a step."""
+    """Writes whether detection found the motion to be free, to the results of a step."""
     results[Result.CERTIFIED] = wp.where(is_free, 1, 0)
 
 

@@ -21,6 +21,7 @@ class Loop(IntEnum):
     PASS = 8  # passes over dividing planes so far
     MORE_PASSES = 9  # 1 while another is needed
     CUTTING = 10  # 1 while tetrahedra invert, and paths are to be cut again
+    SEARCHING = 11  # 1 if a queue was too small, until contacts are found without queues
 
 
 class Detection(IntEnum):
@@ -36,22 +37,21 @@ class Detection(IntEnum):
 class Result(IntEnum):
     """Results of a step: elements of :attr:`SolveStatus.results`."""
 
-    CERTIFIED = 0  # 1 if the last detection was complete and found no contact
-    UNDETECTED = 1  # 1 if the last detection was incomplete
-    COUNTED = 2  # 1 once all contacts of the predicted motion are counted
-    FIRST_HITS = 3  # contacts of the predicted motion
-    REMAINING = 4  # contacts that the last detection found
-    EXCLUDED = 5  # contacts that the last detection found and excluded
-    BODY_CONTACTS = 6  # contacts between bodies that the last detection found
-    ITERATIONS = 7  # of detect and project or divide
-    TRUNCATED = 8  # 1 if a path was cut
-    FROZEN = 9  # 1 if a vertex or a body was frozen
-    NOT_FINITE = 10  # particles whose predicted position or velocity was not finite
-    CROSSINGS = 11  # edges that cross faces at the start
-    FILTERED = 12  # pairs of the predicted motion that filters left out
-    INVERTING = 13  # tetrahedra that the motion inverts or may invert, if they are looked at
-    INVERTED = 14  # those that were or may have been inverted at the start
-    NEW_CROSSINGS = 15  # by which crossings of an edge are more than at the start of the step before, in all edges
+    CERTIFIED = 0  # 1 if the last detection found no contact
+    COUNTED = 1  # 1 once all contacts of the predicted motion are counted
+    FIRST_HITS = 2  # contacts of the predicted motion
+    REMAINING = 3  # contacts that the last detection found
+    EXCLUDED = 4  # contacts that the last detection found and excluded
+    BODY_CONTACTS = 5  # contacts between bodies that the last detection found
+    ITERATIONS = 6  # of detect and project or divide
+    TRUNCATED = 7  # 1 if a path was cut
+    FROZEN = 8  # 1 if a vertex or a body was frozen
+    NOT_FINITE = 9  # particles whose predicted position or velocity was not finite
+    CROSSINGS = 10  # edges that cross faces at the start
+    FILTERED = 11  # pairs of the predicted motion that filters left out
+    INVERTING = 12  # tetrahedra that the motion inverts or may invert, if they are looked at
+    INVERTED = 13  # those that were or may have been inverted at the start
+    NEW_CROSSINGS = 14  # by which crossings of an edge are more than at the start of the step before, in all edges
 
 
 @wp.struct
