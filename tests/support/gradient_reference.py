@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import warp as wp
+from step_forces import forces_of
 
 from warp_bsc.implicit.contact.system import AT_PLANE
 from warp_bsc.implicit.gradients.contact_forces import RecordedContacts
@@ -160,12 +161,13 @@ class ReferenceSteps:
             step.x1.assign(positions)
             equations.load(step)
             found = np.zeros(count)
-            np.maximum.at(found, of_unknowns, np.abs(equations.evaluate().numpy()).max(axis=1))
-            return found
+            forces = forces_of(equations)
+            np.maximum.at(found, of_unknowns, np.abs(forces).max(axis=1))
+            return found, wp.array(forces, dtype=wp.vec3d, device=equations.device)
 
-        size, done = residuals(x1), np.zeros(count, dtype=bool)
+        (size, forces), done = residuals(x1), np.zeros(count, dtype=bool)
         for _k in range(_NEWTON_STEPS):
-            change = self._linear.solve(equations.differentiate(transposed=False), equations.forces).numpy()[unknown]
+            change = self._linear.solve(equations.differentiate(transposed=False), forces).numpy()[unknown]
             failed, largest = np.zeros(count, dtype=bool), np.zeros(count)
             np.logical_or.at(failed, world, ~np.isfinite(change).all(axis=1))
             change[(failed | done)[world]] = 0.0
@@ -174,7 +176,7 @@ class ReferenceSteps:
             for share in _SHARES:
                 tried, goes = x1.copy(), ~taken[world]
                 tried[:n][goes] += share * change[goes]
-                found = residuals(tried)
+                found = residuals(tried)[0]
                 takes = ~taken & ((found < size) | (share * largest < _LEAST_CHANGE))
                 x1[:n][takes[world]] = tried[:n][takes[world]]
                 size[takes], taken = found[takes], taken | takes
@@ -182,7 +184,7 @@ class ReferenceSteps:
                     break
             self.unsolved |= failed | ~taken
             done |= failed | ~taken | ((largest < 1e3 * _LEAST_CHANGE) & (size < 1e-9 * weight))
-            residuals(x1)
+            forces = residuals(x1)[1]
             if done.all():
                 break
         self.unsolved |= ~done

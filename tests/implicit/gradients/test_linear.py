@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 from gradient_scenes import DT, SCENES, add_cloth, marks_of
+from step_forces import forces_of
 
 import warp_bsc as bsc
 from warp_bsc.implicit.contact.rows import make_rows
@@ -50,7 +51,7 @@ class System:
                 moved[p, c] += sign * h
                 step.x1.assign(moved)
                 equations.load(step)
-                forces.append(equations.evaluate().numpy().ravel().copy())
+                forces.append(forces_of(equations).ravel())
             matrix[:, 3 * unknown[p] + c] = (forces[1] - forces[0]) / (2.0 * h)
         step.x1.assign(x)
         return matrix

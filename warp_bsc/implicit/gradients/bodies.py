@@ -151,24 +151,6 @@ def find_arms(
 
 
 @wp.kernel(enable_backward=False)
-def add_moments(
-    # in
-    rows: wp.array2d[int],
-    arms: wp.array2d[wp.vec3d],
-    forces: wp.array3d[wp.vec3d],
-    # out
-    of_unknowns: wp.array[wp.vec3d],
-):
-    """Adds the forces on corners to those on their unknowns, and their moments to those on turns."""
-    e, i = wp.tid()
-    u, turn = rows[e, i], rows[e, 4 + i]
-    if u >= 0:
-        wp.atomic_add(of_unknowns, u, forces[e, 0, i])
-    if turn >= 0:
-        wp.atomic_add(of_unknowns, turn, wp.cross(arms[e, i], forces[e, 0, i]))
-
-
-@wp.kernel(enable_backward=False)
 def gather_changes(
     # in
     rows: wp.array2d[int],
@@ -191,7 +173,6 @@ def gather_changes(
 @wp.kernel(enable_backward=False)
 def expand_jacobian(
     # in
-    rows: wp.array2d[int],
     arms: wp.array2d[wp.vec3d],
     forces: wp.array3d[wp.vec3d],
     jacobian: wp.array3d[wp.vec3d],
@@ -227,18 +208,13 @@ class ContactsOnBodies(Elements):
         self._of_corners, self.arms = self.jacobian, wp.zeros((count, 4), dtype=wp.vec3d, device=self.device)
         self.jacobian = wp.zeros((count, 24, 8), dtype=wp.vec3d, device=self.device)
 
-    def add_forces(self, dt: float, forces: wp.array) -> None:
-        """Adds forces and moments to those on unknowns, vec3d."""
-        self.compute_forces(dt)
-        self._launch(add_moments, (self.count, 4), [self.rows, self.arms, self.forces], [forces])
-
     def differentiate(self, dt: float) -> None:
         """Computes the Jacobian."""
         expanded, self.jacobian = self.jacobian, self._of_corners
         super().differentiate(dt)
         self.jacobian = expanded
         self.compute_forces(dt)
-        inputs = [self.rows, self.arms, self.forces, self._of_corners]
+        inputs = [self.arms, self.forces, self._of_corners]
         self._launch(expand_jacobian, (self.count, 4, 4), inputs, [expanded])
 
     def gather_multipliers(self, of_unknowns: wp.array, of_corners: wp.array) -> None:

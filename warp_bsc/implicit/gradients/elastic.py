@@ -5,7 +5,7 @@ import numpy as np
 import warp as wp
 
 from ..._private_names.of_warp import struct_fields
-from ..contact.rows import Rows, make_rows
+from ..contact.rows import make_rows
 from ..elasticity.bending import bend, edge_corners
 from ..elasticity.derivatives import store_hessian
 from ..elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, has_energy, kind_of
@@ -23,6 +23,9 @@ class Elastic:
     """The elements of a model, in float64.
 
     Attributes:
+        elements: The elements.
+        count: Their number.
+        corners: Unknowns of their corners, -1 for none, int32, shape [n, 1].
         rows: Sparse rows of their Hessian, one for each unknown.
         blocks: Hessians of elements but those of bending, as :attr:`.rows.Rows.source` counts them.
         bends: Those of bending, 16 for each element.
@@ -30,10 +33,10 @@ class Elastic:
 
     def __init__(self, model: newton.Model, unknown: np.ndarray, count: int):
         """Allocates buffers; ``unknown`` is that of each particle, of so many."""
-        self._elements, vertices = elements_of_model(model)
+        self.elements, vertices = elements_of_model(model)
         self.device = model.device
         self.rows = make_rows(vertices, unknown, count, model.device)
-        self._count = sum(map(len, vertices))
+        self.count = sum(map(len, vertices))
         bends = 16 * len(vertices[ElementKind.BENDING])
         blocks = sum(v.size * size for v, size in zip(vertices, SIZES, strict=True)) - bends
 
@@ -42,47 +45,24 @@ class Elastic:
 
         corners = np.concatenate([v.ravel() for v in vertices])
         corners = np.where(corners >= 0, unknown[np.maximum(corners, 0)], -1) if len(unknown) else corners
-        self._corners = wp.array(corners.astype(np.int32).reshape(-1, 1), dtype=int, device=model.device)
+        self.corners = wp.array(corners.astype(np.int32).reshape(-1, 1), dtype=int, device=model.device)
         self._forces = zeros((len(corners), 1, 1), wp.vec3d)
         self.blocks, self.bends = zeros(blocks, wp.mat33d), zeros(bends, wp.mat33d)
 
-    def add_forces(self, dt: float, x1: wp.array, x0: wp.array, forces: wp.array) -> None:
-        """Adds the forces on unknowns, vec3d, at positions at the end and at the start of a step, vec3d."""
-        inputs, outputs = [self._elements, wp.float64(dt), x1, x0], [self._forces.flatten()]
-        wp.launch(energies.elastic_forces, self._count, inputs=inputs, outputs=outputs, device=self.device)
-        inputs = [self.rows, *outputs]
-        wp.launch(_add_corners, len(forces), inputs=inputs, outputs=[forces], device=self.device)
-
     def differentiate(self, dt: float, x1: wp.array, x0: wp.array) -> None:
         """Computes the Hessians of elements at these positions."""
-        inputs, outputs = [self._elements, x1, x0, wp.float64(dt)], [self.blocks, self.bends]
-        wp.launch(_find_hessians, self._count, inputs=inputs, outputs=outputs, device=self.device)
+        inputs, outputs = [self.elements, x1, x0, wp.float64(dt)], [self.blocks, self.bends]
+        wp.launch(_find_hessians, self.count, inputs=inputs, outputs=outputs, device=self.device)
 
     def add_gradients(self, dt: float, x1: wp.array, x0: wp.array, multipliers: wp.array) -> None:
         """Adds to the gradients of positions and parameters, given those with respect to forces on unknowns, vec3d."""
         elements = Elements()
         for name in struct_fields(Elements):  # with the gradients that arrays have now
-            setattr(elements, name, getattr(self._elements, name))
-        inputs, of_forces = [self._corners, multipliers], self._forces
-        wp.launch(gather, self._corners.shape, inputs=inputs, outputs=[of_forces], device=self.device)
+            setattr(elements, name, getattr(self.elements, name))
+        inputs, of_forces = [self.corners, multipliers], self._forces
+        wp.launch(gather, self.corners.shape, inputs=inputs, outputs=[of_forces], device=self.device)
         inputs = [elements, wp.float64(dt), x1, x0]
-        launch_adjoint(energies.elastic_forces, self._count, inputs, [of_forces.flatten()], self.device)
-
-
-@wp.kernel
-def _add_corners(
-    # in
-    rows: Rows,
-    of_corners: wp.array[wp.vec3d],
-    # in and out
-    forces: wp.array[wp.vec3d],
-):
-    """Adds the forces on corners of elements to those on their unknowns."""
-    i = wp.tid()
-    total = wp.vec3d()
-    for n in range(rows.first_corner[i], rows.first_corner[i + 1]):
-        total += of_corners[rows.corner[n]]
-    forces[i] = forces[i] + total
+        launch_adjoint(energies.elastic_forces, self.count, inputs, [of_forces.flatten()], self.device)
 
 
 @wp.func

@@ -67,11 +67,6 @@ class Elements:
         self._launch(element_kernels.gather, shape, [self.vertices, x1], [self._x1])
         self._launch(element_kernels.gather, shape, [self.vertices, x0], [self._x0])
 
-    def add_forces(self, dt: float, forces: wp.array) -> None:
-        """Adds the forces to those on unknowns, vec3d."""
-        self.compute_forces(dt)
-        self._launch(element_kernels.scatter, (self.count, self._size), [self.rows, self.forces], [forces])
-
     def compute_forces(self, dt: float) -> None:
         """Computes the forces on the vertices of each element."""
         inputs = [wp.float64(dt), self._x1, self._x0, *self.parameters]

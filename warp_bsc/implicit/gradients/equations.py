@@ -77,11 +77,11 @@ class SolvedStep(NamedTuple):
 
 
 class StepEquations:
-    """The forces on the unknowns of a solver, and their derivatives, for one step at a time.
+    """The derivatives of the forces on the unknowns of a solver, for one step at a time.
 
     Attributes:
         count: Number of unknowns.
-        forces: Sum of the forces on each, 0 for those that are fixed [N], vec3d.
+        elastic: Elastic forces.
         attachments: Attachments of the model, None without any.
         unknown: Unknown of each particle.
         of_bodies: First unknown of each body, -1 for none; None if no body is solved for.
@@ -93,11 +93,10 @@ class StepEquations:
         self._newton, model = newton, newton.mesh.model
         self.model, self.device, self.count = model, model.device, len(newton.problem.unknowns.particle)
         self._unknowns = unknowns = newton.problem.unknowns
-        self.forces = wp.zeros(self.count, dtype=wp.vec3d, device=self.device)
         self._inertia = wp.zeros(self.count, dtype=wp.float64, device=self.device)
         unknown = unknowns.of_vertex.numpy()[: model.particle_count]
         self.unknown = unknowns.of_vertex[: model.particle_count]
-        self._elastic = Elastic(model, unknown, self.count)
+        self.elastic = Elastic(model, unknown, self.count)
         self.attachments: Any = attachment_arrays(model)
         self._springs: list[Elements] = []
         if self.attachments is not None:
@@ -113,7 +112,7 @@ class StepEquations:
         world = np.repeat(np.arange(len(of_worlds) - 1), np.diff(of_worlds))
         self.world = wp.array(world.astype(np.int32), dtype=int, device=self.device)
         self._is_fixed = wp.zeros(self.count, dtype=int, device=self.device)
-        self._matrix = StepMatrix(self._elastic, self._of_one_unknown(), self._is_fixed)
+        self._matrix = StepMatrix(self.elastic, self._of_one_unknown(), self._is_fixed)
         self._contacts: Elements | None = None
         self._in_contact: Elements | None = None  # those of the step, if it has any
         self._step: SolvedStep | None = None
@@ -140,7 +139,7 @@ class StepEquations:
         self._step = step
         wp.copy(self._is_fixed, step.is_fixed)
         inputs = [wp.float64(step.dt), self.model.particle_inv_mass, self._unknowns.particle, step.is_fixed]
-        self._launch(kernels.inertia_of, inputs, [self._inertia])
+        wp.launch(kernels.inertia_of, self.count, inputs=inputs, outputs=[self._inertia], device=self.device)
         for springs in self._springs:
             attached = self.attachments
             parameters = [attached.body, attached.body_point, attached.stiffness, attached.damping, attached.enabled]
@@ -149,7 +148,7 @@ class StepEquations:
             parameters = [self._body, self._is_turn, step.poses[0], step.bodies.goals, step.motion.bodies]
             self._inertia_of_bodies.parameters = parameters
         self._in_contact = self._load_contacts(step)
-        for elements in self._elements():
+        for elements in self.elements():
             elements.load(step.x1, step.x0)
 
     def _load_contacts(self, step):
@@ -173,21 +172,11 @@ class StepEquations:
             wp.launch(find_arms, (count, 4), inputs=inputs, outputs=[elements.arms], device=self.device)
         return elements
 
-    def evaluate(self) -> wp.array:
-        """Returns the forces, which vanish where the step is solved."""
-        step = self.step
-        self._launch(energies.inertial_forces, self._inertial(step.x1, step.x0, step.v0), [self.forces])
-        self._elastic.add_forces(step.dt, step.x1, step.x0, self.forces)
-        for elements in self._elements():
-            elements.add_forces(step.dt, self.forces)
-        self._launch(kernels.clear_fixed, [step.is_fixed], [self.forces])
-        return self.forces
-
     def differentiate(self, *, transposed: bool) -> Matrix:
         """Returns the matrix A, the derivative of minus the forces, or A^T."""
         step = self.step
-        self._elastic.differentiate(step.dt, step.x1, step.x0)
-        for elements in self._elements():
+        self.elastic.differentiate(step.dt, step.x1, step.x0)
+        for elements in self.elements():
             elements.differentiate(step.dt)
         return self._matrix.assemble(self._inertia, self._in_contact, transposed=transposed)
 
@@ -203,20 +192,19 @@ class StepEquations:
         """
         step = self.step
         x1, x0, v0 = with_gradient(step.x1, of_x1), with_gradient(step.x0, of_x0), with_gradient(step.v0, of_v0)
-        inputs = self._inertial(x1, x0, v0, of_force)
+        inputs = self.inertial(x1, x0, v0, of_force)
         launch_adjoint(energies.inertial_forces, self.count, inputs, [multipliers], self.device)
-        self._elastic.add_gradients(step.dt, x1, x0, multipliers)
-        for elements in self._elements():
+        self.elastic.add_gradients(step.dt, x1, x0, multipliers)
+        for elements in self.elements():
             elements.add_gradients(step.dt, multipliers, of_x1, of_x0)
 
-    def _elements(self):
+    def elements(self) -> list[Elements]:
+        """Returns the elements of the step, but for elastic ones."""
         return [*self._of_one_unknown(), *([] if self._in_contact is None else [self._in_contact])]
 
-    def _inertial(self, x1, x0, v0, of_force=None):
+    def inertial(self, x1: wp.array, x0: wp.array, v0: wp.array, of_force: wp.array | None = None) -> list:
+        """Returns the inputs of :func:`.energies.inertial_forces`, at positions and velocities."""
         step, model = self.step, self.model
         force = None if step.force is None else with_gradient(step.force, of_force)
         inputs = [wp.float64(step.dt), x1, x0, v0, force, model.particle_inv_mass, model.gravity]
         return [*inputs, model.particle_world, self._unknowns.particle, step.is_fixed]
-
-    def _launch(self, kernel, inputs, outputs):
-        wp.launch(kernel, self.count, inputs=inputs, outputs=outputs, device=self.device)

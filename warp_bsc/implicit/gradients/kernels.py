@@ -127,19 +127,6 @@ def inertia_of(
 
 
 @wp.kernel
-def clear_fixed(
-    # in
-    is_fixed: wp.array[int],
-    # out
-    values: wp.array[wp.vec3d],
-):
-    """Sets the values of what is fixed to 0."""
-    u = wp.tid()
-    if is_fixed[u] != 0:
-        values[u] = wp.vec3d()
-
-
-@wp.kernel
 def of_end(
     # in
     dt: wp.float64,

@@ -31,7 +31,7 @@ def _merged(result: int, before: int, found: int) -> int:
 
 
 @wp.func
-def _marks(step: Step, status: SolveStatus, vertex: int, is_particle: bool, responds: bool) -> int:
+def _marks(step: Step, vertex: int, is_particle: bool, responds: bool) -> int:
     """Returns the bits of a vertex for what a certificate lacks, if a response or none resolved the step."""
     motion, vertices = step.motion, step.vertices
     bits = int(0)
@@ -54,7 +54,7 @@ def merge_step(step: Step, status: SolveStatus, particle_count: int, responds: b
     if i < out.of_vertices.shape[0]:
         outcome = step.vertices.outcome[i] + int(0)
         if not is_certified(status.results):
-            outcome = outcome | _marks(step, status, i, i < particle_count, responds)
+            outcome = outcome | _marks(step, i, i < particle_count, responds)
         out.of_vertices[i] = outcome | wp.where(first, 0, out.of_vertices[i])
     if i < out.of_bodies.shape[0]:
         out.of_bodies[i] = step.vertices.bodies.outcome[i] | wp.where(first, 0, out.of_bodies[i])
