@@ -9,13 +9,18 @@ import numpy as np
 from warp_bsc.bench.measure import given_queries as given
 from warp_bsc.bench.measure.detector import ipc_milliseconds, phase_columns
 from warp_bsc.bench.measure.penetration import SIMULATORS
-from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH, PAGE_COSTS, PAGE_MESHES, RepairRun, summarize
-from warp_bsc.bench.tables import Column, grouped, markdown, three, two
+from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH, STRAIN, RepairRun, summarize
+from warp_bsc.bench.tables import Column, grouped, two
 
 Found = dict[str, Any]
 """A measurement: what a command wrote with --json."""
 Rows = list[tuple[str, ...]]
 """The rows of a table, the header first."""
+
+
+def three(value: float) -> str:
+    """Returns a number with three digits, more if it is large."""
+    return f"{value:,.0f}" if value >= 99.5 else f"{value:#.3g}"
 
 
 def milliseconds(value: float) -> str:
@@ -26,6 +31,19 @@ def milliseconds(value: float) -> str:
 def percent(value: float) -> str:
     """Returns a percentage with two digits, more if it is large."""
     return f"{two(value)}%"
+
+
+def markdown(first: str, columns: Iterable[Column], rows: Iterable[tuple[str, Any]]) -> Rows:
+    """Returns the rows of a table.
+
+    Args:
+        first: Header of the names of the rows.
+        columns: The other columns.
+        rows: The name of each row, and a value of which the columns show parts.
+    """
+    columns = list(columns)
+    head = first, *(column.header if column.title is None else column.title for column in columns)
+    return [head, *((name, *(column.cell(row, page=True) for column in columns)) for name, row in rows)]
 
 
 def pivot(runs: Iterable[Found], row: str, column: str) -> dict[str, Found]:
@@ -379,6 +397,25 @@ def _by_scene(measurements: Iterable[Found], cell: Callable[[Found], str]) -> Ro
 # Repair and replay -------------------------------------------------------------------------------------------------
 
 
+_MESH_COLUMNS = (
+    Column("vertices", "0.vertices"),
+    Column("crossings", lambda row: f"{row[0].crossings:,} to {row[1].crossings:,}"),
+    Column("largest, mean move", lambda row: f"{two(row[1].largest_move)}, {two(row[1].mean_move)}"),
+    Column("strain", "1.strain", lambda strain: f"{two(100.0 * strain)}%"),
+    Column("time", "1.seconds", "{:.2f} s".format),
+)
+"""Columns of a run and an attempt."""
+_COST_COLUMNS = (
+    Column("freed", lambda found: f"{found.freed} of {found.meshes}"),
+    Column("crossings", "crossings", "{0[0]:,} to {0[1]:,}".format),
+    Column("largest move, median and most", "move", lambda ends: ", ".join(map(two, ends))),
+    Column("strain, median and most", "strain", lambda ends: f"{two(100.0 * ends[0])}, {two(100.0 * ends[1])}%"),
+    Column(f"more than {100 * STRAIN:.0f}%", "strained"),
+    Column("median time", "seconds", "{:.2f} s".format),
+)
+"""Columns of a ``DamageSummary``."""
+
+
 def repair_named(found: Found, *kinds: str) -> Rows:
     """Repairs of known meshes or files, each with every hint that was tried."""
     rows = []
@@ -386,13 +423,13 @@ def repair_named(found: Found, *kinds: str) -> Rows:
         for attempt in run.attempts:
             hint = "" if attempt.hint == "none" else f", `{attempt.hint}=`"
             rows.append((f"{Path(run.name).stem}{hint}", (run, attempt)))
-    return markdown("`bsc.repair`", PAGE_MESHES, rows)
+    return markdown("`bsc.repair`", _MESH_COLUMNS, rows)
 
 
 def repair_random(found: Found) -> Rows:
     """Random damage by kind."""
     runs = [RepairRun.of_json(run) for run in found["runs"] if run["kind"] not in (KNOWN_MESH, FILE)]
-    return markdown("kind", PAGE_COSTS, [(kind, summarize(group)) for kind, group in grouped(runs, "kind").items()])
+    return markdown("kind", _COST_COLUMNS, [(kind, summarize(group)) for kind, group in grouped(runs, "kind").items()])
 
 
 def repair_shots(found: Found) -> Rows:

@@ -11,10 +11,11 @@ from types import SimpleNamespace
 import newton
 import pytest
 import warp as wp
+from measured import write_measurement
 
 import warp_bsc
 from warp_bsc.bench import record as records
-from warp_bsc.bench.record import describe_run, shorten_path, with_record, write_measurement
+from warp_bsc.bench.record import describe_run, shorten_path, with_record
 from warp_bsc.bench.timing import count_threads
 from warp_bsc.cli.main import main
 
@@ -101,16 +102,16 @@ def test_paths_below_the_checkout_begin_at_its_root():
 def test_a_file_is_complete_or_absent(tmp_path):
     path = tmp_path / "found.json"
     with pytest.raises(TypeError):
-        write_measurement(path, {"benchmark": object()}, ["x"])
+        write_measurement(path, {"benchmark": object()})
     assert not list(tmp_path.iterdir())
-    write_measurement(path, {"benchmark": "a", "rows": [1, 2]}, ["x"], [GPU])
+    write_measurement(path, {"benchmark": "a", "rows": [1, 2]}, [GPU])
     found = json.loads(path.read_text())
     record = found.pop("record")
     assert found == {"benchmark": "a", "rows": [1, 2]}
     assert record.keys() == with_record({}, ["x"])["record"].keys()
     assert record["gpus"] == ["a GPU"]
     with pytest.raises(FileNotFoundError, match="there is no folder"):
-        write_measurement(tmp_path / "gone" / "a.json", {}, ["x"])
+        write_measurement(tmp_path / "gone" / "a.json", {})
 
 
 @pytest.mark.slow

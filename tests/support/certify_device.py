@@ -13,7 +13,6 @@ device leaves to the host. With minimum distances these are many, see :mod:`warp
 
 import argparse
 import os
-import sys
 import time
 import zlib
 from collections import deque
@@ -30,10 +29,10 @@ from device_methods import answer_kernel, count_answers, distance_kernel, exact_
 from device_queries import LATTICE, Generator, make_lattice_queries, make_queries
 from exact_queries import exact_kernel
 from lattice_truth import decide_lattice
+from measured import write_measurement
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from warp_bsc import checker
-from warp_bsc.bench.record import write_measurement
 from warp_bsc.cli.tables import Console
 from warp_bsc.kernels.exact.distance import BITS as DISTANCE_BITS
 from warp_bsc.kernels.exact.polygon import BITS
@@ -412,5 +411,5 @@ def run(arguments):
     found = certify_on_device(jobs, arguments.device)
     if arguments.json:
         devices = [wp.get_device(arguments.device)]
-        write_measurement(arguments.json, {"benchmark": "certify"} | found, sys.argv, devices)
+        write_measurement(arguments.json, {"benchmark": "certify"} | found, devices)
     return found["failures"]

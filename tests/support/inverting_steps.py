@@ -10,17 +10,16 @@ contacts, and with stages that leave, report and prevent inversions. Times are o
 
 import argparse
 import importlib
-import sys
 import time
 
 import newton
 import newton.examples
 import numpy as np
 import warp as wp
+from measured import write_measurement
 from newton.viewer import ViewerNull
 
 import warp_bsc as bsc
-from warp_bsc.bench.record import write_measurement
 from warp_bsc.bench.scenes.contact import SCENES, build_scene
 from warp_bsc.bench.scenes.simulation import Simulation
 from warp_bsc.response.state.mesh import ModelMesh
@@ -147,7 +146,7 @@ def main():
             print(f"{row}  {'' if mode == 'plain' else solver.report}", flush=True)
     if options.json:
         found = {"benchmark": "inverting_steps", "rows": rows}
-        write_measurement(options.json, found, sys.argv, [wp.get_device()])
+        write_measurement(options.json, found, [wp.get_device()])
 
 
 if __name__ == "__main__":

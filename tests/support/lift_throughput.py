@@ -12,16 +12,15 @@ substeps each. On a GPU it is a CUDA graph. The exact detector counts edges that
 """
 
 import argparse
-import sys
 import time
 
 import newton
 import warp as wp
+from measured import write_measurement
 from newton.solvers.experimental.coupled import SolverCoupled, SolverCoupledProxy
 
 import warp_bsc as bsc
 from warp_bsc.bench.crossings import CrossingCounter
-from warp_bsc.bench.record import write_measurement
 
 SIDE, CELLS = 0.2, 8  # m and cells, of a side of the cloth: 128 triangles
 CLOTH = {"tri_ke": 5e2, "tri_ka": 5e2, "tri_kd": 1e-3, "edge_ke": 0.5, "edge_kd": 1e-3, "particle_radius": 0.002}
@@ -306,7 +305,7 @@ def main():
                 rows[-1] |= {"uncertified_steps": uncertified, "episodes": ended, "lifted": lifted}
         if options.json:
             found = {"benchmark": "lift_throughput", "steps": options.steps, "rows": rows}
-            write_measurement(options.json, found, sys.argv, [wp.get_device()])
+            write_measurement(options.json, found, [wp.get_device()])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
 """What programs that measure share: options, a table of their rows, and the file that has them."""
 
 import argparse
+import json
 import sys
 
-from warp_bsc.bench.record import write_measurement
+from warp_bsc._atomic_file import OutputFile
+from warp_bsc.bench.record import with_record
 from warp_bsc.cli.tables import Console, print_table
 
-__all__ = ["options_of", "print_rows", "report"]
+__all__ = ["options_of", "print_rows", "report", "write_measurement"]
 
 
 def options_of(doc, *, device=None):
@@ -30,4 +32,17 @@ def report(arguments, benchmark, first, columns, rows, devices, *, name="scene",
     """
     print_rows(first, columns, [(name(row) if callable(name) else row[name], row) for row in rows])
     if arguments.json:
-        write_measurement(arguments.json, {"benchmark": benchmark, **settings, "rows": rows}, sys.argv, devices)
+        write_measurement(arguments.json, {"benchmark": benchmark, **settings, "rows": rows}, devices)
+
+
+def write_measurement(path, found, devices=()):
+    """Writes a measurement of devices with its record to a file, which appears complete or not at all.
+
+    ``found`` is plain data, with the name of the measurement as ``benchmark``.
+    """
+    file = OutputFile(path)
+    try:
+        file.write(json.dumps(with_record(found, sys.argv, devices)))
+        file.commit()
+    finally:
+        file.discard()

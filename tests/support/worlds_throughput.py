@@ -11,16 +11,15 @@ of the steps. On a GPU, a pair of steps is a CUDA graph, and the memory of a sol
 
 import argparse
 import os
-import sys
 import time
 
 import newton
 import numpy as np
 import warp as wp
+from measured import write_measurement
 
 import warp_bsc as bsc
 from warp_bsc.bench.crossings import CrossingCounter
-from warp_bsc.bench.record import write_measurement
 
 DT = 1.0 / 120.0  # [s]
 CELLS, SIDE, RADIUS = 10, 0.5, 0.2  # m
@@ -158,7 +157,7 @@ def main():
                 print(f"{row}{'-' if uncertified is None else uncertified:>13}", flush=True)
         if options.json:
             found = {"benchmark": "worlds_throughput", "steps": options.steps, "rows": rows}
-            write_measurement(options.json, found, sys.argv, [wp.get_device()])
+            write_measurement(options.json, found, [wp.get_device()])
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 import contextlib
 import datetime
 import importlib.metadata
-import json
 import os
 import platform
 import shlex
@@ -15,7 +14,6 @@ from typing import Any
 
 import warp as wp
 
-from .._atomic_file import OutputFile
 from .._version import __version__
 from .tables import count
 from .timing import count_threads
@@ -29,7 +27,6 @@ __all__ = [
     "shorten_path",
     "version_of",
     "with_record",
-    "write_measurement",
 ]
 
 COMMIT = "WARP_BSC_COMMIT"
@@ -97,28 +94,6 @@ def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> d
 def with_record(found: dict[str, Any], command: Sequence[str], devices: Iterable[wp.Device] = ()) -> dict[str, Any]:
     """Returns a measurement with ``record``, where it comes from. Arguments: as of :func:`describe_run`."""
     return found | {"record": describe_run(command, devices)}
-
-
-def write_measurement(
-    path: str | os.PathLike, found: dict[str, Any], command: Sequence[str], devices: Iterable[wp.Device] = ()
-) -> None:
-    """Writes a measurement with its record to a file, which appears complete or not at all.
-
-    Args:
-        path: The file.
-        found: The measurement as plain data, with ``benchmark``, its name.
-        command: The program and its arguments.
-        devices: The Warp devices that are measured.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    file = OutputFile(path)
-    try:
-        file.write(json.dumps(with_record(found, command, devices)))
-        file.commit()
-    finally:
-        file.discard()
 
 
 def name_place(found: dict[str, Any]) -> str:

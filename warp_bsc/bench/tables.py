@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-__all__ = ["LONGEST", "Column", "Table", "count", "grouped", "in_thousands", "list_titles", "markdown", "three", "two"]
+__all__ = ["LONGEST", "Column", "Table", "count", "grouped", "in_thousands", "list_titles", "two"]
 
 _Row = TypeVar("_Row")
 
@@ -70,19 +70,6 @@ def _part(row: Any, name: str) -> Any:
     return row[int(name)] if name.isdigit() else getattr(row, name)
 
 
-def markdown(first: str, columns: Iterable[Column], rows: Iterable[tuple[str, Any]]) -> list[tuple[str, ...]]:
-    """Returns the rows of a table of a page, the header first.
-
-    Args:
-        first: Header of the names of the rows.
-        columns: The other columns.
-        rows: The name of each row, and a value of which the columns show parts.
-    """
-    columns = list(columns)
-    head = first, *(column.header if column.title is None else column.title for column in columns)
-    return [head, *((name, *(column.cell(row, page=True) for column in columns)) for name, row in rows)]
-
-
 def count(number: int, one: str, many: str = "") -> str:
     """Returns a number with the noun that it counts, singular or plural."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
@@ -104,11 +91,6 @@ def list_titles(titles: Sequence[str]) -> str:
 def two(value: float) -> str:
     """Returns a number with two digits, more if it is large."""
     return f"{value:#.2g}".rstrip(".") if abs(value) < 99.5 else f"{value:,.0f}"
-
-
-def three(value: float) -> str:
-    """Returns a number with three digits, more if it is large."""
-    return f"{value:,.0f}" if value >= 99.5 else f"{value:#.3g}"
 
 
 def in_thousands(decimals: int) -> Callable[[float], str]:

@@ -14,7 +14,7 @@ from ...repairing.repair import repair
 from ...repairing.results import RepairResult
 from ..peers import ipc_toolkit
 from ..scenes.repair import KINDS, TangledMesh
-from ..tables import LONGEST, Column, Table, count, grouped, list_titles, two
+from ..tables import LONGEST, Column, Table, count, grouped, list_titles
 
 __all__ = [
     "CROSSING_RANGES",
@@ -23,8 +23,6 @@ __all__ = [
     "FILE",
     "HINTS",
     "KNOWN_MESH",
-    "PAGE_COSTS",
-    "PAGE_MESHES",
     "STRAIN",
     "DamageSummary",
     "Hint",
@@ -80,14 +78,6 @@ _MESHES = (  # of a run and an attempt; the mean move is that of vertices that m
     Column("Strain\n[%]", lambda row: 100 * row[1].strain, ".1f"),
     Column("Time\n[s]", "1.seconds", ".2f"),
 )
-PAGE_MESHES = (
-    Column("vertices", "0.vertices"),
-    Column("crossings", lambda row: f"{row[0].crossings:,} to {row[1].crossings:,}"),
-    Column("largest, mean move", lambda row: f"{two(row[1].largest_move)}, {two(row[1].mean_move)}"),
-    Column("strain", "1.strain", lambda strain: f"{two(100.0 * strain)}%"),
-    Column("time", "1.seconds", "{:.2f} s".format),
-)
-"""Columns of a run and an attempt, in pages."""
 _FREED = (  # of a summary, as the next ones
     Column("Meshes", "meshes"),
     Column("Freed", "freed"),
@@ -102,15 +92,6 @@ _COSTS = (
     Column(f"more\nthan\n{100 * STRAIN:.0f}%", "strained"),
     Column("Time,\nmedian\n[s]", "seconds", ".2f"),
 )
-PAGE_COSTS = (
-    Column("freed", lambda found: f"{found.freed} of {found.meshes}"),
-    Column("crossings", "crossings", "{0[0]:,} to {0[1]:,}".format),
-    Column("largest move, median and most", "move", lambda ends: ", ".join(map(two, ends))),
-    Column("strain, median and most", "strain", lambda ends: f"{two(100.0 * ends[0])}, {two(100.0 * ends[1])}%"),
-    Column(f"more than {100 * STRAIN:.0f}%", "strained"),
-    Column("median time", "seconds", "{:.2f} s".format),
-)
-"""Columns of a :class:`DamageSummary`, in pages."""
 
 
 @dataclass(frozen=True)
