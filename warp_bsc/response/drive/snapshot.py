@@ -1,24 +1,11 @@
-"""Copies of arrays and states, to which they can be set back, all of them or in some worlds."""
+"""Copies of arrays, to which they can be set back, all of them or in some worlds."""
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
-import newton
 import warp as wp
 
 from ..state.motion import takes_part
-
-
-def _clone(x: Any) -> Any:
-    """Returns a copy of an array, or of a state or a namespace of one; the model of a state may be any."""
-    if isinstance(x, wp.array):
-        return wp.clone(x, requires_grad=False)
-    copied = copy.copy(x)
-    for name, value in vars(x).items():
-        if isinstance(value, (wp.array, newton.Model.AttributeNamespace)):
-            setattr(copied, name, _clone(value))
-    return copied
 
 
 def _restoring(dtype: type) -> wp.Kernel:
@@ -44,18 +31,18 @@ def restore_worlds(saved: Any, worlds: wp.array[int], mask: wp.array[wp.bool], a
 
 
 class Snapshot:
-    """Keeps what arrays and states hold at one time.
+    """Keeps what arrays hold at one time.
 
     Attributes:
         saved: The copies, in the order of what is kept.
     """
 
-    def __init__(self, kept: Sequence[newton.State | wp.array], worlds: Sequence[wp.array[int]] = ()):
-        """Copies arrays and states, as they are now; :meth:`save` copies them again, and allocates nothing.
+    def __init__(self, kept: Sequence[wp.array], worlds: Sequence[wp.array[int]] = ()):
+        """Copies arrays, as they are now; :meth:`save` copies them again, and allocates nothing.
 
         ``worlds`` has the worlds of the elements of each array, if it is ever to be restored by a mask.
         """
-        self._kept, self._worlds, self.saved = kept, worlds, [_clone(x) for x in kept]
+        self._kept, self._worlds, self.saved = kept, worlds, [wp.clone(x, requires_grad=False) for x in kept]
 
     def save(self) -> None:
         """Copies what they hold."""
