@@ -1,12 +1,13 @@
 """The command ``warp-bsc bench newton``: its rows, its outputs, and what an interrupt leaves."""
 
+import functools
 import json
 
 import pytest
+from bench_commands import check_interrupt, check_json_file, check_wrong_use, runner
 
 from warp_bsc.bench.measure import newton_examples
 from warp_bsc.bench.measure.newton_examples import ExampleMeasurement, ExampleRun, StageTotals
-from warp_bsc.cli.main import main
 
 
 def measurement(**others):
@@ -58,9 +59,7 @@ def measured(monkeypatch):
     return calls
 
 
-def run(capsys, *arguments, status=0):
-    assert main(["bench", "newton", *map(str, arguments), "--device", "cpu"]) == status
-    return capsys.readouterr()
+run = runner("newton")
 
 
 def test_tables(capsys, monkeypatch, measured):
@@ -113,12 +112,7 @@ def test_json(capsys, tmp_path, measured):
     assert all(call.items() >= options.items() for call in measured)
 
     path = tmp_path / "found.json"
-    output = run(capsys, *arguments, "--json", path).out
-    written = json.loads(path.read_text())
-    assert written.pop("record")["command"] == found.pop("record")["command"]
-    assert found["benchmark"] == "newton"
-    assert written == found
-    assert output.startswith("Newton's examples on cpu")
+    check_json_file(run(capsys, *arguments, "--json", path), path, found, "Newton's examples on cpu")
 
 
 @pytest.mark.parametrize(
@@ -131,23 +125,10 @@ def test_modes(capsys, measured, modes, expected):
 
 @pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
-    made_up = newton_examples.measure_example
-
-    def interrupt_third(*arguments, **options):
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return made_up(*arguments, **options)
-
-    monkeypatch.setattr(newton_examples, "measure_example", interrupt_third)
-    path = tmp_path / "found.json"
-    output = run(capsys, "cloth_twist", "cloth_hanging --width 9", *["--json", path] * to_file, status=130)
-    assert sum(line.startswith("cloth_twist ") for line in output.out.splitlines()) == 3
-    assert "Interrupted: the other runs are missing." in output.out
-    assert output.err == "warp-bsc: interrupted\n"
-    assert path.exists() == to_file
-    if to_file:
-        found = json.loads(path.read_text())
-        assert (len(found["runs"]), found["partial"]) == (2, True)
+    path = tmp_path / "found.json" if to_file else None
+    command = functools.partial(run, capsys, "cloth_twist", "cloth_hanging --width 9")
+    out = check_interrupt(monkeypatch, newton_examples, "measure_example", measured, command, path)
+    assert sum(line.startswith("cloth_twist ") for line in out.splitlines()) == 3
 
 
 def test_list(capsys, monkeypatch, measured):
@@ -171,8 +152,4 @@ def test_list(capsys, monkeypatch, measured):
     ],
 )
 def test_wrong_use(capsys, arguments, part):
-    output = run(capsys, *arguments, status=2)
-    (line,) = output.err.splitlines()
-    assert line.startswith("warp-bsc: error: ")
-    assert part in line
-    assert output.out == ""
+    check_wrong_use(run(capsys, *arguments, status=2), part)

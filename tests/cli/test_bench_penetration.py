@@ -1,12 +1,13 @@
 """The command ``warp-bsc bench penetration``: its tables, its outputs, and what an interrupt leaves."""
 
+import functools
 import json
 
 import pytest
+from bench_commands import check_interrupt, check_json_file, runner
 
 from warp_bsc.bench.measure import penetration
 from warp_bsc.bench.measure.penetration import SCENES, SIMULATORS, PenetrationMeasurement, PenetrationRun
-from warp_bsc.cli.main import main
 
 
 def measurement(**others):
@@ -60,9 +61,7 @@ def measured(monkeypatch):
     return calls
 
 
-def run(capsys, *arguments, status=0):
-    assert main(["bench", "penetration", *map(str, arguments), "--device", "cpu"]) == status
-    return capsys.readouterr()
+run = runner("penetration")
 
 
 def test_tables(capsys, monkeypatch, measured):
@@ -102,11 +101,7 @@ def test_json(capsys, tmp_path, measured):
     assert [call["frames"] for call in measured] == [3, 3, 3]
 
     path = tmp_path / "found.json"
-    output = run(capsys, *arguments, "--json", path).out
-    written = json.loads(path.read_text())
-    assert written.pop("record")["command"] == found.pop("record")["command"]
-    assert written == found
-    assert output.startswith("Penetration, Newton's solvers on cpu")
+    check_json_file(run(capsys, *arguments, "--json", path), path, found, "Penetration, Newton's solvers on cpu")
 
 
 def test_all_by_default_and_each_once(capsys, measured):
@@ -119,20 +114,11 @@ def test_all_by_default_and_each_once(capsys, measured):
     assert [call["scene"] for call in measured] == ["soft", "bullet"]
 
 
-def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured):
-    made_up = penetration.measure_penetration
-
-    def interrupt_third(*arguments, **options):
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return made_up(*arguments, **options)
-
-    monkeypatch.setattr(penetration, "measure_penetration", interrupt_third)
-    path = tmp_path / "found.json"
-    output = run(capsys, "--json", path, status=130)
-    assert "Interrupted: the other runs are missing." in output.out
-    found = json.loads(path.read_text())
-    assert (len(found["runs"]), found["partial"]) == (2, True)
+@pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
+def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
+    path = tmp_path / "found.json" if to_file else None
+    command = functools.partial(run, capsys)
+    check_interrupt(monkeypatch, penetration, "measure_penetration", measured, command, path)
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,16 @@
 """The command ``warp-bsc bench repair``: its tables, its outputs, and what an interrupt leaves."""
 
+import functools
 import json
 
 import pytest
+from bench_commands import check_interrupt, check_json_file, check_wrong_use, runner
 
 from warp_bsc.bench.measure import repair
 from warp_bsc.bench.measure.repair import RepairAttempt, RepairRun
 from warp_bsc.bench.peers import ipc_toolkit
 from warp_bsc.bench.scenes.repair import KINDS, KNOWN
 from warp_bsc.cli import bench_run
-from warp_bsc.cli.main import main
 
 
 def attempt(hint="none", crossings=0, **others):
@@ -51,9 +52,7 @@ def measured(monkeypatch):
     return calls
 
 
-def run(capsys, *arguments, status=0):
-    assert main(["bench", "repair", *map(str, arguments), "--device", "cpu"]) == status
-    return capsys.readouterr()
+run = runner("repair")
 
 
 def test_tables(capsys, monkeypatch, tmp_path, measured):
@@ -115,32 +114,14 @@ def test_json(capsys, tmp_path, measured):
     assert corner["attempts"][0]["reasons"] == ["a reason [red]"]
 
     path = tmp_path / "found.json"
-    output = run(capsys, "--random", 1, "--json", path).out
-    written = json.loads(path.read_text())
-    assert written.pop("record")["command"] == found.pop("record")["command"]
-    assert found["benchmark"] == "repair"
-    assert written == found
-    assert output.startswith("bsc.repair on cpu")
+    check_json_file(run(capsys, "--random", 1, "--json", path), path, found, "bsc.repair on cpu")
 
 
 @pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
-    made_up = repair.measure_repair
-
-    def interrupt_third(*arguments, **options):
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return made_up(*arguments, **options)
-
-    monkeypatch.setattr(repair, "measure_repair", interrupt_third)
-    path = tmp_path / "found.json"
-    output = run(capsys, *["--json", path] * to_file, status=130)
-    assert "Interrupted: the other repairs are missing." in output.out
-    assert output.err == "warp-bsc: interrupted\n"
-    assert path.exists() == to_file
-    if to_file:
-        found = json.loads(path.read_text())
-        assert (len(found["runs"]), found["partial"]) == (2, True)
+    path = tmp_path / "found.json" if to_file else None
+    command = functools.partial(run, capsys)
+    check_interrupt(monkeypatch, repair, "measure_repair", measured, command, path, what="repairs")
 
 
 @pytest.mark.parametrize(
@@ -154,8 +135,5 @@ def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measure
     ],
 )
 def test_wrong_use(capsys, measured, arguments, part):
-    output = run(capsys, *arguments, status=2)
-    (line,) = output.err.splitlines()
-    assert line.startswith("warp-bsc: error: ")
-    assert part in line
-    assert output.out == "" and not measured
+    check_wrong_use(run(capsys, *arguments, status=2), part)
+    assert not measured

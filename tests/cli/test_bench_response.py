@@ -1,13 +1,14 @@
 """The command ``warp-bsc bench response``: its tables, its outputs, and what an interrupt leaves."""
 
+import functools
 import json
 
 import numpy as np
 import pytest
+from bench_commands import check_interrupt, check_json_file, check_wrong_use, runner
 
 from warp_bsc.bench.measure import response
 from warp_bsc.bench.measure.response import CONFIGURATIONS, SCENES, ResponseMeasurement, ResponseRun, Spread
-from warp_bsc.cli.main import main
 
 
 def measurement(**others):
@@ -62,9 +63,7 @@ def measured(monkeypatch):
     return calls
 
 
-def run(capsys, *arguments, status=0):
-    assert main(["bench", "response", *map(str, arguments), "--device", "cpu"]) == status
-    return capsys.readouterr()
+run = runner("response")
 
 
 def test_tables(capsys, monkeypatch, measured):
@@ -118,12 +117,7 @@ def test_json(capsys, tmp_path, measured):
     assert all(call.items() >= options.items() for call in measured)
 
     path = tmp_path / "found.json"
-    output = run(capsys, *arguments, "--json", path).out
-    written = json.loads(path.read_text())
-    assert written.pop("record")["command"] == found.pop("record")["command"]
-    assert found["benchmark"] == "response"
-    assert written == found
-    assert output.startswith("Contact on cpu")
+    check_json_file(run(capsys, *arguments, "--json", path), path, found, "Contact on cpu")
 
 
 @pytest.mark.parametrize(
@@ -151,22 +145,9 @@ def test_all_scenes_by_default_and_each_once(capsys, measured):
 
 @pytest.mark.parametrize("to_file", [False, True], ids=["table", "file"])
 def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measured, to_file):
-    made_up = response.measure_response
-
-    def interrupt_third(*arguments, **options):
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return made_up(*arguments, **options)
-
-    monkeypatch.setattr(response, "measure_response", interrupt_third)
-    path = tmp_path / "found.json"
-    output = run(capsys, "sphere", *["--json", path] * to_file, status=130)
-    assert "Interrupted: the other runs are missing." in output.out
-    assert output.err == "warp-bsc: interrupted\n"
-    assert path.exists() == to_file
-    if to_file:
-        found = json.loads(path.read_text())
-        assert (len(found["runs"]), found["partial"]) == (2, True)
+    path = tmp_path / "found.json" if to_file else None
+    command = functools.partial(run, capsys, "sphere")
+    check_interrupt(monkeypatch, response, "measure_response", measured, command, path)
 
 
 @pytest.mark.parametrize(
@@ -189,8 +170,5 @@ def test_an_interrupt_leaves_what_is_done(capsys, monkeypatch, tmp_path, measure
     ],
 )
 def test_wrong_use(capsys, measured, arguments, part):
-    output = run(capsys, *arguments, status=2)
-    (line,) = output.err.splitlines()
-    assert line.startswith("warp-bsc: error: ")
-    assert part in line
-    assert output.out == "" and not measured
+    check_wrong_use(run(capsys, *arguments, status=2), part)
+    assert not measured
