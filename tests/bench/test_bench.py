@@ -4,6 +4,7 @@ import json
 import os
 
 import pytest
+from bench_commands import fail
 
 from warp_bsc import CollisionDetector, CollisionMesh
 from warp_bsc.bench.measure.detector import benchmark_detector
@@ -17,15 +18,6 @@ def measure(capsys, *arguments):
     output = capsys.readouterr()
     assert status == 0, output.err
     return output.out
-
-
-def fail(capsys, *arguments):
-    assert main(["bench", *map(str, arguments)]) == 2
-    output = capsys.readouterr()
-    assert output.out == ""
-    (line,) = output.err.splitlines()
-    assert line.startswith("warp-bsc: error: ")
-    return line
 
 
 @pytest.mark.parametrize("method", ["float", "conservative", "exact"])

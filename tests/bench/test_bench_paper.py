@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
+from bench_commands import fail
 
 from warp_bsc import CollisionDetector, CollisionMesh, checker
 from warp_bsc.bench.measure import paper as bench_paper
@@ -35,15 +36,6 @@ def bench(capsys, *arguments):
     output = capsys.readouterr()
     assert status == 0, output.err
     return output.out
-
-
-def fail(capsys, *arguments):
-    assert main(["bench", *map(str, arguments)]) == 2
-    output = capsys.readouterr()
-    assert output.out == ""
-    (line,) = output.err.splitlines()
-    assert line.startswith("warp-bsc: error: ")
-    return line
 
 
 def test_json_has_everything(capsys):

@@ -1,20 +1,14 @@
 """The exit status of a replay by its findings."""
 
 import pytest
-from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import resting_stage, save
 
 from warp_bsc.cli.main import main
 
 
 @pytest.fixture
 def stage(tmp_path):
-    """A triangle falls through a floor from time 0 to 1; another one rests in it, and leaves it from time 2 to 3."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    add_falling(stage)
-    heights = [-0.25, -0.25, -0.25, 0.25]
-    add_mesh(stage, "/World/Resting", {t: moved(FALLING, (-1, 1, z)) for t, z in enumerate(heights)})
-    return stage
+    return resting_stage(tmp_path)
 
 
 @pytest.mark.parametrize(

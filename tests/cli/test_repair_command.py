@@ -1,7 +1,6 @@
 """The command ``warp-bsc repair``: errors by name, and valid partial files."""
 
 import argparse
-import contextlib
 import json
 import os
 import shlex
@@ -10,8 +9,8 @@ import time
 
 import pytest
 from pxr import Usd, UsdGeom
-from replay_files import Page
-from usd_stages import FALLING, add_falling, add_floor, add_instancer, add_mesh, animate, new_stage, save
+from replay_files import Page, largest_file
+from usd_stages import FALLING, add_falling, add_instancer, add_mesh, animate, floor_stage, new_stage, save
 
 from warp_bsc.cli import device
 from warp_bsc.cli.main import main
@@ -146,18 +145,6 @@ def test_other_options_cannot_resume(tmp_path, monkeypatch, capsys):
     assert "fixed.usdc.part: not a resumable repair of this version" in capsys.readouterr().err
 
 
-@contextlib.contextmanager
-def largest_file(size):
-    """Lets no file become larger: as on a full disk, writing more is an error."""
-    resource = pytest.importorskip("resource")  # of POSIX
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_full_disk(tmp_path, capsys):
     path = crossing_twice(tmp_path)
     assert repair(path, tmp_path / "fixed.usda") == 0  # compiles kernels, whose files are large
@@ -176,8 +163,7 @@ def test_full_disk(tmp_path, capsys):
     ("mover", "is_named"), [("mesh", True), ("transform", False), ("shape", False), ("instance", False)]
 )
 def test_replay_says_how_to_repair_only_what_a_repair_moves(tmp_path, capsys, mover, is_named):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     heights = (0, 0, 0.25), (0, 0, -0.25)
     if mover == "mesh":
         add_falling(stage)

@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 import pytest
 from pxr import Ts
-from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_mesh, falling_stage, moved, save
 
 import warp_bsc as bsc
 from warp_bsc.scene_replay.results import IntervalResult, IntervalSummary
@@ -18,10 +18,7 @@ from warp_bsc.usd.interval import Interval
 @pytest.fixture
 def stage(tmp_path):
     """A triangle that falls through a floor."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    add_falling(stage)
-    return stage
+    return falling_stage(tmp_path)
 
 
 def test_a_scene_yields_its_intervals(stage):

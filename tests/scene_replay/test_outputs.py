@@ -18,13 +18,14 @@ from replay_files import (
     Page,
     errors_of,
     falling_through_quads,
+    largest_file,
     left_behind,
     many_hits,
     read_contacts,
     read_polygons,
     replay,
 )
-from usd_stages import FALLING, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_mesh, floor_stage, moved, new_stage, save
 
 from warp_bsc._atomic_file import OutputFile
 from warp_bsc.cli import replay_run
@@ -143,21 +144,8 @@ def test_broken_scene_leaves_what_was_finished(stage, tmp_path, capsys):
     assert "vertex 2 is not finite" in capsys.readouterr().err
 
 
-@contextlib.contextmanager
-def largest_file(size):
-    """Lets no file become larger: as on a full disk, writing more is an error."""
-    resource = pytest.importorskip("resource")  # of POSIX
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_full_disk(tmp_path, capsys):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     heights = {time: 0.25 if time % 2 else -0.25 for time in range(60)}
     add_mesh(stage, "/World/Falling", {time: moved(FALLING, (0, 0, z)) for time, z in heights.items()})
     replay(stage)  # compiles kernels, whose files are large
@@ -196,8 +184,7 @@ def in_small_disk(folder, size, command):
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare here")
 @pytest.mark.parametrize("size", [600_000, pytest.param(1_600_000, marks=pytest.mark.slow)])
 def test_full_disk_has_room_for_all_files(tmp_path, size):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     many = [moved(FALLING, (0.01 * number, 0, 0)) for number in range(40)]
     points = {time: [point for part in many for point in moved(part, (0, 0, z))]
               for time, z in ((time, 0.25 if time % 2 else -0.25) for time in range(80))}  # fmt: skip

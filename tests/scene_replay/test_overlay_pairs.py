@@ -16,7 +16,7 @@ from replay_files import (
     read_polygons,
     replay,
 )
-from usd_stages import FALLING, add_floor, add_mesh, falling, moved, new_stage, save, with_names
+from usd_stages import FALLING, add_mesh, falling, floor_stage, moved, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc._version import __version__
@@ -99,8 +99,7 @@ def test_the_rest_of_the_pairs(tmp_path, suffix):
 
 
 def test_names_of_pairs_are_valid_and_unique(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     names = ["/A/Falling", "/B/Falling", "/C/Falling_2", "/D/_9"]
     for number, path in enumerate(names):
         add_mesh(stage, path, {t: moved(points, (0.1 * number, 0, 0)) for t, points in falling(0.25, -0.25).items()})

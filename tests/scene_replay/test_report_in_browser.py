@@ -10,7 +10,7 @@ import pytest
 from chromium import CHROMIUM, Browser
 from pxr import Gf, UsdGeom
 from replay_files import Page, falling_through_quads, many_hits, near_and_inside_stage, replay
-from usd_stages import FALLING, add_floor, add_mesh, falling, moved, new_stage
+from usd_stages import FALLING, add_mesh, falling, floor_stage, moved, new_stage
 
 pytestmark = pytest.mark.browser
 
@@ -184,8 +184,7 @@ def test_pairs_are_in_order_of_depth(tmp_path, browser):
 
 
 def test_depth_is_of_the_deepest_time(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     heights = enumerate([0.1, -0.1, -0.05, -0.2])
     add_mesh(stage, "/World/Falling", {time: moved(FALLING, (0, 0, height)) for time, height in heights})
     (pair,) = Page(replay(stage)[3].read_text()).data["pairs"]
@@ -214,8 +213,7 @@ def sentence_of(stage, *options, status=0):
 
 
 def test_sentence_says_what_was_not_checked(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_mesh(stage, "/World/Falling", falling(0.25, -0.25))
     assert sentence_of(stage) == ""
     said = sentence_of(stage, "--ignore", "/World/Floor", "/World/Falling")

@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 import pytest
-from usd_stages import FALLING, FLOOR, add_floor, add_mesh, animate, find, moved, new_stage, save
+from usd_stages import FALLING, FLOOR, add_mesh, animate, find, floor_stage, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
@@ -16,8 +16,7 @@ HEIGHTS = [1, 0.25, 0.125, 0.5]
 @pytest.fixture
 def stage(tmp_path):
     """A triangle that comes near a floor and leaves it again."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_mesh(stage, "/World/Falling", {t: moved(FALLING, (0, 0, z)) for t, z in enumerate(HEIGHTS)})
     return stage
 
@@ -85,8 +84,7 @@ def test_nothing_is_looked_for_without_a_distance(stage, capsys):
 
 
 def test_a_still_scene_is_checked(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_mesh(stage, "/World/Above", moved(FLOOR, (0, 0, 0.25)))
     (result,) = bsc.replay(bsc.Scene(save(stage)), device="cpu", clearance=0.25)
     start, end = result.proximities
@@ -133,8 +131,7 @@ def test_ignored_and_unselected_pairs_do_not_count(stage):
 
 
 def test_a_time_is_checked_once(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     animate(add_mesh(stage, "/World/Falling", FALLING), (0, 0, 0.5), (0, 0, 0.25), (0, 0, 0.125))
     first, second = bsc.replay(bsc.Scene(save(stage)), device="cpu", clearance=1.0)
     ends = [[sample.nearest[0].distance for sample in result.summary.proximities] for result in (first, second)]

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from pxr import Gf, Usd, UsdGeom
-from usd_stages import FALLING, add_falling, add_floor, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_mesh, falling_stage, moved, new_stage, save
 
 UsdValidation = pytest.importorskip("pxr.UsdValidation")
 if not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"):
@@ -18,9 +18,7 @@ from warp_bsc.scene_replay import usd_validation as rules  # noqa: E402
 @pytest.fixture
 def stage(tmp_path):
     """A triangle falls through a floor in the first second; another one crosses it all the time."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    add_falling(stage)
+    stage = falling_stage(tmp_path)
     add_mesh(stage, "/World/Crossing", moved(FALLING, (0.5, 1.0, -0.25)))
     return Usd.Stage.Open(save(stage))
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from usd_stages import FALLING, add_floor, add_instancer, add_mesh, moved, new_stage, save
+from usd_stages import FALLING, add_floor, add_instancer, add_mesh, floor_stage, moved, new_stage, save
 from usdview import Menu, Registry, UsdviewApi, define_usdview
 
 import warp_bsc as bsc
@@ -21,8 +21,7 @@ PLUGIN = Path(bsc.__file__).parent / "scene_replay" / "plugin"
 @pytest.fixture
 def stage(tmp_path):
     """A triangle falls through a floor from time 2 to 4, another one next to it later in that interval."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     for name, x, z in (("Falling", 0, 0.25), ("Later", 1, 0.4)):
         heights = {0: 2, 2: z, 4: z - 0.5, 6: z - 0.5}
         add_mesh(stage, f"/World/{name}", {time: moved(FALLING, (x, 0, height)) for time, height in heights.items()})

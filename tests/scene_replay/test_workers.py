@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from progress_lines import without_progress
 from pxr import Ts, UsdGeom, Vt
-from usd_stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save, with_names
+from usd_stages import FALLING, FLOOR, add_instancer, add_mesh, animate, floor_stage, moved, new_stage, save, with_names
 
 import warp_bsc as bsc
 from warp_bsc.cli import replay_run
@@ -303,8 +303,7 @@ def test_what_breaks_later_is_not_known_earlier(tmp_path, monkeypatch):
 
 def test_what_breaks_at_the_first_time_is_told(tmp_path, monkeypatch):
     """By the worker that has read it before, to find what to ignore."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_sheet(stage, "/World/Breaks", 1.0, broken=1)
     monkeypatch.setattr(worker, "_local", (0, 1))
     monkeypatch.setattr(worker, "_opened", None)
@@ -317,8 +316,7 @@ def test_what_breaks_at_the_first_time_is_told(tmp_path, monkeypatch):
 
 def test_an_error_in_a_worker(tmp_path, capsys):
     """The intervals before it are there, and the error reads as without workers."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_sheet(stage, "/World/A", 0.0, broken=11)
     path, said, found = save(stage), [], []
     for count in ("1", "2"):

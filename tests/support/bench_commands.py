@@ -4,7 +4,7 @@ import json
 
 from warp_bsc.cli.main import main
 
-__all__ = ["check_interrupt", "check_json_file", "check_wrong_use", "runner"]
+__all__ = ["check_interrupt", "check_json_file", "check_wrong_use", "fail", "runner"]
 
 
 def runner(benchmark):
@@ -62,3 +62,10 @@ def check_wrong_use(output, part):
     assert line.startswith("warp-bsc: error: ")
     assert part in line
     assert output.out == ""
+    return line
+
+
+def fail(capsys, *arguments):
+    """Returns the error of a benchmark that is used wrongly."""
+    assert main(["bench", *map(str, arguments)]) == 2
+    return check_wrong_use(capsys.readouterr(), "")

@@ -1,6 +1,7 @@
 """Stages whose replays find something for each kind of file, and readers of the files of a replay."""
 
 import base64
+import contextlib
 import json
 import zlib
 from html.parser import HTMLParser
@@ -15,6 +16,18 @@ from warp_bsc.cli.main import main
 
 OUTPUTS = ("hits.json", "hits.csv", "overlay.usda", "page.html", "hits.npz")
 OPTIONS = ("--json", "--csv", "--overlay", "--report", "--npz")
+
+
+@contextlib.contextmanager
+def largest_file(size):
+    """Lets no file become larger: as on a full disk, writing more is an error."""
+    resource = pytest.importorskip("resource")  # of POSIX
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def replay(stage, *options, status=0):

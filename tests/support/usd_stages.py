@@ -126,3 +126,25 @@ def add_instancer(stage, path, positions, prototypes, numbers=None):
     count = len(next(iter(positions.values())))
     instancer.CreateProtoIndicesAttr(numbers or [0] * count)
     return instancer
+
+
+def floor_stage(folder):
+    """A stage with a floor."""
+    stage = new_stage(folder / "scene.usda")
+    add_floor(stage)
+    return stage
+
+
+def falling_stage(folder):
+    """A triangle falls through a floor from time 0 to 1."""
+    stage = floor_stage(folder)
+    add_falling(stage)
+    return stage
+
+
+def resting_stage(folder):
+    """A triangle falls through a floor from time 0 to 1; another one rests in it, and leaves it from time 2 to 3."""
+    stage = falling_stage(folder)
+    heights = [-0.25, -0.25, -0.25, 0.25]
+    add_mesh(stage, "/World/Resting", {t: moved(FALLING, (-1, 1, z)) for t, z in enumerate(heights)})
+    return stage

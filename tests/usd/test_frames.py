@@ -1,23 +1,16 @@
 """The part of a scene's time that is checked, and its steps."""
 
 import pytest
-from usd_stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage
+from usd_stages import FALLING, add_floor, add_mesh, find, floor_stage, moved, resting_stage
 
 
 @pytest.fixture
 def stage(tmp_path):
-    """A triangle falls through a floor from time 0 to 1; another one rests in it, and leaves it from time 2 to 3."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    add_falling(stage)
-    heights = [-0.25, -0.25, -0.25, 0.25]
-    add_mesh(stage, "/World/Resting", {t: moved(FALLING, (-1, 1, z)) for t, z in enumerate(heights)})
-    return stage
+    return resting_stage(tmp_path)
 
 
 def test_frame_ranges(tmp_path, capsys):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     heights = [0.25, -0.25, 0.25, 1, 0.25, -0.25]
     add_mesh(stage, "/World/Bouncing", {t: moved(FALLING, (0, 0, z)) for t, z in enumerate(heights)})
     found = find(stage)

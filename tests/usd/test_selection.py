@@ -2,7 +2,7 @@
 
 import pytest
 from pxr import UsdGeom
-from usd_stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage, save
+from usd_stages import FALLING, add_falling, add_floor, add_mesh, find, moved, new_stage, resting_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
@@ -81,13 +81,7 @@ def test_wrong_use_is_one_line(crowd, capsys, tmp_path, monkeypatch, options, me
 
 @pytest.fixture
 def resting(tmp_path):
-    """A triangle falls through a floor from time 0 to 1; another one rests in it, and leaves it from time 2 to 3."""
-    resting = new_stage(tmp_path / "scene.usda")
-    add_floor(resting)
-    add_falling(resting)
-    heights = [-0.25, -0.25, -0.25, 0.25]
-    add_mesh(resting, "/World/Resting", {t: moved(FALLING, (-1, 1, z)) for t, z in enumerate(heights)})
-    return resting
+    return resting_stage(tmp_path)
 
 
 def colliding(found):

@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 from pxr import Gf, UsdGeom
-from usd_stages import FALLING, add_floor, add_instancer, add_mesh, animate, moved, new_stage, save
+from usd_stages import FALLING, add_instancer, add_mesh, animate, floor_stage, moved, save
 
 import warp_bsc as bsc
 
 
 @pytest.fixture
 def stage(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    return stage
+    return floor_stage(tmp_path)
 
 
 def add_turning(stage, path="/World/Fan", angles=None):

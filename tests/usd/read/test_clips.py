@@ -2,7 +2,7 @@
 
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
-from usd_stages import FALLING, HIT, add_floor, add_mesh, find, hits, moved, new_stage, save
+from usd_stages import FALLING, HIT, add_floor, add_mesh, find, floor_stage, hits, moved, new_stage, save
 
 from warp_bsc.usd.scene import Scene
 
@@ -21,8 +21,7 @@ def stage(tmp_path):
     rest = new_stage(tmp_path / "rest.usda")  # clips are stronger than what a reference has
     add_mesh(rest, "/Odd", moved(FALLING, (0, 0, 0.25)))
     save(rest)
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     prim = stage.OverridePrim("/World/Falling")
     prim.GetReferences().AddReference("./rest.usda", "/Odd")
     set_clips(stage, {})

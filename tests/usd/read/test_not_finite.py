@@ -4,7 +4,7 @@ import math
 
 import pytest
 from pxr import Gf, UsdGeom, UsdSkel
-from usd_stages import FALLING, HIT, add_falling, add_floor, add_instancer, add_mesh, find, hits, moved, new_stage, save
+from usd_stages import FALLING, HIT, add_instancer, add_mesh, falling_stage, find, floor_stage, hits, moved, save
 
 from warp_bsc.usd import scene as scene_module
 from warp_bsc.usd.frames import FrameRange
@@ -42,8 +42,7 @@ TRANSFORMS = {
 @pytest.fixture
 def stage(tmp_path):
     """A floor, and a triangle that moves from time 0 to 4."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_mesh(stage, "/World/Falling", {time: moved(FALLING, (0, 0, 1 - time / 8)) for time in range(LAST + 1)})
     return stage
 
@@ -250,9 +249,7 @@ def test_a_transform_beside_the_chosen_time_is_not_read(stage, name):
 
 
 def test_status(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    add_falling(stage)
+    stage = falling_stage(tmp_path)
     transform(add_mesh(stage, "/World/Odd", moved(FALLING, (0, 0, -0.1))).GetPrim(), "translate", "static")
     found = find(stage, status=4)
     assert hits(found) == [HIT]
@@ -260,8 +257,7 @@ def test_status(tmp_path):
 
 
 def test_a_scene_in_which_nothing_moves(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_mesh(stage, "/World/Near", moved(FALLING, (0, 0, -0.25)))
     transform(add_mesh(stage, "/World/Odd", FALLING).GetPrim(), "scale", "static")
     add_mesh(stage, "/World/Points", [*FALLING[:2], (0, NAN, 0)])

@@ -2,16 +2,14 @@
 
 import pytest
 from pxr import Gf, UsdGeom
-from usd_stages import FALLING, add_floor, add_mesh, animate, falling, new_stage, save
+from usd_stages import FALLING, add_mesh, animate, falling, floor_stage, save
 
 import warp_bsc as bsc
 
 
 @pytest.fixture
 def stage(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    return stage
+    return floor_stage(tmp_path)
 
 
 def add_group(stage, count=5):

@@ -9,7 +9,7 @@ from boxes import CORNERS, SIDES
 from chromium import CHROMIUM, Browser
 from pxr import Usd, UsdGeom
 from replay_files import Page, add_up, prims_of_pairs
-from usd_stages import FALLING, FLOOR, add_floor, add_instancer, add_mesh, animate, find, hits, moved, new_stage, save
+from usd_stages import FALLING, FLOOR, add_instancer, add_mesh, animate, find, floor_stage, hits, moved, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc import checker
@@ -21,9 +21,7 @@ ALONG = [(0.0, -0.5, 0.0), (0.5, -0.5, 0.0), (1.0, -0.5, 0.0)]
 
 @pytest.fixture
 def stage(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    return stage
+    return floor_stage(tmp_path)
 
 
 def add_rope(stage, path, points, widths=(), interpolation="constant", counts=None, kind="linear"):

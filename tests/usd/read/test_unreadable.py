@@ -16,7 +16,9 @@ from usd_stages import (
     add_instancer,
     add_mesh,
     falling,
+    falling_stage,
     find,
+    floor_stage,
     hits,
     moved,
     new_stage,
@@ -30,10 +32,7 @@ from warp_bsc.usd.scene import Scene
 @pytest.fixture
 def stage(tmp_path):
     """A triangle that falls through a floor."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
-    add_falling(stage)
-    return stage
+    return falling_stage(tmp_path)
 
 
 def add_bare_mesh(stage):
@@ -273,8 +272,7 @@ def test_nothing_readable_is_an_error(tmp_path, capsys):
 
 
 def test_obstacles_are_checked_at_rest_if_all_that_moves_is_left_out(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_mesh(stage, "/World/Post", moved(FALLING, (0, 0, -0.25)))
     add_mesh(stage, "/World/Odd", {time: [(0, 0, time)] for time in (0, 1)}, [3])
     found = find(stage, status=4)
@@ -343,8 +341,7 @@ BREAKS = [
 
 @pytest.mark.parametrize("breaks", BREAKS)
 def test_what_breaks_is_left_out_as_long_as_it_is_broken(tmp_path, capsys, breaks):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_long_fall(stage)
     when, reason = breaks(stage)
     found = find(stage, status=4)
@@ -360,8 +357,7 @@ def test_what_breaks_is_left_out_as_long_as_it_is_broken(tmp_path, capsys, break
 
 
 def test_what_breaks_for_some_time_is_checked_before_and_after(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_long_fall(stage)
     add_mesh(stage, "/World/Sheet", {0: moved(FALLING, (0, 0, -2)), 5: moved(FALLING, (0, 0, -1.5))})
     add_breaking(stage, {3: [(0, 0, 0), (np.inf, 0, 0), (0, 0, 0)]})
@@ -378,8 +374,7 @@ def test_what_breaks_for_some_time_is_checked_before_and_after(tmp_path):
 @pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize("blocked", [{3: Sdf.ValueBlock()}, {3: Sdf.ValueBlock(), 4: Sdf.ValueBlock()}])
 def test_a_mesh_is_there_again_when_it_has_points_again(tmp_path, beside, blocked):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     heights = [3, 2, 2, 2, 0.5, 0.25, -0.25]
     add_mesh(stage, "/World/Falling", {t: moved(FALLING, (0, 0, z)) for t, z in enumerate(heights)} | blocked)
     if beside:
@@ -392,8 +387,7 @@ def test_a_mesh_is_there_again_when_it_has_points_again(tmp_path, beside, blocke
 
 
 def test_a_mesh_that_breaks_again_is_left_out_again(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     blocked = {time: Sdf.ValueBlock() for time in (0, 3, 5)}
     heights = [0.25, -0.25, -0.5, -0.75, -1, -1.25, -1.5]
     add_mesh(stage, "/World/Falling", {t: moved(FALLING, (0, 0, z)) for t, z in enumerate(heights, 1)} | blocked)
@@ -407,8 +401,7 @@ def test_a_mesh_that_breaks_again_is_left_out_again(tmp_path):
 
 @pytest.mark.slow
 def test_workers_leave_out_the_same(tmp_path):
-    stage = new_stage(tmp_path / "scene.usda")
-    add_floor(stage)
+    stage = floor_stage(tmp_path)
     add_long_fall(stage)
     add_breaking(stage, {1: Sdf.ValueBlock(), 3: Sdf.ValueBlock()})
     alone = find(stage, status=4)
