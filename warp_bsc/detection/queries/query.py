@@ -146,26 +146,20 @@ def query_edge_edge(
     Args:
         points: Positions, float32 or float64, NumPy or Warp array of shape [n, 8, 3], rows a0 b0 c0 d0 a1 b1 c1 d1:
             edges a b and c d at the start (0) and at the end (1) of the step. Any unit of length.
-        min_distance: Distance up to which a pair collides, in the unit of the positions, 0 or at least 2^-1021, taken
-            as exact: one for all queries, or one each, shape [n].
+        min_distance: As of :func:`query_vertex_face`.
         method: What becomes of queries that floating point cannot certify, one of :data:`METHODS`.
         toi: Whether to find times of impact, coordinates and normals as well.
         tolerance: Of the times of impact, as a share of the step, in [2^-38, 1].
         device: Warp device to compute on; default: the points' own, or Warp's default for NumPy.
-        out: Results that stay on the device, to write to: nothing waits for the device, and a graph may capture the
-            call, see :class:`DeviceQueryResult`. The points must be a contiguous Warp array on the same device, and
-            there must be no minimum distance.
+        out: Results that stay on the device, as of :func:`query_vertex_face`.
 
     Returns:
         QueryResult: One row a query; or ``out``.
 
     Raises:
-        TypeError: If an argument has another type.
-        ValueError: If the points have another shape or type, are not finite or 2^29 rows or more, a distance or the
-            tolerance is out of range, or the method is unknown. With ``out``: if it has another
-            number of rows or another device than the points, the points are not contiguous, ``toi`` is not as in it, or
-            there is a minimum distance.
-        RuntimeError: With ``out``: if a GPU captures a graph before the first such call.
+        TypeError: As :func:`query_vertex_face`.
+        ValueError: As :func:`query_vertex_face`.
+        RuntimeError: As :func:`query_vertex_face`.
     """
     if out is not None:
         return _query_into(out, PairKind.EDGE_EDGE, points, min_distance, method, toi, tolerance, device)
