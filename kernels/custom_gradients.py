@@ -6,8 +6,6 @@ from types import SimpleNamespace
 
 import warp as wp
 
-__all__ = ["func_grad"]
-
 
 @contextlib.contextmanager
 def _known_return_type(function: wp.Function, returned: type) -> Iterator[None]:

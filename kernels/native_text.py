@@ -7,8 +7,6 @@ share. Its text becomes a part of the snippet, so that Warp compiles a module an
 from collections.abc import Mapping
 from pathlib import Path
 
-__all__ = ["definitions", "header"]
-
 
 def header(module: str, name: str) -> str:
     """Returns the text of a header, by the file of a module beside it and its name."""

@@ -7,8 +7,6 @@ from ._garbage import paused_collection
 from .cli.error_boundary import run_guarded
 from .cli.interrupts import INTERRUPTS
 
-__all__ = ["main"]
-
 
 def main() -> int:
     """Runs the command line with the arguments of the process and returns its exit status."""

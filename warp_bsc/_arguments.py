@@ -12,25 +12,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-__all__ = [
-    "SMALLEST_DISTANCE",
-    "as_numpy",
-    "check_finite",
-    "check_instance",
-    "checked_bits",
-    "checked_choice",
-    "checked_coordinates",
-    "checked_distance",
-    "checked_distances",
-    "checked_flag",
-    "checked_integer",
-    "checked_integers",
-    "checked_number",
-    "checked_shape",
-    "checked_strings",
-    "given",
-]
-
 SMALLEST_DISTANCE = 2.0**-1021
 """Smallest distance or radius that is not 0: half of it is a normal number, which no processor flushes to 0."""
 

@@ -11,8 +11,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["STDOUT", "OutputFile", "naming", "unfinished_path"]
-
 STDOUT = "-"
 """The path of standard output."""
 

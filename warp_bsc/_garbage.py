@@ -4,8 +4,6 @@ import contextlib
 import gc
 from collections.abc import Iterator
 
-__all__ = ["paused_collection"]
-
 
 @contextlib.contextmanager
 def paused_collection() -> Iterator[None]:

@@ -6,8 +6,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
-__all__ = ["Occupied", "one_at_a_time"]
-
 
 class _Locked(Protocol):
     """An object with a lock: an :class:`threading.RLock`, at which threads wait, or :class:`Occupied`."""

@@ -7,8 +7,6 @@ from typing import ParamSpec, TypeVar
 
 import warp as wp
 
-__all__ = ["phase"]
-
 VARIABLE = "WARP_BSC_PROFILE"
 """Environment variable that turns ranges on if it is 1, read when the package is imported."""
 _Arguments = ParamSpec("_Arguments")

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["distinct", "expand_ranges", "search", "search_ranges"]
-
 _FEW = 1000
 
 

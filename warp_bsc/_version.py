@@ -1,5 +1,3 @@
 """The version of the package, in a module of its own so that its parts can import it."""
 
-__all__ = ["__version__"]
-
 __version__ = "0.1.0"

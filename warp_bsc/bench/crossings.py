@@ -8,8 +8,6 @@ from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 from ..response.state.mesh import ModelMesh
 
-__all__ = ["CrossingCounter", "SoftPairs"]
-
 
 class SoftPairs:
     """Counts edges that meet faces without a common vertex, and pairs that meet on the way, in exact arithmetic.

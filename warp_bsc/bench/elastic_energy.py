@@ -8,8 +8,6 @@ from ..implicit.elasticity.derivatives import element_energy
 from ..implicit.elasticity.elements import Elements, elements_of_model, first_vertex, kind_of
 from ..response.state.mesh import host_array
 
-__all__ = ["ElasticEnergy"]
-
 
 class ElasticEnergy:
     """The elastic energy of triangles, pairs of them at edges, tetrahedra and springs of a model; 0 of those at rest.

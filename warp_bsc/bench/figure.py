@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["draw_paper_benchmarks"]
-
 _METHODS = {
     "exact": ("exact", "#1b6ca8"),
     "conservative": ("conservative", "#58a4d4"),

@@ -18,17 +18,6 @@ from .._version import __version__
 from .tables import count
 from .timing import count_threads
 
-__all__ = [
-    "COMMIT",
-    "LIBRARIES",
-    "Run",
-    "describe_run",
-    "name_place",
-    "shorten_path",
-    "version_of",
-    "with_record",
-]
-
 COMMIT = "WARP_BSC_COMMIT"
 """Environment variable that names the commit of a copy of the project without git, as on another machine."""
 

@@ -4,8 +4,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-__all__ = ["LONGEST", "Column", "Table", "count", "grouped", "in_thousands", "list_titles", "two"]
-
 _Row = TypeVar("_Row")
 
 LONGEST = 30

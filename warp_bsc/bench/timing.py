@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator
 
 import warp as wp
 
-__all__ = ["count_threads", "limited_threads", "median_milliseconds", "replay_graph"]
-
 
 def median_milliseconds(run: Callable[[], None], device: wp.Device, repeat: int) -> float:
     """Returns the median time of a run [ms]: on a GPU of a replay of it as a CUDA graph, on the CPU of a call.

@@ -7,8 +7,6 @@ from .._arguments import checked_coordinates
 from .coordinates import as_integers
 from .queries import VERTEX_FACE, collides, undecided_triangles
 
-__all__ = ["edge_face_crossings", "edges_pass_faces", "rays_pass_faces"]
-
 _RAY_ERROR = 2.0**-49  # relative to sums of absolute values: more than 8 roundings of 2^-53, see _ray_signs
 _RAY_UNDERFLOW = 2.0**-900  # more than the underflow there
 

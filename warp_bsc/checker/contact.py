@@ -5,8 +5,6 @@ import functools
 from .polynomials import add, cross, dot, multiply, negate, sign_at, triangle_areas, triangle_weights, trim
 from .roots import inner_part, isolated_roots, sign_at_root
 
-__all__ = ["Polygon", "Triangle", "contacts"]
-
 
 class Triangle:
     """The polynomials of one moving triangle, see :mod:`warp_bsc.checker`; each corner is three polynomials."""

@@ -2,16 +2,6 @@
 
 import numpy as np
 
-__all__ = [
-    "as_integers",
-    "corners_of",
-    "decompose",
-    "decompose_with_distance",
-    "flattened",
-    "scale_to_floats",
-    "scale_to_integers",
-]
-
 
 def corners_of(points, pairs):
     """Returns the corners of the queries' polygons around the origin: shape (n, ..., corners, 2 ends, 3)."""

@@ -5,8 +5,6 @@ import numpy as np
 from .coordinates import corners_of, decompose, decompose_with_distance, flattened, scale_to_floats
 from .polynomials import dot, triangle_areas, triangle_weights
 
-__all__ = ["polygons_near", "triangles_may_touch"]
-
 _PIECES = 8  # into which the filter cuts the step
 _MARGIN = 1e-10  # more than the error of any value in the filter, see triangles_may_touch
 _HALVINGS = 7  # of the step in the filter of minimum distances

@@ -3,20 +3,6 @@
 import functools
 import itertools
 
-__all__ = [
-    "add",
-    "cross",
-    "differentiate",
-    "dot",
-    "multiply",
-    "negate",
-    "sign_at",
-    "sign_at_ratio",
-    "triangle_areas",
-    "triangle_weights",
-    "trim",
-]
-
 
 def add(f, g):
     """Returns the sum of two polynomials."""

@@ -11,23 +11,6 @@ from .coordinates import as_integers, corners_of, decompose_with_distance, scale
 from .filters import polygons_near, triangles_may_touch
 from .roots import doubles_around
 
-__all__ = [
-    "POLYGONS",
-    "VERTEX_FACE",
-    "collides",
-    "earliest",
-    "edge_edge",
-    "edge_edge_toi",
-    "polygons",
-    "undecided_triangles",
-    "vertex_edge",
-    "vertex_edge_toi",
-    "vertex_face",
-    "vertex_face_toi",
-    "vertex_vertex",
-    "vertex_vertex_toi",
-]
-
 # The triangles of a query, each corner a difference of two of its four points (first minus second).
 VERTEX_FACE = np.array([[(1, 0), (2, 0), (3, 0)]])
 _EDGE_EDGE = np.array([[(0, 2), (1, 2), (1, 3)], [(0, 2), (1, 3), (0, 3)]])

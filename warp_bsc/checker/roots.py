@@ -10,8 +10,6 @@ import numpy as np
 
 from .polynomials import differentiate, multiply, sign_at, sign_at_ratio, trim
 
-__all__ = ["doubles_around", "inner_part", "isolated_roots", "sign_at_root"]
-
 _HALVINGS = 24
 """Of an interval with a root. In one of this length, a polynomial that is not zero at the root is seldom zero."""
 

@@ -8,8 +8,6 @@ from .coordinates import as_integers, decompose, flattened, scale_to_floats
 from .polynomials import add, cross, dot, negate, sign_at, trim
 from .roots import doubles_around, inner_part, isolated_roots
 
-__all__ = ["tetrahedron", "tetrahedron_toi"]
-
 _MARGIN = 1e-12
 """More than the error of a Bernstein coefficient of the volume, see :func:`_may_invert`."""
 

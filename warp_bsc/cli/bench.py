@@ -39,8 +39,6 @@ from .options import (
     switch,
 )
 
-__all__ = ["BENCHMARKS", "add_to"]
-
 _DESCRIPTION = """\
 Measure detection, SolverCCD and repair. Without the name of a benchmark,
 warp-bsc bench runs the paper's five benchmarks, as warp-bsc bench paper does."""

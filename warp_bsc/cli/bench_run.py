@@ -45,8 +45,6 @@ from .interrupts import INTERRUPTS
 from .query_file import find_query_files, read_query_file
 from .tables import Console, print_table, say
 
-__all__ = ["run_detector", "run_newton", "run_paper", "run_penetration", "run_queries", "run_repair", "run_response"]
-
 _FIGURES = (".png", ".svg", ".pdf")
 
 _Run = TypeVar("_Run")

@@ -18,8 +18,6 @@ from ..detection.run.settings import Method
 from .progress import LOG_SECONDS
 from .tables import Console, say
 
-__all__ = ["find_device", "load_detector", "loading_kernels"]
-
 _SILENT_SECONDS = 2.0
 
 

@@ -13,8 +13,6 @@ from .exit_status import ExitStatus
 from .interrupts import INTERRUPTS, Interrupted
 from .option_names import with_option
 
-__all__ = ["describe", "run_guarded"]
-
 
 def run_guarded(command: Callable[[], int]) -> int:
     """Runs a command and returns its exit status, also after an error or a signal.

@@ -3,8 +3,6 @@
 import textwrap
 from enum import IntEnum
 
-__all__ = ["ExitStatus", "explain_statuses"]
-
 
 class ExitStatus(IntEnum):
     """An exit status. After a signal it is 128 plus the number of the signal."""

@@ -9,8 +9,6 @@ from .._version import __version__
 from .error_boundary import run_guarded
 from .exit_status import ExitStatus, explain_statuses
 
-__all__ = ["build_parser", "main", "run"]
-
 _EPILOG = f"""\
 examples:
   warp-bsc replay demo

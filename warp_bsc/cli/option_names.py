@@ -2,8 +2,6 @@
 
 import re
 
-__all__ = ["with_option"]
-
 _OPTIONS = {
     name: f"--{name.replace('_', '-')}"
     for name in (

@@ -10,33 +10,6 @@ from typing import Any
 from .._arguments import SMALLEST_DISTANCE
 from ..detection.run.settings import METHODS
 
-__all__ = [
-    "DEVICE",
-    "JSON",
-    "THREADS",
-    "Commands",
-    "Options",
-    "add_command",
-    "add_fail_on",
-    "add_options",
-    "add_scene",
-    "detection_options",
-    "distance",
-    "file_option",
-    "flag",
-    "names_of",
-    "natural",
-    "number",
-    "pair",
-    "patterns",
-    "positive",
-    "positive_real",
-    "repeat_options",
-    "scene_path",
-    "several",
-    "switch",
-]
-
 Commands = argparse._SubParsersAction
 """What ``ArgumentParser.add_subparsers`` returns: the commands, to which each module adds its own."""
 

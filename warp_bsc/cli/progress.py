@@ -9,8 +9,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .tables import Console, say
 
-__all__ = ["LOG_SECONDS", "RunProgress"]
-
 LOG_SECONDS = 10.0
 """Time between two lines on the progress, where there is no terminal."""
 

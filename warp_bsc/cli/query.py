@@ -26,8 +26,6 @@ from .query_file import KINDS, find_query_files, read_query_file
 from .query_tables import QueryResults, print_queries, queries_to_dict
 from .tables import Console
 
-__all__ = ["add_to"]
-
 _DESCRIPTION = """\
 Decide elementary queries and, if the truth is known, compare the results with
 it. A query is eight rows of a CSV file, one a point; a row holds the numerators

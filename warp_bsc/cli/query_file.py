@@ -20,8 +20,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["KINDS", "QueryFile", "find_query_files", "read_query_file"]
-
 KINDS = ("vertex-face", "edge-edge")
 
 _INTEGERS = re.compile("-?[0-9]+(,-?[0-9]+)*")

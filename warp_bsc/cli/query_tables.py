@@ -13,8 +13,6 @@ from ..detection.queries.query import QueryResult
 from .query_file import QueryFile
 from .tables import print_table, say
 
-__all__ = ["QueryResults", "print_queries", "queries_to_dict"]
-
 _STATUS = ("free", "hit", "unsure")  # by the value of query_vertex_face(...).status
 
 

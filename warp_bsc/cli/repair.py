@@ -31,8 +31,6 @@ from .repair_tables import print_repair
 from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
 from .tables import Console
 
-__all__ = ["add_to"]
-
 _DESCRIPTION = """\
 Write a USD layer over a scene in which the points of its deforming meshes are
 moved so that they neither intersect nor collide, as warp-bsc replay checks it.

@@ -24,8 +24,6 @@ from .error_boundary import describe
 from .interrupts import INTERRUPTS, Interrupted
 from .progress import RunProgress
 
-__all__ = ["RepairRun", "count_found", "find"]
-
 
 class RepairRun:
     """Finds collisions, repairs, and writes the USD layer of the stretches that are done.

@@ -7,8 +7,6 @@ from .option_names import with_option
 from .repair_run import RepairRun
 from .tables import Console, print_table, say
 
-__all__ = ["print_repair"]
-
 _STRETCHES = (  # of a stretch and its frames
     Column("frames", lambda row: len(row[1])),
     Column("points", lambda row: row[0].moved),

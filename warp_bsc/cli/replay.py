@@ -14,8 +14,6 @@ from .options import Commands, add_command, scene_path
 from .replay_options import DESCRIPTION, EPILOG, add_replay_options, describe_selection, read_scene, read_selection
 from .replay_run import ReplayRun
 
-__all__ = ["add_to"]
-
 
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""

@@ -35,18 +35,6 @@ from .options import (
 )
 from .progress import RunProgress
 
-__all__ = [
-    "DESCRIPTION",
-    "EPILOG",
-    "add_replay_options",
-    "add_scene_selection",
-    "command_of",
-    "describe_selection",
-    "read_scene",
-    "read_selection",
-    "repair_command_of",
-]
-
 DESCRIPTION = """\
 Find the collisions of the meshes of a USD scene, with themselves and with each
 other, between each two consecutive time samples; vertices move straight from

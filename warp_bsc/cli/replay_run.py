@@ -29,8 +29,6 @@ from .replay_options import command_of, repair_command_of
 from .replay_tables import print_new, print_repair, print_replay, print_work
 from .tables import Console, say
 
-__all__ = ["ReplayRun", "finish_outputs"]
-
 
 class ReplayRun(contextlib.ExitStack):
     """Replays a scene into the files that the options name; those that are not finished go when it is closed.

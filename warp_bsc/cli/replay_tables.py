@@ -14,8 +14,6 @@ from ..scene_replay.validation import Validation
 from .option_names import with_option
 from .tables import print_table, say, say_list
 
-__all__ = ["print_new", "print_repair", "print_replay", "print_work"]
-
 _WITH_POSITIONS = 60
 """Least width of a terminal on which the table of intervals has positions."""
 

@@ -10,8 +10,6 @@ from rich.text import Text
 
 from ..bench.tables import LONGEST, Column
 
-__all__ = ["Console", "print_table", "say", "say_list"]
-
 
 class Console(rich.console.Console):
     """A terminal or a file that raises BrokenPipeError if its reader has closed it."""

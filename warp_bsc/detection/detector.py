@@ -19,8 +19,6 @@ from .run.host_function import run_on_host
 from .run.launch import retry_until_fits
 from .run.settings import TOLERANCE, DistanceKind, Method
 
-__all__ = ["CollisionDetector"]
-
 _SAMPLED = 64
 """Vertices whose collisions bound the earliest time of impact. In 92,230 triangles these take a twelfth of all."""
 _SAMPLED_OF = 16 * _SAMPLED

@@ -7,8 +7,6 @@ from ..kernels.pipeline.hierarchy import WIDTH
 from .run.launch import launch, launch_over
 from .run.settings import NO_GRADIENTS
 
-__all__ = ["BUNDLE", "CLUSTER", "order_faces"]
-
 CLUSTER = WIDTH
 """Places of a cluster."""
 

@@ -16,8 +16,6 @@ from .mesh import CollisionMesh
 from .run.launch import launch_over, made_once
 from .run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Method
 
-__all__ = ["Inversions", "inversions_of_motion"]
-
 
 @dataclass(frozen=True, eq=False)
 class Inversions:

@@ -15,8 +15,6 @@ from .face_order import order_faces
 from .run.settings import DistanceKind, PairKind
 from .run.start import checked_device
 
-__all__ = ["CollisionMesh", "DevicePlaces", "ElementsOfParts", "leave_out"]
-
 _MOST_LISTED = 31
 
 

@@ -29,8 +29,6 @@ from .run.settings import (
     checked_tolerance,
 )
 
-__all__ = ["DetectionPipeline"]
-
 MIN_CAPACITY = 2**17
 """Smallest capacity of a queue for a given number of pairs a face, as a small mesh can have many pairs a face."""
 

@@ -7,8 +7,6 @@ from .elastic import Springs
 from .motion import move_freely
 from .surface import Surface
 
-__all__ = ["approach"]
-
 _ROUNDS = 24
 _SWEEPS, _MORE_SWEEPS = 40, 640
 """Sweeps of a round in which strains are below the limit at its start, and above it."""

@@ -8,8 +8,6 @@ import warp as wp
 
 from .._arguments import as_numpy, given
 
-__all__ = ["checked_mask", "checked_sheets"]
-
 
 def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:
     """Returns which vertices are given, bool, shape [count].

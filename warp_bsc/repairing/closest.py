@@ -7,8 +7,6 @@ from ..detection.run.launch import launch
 from .kernels import find_closest, find_exits
 from .surface import Surface
 
-__all__ = ["closest_points", "exit_distances"]
-
 
 def closest_points(
     surface: Surface, x: np.ndarray, faces: np.ndarray, points: np.ndarray

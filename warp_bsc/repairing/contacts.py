@@ -10,8 +10,6 @@ from ..detection.results.collisions import Collisions
 from ..detection.run.launch import launch_repeatedly
 from .kernels import Planes, find_shortfalls, move_apart
 
-__all__ = ["Contacts", "as_contacts", "as_planes", "projected"]
-
 _SWEEPS = 4
 _LEAST_MOBILITY = 0.05
 """Sum of squared weights below which a contact counts as one that hardly moves."""

@@ -7,8 +7,6 @@ import numpy as np
 
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["ContourKind", "Contours", "trace_contours"]
-
 ContourKind = Literal["closed", "border", "open"]
 """Whether a contour ends nowhere, at borders of the surface alone, or elsewhere: at a vertex that both sides share."""
 

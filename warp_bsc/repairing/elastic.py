@@ -8,8 +8,6 @@ from .contacts import Contacts, as_planes
 from .kernels import Planes, grow_ring, relax_springs, spread_moves
 from .surface import Surface
 
-__all__ = ["Springs", "near", "within"]
-
 _BENDING = 0.3
 """Stiffness of the springs across edges, which keep dihedral angles, as a share of that of edges."""
 _NOT_REACHED = 2**31 - 1

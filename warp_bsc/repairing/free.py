@@ -9,8 +9,6 @@ from .motion import push_apart
 from .surface import Surface, differ
 from .untangle import untangle
 
-__all__ = ["free", "restore_parts"]
-
 _RINGS = 10
 """Edges around vertices that are pushed apart within which others may follow."""
 

@@ -15,8 +15,6 @@ from .contours import connected_components
 from .solids import leave_solid, leave_solid_whole, spread_exits
 from .surface import Surface, differ, weld_borders, welded
 
-__all__ = ["ModelSurface"]
-
 _ESCAPES = 4
 """Times that particles are put outside: the way out of a solid may lead into another one."""
 _MARGIN = 2.0

@@ -5,8 +5,6 @@ import numpy as np
 from .contacts import Contacts, as_contacts, projected
 from .surface import Surface, differ
 
-__all__ = ["move_freely", "near_pairs", "push_apart"]
-
 _PROJECTIONS = 6
 """Detections after which contacts no longer slide, but stop."""
 _DETECTIONS = 40

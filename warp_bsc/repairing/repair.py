@@ -18,8 +18,6 @@ from .sheets import separate_sheets
 from .surface import Surface, differ, weld_borders, welded
 from .unresolved import unresolved_contours
 
-__all__ = ["repair"]
-
 
 def repair(
     mesh: CollisionMesh | np.ndarray | wp.array,

@@ -7,8 +7,6 @@ import warp as wp
 
 from .contours import ContourKind
 
-__all__ = ["RepairResult", "UnresolvedContour"]
-
 
 @dataclass(frozen=True, eq=False)
 class UnresolvedContour:

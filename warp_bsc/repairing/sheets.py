@@ -7,8 +7,6 @@ from .contours import connected_components
 from .elastic import Springs, near
 from .surface import Surface
 
-__all__ = ["separate_sheets"]
-
 _GAP = 0.5
 """Distance from the sheets inside at which a vertex is put, in edges."""
 _ALONG_NORMAL = 0.5

@@ -7,8 +7,6 @@ from .contours import connected_components
 from .elastic import Springs, near
 from .surface import Surface
 
-__all__ = ["leave_solid", "leave_solid_whole", "spread_exits"]
-
 _GAP = 0.25
 """Distance from the solid at which a vertex is put, in edges."""
 _SAMPLES = 16

@@ -19,8 +19,6 @@ from .sheets import separate_sheets
 from .tetrahedra import are_inverted, follow_surface, restore_inverted
 from .unresolved import unresolved_contours
 
-__all__ = ["StateRepairResult", "repair_state"]
-
 
 @dataclass(frozen=True, eq=False)
 class StateRepairResult(RepairResult):

@@ -8,8 +8,6 @@ import warp as wp
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 
-__all__ = ["Surface", "differ", "weld_borders", "welded"]
-
 
 def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Returns for each vertex the first one that it is welded to, int, shape [n].

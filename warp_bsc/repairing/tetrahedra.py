@@ -8,8 +8,6 @@ from .contours import connected_components
 from .elastic import Springs
 from .surface import Surface, differ
 
-__all__ = ["are_inverted", "follow_surface", "restore_inverted"]
-
 _ROUNDOFF = 2.0**-48
 """Bound on the rounding error of a determinant of differences, as a share of the product of their magnitudes."""
 _SWEEPS = 200

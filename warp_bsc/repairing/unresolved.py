@@ -7,8 +7,6 @@ from .contours import trace_contours
 from .results import UnresolvedContour
 from .surface import Surface
 
-__all__ = ["unresolved_contours"]
-
 _FIXED = "both of its sides are fixed"
 _BORDER = "it runs from border to border, so that both sides may be the right one: order or x_previous would tell"
 _NOT_FOUND = "no positions without it were found"

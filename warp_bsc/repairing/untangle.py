@@ -18,8 +18,6 @@ from .elastic import Springs, near, within
 from .kernels import contour_gradients
 from .surface import Surface
 
-__all__ = ["Untangled", "untangle"]
-
 _STEP = 0.25
 """Distance by which an edge and a face move apart in an iteration, in edges."""
 _RINGS = 10

@@ -12,8 +12,6 @@ from .earlier import describe_difference
 from .hit_records import is_tail_line, read_head, read_tail
 from .summary import Summary
 
-__all__ = ["Baseline", "NewFinding"]
-
 Event = Literal["collides", "crosses", "is inside", "is near", "are duplicates"]
 """What meshes may do in a replay."""
 

@@ -33,8 +33,6 @@ from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
 from .validation import validate
 
-__all__ = ["Checks", "IntervalChecker"]
-
 _Found = TypeVar("_Found")
 
 

@@ -21,8 +21,6 @@ from ..detection.at_rest.closest_points import ClosestPointFinder
 from ..usd.segment import Segment
 from .scene_intersections import SceneIntersections
 
-__all__ = ["DepthFinder"]
-
 _ON_SIDE = 1e-5  # barycentric coordinate up to which the closest point of a face is on a side of it
 _FIRST_REACH = 0.02  # part of the size of a mesh or a surface up to which vertices are searched first
 _SAME_POINT = 1e-6  # part of an edge within which it passes through two neighbouring faces at once: at their side

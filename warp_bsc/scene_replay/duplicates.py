@@ -11,8 +11,6 @@ from ..detection.at_rest.containment import Containment
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 
-__all__ = ["Duplicates"]
-
 
 class Duplicates:
     """The duplicates among the meshes of a segment.

@@ -11,8 +11,6 @@ from .hit_records import is_interval_line, is_tail_line, needs_following, read_h
 from .results import IntervalResult
 from .threads import read_ahead
 
-__all__ = ["EarlierReplay", "describe_difference", "find_earlier"]
-
 
 def find_earlier(path: str | os.PathLike, facts: dict[str, Any]) -> "EarlierReplay | None":
     """Returns the earlier replay with the most intervals that has written, or was to write, a JSON file; None for none.

@@ -20,8 +20,6 @@ from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import Summary
 
-__all__ = ["HitsNpz"]
-
 _KINDS = (*KINDS, "edge-face")
 _PHASES = (*PHASES, "crosses", "touches", "inside", "near", "")
 _CROSSES, _TOUCHES, _INSIDE, _NEAR, _NONE = range(len(PHASES), len(_PHASES))

@@ -32,8 +32,6 @@ from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 from .summary_records import mesh_pairs_to_list, with_numbers
 
-__all__ = ["HitsCsv", "HitsJson", "replay_facts"]
-
 _SAVE_SECONDS = 20.0
 
 

@@ -19,21 +19,6 @@ from .scene_pairs import DIAGONAL, EDGE, ELEMENT_WORDS, FACE, KINDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary_records import read_summary, summary_fields
 
-__all__ = [
-    "head_line",
-    "intersection_kinds",
-    "intersection_phases",
-    "interval_line",
-    "is_interval_line",
-    "is_tail_line",
-    "needs_following",
-    "read_head",
-    "read_interval",
-    "read_result",
-    "read_tail",
-    "tail_line",
-]
-
 _INTERVALS = "intervals"
 _COMPLETE = "complete"
 _END_OF_INTERVAL = b"],\r\n"

@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["block", "fill_page", "inert", "shared_part", "spread"]
-
 _SMALL_BLOCK = 4096  # bytes up to which a block is not compressed
 
 

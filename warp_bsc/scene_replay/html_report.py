@@ -23,8 +23,6 @@ from .scene_proximities import SceneProximities
 from .summary import Summary
 from .view_blocks import ViewBlocks, moving_points
 
-__all__ = ["ReportPage"]
-
 _ALL_ROWS = 300_000  # in the table; divided by the number of intervals, twice the limit of an interval ...
 _FEWEST_ROWS, _MOST_ROWS = 100, 50_000  # ... within these bounds
 _MOST_CAMERAS, _MOST_CAMERA_TIMES = 100, 100_000

@@ -12,8 +12,6 @@ from .checking import Checks, IntervalChecker
 from .results import IntervalResult
 from .workers import Cluster, LocalWorkers, check_in_workers, checked_address, selection_without_initial_in_workers
 
-__all__ = ["replay"]
-
 
 def replay(
     scene: Scene,

@@ -11,8 +11,6 @@ from .scene_intersections import SceneIntersections
 from .scene_proximities import SceneProximities
 from .summary import Summary
 
-__all__ = ["NotListed", "limit_rows", "not_listed"]
-
 _Pairs = TypeVar("_Pairs", SceneContacts, SceneProximities)
 
 

@@ -9,8 +9,6 @@ from .._atomic_file import OutputFile
 from .results import IntervalResult
 from .summary import Summary
 
-__all__ = ["RecordFile", "ReplayOutput", "without_last_eighth"]
-
 _Item = TypeVar("_Item")
 
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from ..usd.segment import Segment
 
-__all__ = ["Outline", "choose_faces", "find_outline"]
-
 _LEVELS = 7  # the finest grid has 2^7 cells along an axis
 
 

@@ -7,8 +7,6 @@ from ..usd.scene import Scene
 from .baseline import Baseline, NewFinding
 from .summary import CERTIFIED_FOR, Summary
 
-__all__ = ["MAX_PAIRS", "Depths", "report_data", "report_title"]
-
 MAX_PAIRS = 10_000
 """Largest number of pairs of meshes in the page."""
 

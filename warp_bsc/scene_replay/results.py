@@ -13,19 +13,6 @@ from .scene_pairs import KINDS, count_by_meshes
 from .scene_proximities import SceneProximities
 from .validation import Validation
 
-__all__ = [
-    "TOI_BINS",
-    "Contact",
-    "IntersectionSummary",
-    "IntervalResult",
-    "IntervalSummary",
-    "Nearest",
-    "ProximitySummary",
-    "Work",
-    "summarize",
-    "summarize_intersections",
-]
-
 TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
 

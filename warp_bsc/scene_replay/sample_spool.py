@@ -12,8 +12,6 @@ from ..usd.write.layer import just_before
 from ..usd.write.layer_writer import SHAPES
 from .outputs import without_last_eighth
 
-__all__ = ["Sample", "SampleSpool"]
-
 Key = tuple[str, ...]
 """What has samples: a prim, by the names of its parents and itself."""
 

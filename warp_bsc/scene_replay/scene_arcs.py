@@ -5,8 +5,6 @@ import numpy as np
 from ..detection.arcs.rigid_motion import RigidMotion, points_on_arcs
 from ..usd.interval import Interval
 
-__all__ = ["arcs_of", "positions_at"]
-
 _TOLERANCE = 2.0**-16
 """Distance within which meshes that turn are reported, as a share of the largest distance of a point from its axis."""
 _LARGEST_COORDINATE = 2.0**500

@@ -16,8 +16,6 @@ from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
 
-__all__ = ["PHASES", "SceneContacts", "compare_contacts", "find_contacts", "find_strand_contacts", "join_contacts"]
-
 PHASES = ("passes", "enters", "leaves", "stays")
 """The phases of a contact, by 1 if the surfaces at its elements cross at the interval's end, plus 2 if at its start.
 

@@ -14,8 +14,6 @@ from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, take_rows
 
-__all__ = ["Cuts", "SceneIntersections", "name_intersections"]
-
 
 class Cuts(NamedTuple):
     """The segments in which two triangles meet: together, the curves in which surfaces cut each other.

@@ -7,21 +7,6 @@ import numpy as np
 
 from ..usd.segment import Segment
 
-__all__ = [
-    "DIAGONAL",
-    "EDGE",
-    "ELEMENT_WORDS",
-    "FACE",
-    "KINDS",
-    "NO_PAIRS",
-    "VERTEX",
-    "ScenePairs",
-    "are_stiff_pairs",
-    "count_by_meshes",
-    "name_elements",
-    "take_rows",
-]
-
 KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex")
 """Labels of the kinds of pair in collisions and proximities, by their numbers; the last two have points or curves."""
 

@@ -11,8 +11,6 @@ from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .scene_pairs import NO_PAIRS, ScenePairs, are_stiff_pairs, name_elements
 
-__all__ = ["SceneProximities", "name_proximities"]
-
 
 @dataclass(frozen=True)
 class SceneProximities(ScenePairs):

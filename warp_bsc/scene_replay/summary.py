@@ -11,15 +11,6 @@ from ..usd.scene import Scene
 from .results import TOI_BINS, Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
 from .validation import Validation
 
-__all__ = [
-    "CERTIFIED_FOR",
-    "CollisionSpan",
-    "DuplicateSpan",
-    "IntersectionSpan",
-    "ProximitySpan",
-    "Summary",
-]
-
 _Span = TypeVar("_Span")
 _AtRest = TypeVar("_AtRest", IntersectionSummary, ProximitySummary)
 

@@ -15,8 +15,6 @@ from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, Pro
 from .scene_contacts import PHASES
 from .validation import Validation
 
-__all__ = ["mesh_pairs_to_list", "read_summary", "summary_fields", "with_numbers"]
-
 
 def with_numbers(found: Any, numbers: Mapping[str, int]) -> dict[str, Any]:
     """Returns the fields of a finding on meshes, a dataclass, with ``mesh``, their numbers, instead of ``meshes``.

@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Generic, TypeVar
 
-__all__ = ["WriteBehind", "read_ahead"]
-
 _Item = TypeVar("_Item")
 
 

@@ -22,8 +22,6 @@ from .scene_intersections import SceneIntersections
 from .scene_pairs import ScenePairs
 from .summary import Summary
 
-__all__ = ["COLORS", "LIFT", "MOST_PAIRS", "SHOWN_BY", "VARIANTS", "Overlay"]
-
 COLORS = {
     "Polygons": (0.85, 0.08, 0.06),
     "VertexFace": (1.0, 0.9, 0.2),

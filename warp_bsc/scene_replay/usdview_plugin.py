@@ -19,8 +19,6 @@ from .results import IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_pairs import FACE
 
-__all__ = ["Hits", "HitsContainer"]
-
 _MARGIN = 3.0  # a view of a hit is so many times as wide as its elements
 
 

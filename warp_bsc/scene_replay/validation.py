@@ -9,8 +9,6 @@ from .. import checker
 from ..detection.detector import CollisionDetector, Collisions
 from ..detection.queries.query_points import query_points
 
-__all__ = ["Validation", "overlapping_boxes", "validate"]
-
 _CHUNK = 1 << 18  # pairs in memory at a time
 _FEWEST = 1 << 14  # fewest pairs in a call of the checker, as long as there are more: each call has a fixed cost
 _NEIGHBOURS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -9,8 +9,6 @@ from .html_page import block, spread
 from .page_view import choose_faces, find_outline
 from .results import IntervalResult
 
-__all__ = ["ViewBlocks", "moving_points"]
-
 _ALL_FACES = 1_500_000  # in the views of all intervals together; divided by their number, the limit of an interval ...
 _FEWEST_FACES, _MOST_FACES = 1_000, 150_000  # ... within these bounds
 _ALL_OUTLINES, _FEWEST_OUTLINE, _MOST_OUTLINE = 200_000, 500, 20_000  # likewise, of the outlines

@@ -25,16 +25,6 @@ from ..usd.selection import Selection
 from .checking import Checks, IntervalChecker
 from .results import IntervalResult
 
-__all__ = [
-    "check_chunk",
-    "device_of_worker",
-    "find_selection_without_initial",
-    "name_device",
-    "pack",
-    "serve",
-    "unpack",
-]
-
 _CHUNK_SECONDS = 15.0  # a chunk ends after this time: results that are not yet written can be lost
 
 _ONE_CHUNK = threading.Lock()

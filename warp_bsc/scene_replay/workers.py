@@ -31,18 +31,6 @@ from .checking import Checks
 from .results import IntervalResult
 from .worker import check_chunk, find_selection_without_initial, name_device, pack, serve, unpack
 
-__all__ = [
-    "Cluster",
-    "LocalWorkers",
-    "WorkerCall",
-    "Workers",
-    "check_in_workers",
-    "checked_address",
-    "device_of_cluster",
-    "results_in_order",
-    "selection_without_initial_in_workers",
-]
-
 _CHUNK_BYTES = 512 << 20  # of positions that a worker sends at a time
 _MOST_INTERVALS = 16  # in a chunk; each chunk reads and checks one time more than it has intervals
 _CHUNKS_EACH = 4  # fewest chunks for each worker, so that all workers end at about the same time

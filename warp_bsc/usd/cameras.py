@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from pxr import Usd, UsdGeom
 
-__all__ = ["StageCamera", "find_cameras", "read_camera"]
-
 
 @dataclass(frozen=True)
 class StageCamera:

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 
 from .._arguments import checked_number
 
-__all__ = ["FrameRange"]
-
 
 @dataclass(frozen=True)
 class FrameRange:

@@ -8,8 +8,6 @@ import numpy as np
 from .segment import Segment
 from .turns import Turn
 
-__all__ = ["Interval", "LeftOutMesh", "ReadingNotes", "ReadingRecord"]
-
 _NAMED = 5  # largest number of parts left out, and of messages of OpenUSD, in the warnings
 
 

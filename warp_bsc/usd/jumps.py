@@ -4,8 +4,6 @@ import numpy as np
 
 from .segment import Segment
 
-__all__ = ["JumpFinder", "jumps_at"]
-
 _JUMP = 1e-4  # a jump is more than this share of a mesh's way in an interval; merged times make smaller gaps
 _ROUNDING = 1e-12
 

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
     from .read.meshes import UsdMesh  # which imports pxr
 
-__all__ = ["Scene"]
-
 # If a crate file is mapped into memory, every page read counts as memory of this process, which seems to grow with each
 # frame. USD reads these variables when it is loaded; without the second one it reports the first on standard error.
 if "USDC_USE_ASSET" not in os.environ:

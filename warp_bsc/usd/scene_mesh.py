@@ -4,8 +4,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["InPrims", "SceneMesh"]
-
 
 @dataclass(frozen=True)
 class SceneMesh:

@@ -9,8 +9,6 @@ from .frames import FrameRange
 from .interval import LeftOutMesh
 from .selection import Selection
 
-__all__ = ["Revealed", "SceneOptions"]
-
 _MOST_PARTS = 10_000  # of a step between two times
 
 

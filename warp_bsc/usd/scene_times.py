@@ -10,8 +10,6 @@ from .interval import times_in_words
 if TYPE_CHECKING:
     from .read.meshes import UsdMesh  # which imports pxr
 
-__all__ = ["SceneTimes", "find_times"]
-
 _SAME_TIME = 1e-6
 """Times less apart are one, in time codes, or as a share of the whole time if that is shorter: rounding makes them, and
 OpenUSD separates the end of a value clip from the start of the next by them."""

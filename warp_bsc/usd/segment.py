@@ -15,8 +15,6 @@ from .welding import first_by_hash, first_by_position
 if TYPE_CHECKING:
     from .read.meshes import UsdMesh
 
-__all__ = ["Segment"]
-
 
 class Segment:
     """Meshes merged to one list of vertices and one of faces, and their positions at the times of the segment.

@@ -10,8 +10,6 @@ import numpy as np
 
 from .._arguments import checked_choice, checked_flag, checked_strings, given
 
-__all__ = ["PURPOSES", "NamedMesh", "Purpose", "Selection"]
-
 Purpose = Literal["default", "render", "proxy", "guide"]
 """A purpose of prims in USD."""
 

@@ -10,8 +10,6 @@ from .read.instancers import Instancer
 from .read.meshes import UsdMesh
 from .turns import Turn, find_turns
 
-__all__ = ["transform_warnings"]
-
 _LARGE_TURN = 180.0  # degrees; from there on a straight path goes through the axis, or the other way round
 _FINE_TURN = 45.0
 _ROUNDING = 1e-6  # of angles, which USD interpolates in single precision

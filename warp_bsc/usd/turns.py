@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Turn", "find_turns"]
-
 _FIRST = 0.382
 """Where between the two times a transform is first tested for a turn; halfway, two whole turns look like none."""
 _COUNTED = [2.0**-10, 2.0**-5, 1.0]

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["first_by_hash", "first_by_position"]
-
 
 def first_by_hash(positions: np.ndarray) -> np.ndarray:
     """Returns for each position the first one with the same hash, shape [n]."""

@@ -21,17 +21,6 @@ from ..scenes.detector import BenchmarkScene
 from ..tables import Column, Table, count
 from ..timing import replay_graph
 
-__all__ = [
-    "DESCRIPTION",
-    "EXAMPLES",
-    "DetectorBenchmark",
-    "benchmark_detector",
-    "ipc_milliseconds",
-    "phase_columns",
-    "show",
-    "to_dict",
-]
-
 DESCRIPTION = """\
 Measure the detector, from positions on the device to results on the device and
 on the host. A scene is one interval of a USD file; two mesh files joined by a

@@ -15,8 +15,6 @@ from ..record import name_place
 from ..tables import Column, Table, count, two
 from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
 
-__all__ = ["COLUMNS", "METHODS", "GivenQueries", "benchmark_given_queries", "show", "to_dict"]
-
 METHODS = (*NARROW_PHASE_METHODS, "cubic")
 """The methods, see :mod:`.methods`."""
 

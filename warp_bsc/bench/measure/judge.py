@@ -14,8 +14,6 @@ from ...response.state.mesh import ModelMesh, host_array
 from ..crossings import SoftPairs
 from ..scenes.simulation import largest_stretch
 
-__all__ = ["Judge", "Judgement"]
-
 
 @dataclass(frozen=True)
 class Judgement:

@@ -46,8 +46,6 @@ from ...kernels.time_of_impact import impact
 from ..peers.baselines import classify_reduced, cubic_solver_edge_edge, cubic_solver_vertex_face
 from ..timing import median_milliseconds
 
-__all__ = ["METHODS", "PHASES", "MethodRun", "Queries", "QuerySet", "measure_nanoseconds", "trace"]
-
 METHODS: tuple[str, ...] = (*NARROW_PHASE_METHODS, "cubic", "reduced")
 """The methods that are compared."""
 

@@ -20,21 +20,6 @@ from ..record import Run
 from ..scenes.newton_examples import NewtonExample, describe_needs
 from ..tables import Column, Table
 
-__all__ = [
-    "CPU_FRAMES",
-    "DESCRIPTION",
-    "EXAMPLES",
-    "FRAMES",
-    "MODES",
-    "WARM_UP",
-    "ExampleMeasurement",
-    "ExampleRun",
-    "StageTotals",
-    "measure_example",
-    "show",
-    "to_dict",
-]
-
 DESCRIPTION = """\
 Run Newton's own examples, unchanged, and measure them: plain, with SolverCCD
 put behind their solver, or behind each entry of a coupled solver that has

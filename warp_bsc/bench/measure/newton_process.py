@@ -20,8 +20,6 @@ from ..._garbage import paused_collection
 from ..scenes.newton_examples import describe_download
 from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals
 
-__all__ = ["SOLVERS", "serve"]
-
 SOLVERS = ("SolverVBD", "SolverXPBD", "SolverStyle3D", "SolverSemiImplicit")
 """The solvers of Newton that move cloth and soft bodies."""
 

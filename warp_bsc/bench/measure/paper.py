@@ -29,19 +29,6 @@ from .detector import benchmark_detector
 from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 from .worst_case import WorstQuery, adversarial_queries, find_worst
 
-__all__ = [
-    "Effort",
-    "Errors",
-    "Place",
-    "SceneBenchmark",
-    "Timing",
-    "benchmark_scene",
-    "find_adversarial_worst",
-    "find_places",
-    "gather_queries",
-    "to_dict",
-]
-
 SEED = 0
 _TURNS = 8  # of timing all methods
 _CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # smallest launches: fewer queries are repeated

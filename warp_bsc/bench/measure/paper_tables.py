@@ -8,8 +8,6 @@ from ..tables import Column, Table, count
 from .detector import phase_columns
 from .methods import METHODS, PHASES
 
-__all__ = ["DESCRIPTION", "EXAMPLES", "show"]
-
 DESCRIPTION = """\
 Measure the paper's five benchmarks, on the candidate pairs of each scene: the
 mean and the worst time of a query by this project's methods, by a

@@ -17,22 +17,6 @@ import warp as wp
 from ..record import Run, version_of
 from ..tables import Column, Table, count, grouped
 
-__all__ = [
-    "DESCRIPTION",
-    "EXAMPLES",
-    "FRAME_RATE",
-    "SCENES",
-    "SIMULATORS",
-    "WARM_UP",
-    "PenetrationMeasurement",
-    "PenetrationRun",
-    "Simulator",
-    "find_speed_kept",
-    "measure_penetration",
-    "show",
-    "to_dict",
-]
-
 SCENES = {
     "bullet": "a patch is shot at a held sheet, at 20 m/s",
     "drape": "a cloth drapes over a sphere",

@@ -27,18 +27,6 @@ from ..scenes.queries import generate_queries, generate_touching_queries
 from ..tables import Column, Table, count
 from ..timing import median_milliseconds
 
-__all__ = [
-    "DESCRIPTION",
-    "EXAMPLES",
-    "MODES",
-    "QueryBenchmark",
-    "benchmark_copy",
-    "benchmark_queries",
-    "check_query_count",
-    "show",
-    "to_dict",
-]
-
 DESCRIPTION = """\
 Measure how many elementary queries a second are decided. The queries are
 random and the same on every device; a third of them survive the culls. Queries

@@ -16,24 +16,6 @@ from ..peers import ipc_toolkit
 from ..scenes.repair import KINDS, TangledMesh
 from ..tables import LONGEST, Column, Table, count, grouped, list_titles
 
-__all__ = [
-    "CROSSING_RANGES",
-    "DESCRIPTION",
-    "EXAMPLES",
-    "FILE",
-    "HINTS",
-    "KNOWN_MESH",
-    "STRAIN",
-    "DamageSummary",
-    "Hint",
-    "RepairAttempt",
-    "RepairRun",
-    "measure_repair",
-    "show",
-    "summarize",
-    "to_dict",
-]
-
 Hint = Literal["none", "order", "x_previous"]
 """What a repair is told: nothing; which sheet is inside which; positions that do not cross."""
 

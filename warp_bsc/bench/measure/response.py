@@ -17,26 +17,6 @@ import warp as wp
 from ..record import Run
 from ..tables import Column, Table, count, grouped, in_thousands
 
-__all__ = [
-    "CONFIGURATIONS",
-    "CONVERGED",
-    "DESCRIPTION",
-    "EARLY_STEPS",
-    "EXAMPLES",
-    "REFERENCE",
-    "REFERENCE_RATE",
-    "SCENES",
-    "SEMI_IMPLICIT_STEPS",
-    "SOLVERS",
-    "WARM_UP",
-    "ResponseMeasurement",
-    "ResponseRun",
-    "Spread",
-    "measure_response",
-    "show",
-    "to_dict",
-]
-
 SCENES = (
     "sphere",
     "box_edge",

@@ -15,8 +15,6 @@ import warp as wp
 from ...detection.run.settings import PairKind
 from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
 
-__all__ = ["WorstQuery", "adversarial_queries", "find_worst"]
-
 _LOOKS = 3
 _SUSPECTS = 24
 _MIN_COPIES, _MAX_COPIES = 256, 2**16

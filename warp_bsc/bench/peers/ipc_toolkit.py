@@ -18,18 +18,6 @@ from ...detection.run.settings import PairKind
 from ..scenes.detector import BenchmarkScene
 from ..timing import count_threads
 
-__all__ = [
-    "CCD_CLASSES",
-    "IpcQueryTiming",
-    "IpcToolkitBenchmark",
-    "benchmark_ipc_toolkit",
-    "decide_queries",
-    "has_intersections",
-    "is_installed",
-    "time_queries",
-    "version",
-]
-
 CCD_CLASSES = {"tight inclusion": "TightInclusionCCD", "additive": "AdditiveCCD"}
 """Methods of the IPC Toolkit, with the names of their classes, which are used with their default settings."""
 

@@ -23,8 +23,6 @@ try:
 except ImportError:  # also where a library that it needs is missing
     uipc = cast(Any, None)
 
-__all__ = ["LibuipcScene", "simulate_libuipc"]
-
 _THICKNESS = 1e-3
 """Of cloth [m], as in its default configuration of shells and as MuJoCo has it here."""
 _CONTACT_DISTANCE = 1e-3

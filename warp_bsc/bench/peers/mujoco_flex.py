@@ -23,8 +23,6 @@ try:
 except ModuleNotFoundError:
     mujoco = cast(Any, None)
 
-__all__ = ["make_mujoco_xml", "simulate_mujoco"]
-
 _THICKNESS = 1e-3
 """Of cloth [m]: "the mode assumes metre-scale models with millimetre-thick flexes" (XMLreference, option/flag/ipc)."""
 _DAMPING = 2e-3

@@ -11,8 +11,6 @@ from ..scenes.penetration import PenetrationScene
 from ..scenes.simulation import NotFinite, Simulation, largest_stretch, make_solver, self_contact
 from .states import Trajectory
 
-__all__ = ["simulate_newton"]
-
 _ITERATIONS = 10
 """Of VBD and XPBD in Newton's examples cloth_hanging, softbody_hanging and, for XPBD, cloth_hanging --solver xpbd."""
 _STYLE3D_ITERATIONS = 4

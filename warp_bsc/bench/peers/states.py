@@ -8,8 +8,6 @@ import numpy as np
 from ...response.state.mesh import host_array
 from ..scenes.contact import Motion
 
-__all__ = ["Body", "NotInstalled", "Trajectory", "find_bodies", "held_positions"]
-
 
 class NotInstalled(Exception):
     """A simulator is not installed or cannot run on this machine; the message says what it needs."""

@@ -11,8 +11,6 @@ import newton
 import numpy as np
 import warp as wp
 
-__all__ = ["SCENES", "Motion", "NotRunnable", "Scene", "SceneBuilder", "build_scene"]
-
 _FRICTION = 0.5
 _IDENTITY = wp.quat_identity()
 _EXPLICIT_CONTACT = 1e2, 0.1, 0.5

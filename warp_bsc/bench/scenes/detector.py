@@ -15,20 +15,6 @@ from ...detection.run.settings import PairKind
 from ...usd.scene import Scene
 from .mesh_files import read_mesh
 
-__all__ = [
-    "GENERATORS",
-    "PAPER_SCENES",
-    "BenchmarkScene",
-    "default_scenes",
-    "find_overlapping",
-    "generate_cloth",
-    "generate_crash",
-    "is_scene_name",
-    "load_intervals",
-    "load_scene",
-    "paper_scenes",
-]
-
 PAPER_SCENES = ("twisting", "funnel", "dancer", "flamenco", "crashing")
 """Names of the scenes of the paper's benchmarks (Sec. 5.2)."""
 

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-__all__ = ["is_mesh_name", "read_mesh"]
-
 
 def read_mesh(path: str):
     """Returns the mesh of a file as ``trimesh.Trimesh``, whose vertices and faces are those of the file.

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from ..tables import Column, Table
 
-__all__ = ["FOLDERS", "NewtonExample", "describe_download", "describe_needs", "find_examples", "list_examples"]
-
 FOLDERS = ("cloth", "softbody", "multiphysics")
 """The folders of Newton's examples that are measured by default."""
 

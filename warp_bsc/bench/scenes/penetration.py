@@ -13,8 +13,6 @@ import warp as wp
 
 from .contact import Motion, Scene, SceneBuilder, build_scene
 
-__all__ = ["SCENES", "PenetrationScene", "build_penetration_scene"]
-
 _STIFFNESS = 1e3  # N/m of the membranes that are hit
 _FREE = 0.75
 """Share of the way to what it meets over which the speed of what flies is measured."""

@@ -5,8 +5,6 @@ import warp as wp
 from ...detection.run.launch import launch_over
 from ...detection.run.settings import NO_FUSED_OPERATIONS, PairKind
 
-__all__ = ["SEED", "generate_queries", "generate_touching_queries"]
-
 SEED = 0
 """Seed of the random numbers."""
 

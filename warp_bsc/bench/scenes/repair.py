@@ -9,8 +9,6 @@ from ...detection.at_rest.intersections import IntersectionFinder
 from ...detection.mesh import CollisionMesh
 from .mesh_files import read_mesh
 
-__all__ = ["KINDS", "KNOWN", "TangledMesh", "damaged", "load_tangled"]
-
 
 @dataclass(frozen=True, eq=False)
 class TangledMesh:

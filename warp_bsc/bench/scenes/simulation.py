@@ -19,8 +19,6 @@ from ..crossings import CrossingCounter
 from ..elastic_energy import ElasticEnergy
 from .contact import Scene
 
-__all__ = ["NotFinite", "Simulation", "energy_gained", "largest_stretch", "make_solver", "self_contact", "total_energy"]
-
 _ITERATIONS = 10
 _MARGIN = 0.005
 """Distance at which VBD's self-contact begins to push, and the gap beyond it [m]; smaller ones hinder a free fall."""

@@ -13,8 +13,6 @@ from .arc_pipeline import LARGEST_TURN, ArcPipeline
 from .arc_search import ArcSearch, join_contacts, straight_mesh
 from .rigid_motion import ArcBounds, RigidMotion
 
-__all__ = ["ArcDetector"]
-
 
 class ArcDetector:
     """Finds the collisions of motions in which bodies turn. It reuses what it has made for the same vertices.

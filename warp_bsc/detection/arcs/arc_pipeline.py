@@ -15,8 +15,6 @@ from ..run.launch import launch, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind
 from .rigid_motion import ArcBounds
 
-__all__ = ["LARGEST_TURN", "ArcPipeline"]
-
 LARGEST_TURN = 0.5 * np.pi
 """Turn up to which one pass takes less time than parts of the step: its boxes reach beyond chords by the deviation over
 the whole step, which is at most 0.31 of the distance from the axis."""

@@ -22,8 +22,6 @@ from ..run.phase_timer import PhaseTimer
 from ..run.settings import Counts, DistanceKind, add_counts
 from .rigid_motion import ArcBounds
 
-__all__ = ["ArcSearch", "join_contacts", "straight_mesh"]
-
 _COARSE = 0.25
 """Largest deviation in the parts that a search begins with, as a share of the mean edge of turning bodies: boxes then
 are not much larger than those of their elements."""

@@ -13,8 +13,6 @@ from ...kernels.motion import double
 from ..run.launch import launch, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS
 
-__all__ = ["ArcBounds", "RigidMotion", "points_on_arcs"]
-
 _LARGEST_TURN = 4096.0
 _SMALLEST_TURN = 2.0**-400
 _LARGEST_COORDINATE = 2.0**500

@@ -6,8 +6,6 @@ from ..._sorted_keys import distinct, expand_ranges
 from ..mesh import CollisionMesh
 from .intersections import Intersections
 
-__all__ = ["BodyParts", "connect_cells", "pair_keys"]
-
 
 class BodyParts:
     """The connected parts of bodies.

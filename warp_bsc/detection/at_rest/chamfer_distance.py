@@ -14,8 +14,6 @@ from ...kernels.polynomials import VERTEX_FACE
 from ..run.launch import launch
 from ..run.settings import NO_GRADIENTS
 
-__all__ = ["chamfer_distance"]
-
 _IGNORED, _UNKNOWN = wp.constant(-1), wp.constant(-2)  # faces of points without weight, and of what is not finite
 
 

@@ -8,8 +8,6 @@ import warp as wp
 from ..run.launch import launch
 from ..run.settings import NO_GRADIENTS
 
-__all__ = ["ClosestPointFinder", "ClosestPoints"]
-
 
 @wp.kernel(**NO_GRADIENTS)
 def find_closest(

@@ -14,8 +14,6 @@ from ..mesh import CollisionMesh
 from .body_parts import BodyParts, pair_keys
 from .intersections import Intersections, points_on_faces
 
-__all__ = ["Containment", "ContainmentFinder", "enclosing_boxes"]
-
 _CHUNK = 1 << 20  # pairs in memory at a time
 
 

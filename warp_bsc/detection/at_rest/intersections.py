@@ -23,8 +23,6 @@ from ..results.collisions import Collisions
 from ..run.launch import launch_over, launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, UNLIMITED, Count, Counters, capacity_for
 
-__all__ = ["IntersectionFinder", "Intersections", "find_intersections", "points_on_faces"]
-
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _PAIRS_OF_HIT = 8

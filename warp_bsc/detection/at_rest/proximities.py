@@ -23,8 +23,6 @@ from ..run.launch import launch_over_queue, made_once, retry_until_fits
 from ..run.settings import NO_GRADIENTS, Count, Counters, DistanceKind, PairCounts, capacity_for
 from ..run.start import checked_device
 
-__all__ = ["Proximities", "ProximityFinder", "distances", "least_distance"]
-
 _FOUND = wp.constant(int(Count.FOUND))
 _QUEUED = wp.constant(int(Count.QUEUED))
 _LARGEST = 2.0**1000

@@ -11,8 +11,6 @@ from ..mesh import CollisionMesh
 from .broad_phase_hierarchy import BroadPhaseHierarchy
 from .broad_phase_simd import BroadPhaseSimd
 
-__all__ = ["BroadPhase", "make_broad_phase"]
-
 
 class BroadPhase(Protocol):
     """Finds the candidates of a mesh: pairs of elements that share no vertex, and whose swept boxes overlap.

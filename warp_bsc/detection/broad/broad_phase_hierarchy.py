@@ -13,8 +13,6 @@ from ..run.settings import capacity_for
 from .element_pairs import pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
 from .face_hierarchy import box_bundles, bundle_count, fit_kernel, make_hierarchy, traversal_kernel
 
-__all__ = ["BroadPhaseHierarchy"]
-
 _WARPS_OF_MULTIPROCESSOR = 128
 """Number of warps to aim at for a multiprocessor of a GPU in a traversal."""
 _MAX_WARPS_OF_CLUSTER = 16

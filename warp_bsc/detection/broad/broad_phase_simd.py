@@ -10,8 +10,6 @@ from ..mesh import CollisionMesh
 from ..run.settings import UNLIMITED
 from .wide_tree import WideTree, sort_trees
 
-__all__ = ["BroadPhaseSimd"]
-
 
 class BroadPhaseSimd:
     """The broad phase by wide BVHs, one for each kind of element, see :class:`.broad_phase.BroadPhase`.

@@ -24,14 +24,6 @@ from ..run.launch import made_once
 from ..run.settings import NO_GRADIENTS, Count
 from .face_hierarchy import FaceHierarchy
 
-__all__ = [
-    "filtered_pairs",
-    "pair_edges_with_faces_kernel",
-    "pair_elements_kernel",
-    "pair_functions",
-    "pair_points_kernel",
-]
-
 _FILTERED = wp.constant(int(Count.FILTERED))
 _QUEUED = wp.constant(int(Count.QUEUED))
 

@@ -40,8 +40,6 @@ from ..mesh import CollisionMesh
 from ..run.launch import made_once
 from ..run.settings import NO_GRADIENTS
 
-__all__ = ["FaceHierarchy", "box_bundles", "bundle_count", "fit_kernel", "make_hierarchy", "traversal_kernel"]
-
 _WIDTH = wp.constant(WIDTH)
 
 _FEW_BUNDLES = 8

@@ -15,8 +15,6 @@ from ...kernels.pipeline.wide_bvh import fit_packet_of, pair_packet
 from ..run.launch import launch_over, made_once
 from ..run.settings import NO_GRADIENTS, Count
 
-__all__ = ["WideTree", "hilbert_transpose", "sort_trees"]
-
 _CODE_BITS = 10
 """Bits of a Hilbert code an axis."""
 _QUEUED = wp.constant(int(Count.QUEUED))

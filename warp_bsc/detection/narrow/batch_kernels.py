@@ -24,8 +24,6 @@ from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
 from .pair_kernels import PairBuffers, write_decision, write_impact
 
-__all__ = ["batch_classification_kernel", "batch_culling_kernel", "batch_impact_kernel"]
-
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))

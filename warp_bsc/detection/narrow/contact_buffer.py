@@ -10,17 +10,6 @@ import warp as wp
 from ...kernels.signs import FREE
 from ..run.settings import capacity_for
 
-__all__ = [
-    "ContactBuffer",
-    "ContactBufferPool",
-    "ContactRows",
-    "HostContacts",
-    "contacts_from_host",
-    "empty_contacts",
-    "make_contact_buffer",
-    "read_contacts",
-]
-
 _MAX_FREE = 4
 """Free buffers that a pool keeps: those of two results."""
 

@@ -30,8 +30,6 @@ from ..run.settings import NO_FUSED_OPERATIONS, Count, DistanceKind, PairKind
 from .contact_buffer import make_contact_buffer
 from .pair_kernels import PairBuffers
 
-__all__ = ["are_within_distance", "launch_exact_distances", "launch_exact_phase"]
-
 _WIDTHS_ON_GPU = (1, 2, 8)
 """Limbs of the integers on a GPU, where a launch over an empty queue takes longer than four limbs would save."""
 

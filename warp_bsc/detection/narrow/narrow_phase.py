@@ -17,8 +17,6 @@ from .contact_buffer import ContactBuffer, make_contact_buffer
 from .exact_phase import launch_exact_phase
 from .pair_kernels import PairBuffers, PairRule, cull_kernel, decide_kernel, gather_contacts, pad_keys
 
-__all__ = ["NarrowPhase", "Phases", "buffers_of", "launch_culls", "launch_decisions", "launch_over_kinds"]
-
 
 class NarrowPhase:
     """Decides pairs of one kind, on the device.

@@ -13,8 +13,6 @@ from ..run.launch import launch, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, DistanceKind
 from .contact_buffer import HostContacts
 
-__all__ = ["decide_on_host", "pair_distances"]
-
 
 @made_once
 def _kernel(dtype: type, with_distance: bool) -> wp.Kernel:

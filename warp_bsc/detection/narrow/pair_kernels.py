@@ -17,22 +17,6 @@ from ..run.launch import made_once
 from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS, Count
 from .contact_buffer import ContactBuffer
 
-__all__ = [
-    "PairBuffers",
-    "PairRule",
-    "add_contact",
-    "add_open_contact",
-    "count_found",
-    "cull_kernel",
-    "decide_kernel",
-    "entry_of_two",
-    "gather_contacts",
-    "pad_keys",
-    "take_contact",
-    "write_decision",
-    "write_impact",
-]
-
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _CONTACTS = wp.constant(int(Count.CONTACTS))

@@ -7,8 +7,6 @@ from ..._arguments import checked_integer
 from ..._sorted_keys import expand_ranges
 from ..mesh import CollisionMesh
 
-__all__ = ["Rings", "are_within_rings", "make_rings"]
-
 _MAX_NEIGHBOURS = 256
 """Vertices within the rings of one, on average: each candidate compares its vertices with these."""
 

@@ -22,8 +22,6 @@ from ..run.start import checked_device
 from .query_arrays import DeviceQueryResult, query_into
 from .query_points import mesh_of_rows
 
-__all__ = ["QueryResult", "query_edge_edge", "query_vertex_edge", "query_vertex_face", "query_vertex_vertex"]
-
 
 @dataclass(frozen=True)
 class QueryResult:

@@ -16,8 +16,6 @@ from ..run.phase_timer import PhaseTimer
 from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, PairKind
 from ..run.start import checked_device
 
-__all__ = ["DeviceQueryResult", "query_into"]
-
 _MAX_QUERIES = 2**28 - 1
 """Their eight points each are numbered by int32."""
 

@@ -7,8 +7,6 @@ from numpy.typing import ArrayLike
 from ..._arguments import as_numpy, checked_choice, checked_shape
 from ..run.settings import DistanceKind
 
-__all__ = ["mesh_of_rows", "query_points"]
-
 _CORNERS = {"vertex_face": (1, 3), "edge_edge": (2, 2), "vertex_edge": (1, 2), "vertex_vertex": (1, 1)}
 """Number of vertices of both elements, by kind of pair."""
 

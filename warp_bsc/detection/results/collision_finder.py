@@ -16,8 +16,6 @@ from ..run.settings import Counts, DistanceKind
 from .collisions import CapturedCollisions, Collisions
 from .differentiable import DifferentiableContacts
 
-__all__ = ["CollisionFinder"]
-
 
 class CollisionFinder:
     """Finds collisions by a pipeline. It reuses the buffers of results that are garbage.

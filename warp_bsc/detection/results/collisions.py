@@ -13,16 +13,6 @@ from ..run.phase_timer import PhaseTimer, PhaseTimers
 from ..run.settings import Counts, DistanceKind, Method, PairCounts
 from .differentiable import DifferentiableContacts
 
-__all__ = [
-    "Candidates",
-    "CapturedCollisions",
-    "Collisions",
-    "DetectionStats",
-    "FreeStep",
-    "PhaseCounts",
-    "add_stats",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Candidates:

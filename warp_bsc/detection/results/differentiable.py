@@ -15,8 +15,6 @@ from ..narrow.contact_buffer import ContactBuffer
 from ..run.launch import launch, made_once
 from ..run.settings import DistanceKind
 
-__all__ = ["DifferentiableContacts"]
-
 
 @made_once
 def _kernel(dtype: type) -> wp.Kernel:

@@ -8,8 +8,6 @@ import warp as wp
 
 from ..._private_names.of_warp import on_compilation
 
-__all__ = ["duration", "report_compilation", "reported_to", "say_compiling"]
-
 _listeners: list[Callable[[], None]] = []
 
 

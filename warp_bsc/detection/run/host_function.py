@@ -20,8 +20,6 @@ import warp as wp
 from ..._private_names.of_warp import cpu_graph
 from .launch import launch
 
-__all__ = ["functions_of_graphs", "run_on_host"]
-
 
 @dataclass(eq=False)
 class _Failure:

@@ -20,19 +20,6 @@ import warp as wp
 from ..._private_names.of_warp import may_run_in_threads
 from . import compilation  # noqa: F401 (says so where kernels are compiled)
 
-__all__ = [
-    "THREADS_OF_MULTIPROCESSOR",
-    "GrowingBuffers",
-    "cores",
-    "launch",
-    "launch_over",
-    "launch_over_queue",
-    "made_once",
-    "max_blocks",
-    "retry_until_fits",
-    "thread_pool",
-]
-
 _THREADS = os.cpu_count() or 1
 
 THREADS_OF_MULTIPROCESSOR = 1024

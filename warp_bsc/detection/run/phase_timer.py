@@ -7,8 +7,6 @@ from typing import Any
 
 import warp as wp
 
-__all__ = ["PhaseTimer", "PhaseTimers"]
-
 
 class PhaseTimer:
     """Measures phases that follow one another: by events on a GPU, without synchronizing, else by the clock.

@@ -10,25 +10,6 @@ import warp as wp
 from ..._arguments import checked_number
 from ...kernels import polynomials
 
-__all__ = [
-    "FILTERED_COUNTS",
-    "METHODS",
-    "NO_FUSED_OPERATIONS",
-    "NO_GRADIENTS",
-    "TOLERANCE",
-    "UNLIMITED",
-    "Count",
-    "Counters",
-    "Counts",
-    "DistanceKind",
-    "Method",
-    "PairCounts",
-    "PairKind",
-    "add_counts",
-    "capacity_for",
-    "checked_tolerance",
-]
-
 Method = Literal["float", "conservative", "exact"]
 """What becomes of a pair that floating point cannot certify: its computed signs decide, it counts as a hit, or exact
 arithmetic decides."""

@@ -7,8 +7,6 @@ import warp as wp
 
 from ..._arguments import check_instance
 
-__all__ = ["checked_device", "find_device", "gpu_count", "is_cpu", "start_warp"]
-
 
 def start_warp() -> None:
     """Initializes Warp without the line that its native library prints to standard error if there is no CUDA driver."""

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["BLEND", "MARGIN", "blend"]
-
 BLEND = 4
 """Intervals over which a displacement grows before a collision, and fades after it."""
 _SMOOTHINGS = 2

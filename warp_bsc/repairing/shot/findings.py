@@ -16,8 +16,6 @@ from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.selection import Selection
 
-__all__ = ["Finding", "MeshPair", "find_collisions", "kept_meshes"]
-
 MeshPair = tuple[str, str]
 """Names of two meshes."""
 

@@ -17,8 +17,6 @@ from .follow_kernels import find_directions, normalize, smooth
 if TYPE_CHECKING:
     from .playback import Playback
 
-__all__ = ["FollowedFrame", "Follower"]
-
 _SWEEPS = 64, 16, 8
 """Sweeps that spread the displacements by contacts over the mesh, one number after the other."""
 _DETECTIONS = 16

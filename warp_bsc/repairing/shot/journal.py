@@ -15,8 +15,6 @@ from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
 from .stretch import RepairedStretch
 
-__all__ = ["Journal"]
-
 _FORMAT = "warp-bsc repair 1"
 
 

@@ -7,8 +7,6 @@ import numpy as np
 from ...usd.segment import Segment
 from .findings import MeshPair
 
-__all__ = ["groups_of"]
-
 _MOST_KINDS = 32
 """Groups of a :class:`warp_bsc.CollisionMesh`."""
 

@@ -11,8 +11,6 @@ from ...detection.mesh import CollisionMesh
 from ...response.solver_ccd import SolverCCD
 from ...response.state.collision_filter import CollisionFilter
 
-__all__ = ["Playback"]
-
 
 class Playback:
     """The stage behind a solver that moves the vertices of a mesh to given positions."""

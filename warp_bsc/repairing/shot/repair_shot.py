@@ -22,8 +22,6 @@ from .follow import Follower
 from .mesh_groups import groups_of
 from .stretch import FollowedMesh, RepairedStretch, ShotFrame, StretchRecorder
 
-__all__ = ["repair_shot"]
-
 _FADING = 0.7
 """Share of a displacement that the next frame begins with, while the displacements are sought."""
 _FADED = 0.002

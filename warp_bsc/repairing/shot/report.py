@@ -18,8 +18,6 @@ from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
 from .stretch import RepairedStretch
 
-__all__ = ["UNREPAIRED_HITS", "RepairPage"]
-
 UNREPAIRED_HITS = "collisions of meshes that cross at the first frame"
 """What remains of pairs of meshes that stay as they are."""
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from ...usd.write.points_layer import MovedFrame
 
-__all__ = ["FollowedMesh", "RepairedStretch", "ShotFrame", "StretchRecorder"]
-
 
 @dataclass(frozen=True)
 class RepairedStretch:

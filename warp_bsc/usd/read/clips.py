@@ -9,8 +9,6 @@ from pxr import Sdf, Tf, Usd, Vt
 from .topology import is_empty
 from .unreadable import LeftOut, UnreadableError, reading
 
-__all__ = ["has_clips", "leave_out_clips"]
-
 _NEEDED = {"assetPaths": Sdf.AssetPathArray, "active": Vt.Vec2dArray}
 _NEEDED_OF_TEMPLATE = {"templateStartTime": float, "templateEndTime": float, "templateStride": float}
 _READ = frozenset(

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pxr import Usd
 
-__all__ = ["SceneFiles"]
-
 
 class SceneFiles:
     """The files of all layers that a USD stage has opened so far, value clips included; and whether it was changed."""

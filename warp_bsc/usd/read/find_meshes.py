@@ -12,8 +12,6 @@ from .mesh_prims import MeshPrimFinder
 from .meshes import UsdMesh
 from .unreadable import LeftOut, UnreadableError, reading
 
-__all__ = ["find_meshes"]
-
 
 def find_meshes(
     stage: Usd.Stage, file: str | os.PathLike, selection: Selection, left_out: LeftOut

@@ -10,20 +10,6 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from .samples import may_jump, sample_times
 from .unreadable import LeftOut, UnreadableError, reading
 
-__all__ = [
-    "Instance",
-    "Instancer",
-    "are_finite",
-    "find_instances",
-    "is_ever_shown",
-    "is_shown",
-    "masking_attributes",
-    "transform_attributes",
-    "transform_ops",
-    "transform_times",
-    "visibility_times",
-]
-
 # Prototypes are often below a class or an over, so that they are not drawn themselves.
 _PROTOTYPES = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded)
 

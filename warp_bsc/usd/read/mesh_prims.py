@@ -14,8 +14,6 @@ from .skinning import find_bindings
 from .strands import is_strands
 from .unreadable import LeftOut, UnreadableError, reading
 
-__all__ = ["MeshPrim", "MeshPrimFinder"]
-
 
 class MeshPrim:
     """A prim that is read as a mesh, or one instance of it, before it is read.

@@ -9,8 +9,6 @@ from pxr import Usd, UsdGeom
 from .instancers import Instance, are_finite, masking_attributes, transform_attributes, transform_ops, transform_times
 from .samples import may_jump
 
-__all__ = ["MeshTransforms"]
-
 _BETWEEN = 0.382  # where between two samples transforms are tested for bends; halfway, two whole turns look like none
 _ROUNDING = 1e-6  # of transforms that USD interpolates in single precision
 

@@ -19,8 +19,6 @@ from .strands import Strands, is_strands
 from .topology import BROKEN, Topologies, is_empty
 from .unreadable import UnreadableError, reading
 
-__all__ = ["UsdMesh"]
-
 _MOST_TIMES = 1_000_000
 
 _States = dict[float, tuple[bytes, bytes] | None]

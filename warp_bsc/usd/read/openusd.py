@@ -1,7 +1,5 @@
 """Whether OpenUSD can be imported, and is new enough."""
 
-__all__ = ["OLDEST", "check_openusd"]
-
 OLDEST = 25, 8
 """The oldest version of OpenUSD that the tests of this package have passed with."""
 

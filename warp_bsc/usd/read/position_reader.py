@@ -7,8 +7,6 @@ import numpy as np
 if TYPE_CHECKING:
     from .meshes import UsdMesh  # which imports pxr
 
-__all__ = ["PositionReader"]
-
 
 class PositionReader:
     """Reads positions of some vertices of meshes, those of instances of one prim and of rigid meshes together."""

@@ -5,8 +5,6 @@ from pxr import Usd, UsdGeom
 
 from .meshes import UsdMesh
 
-__all__ = ["RigidMeshes", "is_rigid"]
-
 
 def is_rigid(mesh: UsdMesh) -> bool:
     """Returns whether a mesh always has the same points in a space of its own, which a transform places in the world.

@@ -6,8 +6,6 @@ from itertools import pairwise
 import numpy as np
 from pxr import Gf, Ts, Usd
 
-__all__ = ["as_time_code", "may_jump", "sample_times"]
-
 _STILL = (Ts.ExtrapHeld, Ts.ExtrapValueBlock)
 _PROBES = 8  # parts of a piece of a spline; at their ends the spline is compared with the straight line
 _BEND = 0.01  # largest distance of a piece from the straight line, as a share of the spline's range of values

@@ -10,8 +10,6 @@ from pxr import Usd, UsdGeom
 
 from .samples import may_jump
 
-__all__ = ["MeshPolygons", "Polygons", "ShapePolygons", "is_shape"]
-
 _SHAPES = (UsdGeom.Cube, UsdGeom.Sphere, UsdGeom.Capsule, UsdGeom.Cylinder, UsdGeom.Cone, UsdGeom.Plane)
 _CUBE = [(x, y, z) for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)]
 _CUBE_SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]

@@ -6,8 +6,6 @@ from pxr import Sdf, Usd, UsdSkel, Vt
 from .samples import may_jump, sample_times
 from .unreadable import UnreadableError
 
-__all__ = ["Skin", "find_bindings"]
-
 
 class Skin:
     """The deformation of one mesh: blend shapes, then joints.

@@ -15,8 +15,6 @@ from ..._arguments import given
 from ..._warnings import warn_caller
 from .unreadable import LeftOut, UnreadableError, collecting, describe_error, in_one_line
 
-__all__ = ["check_stage", "given_stage", "name_of", "open_stage", "write_for_others"]
-
 # OpenUSD's messages on a missing file or prim; its error classes do not reach Python.
 _MISSING = re.compile(
     r"(Could not open asset|Could not load sublayer|Unresolved \w+ prim path) @(?P<asset>.+?)@"

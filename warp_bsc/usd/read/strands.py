@@ -8,8 +8,6 @@ from pxr import Usd, UsdGeom
 
 from .unreadable import UnreadableError
 
-__all__ = ["Strands", "is_strands"]
-
 
 class Strands:
     """The linear curves of a ``UsdGeom.BasisCurves`` prim, or the points of a ``UsdGeom.Points`` prim.

@@ -14,8 +14,6 @@ from .shapes import Polygons
 from .triangulation import triangulate
 from .unreadable import UnreadableError
 
-__all__ = ["BROKEN", "Topologies", "Topology", "as_topology", "is_empty"]
-
 BROKEN = b"", b""
 """The digests of polygons of which a sample is blocked."""
 

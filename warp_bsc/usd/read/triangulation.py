@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["triangulate"]
-
 
 def triangulate(counts: np.ndarray, indices: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cuts polygons into triangles: convex ones as a fan from their first corner, concave ones by clipping ears.

@@ -8,8 +8,6 @@ from fnmatch import fnmatchcase
 import numpy as np
 from pxr import Tf, Usd, UsdShade, UsdUtils
 
-__all__ = ["LeftOut", "UnreadableError", "collecting", "describe_error", "in_one_line", "reading"]
-
 _DAMAGE = (RuntimeError, TypeError, OverflowError, UnicodeError)  # Tf.ErrorException is a RuntimeError
 _NO_GEOMETRY = frozenset(
     f".{extension}"

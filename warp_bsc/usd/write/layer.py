@@ -2,8 +2,6 @@
 
 from ..scene import Scene
 
-__all__ = ["just_before", "layer_metadata", "unused_path"]
-
 
 def unused_path(scene: Scene, path: str) -> str:
     """Returns a path at which the scene has no prim: a given one, with underscores appended if necessary."""

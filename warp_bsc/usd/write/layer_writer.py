@@ -11,17 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-__all__ = [
-    "SHAPES",
-    "LayerContent",
-    "LayerPrim",
-    "LayerScope",
-    "PrimKind",
-    "new_layer",
-    "write_binary_layer",
-    "write_text_layer",
-]
-
 PrimKind = Literal["Mesh", "PointInstancer", "BasisCurves"]
 """The types of prims in a layer."""
 

@@ -19,8 +19,6 @@ from .layer_writer import new_layer
 if TYPE_CHECKING:
     from ..read.meshes import UsdMesh  # which imports pxr
 
-__all__ = ["MovedFrame", "PointsLayer"]
-
 
 @dataclass(frozen=True)
 class MovedFrame:

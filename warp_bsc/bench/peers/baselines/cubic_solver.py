@@ -39,8 +39,6 @@ import warp as wp
 from ....kernels.culling import edge_edge_boxes_apart, vertex_face_boxes_apart
 from ....kernels.signs import FREE, HIT
 
-__all__ = ["COPLANAR", "DISTANCE", "cubic_solver_edge_edge", "cubic_solver_vertex_face"]
-
 COPLANAR = wp.constant(wp.float64(1.0e-9))
 """Largest value of the cubic that counts as zero, as a share of the sum of its coefficients' absolute values."""
 DISTANCE = wp.constant(wp.float64(1.0e-6))

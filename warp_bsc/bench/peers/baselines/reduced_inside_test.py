@@ -13,8 +13,6 @@ from ....kernels.classification import classify_with
 from ....kernels.polynomials import VERTEX_FACE, Coplanarity, InsideTests, Motion, cross_middle
 from ....kernels.signs import FREE, certified_sign_cubic
 
-__all__ = ["classify_reduced", "reduced_inside_tests"]
-
 _HALF = wp.constant(wp.float64(0.5))
 _THREE = wp.constant(wp.float64(3.0))
 _FOUR = wp.constant(wp.float64(4.0))

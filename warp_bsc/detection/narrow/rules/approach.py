@@ -26,14 +26,6 @@ from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions
 from ..pair_kernels import PairRule
 from ..rings import Rings, are_within_rings, make_rings
 
-__all__ = [
-    "MinDistances",
-    "distances_of_pair",
-    "impact_on_arcs_at_distance",
-    "make_min_distances",
-    "run_approaches",
-]
-
 KEPT = wp.constant(wp.float64(1.0 - 2.0**-20))
 """Share of its distance at the start that a pair must keep which starts within its minimum distance.
 

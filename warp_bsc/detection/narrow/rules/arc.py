@@ -22,8 +22,6 @@ from ...run.settings import NO_FUSED_OPERATIONS, Count
 from ..narrow_phase import Phases, buffers_of, launch_culls, launch_decisions
 from ..pair_kernels import PairBuffers, PairRule, add_contact
 
-__all__ = ["allocate_arcs", "bound_arc", "run_arcs"]
-
 _QUEUED = wp.constant(int(Count.QUEUED))
 _SURVIVORS = wp.constant(int(Count.SURVIVORS))
 _ONE = wp.constant(wp.float64(1.0))

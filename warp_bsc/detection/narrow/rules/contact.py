@@ -36,8 +36,6 @@ from ..pair_kernels import (
     write_impact,
 )
 
-__all__ = ["run_contacts"]
-
 _CONTACTS = wp.constant(int(Count.CONTACTS))
 _FOR_EXACT = wp.constant(int(Count.FOR_EXACT))
 

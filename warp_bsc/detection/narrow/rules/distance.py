@@ -22,8 +22,6 @@ from ..narrow_phase import Phases, buffers_of, launch_culls
 from ..pair_kernels import PairBuffers, PairRule, count_found, take_contact, write_decision, write_impact
 from ..rings import Rings, are_within_rings
 
-__all__ = ["run_distances"]
-
 _BLOCK = 64
 """Threads of a block that searches."""
 _ADVANCING, _SUBDIVIDING = 384, 256
