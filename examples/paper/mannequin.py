@@ -4,8 +4,6 @@ import numpy as np
 import warp as wp
 from paper_scene import add_collider, grid_faces, lathe
 
-__all__ = ["FLATNESS", "WAIST_HEIGHT", "WAIST_RADIUS", "add_mannequin", "dance"]
-
 WAIST_HEIGHT, WAIST_RADIUS = 1.06, 0.135  # m, where skirts are fastened, just off the body
 FLATNESS = 0.8  # depth of the trunk and of waists, as a share of their width
 TRUNK = [  # radius and height [m], from below the hips to the top of the head

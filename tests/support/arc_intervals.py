@@ -13,8 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["FREE", "HIT", "UNDECIDED", "Pairs", "Truth", "decide", "decide_by_mpmath", "decide_by_numpy"]
-
 FREE, HIT, UNDECIDED = 0, 1, 2
 _NUMPY_LEVELS, _MPMATH_LEVELS = 26, 60
 _CHUNK = 8192

@@ -6,8 +6,6 @@ import numpy as np
 
 from warp_bsc import RigidMotion
 
-__all__ = ["path", "sampled_distances", "speed_bounds"]
-
 _DIGITS = 60
 
 

@@ -29,8 +29,6 @@ from warp_bsc.cli.options import natural, positive
 from warp_bsc.detection.at_rest.intersections import IntersectionFinder, find_intersections
 from warp_bsc.detection.at_rest.proximities import ProximityFinder
 
-__all__ = ["Row", "main", "rows"]
-
 SECONDS = 20
 """Time after which a call counts as a hang."""
 

@@ -4,8 +4,6 @@ import json
 
 from warp_bsc.cli.main import main
 
-__all__ = ["check_interrupt", "check_json_file", "check_wrong_use", "fail", "runner"]
-
 
 def runner(benchmark):
     """Returns a function that runs a benchmark on the CPU, and returns what it has printed."""

@@ -38,8 +38,6 @@ from warp_bsc.kernels.exact.distance import BITS as DISTANCE_BITS
 from warp_bsc.kernels.exact.polygon import BITS
 from warp_bsc.kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 
-__all__ = ["Job", "Judge", "Result", "certify_on_device", "check_on_host", "jobs_of"]
-
 KINDS = ("vertex_face", "edge_edge", "vertex_edge", "vertex_vertex")
 ONE_IN = 10_000
 """One in this many queries goes to the checker."""

@@ -14,8 +14,6 @@ import warp_bsc as bsc
 from warp_bsc import checker
 from warp_bsc.bench.tables import Column
 
-__all__ = ["KINDS", "Verdict", "judge"]
-
 
 def _upright(rng, n):
     """Tetrahedra of positive volume."""

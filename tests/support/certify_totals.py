@@ -8,8 +8,6 @@ from warp_bsc.bench.tables import Column
 from warp_bsc.cli.tables import print_table
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
-__all__ = ["METHODS", "Result", "print_totals"]
-
 METHODS = {"float": 4, "conservative": 2, "user's kernel": 3, "exact": 1}
 """The axis of each method in counts of answers."""
 

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import nbformat
 
-__all__ = ["NOTEBOOKS", "committed_form"]
-
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples" / "notebooks").glob("*.ipynb"))
 METADATA = {
     "accelerator": "GPU",  # of Colab

@@ -14,8 +14,6 @@ try:
 except ImportError:  # Windows, where each process compiles for itself
     fcntl = None
 
-__all__ = ["FOLDER", "QUICK", "compile_for_gpus", "compile_kernels_once", "compile_quickly"]
-
 FOLDER = os.path.dirname(__file__)
 """Folder from which a program that a test starts can import this module."""
 

@@ -7,8 +7,6 @@ from device_random import integer, real, seeded
 from warp_bsc.kernels.polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_VERTEX
 from warp_bsc.kernels.signs import FREE, HIT
 
-__all__ = ["choose_distances", "make_reached_queries"]
-
 wp.set_module_options({"enable_backward": False} | QUICK)
 
 _0 = wp.constant(wp.float64(0.0))

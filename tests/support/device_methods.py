@@ -17,14 +17,6 @@ from warp_bsc.kernels.pairs import form_of
 from warp_bsc.kernels.polynomials import VERTEX_FACE
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
 
-__all__ = [
-    "answer_kernel",
-    "count_answers",
-    "distance_kernel",
-    "exact_distance_kernel",
-    "user_kernel",
-]
-
 UNFUSED = {"enable_backward": False, "module": "unique", "module_options": QUICK | {"fuse_fp": False}}
 """Options of the kernels of the package, in which no multiplication is fused with an addition."""
 FUSED = {"enable_backward": False, "module": "unique", "module_options": QUICK}

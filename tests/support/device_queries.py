@@ -16,8 +16,6 @@ from device_random import chance, eighths, integer, lattice, next_number, power,
 
 from warp_bsc.kernels.polynomials import VERTEX_FACE
 
-__all__ = ["LATTICE", "Generator", "make_lattice_queries", "make_queries"]
-
 LATTICE = 3**24
 """Number of queries with coordinates in {-1, 0, 1}."""
 

@@ -5,20 +5,6 @@ The state of the random numbers is an array of one element, so that functions ma
 
 import warp as wp
 
-__all__ = [
-    "bits",
-    "chance",
-    "eighths",
-    "integer",
-    "lattice",
-    "next_number",
-    "power",
-    "power_of_two",
-    "real",
-    "seeded",
-    "vector",
-]
-
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _UPPER = wp.constant(wp.float64(2.0**-27))

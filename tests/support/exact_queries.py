@@ -9,8 +9,6 @@ from compilation import QUICK
 from warp_bsc.kernels.exact.first_contact import decide_in
 from warp_bsc.kernels.exact.polygon import spread
 
-__all__ = ["decide_exactly", "exact_kernel"]
-
 _0 = wp.constant(wp.float64(0.0))
 
 

@@ -10,20 +10,6 @@ from newton_versions import needs_attachments, needs_hard_attachments
 
 import warp_bsc as bsc
 
-__all__ = [
-    "DT",
-    "SCENES",
-    "TILT",
-    "Program",
-    "add_cloth",
-    "block_on_plane",
-    "cloth_on_body",
-    "cloth_on_edge",
-    "cloth_on_sheet",
-    "cloth_on_sphere",
-    "marks_of",
-]
-
 DT = 1.0 / 60.0
 CLOTH = {"tri_ke": 80.0, "tri_ka": 60.0, "tri_kd": 0.05, "edge_ke": 5e-3, "edge_kd": 5e-4, "particle_radius": 0.0}
 OF_CLOTH = "tri_materials", "tri_poses", "tri_areas", "edge_rest_angle", "edge_rest_length", "edge_bending_properties"

@@ -5,8 +5,6 @@ import mmap
 
 import warp as wp
 
-__all__ = ["guard_memory"]
-
 _FILLING = 0xA5
 """Fills new memory, so that what is read before it is written shows."""
 

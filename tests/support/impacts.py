@@ -7,8 +7,6 @@ from compilation import QUICK
 
 from warp_bsc.kernels import impact_edge_edge, impact_vertex_face
 
-__all__ = ["impact_kernel"]
-
 
 @functools.cache
 def impact_kernel(dtype):

@@ -11,8 +11,6 @@ from isaaclab_newton.physics import NewtonCfg
 from isaaclab_newton.sim.schemas import NewtonDeformableBodyPropertiesCfg
 from isaaclab_newton.sim.spawners.materials import NewtonSurfaceDeformableBodyMaterialCfg
 
-__all__ = ["cloth_above_ball"]
-
 _SOFT = {"tri_ke": 1e2, "tri_ka": 1e2, "edge_ke": 1e-4}
 
 

@@ -50,8 +50,6 @@ from warp_bsc.kernels.not_inlined import NOT_INLINED
 from warp_bsc.kernels.polynomials import VERTEX_FACE
 from warp_bsc.kernels.signs import FREE, HIT
 
-__all__ = ["LARGEST", "decide_lattice"]
-
 wp.set_module_options({"enable_backward": False} | QUICK)
 
 LARGEST = 2

@@ -8,8 +8,6 @@ from warp_bsc._atomic_file import OutputFile
 from warp_bsc.bench.record import with_record
 from warp_bsc.cli.tables import Console, print_table
 
-__all__ = ["options_of", "print_rows", "report", "write_measurement"]
-
 
 def options_of(doc, *, device=None):
     """Returns a parser with the text of a program, ``--json``, and ``--device`` if that has a default."""

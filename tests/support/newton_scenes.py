@@ -10,26 +10,6 @@ from warp_bsc.detection.narrow.on_host import pair_distances
 from warp_bsc.detection.run.settings import DistanceKind
 from warp_bsc.response.state.mesh import ModelMesh
 
-__all__ = [
-    "DT",
-    "SOLVERS",
-    "STIFF",
-    "Changed",
-    "DistanceRollout",
-    "Rollout",
-    "Still",
-    "add_crossing_sheets",
-    "add_patch",
-    "add_plates",
-    "add_rope",
-    "add_square",
-    "bullet",
-    "crossing_sheets",
-    "grid",
-    "place_plates",
-    "strands",
-]
-
 DT = 1.0 / 240.0
 """Length of a step [s]."""
 STIFF = {"tri_ke": 1e3, "tri_ka": 1e3, "tri_kd": 1e-1, "edge_ke": 1e-2, "edge_kd": 1e-3, "particle_radius": 0.005}

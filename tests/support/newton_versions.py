@@ -3,14 +3,6 @@
 import newton
 import pytest
 
-__all__ = [
-    "HAS_ATTACHMENTS",
-    "HAS_HARD_ATTACHMENTS",
-    "HAS_OBSERVABLES",
-    "needs_attachments",
-    "needs_hard_attachments",
-]
-
 HAS_OBSERVABLES = hasattr(newton.solvers.SolverBase, "observables")
 """Whether solvers have observables: those of Newton 1.6 have none."""
 

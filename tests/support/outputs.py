@@ -4,8 +4,6 @@ import math
 
 import warp as wp
 
-__all__ = ["filled_with_nan"]
-
 
 def filled_with_nan(shape, dtype, device=None, **options):
     """Returns an array of floats that are NaN: an element that the kernel does not write fails every comparison.

@@ -10,8 +10,6 @@ from newton_scenes import grid
 import warp_bsc as bsc
 from warp_bsc._private_names.of_newton import make_style3d
 
-__all__ = ["KINDS", "Scene", "Settings"]
-
 GRAVITY = 9.81
 KINDS = "drape", "block", "pile", "bodies"
 

@@ -15,8 +15,6 @@ from pathlib import Path
 
 import warp as wp
 
-__all__ = ["SANITIZED", "restart_with_sanitizers", "sanitize_kernels", "sanitizers_available"]
-
 _FLAGS = [
     *("-std=c++17", "-O1", "-g", "-fPIC", "-shared", "-march=native", "-fms-extensions", "-fdeclspec", "-w"),
     *("-fsanitize=address,undefined", "-fno-sanitize=vptr,function", "-fno-sanitize-recover=all", "-shared-libasan"),

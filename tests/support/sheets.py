@@ -2,8 +2,6 @@
 
 import numpy as np
 
-__all__ = ["crumpled", "grid"]
-
 
 def grid(n, dtype=np.float32):
     """A flat sheet of n x n quads of 1 cm: positions and faces."""

@@ -26,8 +26,6 @@ from rich.table import Table
 import warp_bsc as bsc
 from warp_bsc.implicit.solver_implicit import SolverImplicit
 
-__all__ = ["SCENES", "Judged", "Stress"]
-
 _CELLS = 3
 
 

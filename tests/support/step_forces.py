@@ -6,8 +6,6 @@ import warp as wp
 from warp_bsc.implicit.gradients.bodies import ContactsOnBodies
 from warp_bsc.implicit.gradients.energies import elastic_forces, inertial_forces
 
-__all__ = ["forces_of", "forces_of_elastic"]
-
 
 def forces_of(equations):
     """Returns the forces of the step that equations have loaded [N], float64, shape [count, 3]; 0 on what is fixed.
