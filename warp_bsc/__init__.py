@@ -45,7 +45,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.queries.query_points import query_points
     from .detection.results.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.results.differentiable import DifferentiableContacts
-    from .implicit.solver_implicit import SolverImplicit
+    from .implicit.solver_implicit import SolverImplicit, checkpointed
     from .repairing.repair import repair
     from .repairing.results import RepairResult, UnresolvedContour
     from .repairing.state import StateRepairResult, repair_state
@@ -95,6 +95,7 @@ _MODULES = {
     "StateRepairResult": "repairing.state",
     "UnresolvedContour": "repairing.results",
     "chamfer_distance": "detection.at_rest.chamfer_distance",
+    "checkpointed": "implicit.solver_implicit",
     "distances": "detection.at_rest.proximities",
     "leave_out": "detection.mesh",
     "query_edge_edge": "detection.queries.query",
@@ -138,6 +139,7 @@ __all__ = [
     "UnresolvedContour",
     "chamfer_distance",
     "checker",
+    "checkpointed",
     "distances",
     "leave_out",
     "query_edge_edge",

@@ -62,9 +62,9 @@ class ReferenceSteps:
         """Lets the solver record its own steps again."""
         self._solver.gradients.record = self._record
 
-    def record(self, tape, dt, start, end):
+    def record(self, place, dt, start, end):
         """Returns the step that was taken last, as ``StepGradients.record`` does, after solving it in float64."""
-        recorded = self._record(tape, dt, start, end)
+        recorded = self._record(place, dt, start, end)
         self.contacts.append(int((recorded.step.contacts.kind.numpy() >= 0).sum()))
         step, n = recorded.step, len(self.x)
         free = self._solver.mesh.inverse_masses.numpy()[:n] > 0.0

@@ -45,7 +45,7 @@ def access_to(array: wp.array, launches: Iterable[Any]) -> Access:
     found = Access.READ
     for launch in launches:
         for place, other in arrays_of_launch(launch):
-            if not _overlap(array, other):
+            if not overlap(array, other):
                 continue
             if callable(launch):
                 found = Access.WRITTEN
@@ -56,7 +56,8 @@ def access_to(array: wp.array, launches: Iterable[Any]) -> Access:
     return found
 
 
-def _overlap(array, other):
+def overlap(array: wp.array, other: wp.array) -> bool:
+    """Returns whether arrays share memory."""
     if not array.ptr or not other.ptr:
         return False
     return array.ptr < other.ptr + other.capacity and other.ptr < array.ptr + array.capacity

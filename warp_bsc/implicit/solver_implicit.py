@@ -1,8 +1,8 @@
 """The solver with contact inside: inertia, elasticity, contact and friction in one solve of each step."""
 
 import contextlib
-import weakref
-from collections.abc import Callable, Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal
 
 import newton
@@ -12,7 +12,7 @@ from newton import BodyFlags, ParticleFlags
 from newton.solvers import SolverBase
 from newton.solvers.experimental.coupled import ModelView
 
-from .._arguments import check_instance, checked_choice, checked_integer
+from .._arguments import check_instance, checked_choice, checked_integer, given
 from .._private_names.of_newton import attachment_arrays, check_observables
 from .._private_names.of_warp import paused_tape
 from ..detection.run.host_function import run_on_host
@@ -29,7 +29,7 @@ from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.results import StepResults
-from .gradients.between_steps import BetweenSteps
+from .gradients.checkpoints import ARRAYS, CheckpointedStep, Checkpoints
 from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
 from .report import ImplicitStepReport
 
@@ -235,7 +235,6 @@ class SolverImplicit(SolverCCD):
             report=report,
         )
         self.max_iterations = max_steps
-        self._last_recorded: tuple = (lambda: None), (lambda: None)
         counts = {"results": self.report.results, "unconverged_steps": self.report.unconverged}
         method = self.newton_method = NewtonMethod(
             self.work, max_steps=max_steps, precise=model.requires_grad, **counts
@@ -244,10 +243,8 @@ class SolverImplicit(SolverCCD):
         if self._forces is not None:
             method.keeps_contacts, self._forces.more = True, method.publish
         self.gradients: StepGradients | None = None
-        self._between_steps: BetweenSteps | None = None
         if model.requires_grad:
             method.keeps_contacts = True
-            self._between_steps = BetweenSteps(model, self.report.of_gradients.ambiguous_moves)
             self.gradients = StepGradients(self.work, method, self.report.results.converged, self.report.of_gradients)
         if self._counter is not None:
             vars(self.report.worlds).update({name: getattr(self.report.results, name) for name in StepResults.vars})
@@ -268,43 +265,64 @@ class SolverImplicit(SolverCCD):
     def _entered(self, step):
         """Keeps gradients of the step apart from those of what a program moves before it, and after it."""
         watched = contextlib.nullcontext()
-        if self._between_steps is not None and step.is_recorded:
-            watched = self._between_steps.watched(step.tape, step.state_in, step.state_out)
+        if self.gradients is not None and step.is_recorded:
+            watched = self.gradients.between_steps.watched(step.tape, step.state_in, step.state_out)
         with super()._entered(step), watched:
             yield
 
     def _record(self, step, end):
         """Solves a step; the tape records its adjoint."""
-        device, start, gradients = self.mesh.device, step.state_in, self.gradients
+        start, gradients = step.state_in, self.gradients
         assert gradients is not None
-        given = [start.particle_q, start.particle_qd, start.particle_f, start.body_q, start.body_qd, start.body_f]
-        arrays = [*given, end.particle_q, end.particle_qd, end.body_q, end.body_qd]
+        starts = [start.particle_q, start.particle_qd, start.particle_f, start.body_q, start.body_qd, start.body_f]
+        arrays = [*starts, end.particle_q, end.particle_qd, end.body_q, end.body_qd]
         recorded: RecordedStep | None = None
-        before: Callable[[], RecordedStep | None] = self._step_before(step.tape)
+        place, before = gradients.add_step(step.tape)
 
         def forward():
             nonlocal recorded
             copies = StartArrays.of(start)
             self._resolve_motion(step, end)
-            recorded = gradients.record(step.tape, step.dt, copies, end)
+            recorded = gradients.record(place, step.dt, copies, end)
 
         def backward():
             assert recorded is not None
+            of_arrays = (None if array is None else array.grad for array in arrays)
+            gradients.backward(recorded, before, StateGradients(*of_arrays))
+
+        run_on_host(forward, self.mesh.device)
+        self._record_backward(step.tape, backward, arrays)
+
+    def _record_backward(self, tape, function, arrays):
+        """Lets a tape call a function that changes the gradients of arrays, and of those that steps read."""
+        device = self.mesh.device
+
+        def backward():
             with self._lock:
-                of_arrays = (None if array is None else array.grad for array in arrays)
-                gradients.backward(recorded, before(), StateGradients(*of_arrays))
+                function()
             if not device.is_capturing:
                 self.report.warn()
 
-        run_on_host(forward, device)
-        self._last_recorded = weakref.ref(step.tape), lambda: recorded
         changed = [array for array in arrays if array is not None and array.requires_grad]
-        step.tape.record_func(lambda: run_on_host(backward, device), changed + self._read_arrays())
+        tape.record_func(lambda: run_on_host(backward, device), changed + self._read_arrays())
 
-    def _step_before(self, tape):
-        """Returns what returns the step of the same tape that was recorded last, None if there was none."""
-        last_tape, recorded = self._last_recorded
-        return recorded if last_tape() is tape else lambda: None
+    def take_checkpointed(
+        self, step: CheckpointedStep, state_in: newton.State, state_out: newton.State, *options
+    ) -> None:
+        """Takes the steps of :func:`checkpointed`, and records them on the active tape, if any."""
+        gradients, report = self.gradients, self.report
+        assert gradients is not None
+        with paused_tape() as tape:
+            totals = report.total_values, report.unconverged, report.set_steps
+            checkpoints = Checkpoints(gradients, totals, step, *options)
+            if tape is None:
+                checkpoints.take(None, state_in, state_out)
+                return
+            with gradients.between_steps.watched(tape, state_in, state_out):
+                checkpoints.take(tape, state_in, state_out)
+                arrays = [getattr(state, name) for state in (state_in, state_out) for name in ARRAYS]
+                found = tape.gradients  # not the tape, which would then hold itself
+                self._record_backward(tape, lambda: checkpoints.go_back(found, state_in, state_out), arrays)
 
     def _read_arrays(self):
         """Returns the arrays that steps read beside those of states and get gradients, which a tape sets to zero."""
@@ -327,11 +345,15 @@ class SolverImplicit(SolverCCD):
         return [array for array in arrays if array is not None and len(array) and array.requires_grad]
 
     def _resolve_end(self, step, end):
+        gradients = self.gradients
+        if gradients is not None:
+            gradients.taken += 1
         if step.is_recorded:
             self._record(step, end)
             return
         super()._resolve_end(step, end)
-        self._last_recorded = (lambda: None), (lambda: None)  # gradients of what starts here go no further
+        if gradients is not None:
+            gradients.forget_last()
 
     def _solve(self, step, end):
         """Solves with contact from the inertial prediction, and detects what the solve left.
@@ -366,6 +388,73 @@ class SolverImplicit(SolverCCD):
     def notify_model_changed(self, flags: int) -> None:
         """Reads masses, materials, gravity and shapes again, see :class:`warp_bsc.SolverCCD`."""
         super().notify_model_changed(flags)
-        if self._between_steps is not None:
-            self._between_steps.refresh()
+        if self.gradients is not None:
+            self.gradients.between_steps.refresh()
         self.newton_method.read_materials()
+
+
+def checkpointed(
+    solver: SolverImplicit,
+    step: CheckpointedStep,
+    state_in: newton.State,
+    state_out: newton.State,
+    steps: int,
+    *,
+    every: int | None = None,
+    outputs: Sequence[wp.array] = (),
+) -> None:
+    """Takes steps of a solver of which a tape keeps every ``every``-th state alone.
+
+    On its way back, the tape takes the steps again, ``every`` of them at a time, and has of these what it otherwise
+    has of all. Gradients are those of steps that are recorded one by one, and so are their counts and norms in the
+    report; totals have each step once. What the report says of a last step is of the last one that was taken. On a
+    tape::
+
+        def step(k, start, end):
+            wp.launch(push, particles, inputs=[forces, k], outputs=[start.particle_f])
+            solver.step(start, end, None, None, dt)
+            wp.launch(add_loss, particles, inputs=[end.particle_q], outputs=[loss])
+
+        with wp.Tape() as tape:
+            bsc.checkpointed(solver, step, state_0, state_1, steps=300, outputs=[loss])
+        tape.backward(loss)
+
+    Steps that end elsewhere when they are taken again, by a single bit, make gradients NaN, which
+    ``report.gradient_counts.unrepeated`` counts, and a warning says so. Gradients with respect to positions that a
+    program writes into the states of ``step``, rather than a kernel on the tape, are in none of its arrays.
+
+    Args:
+        solver: A solver whose model was finalized with ``requires_grad=True``.
+        step: Takes a step, given its number from 0 on, the state in which it starts and the one in which it is to end,
+            by one call of ``solver.step`` or several. It is called twice for each number on a tape, and must do the
+            same each time. What it launches on these states is differentiated, what its steps begin with beside them
+            must not depend on earlier steps. Forces are 0 before each step but the first.
+        state_in: The state at the start.
+        state_out: The state at the end.
+        steps: How many steps to take, at least 1.
+        every: Steps between two states that are kept, at least 1; by default the root of ``steps``, which needs the
+            least memory.
+        outputs: Arrays beside the states that steps write and that they have not made, such as a loss that they add
+            to. They are set back after steps were taken again. No step reads what an earlier one wrote there.
+
+    Raises:
+        TypeError: If an argument has another type.
+        ValueError: If a number is out of range, if the model has no gradients, if ``state_out`` is ``state_in``, if no
+            step of the solver is taken, or if the first step writes an array that ``outputs`` lacks.
+    """
+    check_instance(solver, "solver", SolverImplicit, "a SolverImplicit")
+    gradients = solver.gradients
+    if gradients is None:
+        raise ValueError("solver: its model has no gradients; finalize it with requires_grad=True")
+    if not callable(step):
+        raise TypeError(f"step must be a function, not {given(step)}")
+    for name, state in (("state_in", state_in), ("state_out", state_out)):
+        check_instance(state, name, newton.State, "a newton.State")
+    if state_out is state_in:
+        raise ValueError("state_out must not be state_in")
+    count = checked_integer(steps, "steps", 1)
+    every = math.isqrt(count - 1) + 1 if every is None else checked_integer(every, "every", 1)
+    check_instance(outputs, "outputs", (list, tuple), "a list of arrays")
+    for array in outputs:
+        check_instance(array, "outputs", wp.array, "a list of arrays")
+    solver.take_checkpointed(step, state_in, state_out, count, every, outputs)

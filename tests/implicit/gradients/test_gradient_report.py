@@ -25,7 +25,9 @@ def report_of(device, *, before, after, failed=(0, 0), not_solved=(0, 0)):
 
 def test_growth_names_step_and_particle(device):
     report = report_of(wp.get_device(device), before=[1.0, 1.0], after=[0.9e6, 1.1e6])
-    assert report.totals() == GradientCounts(steps=1, unsolved=0, failed_solves=0, growing=1, ambiguous_moves=0)
+    assert report.totals() == GradientCounts(
+        steps=1, unsolved=0, failed_solves=0, growing=1, ambiguous_moves=0, unrepeated=0
+    )
     assert "within step 1 of a tape, most of it at particle 11" in report.warnings()["growing"]
     assert report.norms[1] == pytest.approx([0.9e6**0.5, 1.1e6**0.5]) and report.norms[2] == pytest.approx([1.0, 1.0])
 
@@ -34,7 +36,9 @@ def test_what_is_lost_counts_once(device):
     """Not in a world without gradients, and not again where it was NaN before."""
     report = report_of(wp.get_device(device), before=[1.0, 0.0], after=[1.0, 0.0], failed=(1, 1))
     report.ambiguous_moves.fill_(3)
-    assert report.totals() == GradientCounts(steps=1, unsolved=1, failed_solves=0, growing=0, ambiguous_moves=3)
+    assert report.totals() == GradientCounts(
+        steps=1, unsolved=1, failed_solves=0, growing=0, ambiguous_moves=3, unrepeated=0
+    )
     assert set(report.warnings()) == {"unsolved"} and "NaN in 1 worlds" in report.totals().text()
     report = report_of(wp.get_device(device), before=[1.0, float("nan")], after=[1.0, 1.0], not_solved=(1, 1))
     assert report.totals().failed_solves == 1 and set(report.warnings()) == {"failed solves"}

@@ -29,7 +29,9 @@ class System:
         start, end = states
         solver.step(start, end, None, None, DT)
         self.equations = solver.gradients.equations
-        step = solver.gradients.record(wp.Tape(), DT, StartArrays.of(start), arrays_of(end)).step
+        step = solver.gradients.record(
+            solver.gradients.add_step(wp.Tape())[0], DT, StartArrays.of(start), arrays_of(end)
+        ).step
         self.contacts = int((step.contacts.kind.numpy() >= 0).sum())
         x = step.x1.numpy().copy()
         x[:n] += scale * rng.normal(size=(n, 3)) * (solver.mesh.inverse_masses.numpy()[:n] > 0.0)[:, None]

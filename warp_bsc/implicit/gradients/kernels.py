@@ -22,9 +22,10 @@ class Count(IntEnum):
     FAILED_SOLVES = 2
     GROWING = 3
     AMBIGUOUS_MOVES = 4
-    STEP = 5
+    UNREPEATED = 5
+    STEP = 6
     """Number on its tape of the first step in which a gradient grew."""
-    PARTICLE = 6
+    PARTICLE = 7
     """The particle that had most of it then."""
 
 

@@ -9,6 +9,9 @@ import warp as wp
 from .between_steps import AMBIGUOUS_MOVES
 from .kernels import GROWTH, Count
 
+Place = tuple[int, wp.array]
+"""The number of a step on its tape, and the norms of its gradients: at its end, and at its start."""
+
 
 @dataclass(frozen=True)
 class GradientCounts:
@@ -23,6 +26,8 @@ class GradientCounts:
         growing: Worlds of these steps within which the norm of the gradient grew by more than 1,000.
         ambiguous_moves: Gradients of kinematic particles and bodies that a program moved between steps, and of which it
             cannot be known what they are of: they are NaN, see :mod:`.between_steps`.
+        unrepeated: Segments of :func:`.checkpointed` steps that ended elsewhere when they were taken again: gradients
+            of what is before them are NaN.
     """
 
     steps: int
@@ -30,6 +35,7 @@ class GradientCounts:
     failed_solves: int
     growing: int
     ambiguous_moves: int
+    unrepeated: int
 
     def text(self) -> str:
         """Returns what a line of a report says of them, if anything."""
@@ -50,8 +56,8 @@ class GradientReport:
         self._host = wp.zeros(len(Count), dtype=wp.int64, device="cpu", pinned=device.is_cuda)
         self._tape, self._norms = (lambda: None), list[wp.array]()
 
-    def add_step(self, tape: wp.Tape) -> tuple[int, wp.array]:
-        """Returns the number of another step of a tape, and where to write its norms: at its end, and at its start."""
+    def add_step(self, tape: wp.Tape) -> Place:
+        """Returns the place of another step of a tape."""
         if self._tape() is not tape:
             self._tape, self._norms = weakref.ref(tape), []
         norms = wp.zeros((2, self._worlds), dtype=wp.float64, device=self.counts.device)
@@ -99,4 +105,9 @@ class GradientReport:
             )
         if counts[Count.AMBIGUOUS_MOVES]:
             found["moves"] = f"{AMBIGUOUS_MOVES} (see report.gradient_counts.ambiguous_moves)"
+        if counts[Count.UNREPEATED]:
+            found["unrepeated"] = (
+                "checkpointed steps ended elsewhere when they were taken again: gradients are NaN (see "
+                "report.gradient_counts.unrepeated); step must do the same whenever it gets the same number and state"
+            )
         return found

@@ -4,6 +4,10 @@ A step that a tape records keeps what it began and ended with, and the contacts 
 one linear solve, see :mod:`.equations`, whatever the Newton steps were.
 """
 
+import contextlib
+import copy
+import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -15,12 +19,13 @@ from ...response.state.workspace import Workspace
 from ..contact.newton_method import NewtonMethod
 from . import energies, kernels
 from .arrays import copied, copied_materials, launch_adjoint, materials_with_gradients, with_gradients
+from .between_steps import BetweenSteps
 from .bodies import end_bodies, find_solved, leave_out_solved, predict_goals
 from .contact_forces import RecordedContacts
 from .elements import with_gradient
 from .equations import SolvedBodies, SolvedStep, StepEquations
 from .linear import LinearSolver
-from .report import GradientReport
+from .report import GradientReport, Place
 
 _TOLERANCE, _MAX_ITERATIONS = 1e-6, 1000
 """Residual at which a linear solve ends, relative to its right-hand side, and iterations after which it does."""
@@ -86,8 +91,13 @@ class StepGradients:
     """Records steps, and goes back through them.
 
     Attributes:
-        newton: The solver of the steps.
+        work: The workspace of the steps.
+        newton: Their solver.
+        report: Where gradients are counted.
         equations: Those of the step that was gone back through last.
+        between_steps: What a program moves between them.
+        last: The tape of the last step, as a weak reference, and the norms of its gradients.
+        taken: How many steps were taken so far, recorded or not.
     """
 
     def __init__(self, work: Workspace, newton: NewtonMethod, converged: wp.array[wp.bool], report: GradientReport):
@@ -99,7 +109,7 @@ class StepGradients:
             converged: Whether it converged, by world.
             report: Where gradients are counted.
         """
-        self._work, self.newton, self._converged, self._report = work, newton, converged, report
+        self.work, self.newton, self._converged, self.report = work, newton, converged, report
         self._model: Any = work.mesh.model
         model, self.equations = self._model, StepEquations(newton)
         limits = {"tolerance": _TOLERANCE, "max_iterations": _MAX_ITERATIONS}
@@ -114,18 +124,43 @@ class StepGradients:
         self._carried_poses = wp.zeros_like(model.body_q) if model.body_count else None
         self._room = 0  # contacts that the arrays of a step in a CUDA graph have room for
         self._largest = wp.zeros(work.worlds, dtype=wp.int64, device=device)
-        self._carried_to: RecordedStep | None = None
+        self._carried_to: wp.array | None = None  # norms of a step
+        self.between_steps = BetweenSteps(model, report.ambiguous_moves)
+        self.taken, self._places = 0, None
+        self.forget_last()
 
-    def record(self, tape: wp.Tape, dt: float, start: StartArrays, end: StateArrays) -> RecordedStep:
+    def forget_last(self) -> None:
+        """Lets gradients of what starts here go no further."""
+        self.last: tuple = (lambda: None), None
+
+    def add_step(self, tape: wp.Tape) -> tuple[Place, wp.array | None]:
+        """Returns the place of another step of a tape, and the norms of the one that ended where it begins, if any."""
+        last_tape, before = self.last
+        place = next(self._places or iter([self.report.add_step(tape)]))
+        self.last = weakref.ref(tape), place[1]
+        return place, before if last_tape() is tape else None
+
+    @contextlib.contextmanager
+    def aside(self, places: Iterator[Place]) -> Iterator[None]:
+        """Lets other tapes record steps, which have these places on the tape that goes on afterwards."""
+        kept = self.between_steps, self.last
+        self.between_steps, self._places = copy.copy(self.between_steps), places
+        try:
+            yield
+        finally:
+            self.between_steps, self.last = kept
+            self._places = None
+
+    def record(self, place: Place, dt: float, start: StartArrays, end: StateArrays) -> RecordedStep:
         """Returns a copy of a step that has been taken, before it ends for :class:`.LastStep`.
 
         Args:
-            tape: The tape that records it.
+            place: Its number on its tape, and its norms.
             dt: Its length [s].
             start: What of the state at its start no later step may change.
             end: The state at its end.
         """
-        work, newton, model, device = self._work, self.newton, self._model, self._work.device
+        work, newton, model, device = self.work, self.newton, self._model, self.work.device
         motion, last, particles = work.motion.vertices, work.motion.last, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
         self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
@@ -172,14 +207,14 @@ class StepGradients:
             poses,
             bodies,
         )
-        return RecordedStep(step, failed, of_particles, of_bodies, is_held, *self._report.add_step(tape))
+        return RecordedStep(step, failed, of_particles, of_bodies, is_held, *place)
 
     def _predict(self, dt, start, poses, is_solved):
         """Returns the bodies that the last step has solved for, and where inertia led them."""
         goals, velocities = wp.clone(poses), wp.zeros_like(start.body_qd, requires_grad=False)
         bodies = SolvedBodies(is_solved, start.body_qd, start.body_f, goals, velocities)
         if self.equations.of_bodies is not None:
-            inputs = self._inputs_of_goals(bodies, poses, dt, self._work.motion.vertices.bodies)
+            inputs = self._inputs_of_goals(bodies, poses, dt, self.work.motion.vertices.bodies)
             self._launch(predict_goals, len(poses), inputs, [goals, velocities])
         return bodies
 
@@ -193,7 +228,7 @@ class StepGradients:
         In a CUDA graph there is room for half as many again as steps outside of one have had; worlds fail whose
         contacts do not fit.
         """
-        work, newton, device = self._work, self.newton, self._work.device
+        work, newton, device = self.work, self.newton, self.work.device
         capacity, size = len(newton.problem.contacts.corners), 4 if self.equations.of_bodies is None else 8
         if device.is_capturing and self._room:
             capacity = min(capacity, self._room)
@@ -212,28 +247,28 @@ class StepGradients:
         contacts.fall = wp.clone(newton.problem.progress.fall)
         return _first(vertices, n), _first(rows, n), contacts
 
-    def backward(self, recorded: RecordedStep, before: RecordedStep | None, of: StateGradients) -> None:
+    def backward(self, recorded: RecordedStep, before: wp.array | None, of: StateGradients) -> None:
         """Turns gradients with respect to the end of a step into those with respect to all that it depends on.
 
         Args:
             recorded: The step.
-            before: The step of the same tape that ended where it begins, None if there is none.
+            before: The norms of the step of the same tape that ended where it begins, None if there is none.
             of: The gradients of states, which are changed.
         """
         step, equations, model = recorded.step, self.equations, self._model
         particles, dt = model.particle_count, wp.float64(step.dt)
-        if self._carried_to is not recorded:
+        if self._carried_to is not recorded.norms:
             self._carried_x.zero_()
             if self._carried_poses is not None:
                 self._carried_poses.zero_()
-        norms, world = recorded.norms, self._work.mesh.device_world
+        norms, world = recorded.norms, self.work.mesh.device_world
         for array in (self._of_x1, self._of_x0, self._of_v0, self._of_unknowns, norms, self._largest):
             array.zero_()
         inputs = [dt, of.end_particle_q, of.end_particle_qd, equations.unknown, step.is_fixed, recorded.is_held]
         outputs = [self._of_unknowns, self._of_x1, norms]
         self._launch(kernels.of_end, particles, [*inputs, self._carried_x, world], outputs)
         motion, of_motion = with_gradients(step.motion, ["inverse_mass", "friction"])
-        table = self._work.motion.friction.materials.friction
+        table = self.work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
         planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
         contacts, of_contacts = with_gradients(step.contacts, ["fall"])
@@ -267,7 +302,7 @@ class StepGradients:
             self._go_to_poses(step, of_planes)
             if equations.of_bodies is not None:
                 inputs = self._inputs_of_goals(bodies, poses[1], step.dt, motion.bodies)
-                launch_adjoint(predict_goals, model.body_count, inputs, [*of_goals], self._work.device)
+                launch_adjoint(predict_goals, model.body_count, inputs, [*of_goals], self.work.device)
                 if model.body_inv_mass.grad is not None:
                     self._launch(
                         kernels.add_to, model.body_count, [of_motion.bodies.inverse_mass], [model.body_inv_mass.grad]
@@ -279,15 +314,15 @@ class StepGradients:
         outputs = [of.particle_q, of.particle_qd, self._carried_x, norms, self._largest]
         self._launch(kernels.finish_gradients, particles, inputs, outputs)
         inputs = [recorded.number, recorded.failed, self._linear.failed, self._largest]
-        self._launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self._report.counts])
-        self._report.copy_counts()
+        self._launch(kernels.report_gradients, len(recorded.failed), inputs, [norms, self.report.counts])
+        self.report.copy_counts()
         if model.particle_inv_mass.grad is not None:
             inputs = [of_motion.inverse_mass, step.motion.inverse_mass]
             self._launch(kernels.add_inverse_masses, particles, inputs, [model.particle_inv_mass.grad])
         if model.gravity.grad is not None:  # layers, by which barriers are stiffer, follow from it
             inputs = [wp.float32(step.dt), model.gravity]
-            self._adjoint(energies.find_falls, self._work.worlds, inputs, of_contacts.fall)
-        self._work.motion.friction.backward(of_motion.friction, of_planes.friction)
+            self._adjoint(energies.find_falls, self.work.worlds, inputs, of_contacts.fall)
+        self.work.motion.friction.backward(of_motion.friction, of_planes.friction)
         self._carried_to = before
         for gradient in (
             of.end_particle_q,
@@ -306,13 +341,13 @@ class StepGradients:
             ends[k] = wp.zeros_like(array, requires_grad=False) if ends[k] is None else ends[k]
         changes = with_gradient(wp.zeros_like(self._of_unknowns), wp.zeros_like(self._of_unknowns))
         inputs = [bodies.is_solved, equations.of_bodies, changes, step.poses[0], bodies.goals, bodies.goal_velocities]
-        launch_adjoint(end_bodies, n, [*inputs, of_motion, wp.float64(step.dt)], ends, self._work.device)
+        launch_adjoint(end_bodies, n, [*inputs, of_motion, wp.float64(step.dt)], ends, self.work.device)
         inputs = [bodies.is_solved, equations.of_bodies, changes.grad]
         self._launch(kernels.add_of_bodies, n, inputs, [self._of_unknowns])
 
     def _go_to_poses(self, step, of_planes):
         """Turns gradients with respect to what moves with bodies into those with respect to their poses."""
-        mesh, particles, at = self._work.mesh, self._model.particle_count, self.equations.attachments
+        mesh, particles, at = self.work.mesh, self._model.particle_count, self.equations.attachments
         shapes, infinite, poses = mesh.device_shape_vertices, mesh.device_planes, step.poses
         if self.equations.of_bodies is not None:
             inputs = [step.bodies.is_solved, shapes.body, particles]
@@ -330,10 +365,10 @@ class StepGradients:
                 self._adjoint(energies.place_planes, len(infinite.body), inputs, gradient)
 
     def _adjoint(self, kernel, size, inputs, gradient):
-        launch_adjoint(kernel, size, inputs, [gradient], self._work.device)
+        launch_adjoint(kernel, size, inputs, [gradient], self.work.device)
 
     def _launch(self, kernel, size, inputs, outputs):
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.work.device)
 
 
 def _first(array, n):
