@@ -112,7 +112,8 @@ class Checkpoints:
         self._segments = [range(first, min(first + every, steps)) for first in range(0, steps, every)]
         # of the border at which a segment begins, and of its steps
         self._states = [work.mesh.model.state() for _ in range(len(self._segments[0]) + 2)]
-        self._starts = [*work.motion.last.arrays, work.last_crossings]
+        starts = [*work.motion.last.arrays, work.last_crossings, work.vertices.bodies.pose]
+        self._starts = [array for array in starts if array is not None]
         self._copies = list[Snapshot]()
         self._places = list[list]()
         self._totals = totals
