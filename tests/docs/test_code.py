@@ -125,9 +125,12 @@ def test_gradients(tmp_path, capsys):
     assert names["solver"].report.totals.uncertified_steps == 0
     gradient = names["states"][0].particle_qd.grad.numpy()
     assert np.isfinite(gradient).all() and np.abs(gradient).max() > 0.0
-    derivative, counts = output.strip().split("\n")
+    derivative, counts, shapes = output.strip().split("\n")
     assert np.isfinite([float(number) for number in derivative.strip("[]").split()]).all()
     assert "unsolved=0, failed_solves=0, growing=0" in counts
+    of_forces = names["forces"].grad.numpy()
+    assert shapes == "(30, 49, 3) (49, 3)" and np.isfinite(of_forces).all() and np.abs(of_forces).max() > 0.0
+    assert names["solver"].report.gradient_counts.unrepeated == 0
 
 
 def test_repair(tmp_path, capsys):

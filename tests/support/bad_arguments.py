@@ -170,14 +170,14 @@ class Idle(newton.solvers.SolverBase):
         state_out.assign(state_in)
 
 
-def solver() -> Idle:
+def solver(*, requires_grad: bool = False) -> Idle:
     """Returns a solver of a model with two triangles."""
     builder = newton.ModelBuilder()
     builder.add_cloth_grid(
         pos=wp.vec3(), rot=wp.quat_identity(), vel=wp.vec3(), dim_x=1, dim_y=1, cell_x=0.1, cell_y=0.1, mass=0.1
     )
     builder.color()
-    return Idle(builder.finalize(device="cpu"))
+    return Idle(builder.finalize(device="cpu", requires_grad=requires_grad))
 
 
 def calls() -> dict[str, Call]:
@@ -574,6 +574,25 @@ def calls_of_solvers() -> dict[str, Call]:
                 "report": reported,
             },
             raises=bsc.SolverImplicit.__init__,
+        ),
+        "checkpointed": Call(
+            bsc.checkpointed,
+            {
+                "solver": bsc.SolverImplicit(solver(requires_grad=True).model),
+                "step": print,
+                "state_in": start,
+                "state_out": end,
+                "steps": 1,
+            },
+            {
+                "solver": {**OBJECTS, "another": inner, "no gradients": bsc.SolverImplicit(inner.model)},
+                "step": {**FUNCTIONS, "None": None},
+                "state_in": OBJECTS,
+                "state_out": {**OBJECTS, "the same": start},
+                "steps": NOT_COUNT | {"zero": 0},
+                "every": without(NOT_COUNT, "None") | {"zero": 0},
+                "outputs": {"None": None, "array": wp.zeros(1, dtype=float, device="cpu"), "numbers": [3]},
+            },
         ),
         "CapturedSteps": Call(
             bsc.CapturedSteps,
