@@ -24,7 +24,8 @@ _Choice = TypeVar("_Choice", bound=str)
 
 def given(value: object) -> str:
     """Returns a value in the form in which errors show it."""
-    text = reprlib.repr(value)
+    is_array = type(value).__name__ == "array"  # which reprlib takes for one of Python's own
+    text = reprlib.aRepr.repr_instance(value, 0) if is_array else reprlib.repr(value)
     return text if isinstance(value, str | Real | None) else f"{type(value).__name__} {text}"
 
 

@@ -510,6 +510,7 @@ def calls_of_solvers() -> dict[str, Call]:
     patterns = {"None": None, "number": 3, "string": "particles", "numbers": [3], "unknown": ["nothing"]}
     counts = {name: {"contacts": value} for name, value in (without(NOT_COUNT, "bool") | {"zero": 0}).items()}
     reported = patterns | counts | {f"worlds {name}": {"worlds": value} for name, value in FLAGS.items()}
+    differentiable = bsc.SolverImplicit(solver(requires_grad=True).model)
     found = {
         "CollisionFilter": Call(
             bsc.CollisionFilter,
@@ -578,8 +579,8 @@ def calls_of_solvers() -> dict[str, Call]:
         "checkpointed": Call(
             bsc.checkpointed,
             {
-                "solver": bsc.SolverImplicit(solver(requires_grad=True).model),
-                "step": print,
+                "solver": differentiable,
+                "step": lambda k, start, end: differentiable.step(start, end, None, None, 0.01),
                 "state_in": start,
                 "state_out": end,
                 "steps": 1,

@@ -29,7 +29,7 @@ from .contact import steps
 from .contact.bodies import predict_bodies
 from .contact.newton_method import NewtonMethod
 from .contact.results import StepResults
-from .gradients.checkpoints import ARRAYS, CheckpointedStep, Checkpoints
+from .gradients.checkpoints import CheckpointedStep, Checkpoints
 from .gradients.step_gradients import RecordedStep, StartArrays, StateGradients, StepGradients
 from .report import ImplicitStepReport
 
@@ -306,9 +306,7 @@ class SolverImplicit(SolverCCD):
         changed = [array for array in arrays if array is not None and array.requires_grad]
         tape.record_func(lambda: run_on_host(backward, device), changed + self._read_arrays())
 
-    def take_checkpointed(
-        self, step: CheckpointedStep, state_in: newton.State, state_out: newton.State, *options
-    ) -> None:
+    def _take_checkpointed(self, step, state_in, state_out, *options):
         """Takes the steps of :func:`checkpointed`, and records them on the active tape, if any."""
         gradients, report = self.gradients, self.report
         assert gradients is not None
@@ -320,7 +318,7 @@ class SolverImplicit(SolverCCD):
                 return
             with gradients.between_steps.watched(tape, state_in, state_out):
                 checkpoints.take(tape, state_in, state_out)
-                arrays = [getattr(state, name) for state in (state_in, state_out) for name in ARRAYS]
+                arrays = [x for state in (state_in, state_out) for x in vars(state).values() if isinstance(x, wp.array)]
                 found = tape.gradients  # not the tape, which would then hold itself
                 self._record_backward(tape, lambda: checkpoints.go_back(found, state_in, state_out), arrays)
 
@@ -403,44 +401,34 @@ def checkpointed(
     every: int | None = None,
     outputs: Sequence[wp.array] = (),
 ) -> None:
-    """Takes steps of a solver of which a tape keeps every ``every``-th state alone.
+    """Takes steps of a solver of which a tape keeps every ``every``-th state alone, see :doc:`/newton/gradients`.
 
     On its way back, the tape takes the steps again, ``every`` of them at a time, and has of these what it otherwise
-    has of all. Gradients are those of steps that are recorded one by one, and so are their counts and norms in the
-    report; totals have each step once. What the report says of a last step is of the last one that was taken. On a
-    tape::
-
-        def step(k, start, end):
-            wp.launch(push, particles, inputs=[forces, k], outputs=[start.particle_f])
-            solver.step(start, end, None, None, dt)
-            wp.launch(add_loss, particles, inputs=[end.particle_q], outputs=[loss])
-
-        with wp.Tape() as tape:
-            bsc.checkpointed(solver, step, state_0, state_1, steps=300, outputs=[loss])
-        tape.backward(loss)
+    has of all. Gradients, their counts and norms are those of steps that are recorded one by one; totals of the report
+    have each step once. Its results of the last step are those of the last one that was taken.
 
     Steps that end elsewhere when they are taken again, by a single bit, make gradients NaN, which
-    ``report.gradient_counts.unrepeated`` counts, and a warning says so. Gradients with respect to positions that a
-    program writes into the states of ``step``, rather than a kernel on the tape, are in none of its arrays.
+    ``report.gradient_counts.unrepeated`` counts, and a warning says so. Gradients with respect to positions that
+    ``step`` writes into its states, rather than a kernel on the tape, are in none of its arrays.
 
     Args:
         solver: A solver whose model was finalized with ``requires_grad=True``.
-        step: Takes a step, given its number from 0 on, the state in which it starts and the one in which it is to end,
-            by one call of ``solver.step`` or several. It is called twice for each number on a tape, and must do the
-            same each time. What it launches on these states is differentiated, what its steps begin with beside them
-            must not depend on earlier steps. Forces are 0 before each step but the first.
+        step: Takes a step, given its number from 0 on and the states in which it starts and is to end, by one call of
+            ``solver.step`` or several. On a tape it is called twice for each number, and must do the same each time:
+            it depends on nothing else that earlier steps change. What it launches is differentiated. Forces are 0 at
+            the start of each step but the first.
         state_in: The state at the start.
         state_out: The state at the end.
         steps: How many steps to take, at least 1.
         every: Steps between two states that are kept, at least 1; by default the root of ``steps``, which needs the
             least memory.
         outputs: Arrays beside the states that steps write and that they have not made, such as a loss that they add
-            to. They are set back after steps were taken again. No step reads what an earlier one wrote there.
+            to; no step reads them. They are set back after steps were taken again.
 
     Raises:
         TypeError: If an argument has another type.
-        ValueError: If a number is out of range, if the model has no gradients, if ``state_out`` is ``state_in``, if no
-            step of the solver is taken, or if the first step writes an array that ``outputs`` lacks.
+        ValueError: If a number is out of range, if the model has no gradients, if ``state_out`` is ``state_in``, if
+            ``step`` takes no step of the solver, or if the first step writes an array that ``outputs`` lacks.
     """
     check_instance(solver, "solver", SolverImplicit, "a SolverImplicit")
     gradients = solver.gradients
@@ -457,4 +445,4 @@ def checkpointed(
     check_instance(outputs, "outputs", (list, tuple), "a list of arrays")
     for array in outputs:
         check_instance(array, "outputs", wp.array, "a list of arrays")
-    solver.take_checkpointed(step, state_in, state_out, count, every, outputs)
+    solver._take_checkpointed(step, state_in, state_out, count, every, outputs)

@@ -27,8 +27,6 @@ CheckpointedStep = Callable[[int, newton.State, newton.State], object]
 _ENDS = "particle_q", "particle_qd", "body_q", "body_qd"
 """Arrays of a state that steps lead to."""
 _TYPES = wp.float32, wp.vec2, wp.vec3, wp.vec4, wp.quat, wp.transform, wp.spatial_vector, wp.mat33
-ARRAYS = *_ENDS, "particle_f", "body_f"
-"""Those and what they begin with."""
 
 
 @wp.kernel
