@@ -27,6 +27,7 @@ CheckpointedStep = Callable[[int, newton.State, newton.State], object]
 _ENDS = "particle_q", "particle_qd", "body_q", "body_qd"
 """Arrays of a state that steps lead to."""
 _TYPES = wp.float32, wp.vec2, wp.vec3, wp.vec4, wp.quat, wp.transform, wp.spatial_vector, wp.mat33
+"""Types of arrays of a state that have gradients."""
 
 
 @wp.kernel
@@ -112,15 +113,16 @@ class Checkpoints:
         self._states = [work.mesh.model.state() for _ in range(len(self._segments[0]) + 2)]
         starts = [*work.motion.last.arrays, work.last_crossings, work.vertices.bodies.pose]
         self._starts = [array for array in starts if array is not None]
+        self._totals = totals
         self._copies = list[Snapshot]()
         self._places = list[list]()
-        self._totals = totals
+        self._norms = list[wp.array | None]()  # of the step that ended where each segment begins
         self._changed = wp.zeros(1, dtype=int, device=work.device)
 
     def take(self, tape: wp.Tape | None, state_in: newton.State, state_out: newton.State) -> None:
         """Takes the steps, and keeps copies if they are for a tape, which records none of them."""
         gradients, states = self._gradients, self._states
-        self._before = gradients.last[1] if gradients.last[0]() is tape else None
+        self._norms.append(gradients.last[1] if gradients.last[0]() is tape else None)
         states[0].assign(state_in)
         for segment in self._segments:
             self._keep(tape)
@@ -136,9 +138,11 @@ class Checkpoints:
             states[0].assign(states[len(segment) + 1])
             if tape is not None:
                 self._places.append([gradients.report.add_step(tape) for _ in range(gradients.taken - taken)])
-                gradients.last = weakref.ref(tape), self._places[-1][-1][1]
+                self._norms.append(self._places[-1][-1][1])
         self._keep(tape)
         state_out.assign(states[0])
+        if tape is not None:
+            gradients.last = weakref.ref(tape), self._norms[-1]
 
     def _keep(self, tape):
         if tape is not None:
@@ -181,13 +185,10 @@ class Checkpoints:
             _clear_gradients(border)
             _copy_gradients(state_out, border)
             _clear_gradients(state_out)
-            for segment, norms in zip(
-                reversed(range(len(self._segments))),
-                [*(places[-1][1] for places in reversed(self._places[:-1])), self._before],
-                strict=True,
-            ):
+            for segment in reversed(range(len(self._segments))):
                 with gradients.aside(iter(self._places[segment])):
-                    found.update(self._go_back_through(segment, norms))
+                    read = self._go_back_through(segment)
+                found.update({array: gradient for of, gradient in read.items() if (array := of()) is not None})
             of_states = _gradients_of(border)
             for name, gradient in _gradients_of(state_in).items():
                 values, sums = _flat(of_states[name], float), _flat(gradient, float)
@@ -199,13 +200,16 @@ class Checkpoints:
         copy.restore()
         self._gradients.work.loop[Loop.RECOUNT].fill_(1)
 
-    def _go_back_through(self, segment, norms):
-        """Takes the steps of a segment again, and goes back through them; returns the gradients of what they read."""
+    def _go_back_through(self, segment):
+        """Takes the steps of a segment again, and goes back through them.
+
+        Returns the gradients of arrays that they read, by weak references, as steps may have made them.
+        """
         gradients, numbers, border = self._gradients, self._segments[segment], self._states[0]
         states = self._states[1 : len(numbers) + 2]
         self._restart(self._copies[segment])
         with wp.Tape() as tape:
-            gradients.last = weakref.ref(tape), norms
+            gradients.last = weakref.ref(tape), self._norms[segment]
             with gradients.between_steps.watched(tape, border, states[0]):
                 with paused_tape():
                     states[0].assign(border)
@@ -219,7 +223,8 @@ class Checkpoints:
         self._check(states[-1], self._copies[segment + 1].saved)
         tape.backward()
         of_states = {gradient.ptr for state in self._states for gradient in _gradients_of(state).values()}
-        return {x: gradient for x, gradient in tape.gradients.items() if getattr(gradient, "ptr", 0) not in of_states}
+        read = tape.gradients.items()
+        return {weakref.ref(x): gradient for x, gradient in read if getattr(gradient, "ptr", 0) not in of_states}
 
     def _check(self, end, saved):
         """Makes the gradients at the end of a segment NaN if it is not the end that the steps had before."""
