@@ -5,8 +5,8 @@
 
 A block of 4,000 tetrahedra falls on a sphere, and slides off it onto the ground. A row is measured in a process of its
 own: megabytes that steps, gradients and their states take at most, beside what the solver has after its first step;
-milliseconds a step of a run without a tape, of the way forward on a tape and of the way back; and the last one as a
-multiple of the first.
+milliseconds a step of a run without a tape, of the way forward on a tape and of the way back, on a CPU of all its
+threads, so that other processes matter little; and the last one as a multiple of the first.
 """
 
 import argparse
@@ -55,35 +55,39 @@ def measure(device, steps, every):
         def step(k, start, end):
             solver.step(start, end, None, None, DT)
 
+        clock = time.perf_counter if device.is_cuda else time.process_time
+
         def timed(function):
             wp.synchronize_device(device)
-            begin = time.perf_counter()
+            begin = clock()
             function()
             wp.synchronize_device(device)
-            return 1e3 * (time.perf_counter() - begin) / steps
+            return 1e3 * (clock() - begin) / steps
 
         def run(count, states):
             solver.reset(first)
             for k in range(count):
                 step(k, states[k % len(states)], states[(k + 1) % len(states)])
 
-        def run_for_tape(count):
-            if every:
-                solver.reset(first)
-                bsc.checkpointed(solver, step, first, last, count, every=every)
-            else:
-                run(count, [first, *(model.state() for _ in range(count - 1)), last])
+        def record(count):
+            """Takes steps on a tape, and returns it."""
+            between = [] if every else [model.state() for _ in range(count - 1)]
+            with wp.Tape() as tape:
+                if every:
+                    solver.reset(first)
+                    bsc.checkpointed(solver, step, first, last, count, every=every)
+                else:
+                    run(count, [first, *between, last])
+            return tape
 
-        with wp.Tape() as tape:  # loads kernels
-            run_for_tape(2)
-        tape.backward()
+        record(2).backward()  # loads kernels
         run(steps, [model.state(), model.state()])  # makes buffers as large as they have to be
         without = timed(lambda: run(steps, [model.state(), model.state()]))
         before = used(device)
-        with wp.Tape() as tape:
-            forward = timed(lambda: run_for_tape(steps))
+        tapes = []
+        forward = timed(lambda: tapes.append(record(steps)))
         last.particle_q.grad.fill_(wp.vec3(0.0, 0.0, 1.0 / model.particle_count))
-        back = timed(tape.backward)
+        back = timed(tapes[0].backward)
         is_finite = np.isfinite(first.particle_qd.grad.numpy()).all()
         row = f"{every or '-':>5} {used(device) - before:9.1f} {without:9.1f} {forward:9.1f} {back:7.1f}"
         print(f"{row} {back / without:6.2f}   {is_finite}  {solver.report.gradient_counts}", flush=True)
