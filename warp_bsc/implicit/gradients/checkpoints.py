@@ -120,12 +120,12 @@ class Checkpoints:
         self._changed = wp.zeros(1, dtype=int, device=work.device)
 
     def take(self, tape: wp.Tape | None, state_in: newton.State, state_out: newton.State) -> None:
-        """Takes the steps, and keeps copies if they are for a tape, which records none of them."""
+        """Takes the steps, of which a tape, if there is one, records none."""
         gradients, states = self._gradients, self._states
         self._norms.append(gradients.last[1] if gradients.last[0]() is tape else None)
         states[0].assign(state_in)
         for segment in self._segments:
-            self._keep(tape)
+            self._copies.append(Snapshot([states[0], *self._starts]))
             states[1].assign(states[0])
             taken = gradients.taken
             for k in segment:
@@ -139,14 +139,10 @@ class Checkpoints:
             if tape is not None:
                 self._places.append([gradients.report.add_step(tape) for _ in range(gradients.taken - taken)])
                 self._norms.append(self._places[-1][-1][1])
-        self._keep(tape)
+        self._copies.append(Snapshot([states[0], *self._starts]))
         state_out.assign(states[0])
         if tape is not None:
             gradients.last = weakref.ref(tape), self._norms[-1]
-
-    def _keep(self, tape):
-        if tape is not None:
-            self._copies.append(Snapshot([self._states[0], *self._starts]))
 
     def _take(self, k):
         start, end = self._states[1 + k % self._every :][:2]
