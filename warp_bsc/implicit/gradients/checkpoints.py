@@ -125,7 +125,7 @@ class Checkpoints:
         self._norms.append(gradients.last[1] if gradients.last[0]() is tape else None)
         states[0].assign(state_in)
         for segment in self._segments:
-            self._copies.append(Snapshot([states[0], *self._starts]))
+            self._copies.append(self._copied())
             states[1].assign(states[0])
             taken = gradients.taken
             for k in segment:
@@ -139,10 +139,14 @@ class Checkpoints:
             if tape is not None:
                 self._places.append([gradients.report.add_step(tape) for _ in range(gradients.taken - taken)])
                 self._norms.append(self._places[-1][-1][1])
-        self._copies.append(Snapshot([states[0], *self._starts]))
+        self._copies.append(self._copied())
         state_out.assign(states[0])
         if tape is not None:
             gradients.last = weakref.ref(tape), self._norms[-1]
+
+    def _copied(self):
+        """Returns a copy of all that the next step starts from: its state, then ``_starts``."""
+        return Snapshot([*dict(_arrays_of(self._states[0])).values(), *self._starts])
 
     def _take(self, k):
         start, end = self._states[1 + k % self._every :][:2]
@@ -225,10 +229,10 @@ class Checkpoints:
     def _check(self, end, saved):
         """Makes the gradients at the end of a segment NaN if it is not the end that the steps had before."""
         self._changed.zero_()
-        pairs = [(getattr(saved[0], name), getattr(end, name)) for name in _ENDS if getattr(end, name) is not None]
-        last = self._gradients.work.motion.last
-        for before, now in (*pairs, *zip(saved[1:], last.arrays, strict=False)):
-            if len(now):
+        of_end, last = dict(_arrays_of(end)), self._gradients.work.motion.last.arrays
+        kept = [*of_end.items(), *(("last step", x) for x in last)]
+        for before, (name, now) in zip(saved, kept, strict=False):
+            if len(now) and name in (*_ENDS, "last step"):
                 bits = _flat(now, int)
                 self._launch(_find_changed, len(bits), [_flat(before, int), bits], [self._changed])
         of_end = _flat(end.particle_q.grad, float)
