@@ -1,5 +1,6 @@
 """The rows of the tables of measurements, each made from what commands wrote with ``--json``."""
 
+import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -306,6 +307,12 @@ def worlds_throughput(found: Found) -> Rows:
     ]
     runs = pivot(found["rows"], "solver", "worlds")
     return markdown("worlds", columns, [(title, runs[name]) for name, title in titles.items()])
+
+
+def gradients(found: Found) -> Rows:
+    """Digits to which gradients and central differences agree, by input and scene."""
+    columns = [Column(scene.replace("_", " "), f"{scene}.shown") for scene in found["scenes"]]
+    return markdown("input", columns, [(re.sub(r"^\w+_\w+", r"`\g<0>`", row["input"]), row) for row in found["rows"]])
 
 
 def inverting_steps(*measurements: Found) -> Rows:

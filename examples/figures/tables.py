@@ -22,7 +22,7 @@ from warp_bsc.bench.measure.penetration import SCENES
 from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH
 
 ROOT = Path(__file__).resolve().parents[2]
-_GUIDES = "configuration", "contacts", "reports", "turning_bodies"
+_GUIDES = "configuration", "contacts", "gradients", "reports", "turning_bodies"
 PAGES = [
     ROOT / "README.md",
     ROOT / "docs" / "index.md",
@@ -73,6 +73,7 @@ TABLES = {
     "given_queries": Table(("given_queries_one_core",), table_rows.given_queries),
     "detector": Table(("detector_gpu", "detector_two_cores", "detector_one_core"), table_rows.detector),
     "detector_stages": Table(("detector_gpu", "detector_worlds_gpu"), table_rows.detector_stages),
+    "gradients": Table(("gradients_cpu",), table_rows.gradients),
     "newton_coupled": Table(("newton_coupled_gpu",), table_rows.newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), table_rows.newton),
     "inverting_steps": Table(_INVERTING, table_rows.inverting_steps),

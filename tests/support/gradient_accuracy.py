@@ -158,15 +158,24 @@ class Scene:
         """Returns the losses of worlds."""
         return self.by_world((x * self.loss_weights).sum(axis=1))
 
+    def body_velocities(self, throws):
+        """Returns velocities of bodies, of worlds with these throws."""
+        return np.hstack([throws, np.tile((0.5, -0.3, 0.2), (len(throws), 1))])
+
     def state(self, throws):
         """Returns a state at the start."""
         state = self.model.state()
         state.particle_qd.assign(self.velocities(throws).astype(np.float32))
         if self.has_bodies:
-            velocities = np.zeros((len(throws), 6))
-            velocities[:, :3], velocities[:, 3:] = throws, (0.5, -0.3, 0.2)
-            state.body_qd.assign(velocities.astype(np.float32))
+            state.body_qd.assign(self.body_velocities(throws).astype(np.float32))
         return state
+
+    def gradients(self, state):
+        """Returns the gradients with respect to the throws, given those of the state at the start."""
+        if self.has_bodies:
+            return state.body_qd.grad.numpy()[:, :3].astype(float)
+        of_v = state.particle_qd.grad.numpy().astype(float)
+        return self.by_world(np.where(self.thrown[:, None], of_v, 0.0))
 
 
 def central_differences(run, throws, step):
@@ -182,9 +191,10 @@ def run_exactly(scene, steps):
     x0 = scene.model.particle_q.numpy()
 
     def run(throws):
-        states[0].particle_qd.assign(scene.velocities(throws).astype(np.float32))
+        states[0].assign(scene.state(throws))
         solver.reset(states[0])
-        reference.begin(x0, scene.velocities(throws), held)
+        bodies = [scene.model.body_q.numpy(), scene.body_velocities(throws)] if scene.has_bodies else []
+        reference.begin(held, x0, scene.velocities(throws), *bodies)
         with wp.Tape() as tape:  # what records steps solves them in float64
             for start, end in itertools.pairwise(states):
                 solver.step(start, end, None, None, DT)
@@ -195,8 +205,7 @@ def run_exactly(scene, steps):
     held = reference.held
     states[-1].particle_q.grad.assign(scene.loss_weights.astype(np.float32))
     tape.backward()
-    of_v = states[0].particle_qd.grad.numpy().astype(float)
-    gradients = scene.by_world(np.where(scene.thrown[:, None], of_v, 0.0))
+    gradients = scene.gradients(states[0])
     found = central_differences(lambda throws: run(throws)[1], scene.throws, EXACT)
     reference.end()
     return gradients, found, unsolved
@@ -228,12 +237,7 @@ def run_as_computed(scene, steps):
         take_steps()
     states[-1].particle_q.grad.assign(scene.loss_weights.astype(np.float32))
     tape.backward()
-    if scene.has_bodies:
-        gradients = states[0].body_qd.grad.numpy()[:, :3].astype(float)
-    else:
-        of_v = states[0].particle_qd.grad.numpy().astype(float)
-        gradients = scene.by_world(np.where(scene.thrown[:, None], of_v, 0.0))
-    return gradients, central_differences(run, scene.throws, COMPUTED)
+    return scene.gradients(states[0]), central_differences(run, scene.throws, COMPUTED)
 
 
 def deviations(gradients, found):
@@ -248,12 +252,11 @@ def judge(name, worlds, steps, device):
     """Returns what a row shows of a scene, and all deviations."""
     scene, start = Scene(name, worlds, device), time.perf_counter()
     row = {"scene": name, "worlds": worlds, "steps": steps}
-    if not scene.has_bodies:
-        gradients, found, unsolved = run_exactly(scene, steps)
-        off, of_each = deviations(gradients, found)
-        passes = (off <= 0.01) & (of_each <= 0.05) & ~unsolved
-        row |= {"exact": float(passes.mean()), "median": float(np.median(off)), "unsolved": int(unsolved.sum())}
-        row["exact_deviations"] = off.tolist()
+    gradients, found, unsolved = run_exactly(scene, steps)
+    off, of_each = deviations(gradients, found)
+    passes = (off <= 0.01) & (of_each <= 0.05) & ~unsolved
+    row |= {"exact": float(passes.mean()), "median": float(np.median(off)), "unsolved": int(unsolved.sum())}
+    row["exact_deviations"] = off.tolist()
     gradients, found = run_as_computed(scene, steps)
     off, _ = deviations(gradients, found)
     is_nan = ~np.isfinite(gradients).all(axis=1)
@@ -280,7 +283,7 @@ def main():
         with wp.ScopedDevice(device):
             row = judge(name, options.worlds, options.steps, device)
         rows.append(row)
-        exact = f"{row['exact']:6.0%} {row['median']:8.1e} {row['unsolved']:8}" if "exact" in row else " " * 24
+        exact = f"{row['exact']:6.0%} {row['median']:8.1e} {row['unsolved']:8}"
         computed = f"{row['as computed']:11.0%} {row['of it']:8.1e} {row['NaN']:4} {row['seconds']:6.0f}"
         print(f"{name:<12} {exact} {computed}", flush=True)
     if options.json:

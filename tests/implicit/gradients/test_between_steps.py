@@ -96,7 +96,7 @@ class Scene:
             self.solver.reset(self.states[0])
             self.states[0].particle_q.assign(first)
             if self.reference is not None:
-                self.reference.begin(first, self.model.particle_qd.numpy())
+                self.reference.begin(None, first, self.model.particle_qd.numpy())
         self.take_steps(self.states)
 
     def take_steps(self, states):

@@ -69,15 +69,15 @@ def test_a_body_that_flies(device):
 
 
 def test_a_body_that_hits_a_cloth(device):
-    """By how much barriers are stiffer where the cloth is taut counts as constant, so that gradients are off by 6%."""
+    """By how much barriers are stiffer where the cloth is taut counts as constant, which takes little here."""
     box = Box(device, 0.055, 2)
     of_velocity, of_place = box.gradients()
     free = Box(device, 0.5, 2).gradients()[0]
-    expected = differences(lambda d: box.run(VELOCITY + d), 6, 0.01)
+    expected = differences(lambda d: box.run(VELOCITY + d), 6, 0.003)
     assert np.abs(free - expected).max() > 0.2 * np.abs(expected).max()  # contact matters
-    assert np.abs(of_velocity - expected).max() < 0.08 * np.abs(expected).max()
-    expected = differences(lambda d: box.run(shift=d), 3, 2e-4)
-    assert np.abs(of_place - expected).max() < 0.08 * np.abs(expected).max()
+    assert np.abs(of_velocity - expected).max() < 0.005 * np.abs(expected).max()
+    expected = differences(lambda d: box.run(shift=d), 3, 5e-5)
+    assert np.abs(of_place - expected).max() < 0.005 * np.abs(expected).max()
 
 
 def test_a_model_without_particles_is_refused_on_a_tape(device):

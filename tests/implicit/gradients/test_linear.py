@@ -6,7 +6,7 @@ import newton
 import numpy as np
 import pytest
 import warp as wp
-from gradient_scenes import DT, SCENES, add_cloth, marks_of
+from gradient_scenes import DT, OF_PARTICLES, add_cloth, marks_of
 from step_forces import forces_of
 
 import warp_bsc as bsc
@@ -93,10 +93,10 @@ SYSTEMS = {
     "hanging": functools.partial(hanging, 2e-4),
     "compressed": functools.partial(hanging, 1e-2),
     "worlds": functools.partial(hanging, 2e-4, worlds=3),
-    **{scene.__name__: functools.partial(in_contact, scene) for scene in SCENES[1:]},
+    **{scene.__name__: functools.partial(in_contact, scene) for scene in OF_PARTICLES[1:]},
 }
 """Systems by name; that of a sphere has more contacts than is fast."""
-MARKS = {scene.__name__: marks_of(scene) for scene in SCENES}
+MARKS = {scene.__name__: marks_of(scene) for scene in OF_PARTICLES}
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, [])) for name in SYSTEMS])

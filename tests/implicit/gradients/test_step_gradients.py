@@ -1,17 +1,13 @@
-"""Gradients through steps of SolverImplicit against central differences of the same steps, solved in float64.
+"""Gradients through steps of SolverImplicit: cells of the table of ``tests/support/gradient_table.py``.
 
-Along a random way of each input, the change of a weighted sum of the positions and velocities at the end is that which
-the gradients tell. Inputs are moved by 1e-5 of their size, or 1e-3, and rounded to float32; what is left is rounding.
+Differences have one size and move whole inputs; those of the elasticity of cloth are of one scene.
 """
 
 import numpy as np
 import pytest
-from gradient_scenes import SCENES, marks_of
+from gradient_scenes import SCENES, STEPS, cloth_on_sheet, marks_of
+from gradient_table import contacts_of, deviations, limit_of
 
-LIMIT = 5e-5
-"""Largest deviation of a change, relative to those of all components, added as independent ones are."""
-OF_ROUNDED = {"shape_material_mu": 3e-4, "friction": 3e-4}
-"""The same of inputs from which the coefficient of a pair is computed in float32."""
 OF_SOLVER = 5e-3
 """Largest deviation of gradients of the solver's own steps."""
 
@@ -24,30 +20,25 @@ def scene(request, device):
     program = request.param(device)
     of_solver = program.gradients()
     program.refine()
-    return program, of_solver, program.gradients()
+    gradients = program.gradients()
+    names = [name for name in gradients if request.param is cloth_on_sheet or not name.startswith(("tri_", "edge_"))]
+    return program, of_solver, gradients, names
 
 
 def test_gradients_are_those_of_central_differences(scene):
     """With loads and elasticities held constant, as the adjoint holds them, see ``Held``."""
-    program, _, gradients = scene
-    held = program.reference.held
-    assert min(program.reference.contacts) > 0
-    assert program.reference.residual < 1e-9 and not program.reference.unsolved.any()
-    deviations = {}
-    for name, gradient in gradients.items():
-        change, way = program.difference(name, held)
-        deviation = abs((gradient * way).sum() - change) / np.linalg.norm(gradient * way)
-        if not deviation < OF_ROUNDED.get(name, LIMIT):
-            deviations[name] = deviation
-    assert not deviations
+    program, _, gradients, names = scene
+    contacts_of(program)
+    found = deviations(program, gradients, names, STEPS[1:2], parts={})
+    assert not {name: each for name, each in found.items() if each and not max(each) < limit_of(name)}
 
 
 def test_gradients_of_the_solver_are_as_exact_as_it_solves(scene):
     """They fail as well where the equations are not those of the solver."""
-    _, of_solver, gradients = scene
-    deviations = {}
+    _, of_solver, gradients, _ = scene
+    wrong = {}
     for name, expected in gradients.items():
-        deviation = np.linalg.norm(of_solver[name] - expected) / np.linalg.norm(expected)
-        if not deviation < OF_SOLVER:
-            deviations[name] = deviation
-    assert not deviations
+        deviation = np.linalg.norm(of_solver[name] - expected)
+        if not deviation <= OF_SOLVER * np.linalg.norm(expected):
+            wrong[name] = deviation
+    assert not wrong

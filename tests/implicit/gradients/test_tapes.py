@@ -54,7 +54,7 @@ def test_two_states_that_take_turns(device):
     take_steps(program, [states[k % 2] for k in range(program.steps + 1)], tape := wp.Tape())
     program.states = [states[program.steps % 2]]
     tape.backward(grads=program.seeds())
-    for name, gradient in zip("xv", gradients_of(states[0]), strict=True):
+    for name, gradient in zip(STATE, gradients_of(states[0]), strict=True):
         np.testing.assert_array_equal(gradient, expected[name])
 
 
@@ -157,7 +157,7 @@ def test_gradients_in_a_graph_are_those_without():
         wp.capture_launch(capture.graph)
         for name, end in zip(STATE, ends, strict=True):
             np.testing.assert_array_equal(getattr(states[-1], name).numpy(), end)
-        for name, gradient in zip("xv", gradients_of(states[0]), strict=True):
+        for name, gradient in zip(STATE, gradients_of(states[0]), strict=True):
             np.testing.assert_array_equal(gradient, expected[name])
         np.testing.assert_array_equal(program.model.tri_materials.grad.numpy(), expected["tri_materials"])
 

@@ -40,13 +40,13 @@ class StepMatrix:
     def assemble(self, inertia: wp.array, in_contact: Elements | None, *, transposed: bool) -> Matrix:
         """Returns the matrix, or its transpose, of the Jacobians that elements have, and of inertia.
 
-        Elastic forces have a symmetric one. The Jacobians of the elements ``in_contact`` are scaled where they are.
+        Turns of bodies and contacts are what is not symmetric. The Jacobians ``in_contact`` are scaled where they are.
         """
         matrix, n, rows = self._matrix, len(inertia), self._elastic.rows
         self._blocks.zero_()
         for each in self._springs:
             each.add_blocks(self._blocks, is_fixed=self._is_fixed)
-        inputs = [inertia, self._is_fixed, rows, self._elastic.blocks, self._elastic.bends]
+        inputs = [transposed, inertia, self._is_fixed, rows, self._elastic.blocks, self._elastic.bends]
         self._launch(matrix_kernels.add_up_rows, n, inputs, [self._blocks, matrix.values])
         if in_contact is None:
             self._contacts.offsets.zero_()

@@ -87,6 +87,7 @@ def row_product(matrix: Matrix, i: int, x: wp.array[wp.vec3d], part: int, parts:
 @wp.kernel
 def add_up_rows(
     # in
+    transposed: bool,
     inertia: wp.array[wp.float64],
     is_fixed: wp.array[int],
     rows: Rows,
@@ -105,7 +106,7 @@ def add_up_rows(
     for k in range(rows.first[u], rows.first[u + 1]):
         total = wp.mat33d()
         if k == rows.first[u]:
-            total = diagonal[u] + inertia[u] * wp.identity(3, wp.float64)
+            total = wp.diag(wp.vec3d(inertia[u])) + wp.where(transposed, wp.transpose(diagonal[u]), diagonal[u])
         if is_fixed[u] == 0 and is_fixed[rows.column[k]] == 0:
             for n in range(rows.first_source[k], rows.first_source[k + 1]):
                 source = rows.source[n] + int(0)
