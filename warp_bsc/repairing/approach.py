@@ -37,7 +37,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         springs: Springs of the vertices that may move.
         max_strain: Largest strain.
     """
-    best, score = x, _score(surface, x, max_strain)
+    best, score = x, score_of(surface, x, max_strain)
     best_score = score
     held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
     for _ in range(_ROUNDS):
@@ -53,7 +53,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         start, (x, contacts) = x, move_freely(surface, x, goal)
         known = Contacts.joined([known, contacts]).latest()
         held[contacts.vertices] = True
-        before, score = score, _score(surface, x, max_strain)
+        before, score = score, score_of(surface, x, max_strain)
         stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
@@ -65,7 +65,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         strained = surface.strained(goal, max_strain)
         if not goes_home[strained].any():
             sent, _ = move_freely(surface, best, goal, slides=False)
-            return sent if _score(surface, sent, max_strain) < best_score else best
+            return sent if score_of(surface, sent, max_strain) < best_score else best
         goes_home[strained] = False
 
 
@@ -74,8 +74,8 @@ def _are_near(start: np.ndarray, end: np.ndarray, edge: float) -> bool:
     return bool(np.abs(end - start).max(initial=0.0) < _SETTLED * edge)
 
 
-def _score(surface: Surface, x: np.ndarray, max_strain: float) -> tuple[float, float]:
-    """Returns the strain above the limit and the sum of squared moves."""
+def score_of(surface: Surface, x: np.ndarray, max_strain: float) -> tuple[float, float]:
+    """Returns the strain above the limit and the sum of squared moves, in units: less is better."""
     return max(surface.strain(x) - max_strain, 0.0), float((surface.moves(x) ** 2).sum())
 
 

@@ -1,4 +1,6 @@
-"""Frees a surface: untangles it from a start and returns towards the input; restores the parts that got no better."""
+"""Frees a surface: untangles or smooths it and returns towards the input; restores the parts that got no better."""
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -6,11 +8,16 @@ from .approach import approach
 from .contours import connected_components
 from .elastic import Springs, near
 from .motion import push_apart
+from .sheets import separate_sheets
 from .surface import Surface, differ
 from .untangle import untangle
 
 _RINGS = 10
 """Edges around vertices that are pushed apart within which others may follow."""
+_OFFSET = 0.1
+"""Distance by which layers that lie on each other leave each other, in edges."""
+_SWEEPS, _DOUBLINGS = 8, 10
+"""Sweeps after which a smoothed surface is looked at first, and how often they are doubled."""
 
 
 def free(
@@ -38,6 +45,109 @@ def free(
         may_move |= movable
     is_known = (may_move == untangled.springs.movable).all()
     return approach(surface, x, untangled.springs if is_known else Springs(surface, may_move), max_strain)
+
+
+def offset(surface: Surface, crossings: np.ndarray) -> np.ndarray:
+    """Returns the input with what crosses moved along its normals, if nothing crosses then; else the input.
+
+    Layers that lie on each other have no contours that tell a side. Those of one sheet that is folded have opposite
+    normals, and pieces move by different distances.
+
+    Args:
+        surface: The surface.
+        crossings: What crosses in the input, (edge, face), shape [m, 2].
+    """
+    faces, x = surface.mesh.faces, surface.home
+    a, b, c = (x[faces[:, k]] for k in range(3))
+    normals = np.zeros_like(x)
+    np.add.at(normals, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, axis=0))
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-30)[:, None]
+    moves = near(surface, np.append(surface.mesh.edges[crossings[:, 0]], surface.mesh.faces[crossings[:, 1]]), 1)
+    _, piece = np.unique(connected_components(len(x), surface.edges)[moves], return_inverse=True)
+    distances = np.zeros((len(x), 1))
+    distances[moves, 0] = _OFFSET * surface.edge * (1.0 + piece.reshape(-1)) / (1.0 + piece.max(initial=0))
+    for side in (1.0, -1.0):
+        start = surface.rounded(x + side * distances * normals)
+        if surface.are_fixed(surface.crossings(start)).all():
+            return start
+    return x
+
+
+def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) -> np.ndarray:
+    """Returns positions as :func:`free`, from where pieces that cross themselves are too smooth for that; or the start.
+
+    Smoothing opens what a piece has folded through itself from a border, whose contours have nowhere else to go. A
+    piece keeps its place and the lengths of its edges, in the mean.
+
+    Args:
+        surface: The surface.
+        start: Where the search begins, in units, shape [n, 3].
+        max_strain: Largest strain that is sought.
+    """
+    edges, piece = surface.edges, connected_components(len(start), surface.edges)
+    crossings = surface.crossings(start)
+    first, second = (piece[of[crossings[:, k], 0]] for k, of in enumerate((surface.mesh.edges, surface.mesh.faces)))
+    crossing = first[(first == second) & ~surface.are_fixed(crossings)]
+    if not len(crossing):
+        return start
+    springs, x = Springs(surface, np.isin(piece, crossing) & ~surface.fixed), start
+    sizes = np.bincount(piece, minlength=len(x))[:, None]
+
+    def means(values, rows):
+        return np.stack([np.bincount(rows, v, len(x)) for v in values.T], axis=1) / np.maximum(sizes, 1)
+
+    def lengths(x):
+        return means(np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)[:, None], piece[edges[:, 0]])
+
+    is_whole = springs.movable & ~np.isin(piece, piece[surface.fixed])
+    for doubling in range(_DOUBLINGS):
+        x = springs.spread(x, ~springs.movable, _SWEEPS << doubling)
+        scale = (lengths(start) / np.maximum(lengths(x), 1e-30))[piece]
+        placed = means(start, piece)[piece] + scale * (x - means(x, piece)[piece])
+        opened = surface.rounded(np.where(is_whole[:, None], placed, x))
+        if surface.are_fixed(surface.crossings(opened)).all():
+            return approach(surface, opened, springs, max_strain)
+    return start
+
+
+def free_in_order(surface: Surface, sheet: np.ndarray, start: np.ndarray, max_strain: float) -> np.ndarray:
+    """Returns positions as :func:`free`, from where sheets are on their sides, see :func:`.sheets.separate_sheets`."""
+    x = separate_sheets(surface, sheet, start)
+    return free(surface, x, surface.crossings(x), max_strain, movable=~surface.fixed)
+
+
+def free_by_order(
+    surface: Surface, x: np.ndarray, max_strain: float, rank: Callable[[np.ndarray], tuple], chosen: np.ndarray
+) -> np.ndarray:
+    """Returns positions in which pieces that cross each other have left each other, to the side where they move less.
+
+    Args:
+        surface: The surface.
+        x: Where the search begins, in units, shape [n, 3].
+        max_strain: Largest strain that is sought.
+        rank: Tells how good positions are: whether they are wrecked, what crosses, and what follows; less is better.
+        chosen: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; those that are chosen are
+            written.
+    """
+    piece, tried = connected_components(len(x), surface.edges), set()
+    while True:
+        left = surface.crossings(x)
+        ends = np.stack([piece[surface.mesh.edges[left[:, 0], 0]], piece[surface.mesh.faces[left[:, 1], 0]]], axis=1)
+        of_two = (ends[:, 0] != ends[:, 1]) & ~surface.are_fixed(left)
+        pairs = sorted(set(map(tuple, np.sort(ends[of_two], axis=1).tolist())) - tried)
+        if not pairs:
+            return x
+        tried.add(pairs[0])
+        found = []
+        for inner, outer in (pairs[0], pairs[0][::-1]):
+            sheet = np.where(piece == inner, 0, np.where(piece == outer, 1, -1))
+            y = free_in_order(surface, sheet, x, max_strain)
+            found.append((rank(y), inner, outer, y))
+        best, inner, outer, y = min(found, key=lambda each: each[0])
+        if best[:2] < rank(x)[:2]:
+            x = y
+            chosen[(piece == inner) & (chosen < 0)] = 0
+            chosen[piece == outer] = np.maximum(chosen[piece == outer], chosen[piece == inner].max() + 1)
 
 
 def restore_parts(

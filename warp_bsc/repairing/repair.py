@@ -8,13 +8,12 @@ import warp as wp
 from .._arguments import check_finite, checked_distance, checked_number, checked_shape
 from ..detection.mesh import CollisionMesh
 from ..detection.run.start import checked_device
-from .approach import approach
+from .approach import approach, score_of
 from .arguments import checked_mask, checked_sheets
 from .elastic import Springs
-from .free import free, restore_parts
+from .free import free, free_by_order, free_by_smoothing, free_in_order, offset, restore_parts
 from .motion import near_pairs
 from .results import RepairResult
-from .sheets import separate_sheets
 from .surface import Surface, differ, weld_borders, welded
 from .unresolved import unresolved_contours
 
@@ -34,8 +33,10 @@ def repair(
 
     The contours along which the surface crosses itself are shortened until none remains, while springs keep its shape.
     From there the surface returns towards the given positions along a path without collisions, as near as contact
-    allows. The result is decided exactly in its own type. It never crosses more than the input. Where nothing crosses,
-    nothing moves::
+    allows. What that does not free is smoothed until it does not cross, and begins from there; of two pieces that cross
+    from border to border, one leaves the other to the side where they move less, which ``RepairResult.order`` tells.
+    The result is decided exactly in its own type. It never crosses more than the input. Where nothing crosses, nothing
+    moves::
 
         import warp_bsc as bsc
 
@@ -99,12 +100,12 @@ def repair(
     history = None if x_previous is None else surface.in_units(previous)
     if history is not None and (count := len(surface.crossings(history))):
         raise ValueError(f"x_previous must not cross, but {count} edges meet faces in it")
-    near_before = near_pairs(surface, surface.home)
+    near_before, chosen = near_pairs(surface, surface.home), np.full(len(given), -1)
     final, crossings, near = surface.home, before, near_before
     if len(before) or len(near_before):
-        final, crossings = _repaired(surface, before, history, sheet if order is not None else None, strain)
+        final, crossings = _repaired(surface, before, history, None if order is None else sheet, strain, chosen)
         near = near_pairs(surface, final)
-    if (len(crossings), len(near)) >= (len(before), len(near_before)):
+    if (len(crossings), len(near)) >= (len(before), len(near_before)) or surface.is_wrecked(final):
         final, crossings, near = surface.home, before, near_before
     positions = surface.positions(final)[weld]
     has_moved = differ(final, surface.home)[weld]
@@ -119,6 +120,7 @@ def repair(
         moved=surface.moves(final)[weld] * surface.unit,
         max_strain=surface.strain(final),
         unresolved=unresolved_contours(surface, mesh, weld, crossings),
+        order=chosen[weld] if final is not surface.home and (chosen >= 0).any() else None,
     )
 
 
@@ -140,19 +142,36 @@ def _labels(mesh: CollisionMesh, sheet: np.ndarray) -> np.ndarray:
 
 
 def _repaired(
-    surface: Surface, before: np.ndarray, history: np.ndarray | None, sheet: np.ndarray | None, max_strain: float
+    surface: Surface,
+    before: np.ndarray,
+    history: np.ndarray | None,
+    sheet: np.ndarray | None,
+    max_strain: float,
+    chosen: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the best positions that are found, in units of the surface, and what crosses there; they may be worse."""
+    """Returns the best positions that are found, in units of the surface, and what crosses there; they may be worse.
+
+    Writes the sheets whose order it had to choose to ``chosen``.
+    """
     if history is not None:
         reached = approach(surface, history, Springs(surface, ~surface.fixed), max_strain)
         # fixed vertices that contact keeps from their places cannot stay elsewhere
         if (reached == surface.home)[surface.fixed].all():
             return reached, surface.crossings(reached)
+
+    def rank(x):
+        return surface.is_wrecked(x), len(surface.crossings(x)), *score_of(surface, x, max_strain)
+
     if sheet is None:
-        x = free(surface, surface.home, before, max_strain)
+        x, start = surface.home, offset(surface, before)
+        if start is not surface.home:
+            x = free(surface, start, surface.crossings(start), max_strain, movable=differ(start, surface.home))
+        if start is surface.home or score_of(surface, x, max_strain)[0]:
+            x = min(x, free(surface, surface.home, before, max_strain), key=rank)
+        x = free_by_order(surface, x, max_strain, rank, chosen)
+        x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
     else:
-        start = separate_sheets(surface, sheet)
-        x = free(surface, start, surface.crossings(start), max_strain, movable=~surface.fixed)
+        x = free_in_order(surface, sheet, surface.home, max_strain)
     left = surface.crossings(x)
     if not len(left):
         return x, left

@@ -41,6 +41,9 @@ class RepairResult:
         moved: Distance of each vertex from its input, in the unit of the positions, float64, shape [vertex_count].
         max_strain: Largest change of the length of an edge, as a share of its length in the input.
         unresolved: The contours that remain.
+        order: Sheets that had changed places and were put into an order that nobody told, as the argument ``order``
+            has them: the number of each vertex from inside to outside, -1 for none, int, shape [vertex_count]; pass
+            another one to choose. None if there was nothing to choose.
     """
 
     x: np.ndarray | wp.array
@@ -52,3 +55,4 @@ class RepairResult:
     moved: np.ndarray
     max_strain: float
     unresolved: tuple[UnresolvedContour, ...]
+    order: np.ndarray | None

@@ -15,7 +15,7 @@ _RINGS = 12
 _SWEEPS = 12
 
 
-def separate_sheets(surface: Surface, sheet: np.ndarray) -> np.ndarray:
+def separate_sheets(surface: Surface, sheet: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Returns positions in which sheets that cross are on their sides, nearly: contours may remain.
 
     Parts of a sheet that are behind the sheets inside, bounded by contours, move in front of these: to the side to
@@ -24,8 +24,8 @@ def separate_sheets(surface: Surface, sheet: np.ndarray) -> np.ndarray:
     Args:
         surface: The surface.
         sheet: Sheet of each vertex from inside to outside, -1 for none, int, shape [n].
+        x: Positions from which they move, in units, shape [n, 3].
     """
-    x = surface.home
     for outer in np.unique(sheet[sheet > sheet[sheet >= 0].min(initial=0)]):
         inside, outside = (sheet >= 0) & (sheet < outer), sheet == outer
         if (outside & ~surface.fixed).any():

@@ -103,6 +103,7 @@ def repair_state(
         moved=(surface.moves(after.x)[weld] * surface.unit)[:count],
         max_strain=surface.strain(after.x),
         unresolved=unresolved_contours(surface, placed.mesh, weld, after.crossings),
+        order=None,
         inside_before=len(before.inside),
         inside=after.inside,
         inverted_before=before.inverted,
@@ -150,7 +151,7 @@ def _repaired(placed: ModelSurface, before: _Faults, sheet: np.ndarray | None, m
     What is deep inside a solid may leave it only as a whole: that is tried if the way out of its particles is not free.
     """
     surface, best = placed.surface, before
-    start = surface.home if sheet is None else separate_sheets(surface, placed.sheet)
+    start = surface.home if sheet is None else separate_sheets(surface, placed.sheet, surface.home)
     for whole in (False, True) if len(before.inside) else (False,):
         outside, movable = placed.leave_solids(start, whole=whole)
         movable = movable if sheet is None else ~surface.fixed

@@ -8,6 +8,9 @@ import warp as wp
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
 
+_WRECKED = 0.25
+"""Median strain of edges that have moved above which a surface is no result."""
+
 
 def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Returns for each vertex the first one that it is welded to, int, shape [n].
@@ -126,6 +129,11 @@ class Surface:
     def strain(self, x: np.ndarray) -> float:
         """Returns the largest change of the length of an edge, as a share of its length in the input."""
         return float(self._strains(x)[1].max(initial=0.0))
+
+    def is_wrecked(self, x: np.ndarray) -> bool:
+        """Returns whether most edges that have moved are strained so much that the surface has lost its shape."""
+        _, strains = self._strains(x)
+        return bool(len(strains)) and float(np.median(strains)) > _WRECKED
 
     def strained(self, x: np.ndarray, limit: float) -> np.ndarray:
         """Returns the vertices of edges that are strained by more than a limit, int, shape [2 m]."""

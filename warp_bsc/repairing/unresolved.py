@@ -9,7 +9,7 @@ from .surface import Surface
 
 _FIXED = "both of its sides are fixed"
 _BORDER = "it runs from border to border, so that both sides may be the right one: order or x_previous would tell"
-_NOT_FOUND = "no positions without it were found"
+_NOT_FOUND = "no positions without it were found: order or x_previous may tell where its sides belong"
 
 
 def unresolved_contours(
