@@ -1,5 +1,6 @@
 """Repairs of meshes that cross themselves: free in the end, near, and never worse."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -284,3 +285,13 @@ def test_a_previous_configuration_must_be_free():
     scene = KNOWN["folded"]()
     with pytest.raises(ValueError, match="x_previous"):
         repair(scene, scene.x, x_previous=scene.x)
+
+
+def test_a_time_limit_ends_the_search_and_is_named():
+    scene = KNOWN["corner"]()
+    begin = time.monotonic()
+    result = repair(scene, scene.x, time_limit=0.2)
+    assert time.monotonic() - begin < 3.0
+    assert not result.certified and {contour.reason for contour in result.unresolved} == {
+        "the time limit ended the search for positions without it"
+    }

@@ -400,6 +400,7 @@ def calls() -> dict[str, Call]:
             "x_previous": without(COORDINATES, "None") | {"single": X.astype(np.float32)},
             "min_distance": without(DISTANCES, "None"),
             "max_strain": {**NUMBERS, "zero": 0.0, "negative": -1.0},
+            "time_limit": {**without(NUMBERS, "None"), "zero": 0.0, "negative": -1.0},
             "device": {"beside a mesh": "cpu"},
         },
     )

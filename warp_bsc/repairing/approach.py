@@ -57,7 +57,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
-        if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1):
+        if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1) or surface.is_late:
             break
     goes_home = surface.moves(best) < _SMALL * surface.edge
     while True:

@@ -88,7 +88,7 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
     crossings = surface.crossings(start)
     first, second = (piece[of[crossings[:, k], 0]] for k, of in enumerate((surface.mesh.edges, surface.mesh.faces)))
     crossing = first[(first == second) & ~surface.are_fixed(crossings)]
-    if not len(crossing):
+    if not len(crossing) or surface.is_late:
         return start
     springs, x = Springs(surface, np.isin(piece, crossing) & ~surface.fixed), start
     sizes = np.bincount(piece, minlength=len(x))[:, None]
@@ -135,7 +135,7 @@ def free_by_order(
         ends = np.stack([piece[surface.mesh.edges[left[:, 0], 0]], piece[surface.mesh.faces[left[:, 1], 0]]], axis=1)
         of_two = (ends[:, 0] != ends[:, 1]) & ~surface.are_fixed(left)
         pairs = sorted(set(map(tuple, np.sort(ends[of_two], axis=1).tolist())) - tried)
-        if not pairs:
+        if not pairs or surface.is_late:
             return x
         tried.add(pairs[0])
         found = []

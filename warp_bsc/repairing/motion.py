@@ -49,6 +49,8 @@ def move_freely(
             np.minimum.at(kept, contacts.vertices.ravel(), np.repeat(_KEPT_TIME * contacts.toi, 4))
             kept[kept < _LEAST_TIME] = 0.0
             goal = start + kept[:, None] * (goal - start)
+        if surface.is_late:
+            break
         goal = surface.rounded(goal)
     return start, Contacts.joined(known)
 
@@ -56,7 +58,7 @@ def move_freely(
 def push_apart(surface: Surface, x: np.ndarray) -> np.ndarray:
     """Returns positions with the fewest pairs nearer than the minimum distance that are reached without a collision."""
     best, fewest, since = x, None, 0
-    while since < _PATIENCE:
+    while since < _PATIENCE and not surface.is_late:
         near = _near_contacts(surface, x)
         since += 1
         if fewest is None or len(near.keys) < fewest:

@@ -1,5 +1,6 @@
 """Repairs positions that cross: the nearest positions that do not, certified, and what could not be freed."""
 
+import time
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,6 +28,7 @@ def repair(
     x_previous: np.ndarray | wp.array | None = None,
     min_distance: float = 0.0,
     max_strain: float = 0.1,
+    time_limit: float | None = None,
     device: wp.DeviceLike = None,
 ) -> RepairResult:
     """Returns positions near the given ones at which no edge meets a face, or names what still does.
@@ -64,6 +66,8 @@ def repair(
             is moved apart as far as that is possible; ``RepairResult.near`` tells.
         max_strain: Largest change of the length of an edge that is sought, as a share of its length in ``x``, more than
             0. The result may exceed it where nothing else is free; ``RepairResult.max_strain`` tells.
+        time_limit: Time after which the search ends with the best that it has found [s], more than 0: it still ends the
+            detection that it is in, and names what is left. None for none.
         device: Warp device for given faces; default: Warp's default. A mesh has its own.
 
     Raises:
@@ -92,10 +96,12 @@ def repair(
     previous = given if x_previous is None else _checked_previous(x_previous, given, mesh)
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
+    limit = np.inf if time_limit is None else checked_number(time_limit, "time_limit", 0.0, above=True)
     weld = weld_borders(mesh, np.hstack([given, previous]), _labels(mesh, sheet))
     welded_mesh = welded(mesh, weld)
     is_fixed = np.bincount(weld, fixed_mask, len(given)) > 0
     surface = Surface(welded_mesh, given, is_fixed, distance)
+    surface.end = time.monotonic() + limit
     before = surface.crossings(surface.home)
     history = None if x_previous is None else surface.in_units(previous)
     if history is not None and (count := len(surface.crossings(history))):

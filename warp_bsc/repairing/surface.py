@@ -1,6 +1,7 @@
 """The surface that is repaired: its mesh without doubled vertices, its input, and its exact checks."""
 
 import functools
+import time
 
 import numpy as np
 import warp as wp
@@ -69,7 +70,10 @@ class Surface:
         lengths: Length of each of the edges in the input, in units, float64, shape [m].
         edge: Median length of the edges.
         min_distance: Distance that elements keep, in units, 0 for none.
+        end: Time at which a search ends with what it has found, as of ``time.monotonic`` [s].
     """
+
+    end = np.inf
 
     def __init__(
         self,
@@ -121,6 +125,11 @@ class Surface:
     def distance_detector(self) -> CollisionDetector:
         """A detector of pairs that come within the minimum distance."""
         return CollisionDetector(self.mesh, min_distance=self.min_distance * self.unit)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether a search has to end."""
+        return time.monotonic() > self.end
 
     def in_units(self, x: np.ndarray) -> np.ndarray:
         """Returns positions in units, float64; 0 for vertices that are not used."""

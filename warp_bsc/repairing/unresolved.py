@@ -9,6 +9,7 @@ from .surface import Surface
 
 _FIXED = "both of its sides are fixed"
 _BORDER = "it runs from border to border, so that both sides may be the right one: order or x_previous would tell"
+_LATE = "the time limit ended the search for positions without it"
 _NOT_FOUND = "no positions without it were found: order or x_previous may tell where its sides belong"
 
 
@@ -25,7 +26,7 @@ def unresolved_contours(
     """
     if not len(crossings):
         return ()
-    contours = trace_contours(surface.mesh, crossings)
+    contours, late = trace_contours(surface.mesh, crossings), surface.is_late
     fixed = surface.are_fixed(crossings)
     n = len(weld)
     keys = np.sort(weld[mesh.edges], axis=1).astype(np.int64) @ np.array([n, 1])
@@ -35,6 +36,6 @@ def unresolved_contours(
     found = []
     for number, kind in enumerate(contours.kinds):
         rows = contours.number == number
-        reason = _FIXED if fixed[rows].all() else _BORDER if kind == "border" else _NOT_FOUND
+        reason = _FIXED if fixed[rows].all() else _LATE if late else _BORDER if kind == "border" else _NOT_FOUND
         found.append(UnresolvedContour(elements[rows][np.lexsort(elements[rows].T[::-1])], kind, reason))
     return tuple(found)

@@ -64,7 +64,7 @@ def untangle(surface: Surface, x: np.ndarray, crossings: np.ndarray) -> Untangle
     inner = np.zeros(len(x), dtype=bool)
     springs = Springs(surface, inner)
     best, since, iteration = Untangled(x, crossings, springs), 0, 0
-    while not surface.are_fixed(crossings).all() and since < _PATIENCE:
+    while not surface.are_fixed(crossings).all() and since < _PATIENCE and not surface.is_late:
         vertices = _vertices_of(surface, crossings)
         if not inner[vertices].all():
             inner = inner | within(surface, vertices, _MORE_RINGS)
