@@ -168,17 +168,20 @@ class Tool:
         distributions: Its names on PyPI, the first of which that is installed counts.
         ask: Its function above.
         dtype: Type of its positions.
+        beside: A distribution that it calls for this.
     """
 
     title: str
     distributions: tuple[str, ...]
     ask: Callable[[np.ndarray, np.ndarray], Query | None]
     dtype: type = np.float64
+    beside: str | None = None
 
     @property
     def version(self) -> str | None:
         """Its version, None if it is not installed."""
-        return next(filter(None, map(version_of, self.distributions)), None)
+        found = next(filter(None, map(version_of, self.distributions)), None)
+        return f"{found} with {self.beside} {version_of(self.beside)}" if found and self.beside else found
 
 
 TOOLS = {
@@ -192,7 +195,7 @@ TOOLS = {
         Tool("MeshLib", ("meshlib",), ask_meshlib, np.float32),
         Tool("Open3D", ("open3d", "open3d-cpu"), ask_open3d),
         Tool("PyMeshLab", ("pymeshlab",), ask_pymeshlab),
-        Tool("trimesh, FCL", ("trimesh",), ask_trimesh),
+        Tool("trimesh", ("trimesh",), ask_trimesh, beside="python-fcl"),
         Tool("trueform", ("trueform",), ask_trueform),
         Tool("VTK", ("vtk",), ask_vtk),
     )
@@ -273,7 +276,9 @@ def measure(sizes: list[int]) -> dict:
         case_found = {"name": case.name, "triangles": len(case.faces), "intersects": right[np.float64] > 0}
         cases.append(case_found | {"by_definition": case.name not in names, "answers": given, "wrong": wrong})
     rows = [{"triangles": len(spheres(size)[1]), "seconds": times[size]} for size in sizes]
-    return {"benchmark": "intersections", "tools": tools, "cases": cases, "times": rows}
+    found = with_record({"benchmark": "intersections", "cases": cases, "times": rows}, sys.argv, [wp.get_device()])
+    found["record"]["versions"] |= tools
+    return found
 
 
 # Tables ------------------------------------------------------------------------------------------------------------
@@ -289,7 +294,8 @@ def cell(answers: list[bool] | None) -> str:
 
 def print_answers(found: dict, by_definition: bool, title: str) -> None:
     """Prints the answers to some cases, those that are wrong in red."""
-    table = Table("", "right", *found["tools"], title=title, title_justify="left", box=None, pad_edge=False)
+    tools = found["cases"][0]["answers"]
+    table = Table("", "right", *tools, title=title, title_justify="left", box=None, pad_edge=False)
     for case in found["cases"]:
         if case["by_definition"] == by_definition:
             wrong = () if by_definition else case["wrong"]
@@ -308,15 +314,16 @@ def main() -> int:
     print_answers(found, False, "Does it intersect itself? Wrong answers are red.")
     print_answers(found, True, "Touching, shared vertices, no area: definitions differ, the right answer is by ours.")
     if found["times"]:
-        table = Table("triangles", *found["tools"], title="Seconds", title_justify="left", box=None, pad_edge=False)
+        tools = found["cases"][0]["answers"]
+        table = Table("triangles", *tools, title="Seconds", title_justify="left", box=None, pad_edge=False)
         for row in found["times"]:
-            seconds = map(row["seconds"].get, found["tools"])
+            seconds = map(row["seconds"].get, tools)
             table.add_row(f"{row['triangles']:,}", *("" if time is None else f"{time:.3g}" for time in seconds))
         Console(width=None if sys.stdout.isatty() else 160).print(table)
     if arguments.json:
         file = OutputFile(arguments.json)
         try:
-            file.write(json.dumps(with_record(found, sys.argv, [wp.get_device()])))
+            file.write(json.dumps(found))
             file.commit()
         finally:
             file.discard()
