@@ -78,13 +78,16 @@ def intersections(found: Found, by_definition: bool = False) -> Rows:
 
 
 def intersection_times(found: Found) -> Rows:
-    """Times of tools by the number of triangles."""
+    """Times of tools by the number of triangles, and that of the query alone in the largest mesh."""
     rows = found["times"]
     times = {title: [row["seconds"].get(title) for row in rows] for title in rows[0]["seconds"]}
-    return [
-        ("tool", *(f"{row['triangles']:,} triangles" for row in rows)),
-        *((title, *("" if t is None else milliseconds(1e3 * t) for t in given)) for title, given in times.items()),
-    ]
+
+    def cell(time: Found | None, key: str = "total") -> str:
+        return milliseconds(1e3 * time[key]) if time else ""
+
+    sizes = [f"{row['triangles']:,}" for row in rows]
+    head = "tool", f"{sizes[0]} triangles", *sizes[1:], f"{sizes[-1]}, the query alone"
+    return [head, *((title, *map(cell, given), cell(given[-1], "query")) for title, given in times.items())]
 
 
 # Detection ---------------------------------------------------------------------------------------------------------

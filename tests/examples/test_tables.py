@@ -123,7 +123,7 @@ def test_intersections():
     by_definition = rows_of.intersections(found, by_definition=True)[1:]
     assert len(rows) + len(by_definition) == len(found["cases"]) and "**" not in str(by_definition)
     head, *rows = rows_of.intersection_times(found)
-    assert rows[0][0] == "warp-bsc" and all(len(row) == len(head) == 1 + len(found["times"]) for row in rows)
+    assert rows[0][0] == "warp-bsc" and all(len(row) == len(head) == 2 + len(found["times"]) for row in rows)
 
 
 def test_queries():
