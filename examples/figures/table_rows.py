@@ -52,6 +52,45 @@ def pivot(runs: Iterable[Found], row: str, column: str) -> dict[str, Found]:
     return {name: {run[column]: run for run in group} for name, group in grouped(runs, row).items()}
 
 
+# Intersections -----------------------------------------------------------------------------------------------------
+
+
+ASKED = "CGAL", "IPC Toolkit", "libigl", "MeshFix", "MeshLib", "Open3D", "PyMeshLab", "trimesh", "trueform", "VTK"
+"""Tools that are asked beside this package."""
+
+
+def _answer(answers: list[bool] | None) -> str:
+    if answers is None:
+        return ""
+    yes = sum(answers)
+    return ("no", "yes")[answers[0]] if yes in (0, len(answers)) else f"yes {yes} of {len(answers)}"
+
+
+def intersections(found: Found, by_definition: bool = False) -> Rows:
+    """Answers to the question whether a mesh intersects itself; those that are wrong by every definition are bold."""
+    rows = [("mesh", "right", *found["cases"][0]["answers"])]
+    for case in found["cases"]:
+        if case["by_definition"] == by_definition:
+            answers = {title: _answer(given) for title, given in case["answers"].items()}
+            if not by_definition:
+                answers |= {title: f"**{answers[title]}**" for title in case["wrong"]}
+            rows.append((case["name"], ("no", "yes")[case["intersects"]], *answers.values()))
+    return rows
+
+
+def intersection_times(found: Found) -> Rows:
+    """Times of tools by the number of triangles, and that of the query alone in the largest mesh."""
+    rows = found["times"]
+    times = {title: [row["seconds"].get(title) for row in rows] for title in rows[0]["seconds"]}
+
+    def cell(time: Found | None, key: str = "total") -> str:
+        return milliseconds(1e3 * time[key]) if time else ""
+
+    sizes = [f"{row['triangles']:,}" for row in rows]
+    head = "tool", f"{sizes[0]} triangles", *sizes[1:], f"{sizes[-1]}, the query alone"
+    return [head, *((title, *map(cell, given), cell(given[-1], "query")) for title, given in times.items())]
+
+
 # Detection ---------------------------------------------------------------------------------------------------------
 
 

@@ -26,12 +26,14 @@ _GUIDES = "configuration", "contacts", "gradients", "reports", "turning_bodies"
 PAGES = [
     ROOT / "README.md",
     ROOT / "docs" / "index.md",
+    ROOT / "docs" / "intersections.md",
     ROOT / "docs" / "measurements.md",
     *(ROOT / "docs" / "newton" / f"{name}.md" for name in _GUIDES),
 ]
 MEASUREMENTS = ROOT / "warp_bsc" / "bench" / "measurements"
 _COMPARED = {
     "detector": {"ipctk": "IPC Toolkit"},
+    "intersections": {title: title for title in table_rows.ASKED},
     "penetration": {"mujoco": "MuJoCo", "pyuipc": "libuipc"},
     "repair": {"ipctk": "IPC Toolkit"},
 }
@@ -76,6 +78,11 @@ TABLES = {
     "gradients": Table(("gradients_cpu",), table_rows.gradients),
     "newton_coupled": Table(("newton_coupled_gpu",), table_rows.newton),
     "newton_gpu": Table(("newton_twist_gpu", "newton_gpu"), table_rows.newton),
+    "intersections": Table(("intersections_cpu",), table_rows.intersections, has_sources=False),
+    "intersections_by_definition": Table(
+        ("intersections_cpu",), lambda found: table_rows.intersections(found, by_definition=True), has_sources=False
+    ),
+    "intersection_times": Table(("intersections_cpu",), table_rows.intersection_times),
     "inverting_steps": Table(_INVERTING, table_rows.inverting_steps),
     "paper": Table(("paper_cpu",), table_rows.paper),
     "penetration": Table(_PENETRATION, table_rows.penetration, needs_all=False, has_sources=False),

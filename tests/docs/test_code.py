@@ -75,6 +75,12 @@ def test_from_ipctk(tmp_path, capsys):
     assert names["r"].hit.all() and names["group"].tolist() == [2] * 3 + [4] * 3
 
 
+def test_intersections(tmp_path, capsys):
+    _, output = run("intersections.md", tmp_path, capsys)
+    shown = re.findall(r"print\(.*  # (.*)$", "\n".join(blocks_of("intersections.md")[0]), re.MULTILINE)
+    assert output.splitlines() == shown == ["True", "[3, 4] [0, 1, 2]", "True", "False"]
+
+
 def test_kernels(tmp_path, capsys):
     names, output = run("kernels.md", tmp_path, capsys)
     assert names["count"].numpy().tolist() == [1] and output.startswith("[1]\n")

@@ -113,6 +113,19 @@ def test_the_front_page():
         assert row[1].startswith(f"VBD {np.max(counts['vbd']):,}, ") and row[1].endswith("`SolverCCD` 0")
 
 
+def test_intersections():
+    found = measured("intersections_cpu")
+    head, *rows = rows_of.intersections(found)
+    assert head[2] == "warp-bsc" and set(head[3:]) == set(rows_of.ASKED)
+    assert all(row[2] == row[1] for row in rows)  # of this package
+    wrong = [cell for row in rows for cell in row if cell.startswith("**")]
+    assert wrong and len(wrong) == sum(len(case["wrong"]) for case in found["cases"] if not case["by_definition"])
+    by_definition = rows_of.intersections(found, by_definition=True)[1:]
+    assert len(rows) + len(by_definition) == len(found["cases"]) and "**" not in str(by_definition)
+    head, *rows = rows_of.intersection_times(found)
+    assert rows[0][0] == "warp-bsc" and all(len(row) == len(head) == 2 + len(found["times"]) for row in rows)
+
+
 def test_queries():
     found = measured("queries_one_core")
     faster = copy.deepcopy(found)
