@@ -10,8 +10,15 @@ from newton_scenes import SOLVERS, Still, add_patch
 import warp_bsc as bsc
 
 DT = 1.0 / 4000.0
-INNER = "vbd", "semi_implicit"  # XPBD makes NaN of models that require gradients
 ARRAYS = "particle_q", "particle_qd", "particle_f", "body_q", "body_qd", "body_f"
+
+
+@pytest.fixture(params=["vbd", "semi_implicit"])
+def inner(request, device):
+    """The name of an inner solver; XPBD makes NaN of models that require gradients."""
+    if request.param == "semi_implicit" and device.is_cuda:
+        pytest.skip("on a GPU it adds up forces in any order")
+    return request.param
 
 
 def box_on_sheet(device, *, requires_grad):
@@ -44,7 +51,6 @@ def ends_of(solver, model, steps=4):
 
 
 @pytest.mark.parametrize("substeps", [1, 3])
-@pytest.mark.parametrize("inner", INNER)
 def test_a_step_on_a_tape_is_refused_and_changes_nothing(inner, substeps, device, monkeypatch):
     """Neither the states nor the stage: its next step is that of one which was never on a tape."""
     model, called = box_on_sheet(device, requires_grad=True), []
@@ -63,7 +69,6 @@ def test_a_step_on_a_tape_is_refused_and_changes_nothing(inner, substeps, device
     assert (ends, contacts) == expected and contacts > 0 and called
 
 
-@pytest.mark.parametrize("inner", INNER)
 def test_a_model_that_requires_gradients_is_stepped_as_any_other(inner, device):
     """Without a tape, bit for bit."""
     results = []

@@ -217,6 +217,7 @@ def test_worlds_whose_steps_did_not_converge_have_no_gradients(device):
     """The other one falls freely."""
     with pytest.warns(UserWarning, match="did not converge, or left contacts .* gradients are NaN in its world"):
         solver, gradients = falling((0.008, 0.3), device, max_iterations=3)
+        assert solver.report.gradient_counts.unsolved > 0  # on a GPU, the first number that is read warns
     assert solver.report.unconverged_steps > 0
     for of_worlds in gradients[:2]:
         assert np.isnan(of_worlds[0]).all() and np.isfinite(of_worlds[1]).all()
