@@ -789,6 +789,7 @@ NUMBERS_OF: dict[Any, list[str]] = {positive: NUMERIC, natural: [text for text i
 VALUES: dict[str, list[str]] = {
     "--clearance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--min-distance": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
+    "--max-strain": ["", "x", "nan", "inf", "-1", "0", "1e400", "True"],
     "--max-move": ["", "x", "nan", "inf", "-1", "0", "1e400", "1e-320", "True"],
     "--fail-on": ["", "x", "collisions,x"],
     "--frames": ["", "x", "1", "3:1", "1:2:0", "1:2:-1", "nan:2", "1:inf", "1:2:3:4"],
@@ -838,6 +839,7 @@ TEXTS = {
     "--prims",
     "--exclude",
     "--keep",
+    "--previous",
     "--output",
     "--figure",
     "--between",

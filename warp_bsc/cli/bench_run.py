@@ -33,13 +33,13 @@ from ..bench.peers import ipc_toolkit
 from ..bench.record import with_record
 from ..bench.scenes import detector as scenes_of_detector
 from ..bench.scenes import newton_examples as examples_of_newton
-from ..bench.scenes.mesh_files import is_mesh_name
 from ..bench.scenes.queries import SEED
 from ..bench.scenes.repair import KNOWN, damaged, load_tangled
 from ..bench.tables import Table
 from ..bench.timing import count_threads, limited_threads
 from ..detection.run.launch import cores
 from ..detection.run.settings import PairKind
+from ..mesh_files.mesh_file import is_mesh_file
 from .device import find_device, load_detector, loading_kernels
 from .interrupts import INTERRUPTS
 from .query_file import find_query_files, read_query_file
@@ -367,7 +367,7 @@ def run_response(arguments: argparse.Namespace) -> None:
 
 def run_repair(arguments: argparse.Namespace) -> None:
     """Measures repairs."""
-    _check_json(arguments.json, is_mesh_name, "a mesh file", "meshes")
+    _check_json(arguments.json, is_mesh_file, "a mesh file", "meshes")
     device = find_device(arguments.device)
     files = {path: load_tangled(path) for path in arguments.meshes}
     meshes = [(repair.KNOWN_MESH, name, make) for name, make in KNOWN.items()]

@@ -2,29 +2,12 @@
 
 import re
 
-_OPTIONS = {
-    name: f"--{name.replace('_', '-')}"
-    for name in (
-        "allow_missing",
-        "between",
-        "clearance",
-        "count",
-        "exclude",
-        "frames",
-        "ignore",
-        "ignore_initial",
-        "intersections",
-        "keep",
-        "kind",
-        "max_move",
-        "method",
-        "min_distance",
-        "prims",
-        "subdivide",
-        "validate",
-        "workers",
-    )
-} | {"purposes": "--purpose", "self_collisions": "--self"}
+_NAMES = (
+    "allow_missing between clearance count exclude frames ignore ignore_initial intersections keep kind max_move "
+    "max_strain method min_distance prims subdivide validate workers"
+)
+_OPTIONS = {name: f"--{name.replace('_', '-')}" for name in _NAMES.split()}
+_OPTIONS |= {"purposes": "--purpose", "self_collisions": "--self", "x_previous": "--previous"}
 """The option that sets each argument of the library."""
 
 _ARGUMENT = re.compile(rf"({'|'.join(_OPTIONS)})(?=: | must |\[)")

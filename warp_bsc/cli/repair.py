@@ -1,4 +1,4 @@
-"""The command ``warp-bsc repair``: writes a USD layer over a scene in which its meshes do not collide."""
+"""The command ``warp-bsc repair``: writes a USD layer or mesh files in which meshes do not collide."""
 
 import argparse
 import contextlib
@@ -6,6 +6,7 @@ import json
 import os
 
 from .._atomic_file import STDOUT, unfinished_path
+from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
@@ -18,14 +19,15 @@ from .options import (
     add_command,
     add_fail_on,
     add_options,
-    add_scene,
     distance,
     file_option,
     flag,
     number,
     patterns,
+    positive_real,
     scene_path,
 )
+from .repair_files import repair_files
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
 from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
@@ -46,7 +48,10 @@ Skeletons and blend shapes no longer deform a mesh that is moved; it has points
 of its own. The layer is then replayed, and what remains is named.
 If Ctrl-C, SIGTERM, SIGHUP, an error or a full disk stops the run, the layer
 ends at the last repaired frame, and is marked partial. If it is killed too, a
-file beside the layer remains from which --resume continues."""
+file beside the layer remains from which --resume continues.
+Mesh files (.obj, .off, .ply, .stl) are one configuration: they are written again
+with coordinates at which no edge meets a face, all else as it was, and what was
+written is read and checked exactly. Several files are one scene."""
 
 _EPILOG = f"""\
 examples:
@@ -56,18 +61,23 @@ examples:
   warp-bsc repair shot.usd --output fixed.usdc --min-distance 0.002
   warp-bsc repair shot.usd --output fixed.usdc --frames 101:150 --max-move 0.02
   warp-bsc repair shot.usd --output fixed.usdc --fail-on remaining --json > done.json
+  warp-bsc repair garment.obj --output free.obj
+  warp-bsc repair body.obj garment.obj --keep body.obj --output free.obj
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
+
+_OF_BOTH = {"command_line", "scene", "output", "keep", "min_distance", "json", "fail_on", "device"}
+_OF_FILES = {"max_strain", "order", "previous"}
+"""The options for USD scenes and mesh files, and for mesh files alone. The others are for USD scenes alone."""
 
 
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
     command = add_command(commands, "repair", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    add_scene(command)
+    command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or one or several mesh files")
     which = command.add_argument_group("selection")
-    add_options(
-        which, {"--keep": patterns("obstacles: do not move meshes at or below these prims; * matches any text")}
-    )
+    kept = "obstacles: do not move meshes at or below these prims, or these mesh files; * matches any text"
+    add_options(which, {"--keep": patterns(kept)})
     add_scene_selection(which)
     how = command.add_argument_group("repair")
     add_options(
@@ -92,11 +102,18 @@ def add_to(commands: Commands, summary: str) -> None:
             ),
         },
     )
+    previous = "the files of a time before at which nothing crosses, such as the last frame, in the same order"
+    files = command.add_argument_group("repair of mesh files")
+    strain = "largest change of the length of an edge that is sought, as a share of it (default: %(default)s)"
+    add_options(files, {"--max-strain": number(positive_real, strain, default=0.1, metavar="S")})
+    add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
+    add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
+    command.set_defaults(default_of=command.get_default)
     out = command.add_argument_group("output")
     add_options(
         out,
         {
-            "--output": {"required": True, "metavar": "FILE", "help": "the USD layer, .usda, .usdc or .usd"},
+            "--output": file_option("the USD layer, .usda, .usdc or .usd; or a mesh file, or a folder", required=True),
             "--report": file_option(
                 "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
             ),
@@ -112,13 +129,21 @@ def add_to(commands: Commands, summary: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    is_of_files = any(map(is_mesh_file, arguments.scene))
+    for name, value in vars(arguments).items():
+        if name not in _OF_BOTH and (name in _OF_FILES) != is_of_files and value != arguments.default_of(name):
+            raise ValueError(f"--{name.replace('_', '-')} is for {'USD scenes' if is_of_files else 'mesh files'} only")
     if arguments.output == STDOUT:
         raise ValueError("--output must be a file, not standard output")
+    if is_of_files:
+        return repair_files(arguments)
+    if len(arguments.scene) > 1:
+        raise ValueError("only mesh files can be several")
     if arguments.report == STDOUT:
         raise ValueError("--report must be a file, not standard output")
     written = [file for file in (arguments.output, arguments.report) if file]
     written.append(str(unfinished_path(arguments.output)))
-    arguments.scene = scene_path(arguments.scene)
+    arguments.scene = scene_path(arguments.scene[0])
     paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
     for path in paths:
         if paths.count(path) > 1:

@@ -1,12 +1,35 @@
-"""Checks the arguments of a repair and converts them: vertices that stay, and the sheet of each vertex."""
+"""Checks the arguments of a repair and converts them: the mesh, vertices that stay, and the sheet of each vertex."""
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from .._arguments import as_numpy, given
+from .._arguments import as_numpy, check_finite, checked_shape, given
+from ..detection.mesh import CollisionMesh
+from ..detection.run.start import checked_device
+
+
+def checked_mesh(mesh: Any, x: Any, device: wp.DeviceLike) -> tuple[CollisionMesh, np.ndarray]:
+    """Returns a mesh and its positions as NumPy, given a mesh or faces and positions, or a ``trimesh.Trimesh``."""
+    trimesh = sys.modules.get("trimesh")  # imported if the mesh is one of its own
+    if x is None and trimesh and isinstance(mesh, trimesh.Trimesh):
+        mesh, x = np.array(mesh.faces), np.array(mesh.vertices)
+    positions = checked_shape(x, (3,), "x")
+    if not isinstance(mesh, CollisionMesh):
+        chosen = checked_device(device)
+        try:
+            mesh = CollisionMesh(mesh, len(positions), device=chosen)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"mesh: {error}") from None
+    elif device is not None:
+        raise ValueError("device must be omitted with a mesh, which has its own")
+    if len(positions) != mesh.vertex_count:
+        raise ValueError(f"x must have {mesh.vertex_count} rows, one a vertex, got {len(positions)}")
+    check_finite(positions, "x", mesh.vertices)
+    return mesh, positions
 
 
 def checked_mask(vertices: Any, name: str, count: int) -> np.ndarray:

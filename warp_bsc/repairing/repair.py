@@ -2,15 +2,15 @@
 
 import time
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from .._arguments import check_finite, checked_distance, checked_number, checked_shape
 from ..detection.mesh import CollisionMesh
-from ..detection.run.start import checked_device
 from .approach import approach, score_of
-from .arguments import checked_mask, checked_sheets
+from .arguments import checked_mask, checked_mesh, checked_sheets
 from .elastic import Springs
 from .free import free, free_by_order, free_by_smoothing, free_in_order, offset, restore_parts
 from .motion import near_pairs
@@ -18,10 +18,13 @@ from .results import RepairResult
 from .surface import Surface, differ, weld_borders, welded
 from .unresolved import unresolved_contours
 
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
 
 def repair(
-    mesh: CollisionMesh | np.ndarray | wp.array,
-    x: np.ndarray | wp.array,
+    mesh: "CollisionMesh | np.ndarray | wp.array | Trimesh",
+    x: np.ndarray | wp.array | None = None,
     *,
     fixed: np.ndarray | wp.array | Sequence[int] | None = None,
     order: np.ndarray | wp.array | Sequence | None = None,
@@ -52,8 +55,8 @@ def repair(
     touch, and do not count. Faces that lie on each other with all of their corners at borders are among them.
 
     Args:
-        mesh: The mesh, or its faces: vertex indices, integers, shape [face_count, 3]. Its radii are not counted; pairs
-            that its groups and masks leave out do not cross.
+        mesh: The mesh, or its faces: vertex indices, integers, shape [face_count, 3]; or a ``trimesh.Trimesh``,
+            without x. Its radii are not counted; pairs that its groups and masks leave out do not cross.
         x: Positions, any unit of length, shape [vertex_count, 3], float32 or float64, NumPy or Warp array.
         fixed: Vertices that stay, such as the body under a garment: a mask, bool, shape [vertex_count], or indices,
             integers, shape [n].
@@ -79,18 +82,7 @@ def repair(
         Pascal Volino and Nadia Magnenat-Thalmann. "Resolving Surface Collisions through Intersection Contour
         Minimization." ACM Transactions on Graphics 25, 3 (2006). https://doi.org/10.1145/1141911.1142007.
     """
-    given = checked_shape(x, (3,), "x")
-    if not isinstance(mesh, CollisionMesh):
-        chosen = checked_device(device)
-        try:
-            mesh = CollisionMesh(mesh, len(given), device=chosen)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"mesh: {error}") from None
-    elif device is not None:
-        raise ValueError("device must be omitted with a mesh, which has its own")
-    if len(given) != mesh.vertex_count:
-        raise ValueError(f"x must have {mesh.vertex_count} rows, one a vertex, got {len(given)}")
-    check_finite(given, "x", mesh.vertices)
+    mesh, given = checked_mesh(mesh, x, device)
     fixed_mask = checked_mask(() if fixed is None else fixed, "fixed", len(given))
     sheet = np.full(len(given), -1) if order is None else checked_sheets(order, len(given))
     previous = given if x_previous is None else _checked_previous(x_previous, given, mesh)
@@ -186,6 +178,6 @@ def _repaired(
     return (restored, crossings) if len(crossings) <= len(before) else (x, left)
 
 
-def _as_given(result: np.ndarray, x: np.ndarray | wp.array) -> np.ndarray | wp.array:
+def _as_given(result: np.ndarray, x: np.ndarray | wp.array | None) -> np.ndarray | wp.array:
     """Returns positions as a Warp array where the input was one, of its type and on its device."""
     return wp.array(result, dtype=x.dtype, device=x.device) if isinstance(x, wp.array) else result

@@ -25,10 +25,3 @@ def read_mesh(path: str):
     if not len(faces):
         raise ValueError(f"{path}: it has no triangles")
     return mesh
-
-
-def is_mesh_name(path: str) -> bool:
-    """Returns whether a path ends as the name of a mesh file does, JSON aside."""
-    import trimesh  # noqa: PLC0415 (slow)
-
-    return Path(path).suffix[1:].lower() in trimesh.available_formats() - {"json"}

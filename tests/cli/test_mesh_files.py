@@ -1,0 +1,241 @@
+"""The command ``warp-bsc repair`` for mesh files: what is written, what is checked, and what is said."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+import warp_bsc as bsc
+from warp_bsc._atomic_file import OutputFile
+from warp_bsc.bench.scenes.repair import KNOWN
+from warp_bsc.cli.main import main
+from warp_bsc.mesh_files.mesh_file import MeshFile
+
+FIRST, SECOND = (trimesh.creation.icosphere(2).apply_translation([x, 0, 0]) for x in (0.0, 1.9))
+BALLS = trimesh.util.concatenate([FIRST, SECOND])
+CROSSING = 72
+"""Edges of the balls that pass through faces."""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, mesh in {"first": FIRST, "second": SECOND, "balls": BALLS}.items():
+        for suffix in ("obj", "off", "ply", "stl"):
+            mesh.export(f"{name}.{suffix}")
+    return tmp_path
+
+
+def repair(*arguments):
+    return main(["repair", *map(str, arguments), "--device", "cpu"])
+
+
+def facts_of(capsys, *arguments, status=0):
+    assert repair(*arguments, "--json") == status
+    return json.loads(capsys.readouterr().out)
+
+
+def fail(capsys, *arguments):
+    """The one line that says what is wrong."""
+    assert repair(*arguments) == 2
+    output = capsys.readouterr()
+    assert output.out == "" and "Traceback" not in output.err
+    return output.err.splitlines()[-1].removeprefix("warp-bsc: error: ")
+
+
+def crossings(*paths):
+    """How many edges meet faces in files, as another reader has them."""
+    meshes = [trimesh.load_mesh(path, process=False) for path in paths]
+    x = np.concatenate([np.asarray(mesh.vertices) for mesh in meshes])
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
+    x, numbers = np.unique(x, axis=0, return_inverse=True)
+    mesh = bsc.CollisionMesh(numbers.reshape(-1)[faces], len(x), device="cpu")
+    return len(bsc.CollisionDetector(mesh).find_intersections(x))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "off", "ply", "stl"])
+def test_what_is_written_is_free_for_another_reader(folder, capsys, suffix):
+    assert crossings(f"balls.{suffix}") == CROSSING
+    assert repair(f"balls.{suffix}", "--output", f"free.{suffix}") == 0
+    said = capsys.readouterr().out
+    assert f"Intersections: {CROSSING} before, 0 remain." in said
+    assert "What was written has been read again: certified." in said
+    assert ("normals are kept" in said) == (suffix == "stl")
+    assert crossings(f"free.{suffix}") == 0
+    before, after = MeshFile(f"balls.{suffix}"), MeshFile(f"free.{suffix}")
+    if suffix != "stl":
+        assert 0 < (before.x != after.x).any(axis=1).sum() < 40 and (before.faces == after.faces).all()
+
+
+def test_it_repairs_as_the_library_does(folder, capsys):
+    facts = facts_of(capsys, "balls.obj", "--output", "free.obj")
+    result = bsc.repair(BALLS.faces, MeshFile("balls.obj").x, device="cpu")
+    assert MeshFile("free.obj").x.tobytes() == result.x.tobytes()
+    assert facts["before"] == {"intersections": CROSSING} and facts["remaining"] == {"intersections": 0}
+    (file,) = facts["files"]
+    assert file["moved"] == (result.moved > 0.0).sum() and file["largest_move"] == result.moved.max()
+    assert facts["certified"] is True and facts["max_strain"] == result.max_strain and facts["notes"] == []
+
+
+def test_a_trimesh_in_place_of_faces_and_positions(folder):
+    result, expected = bsc.repair(BALLS, device="cpu"), bsc.repair(BALLS.faces, BALLS.vertices, device="cpu")
+    assert isinstance(result.x, np.ndarray) and result.x.tobytes() == expected.x.tobytes() and result.certified
+    with pytest.raises(TypeError, match="mesh: faces"):
+        bsc.repair(BALLS, BALLS.vertices)
+    with pytest.raises(TypeError, match="x must be"):
+        bsc.repair(BALLS.faces)
+
+
+def test_the_library_does_not_import_trimesh_for_it():
+    script = (
+        "import sys, warp_bsc as bsc, numpy as np; bsc.repair([[0, 1, 2]], np.eye(3)); print('trimesh' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert found.stdout.splitlines()[-1] == "False"
+
+
+def test_files_that_are_kept_are_obstacles(folder, capsys):
+    before = (folder / "first.obj").read_bytes()
+    facts = facts_of(capsys, "first.obj", "second.ply", "--keep", "fir*", "--output", "free.ply")
+    assert [file["output"] for file in facts["files"]] == [None, "free.ply"]
+    assert facts["files"][0]["moved"] == 0 < facts["files"][1]["moved"]
+    assert facts["certified"] and crossings("first.obj", "free.ply") == 0
+    assert (folder / "first.obj").read_bytes() == before
+
+
+def test_several_files_that_move_are_written_to_a_folder(folder, capsys):
+    os.mkdir("free")
+    facts = facts_of(capsys, "first.obj", "second.stl", "--output", "free")
+    assert [file["output"] for file in facts["files"]] == ["free/first.obj", "free/second.stl"]
+    assert crossings("free/first.obj", "free/second.stl") == 0 and facts["certified"]
+
+
+def test_a_minimum_distance(folder, capsys):
+    facts = facts_of(capsys, "balls.obj", "--output", "free.obj", "--min-distance", "0.01")
+    assert facts["before"]["pairs nearer than 0.01"] > 0 == facts["remaining"]["pairs nearer than 0.01"]
+    mesh = bsc.CollisionMesh(BALLS.faces, len(BALLS.vertices), device="cpu")
+    assert bsc.CollisionDetector(mesh).least_distance(MeshFile("free.obj").x) >= 0.01
+
+
+def test_order_and_previous_free_sheets_that_have_changed_places(folder, capsys):
+    """A sheet that is through another one from border to border."""
+    corner = KNOWN["corner"]()
+    assert corner.free is not None
+    for name, x, number in (("low", corner.x, 0), ("high", corner.x, 1), ("before", corner.free, 1)):
+        faces = corner.faces[(corner.sheet[corner.faces] == number).all(axis=1)]
+        mesh = trimesh.Trimesh(x[corner.sheet == number], faces - faces.min(), process=False)
+        mesh.export(f"{name}.obj", digits=17)
+    os.mkdir("free")
+    scene = ["low.obj", "high.obj", "--output", "free"]
+    facts = facts_of(capsys, *scene, "--fail-on", "remaining", status=1)
+    (contour,) = facts["unresolved"]
+    assert "--order or --previous would tell" in contour["reason"] and facts["certified"] is False
+    assert {element["of"] for element in contour["elements"]} == {"low.obj", "high.obj"}
+    assert crossings("free/low.obj", "free/high.obj") == facts["remaining"]["intersections"] == len(contour["elements"])
+    assert repair(*scene) == 0
+    said = capsys.readouterr().out
+    assert "Not repaired: " in said and "edge [" in said and "not certified." in said
+    for options in (["--order"], ["--previous", "low.obj", "before.obj"]):
+        assert facts_of(capsys, *scene, *options, "--fail-on", "remaining")["certified"]
+        assert crossings("free/low.obj", "free/high.obj") == 0
+
+
+def test_what_rounding_does_is_said(folder, capsys):
+    """Sheets nearer to each other than single precision tells apart."""
+    x = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
+    above = np.array([[0.1, 0.1, 1.0 + 1e-9], [0.9, 0.1, 1.0 + 1e-9], [0.1, 0.9, 1.0 + 1e-9]])
+    trimesh.Trimesh(np.concatenate([x, above]), [[0, 1, 2], [3, 4, 5]], process=False).export("near.obj", digits=12)
+    facts = facts_of(capsys, "near.obj", "--output", "free.obj")
+    assert facts["certified"] and facts["before"] == {"intersections": 0}
+    (note,) = facts["notes"]
+    assert "rounded to single precision" in note
+
+
+def test_where_nothing_crosses_the_file_is_copied(folder, capsys):
+    facts = facts_of(capsys, "first.obj", "--output", "free.obj")
+    assert (folder / "free.obj").read_bytes() == (folder / "first.obj").read_bytes()
+    assert facts["files"][0]["moved"] == 0 and facts["certified"]
+
+
+def test_seams_stay_closed(folder, capsys):
+    """Vertices that are double, as at seams of textures: they touch, and move together."""
+    soup = BALLS.vertices[BALLS.faces].reshape(-1, 3)
+    trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False).export("soup.obj", digits=17)
+    facts = facts_of(capsys, "soup.obj", "--output", "free.obj")
+    assert facts["before"] == {"intersections": CROSSING} and facts["certified"]
+    x = MeshFile("free.obj").x
+    assert len(np.unique(x, axis=0)) == len(BALLS.vertices)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["none.obj", "--output", "free.obj"], "none.obj: No such file or directory"),
+        (["balls.glb", "--output", "free.glb"], "balls.glb: "),
+        (["balls.obj", "balls.usd", "--output", "free.obj"], "balls.usd: the name of a mesh file must end in .obj,"),
+        (["a.usda", "b.usda", "--output", "free.usda"], "only mesh files can be several"),
+        (["balls.obj", "--output", "free.ply"], "free.ply: must end as balls.obj does"),
+        (["balls.obj", "--output", "./balls.obj"], "./balls.obj: named twice, or read"),
+        (["balls.obj", "--output", "-"], "--output must be a file, not standard output"),
+        (["balls.obj", "--output", "none/free.obj"], "none/free.obj: there is no folder none"),
+        (["balls.obj", "--output", "free.obj", "--keep", "x*"], "--keep: no file matches x*"),
+        (["balls.obj", "--output", "free.obj", "--keep", "*"], "free.obj: must be a folder, as not one file may move"),
+        (["first.obj", "second.obj", "--output", "free.obj"], "free.obj: must be a folder, as not one file may move"),
+        (["balls.obj", "--output", "free.obj", "--frames", "1:2"], "--frames is for USD scenes only"),
+        (["balls.obj", "--output", "free.obj", "--report", "a.html"], "--report is for USD scenes only"),
+        (["demo", "--output", "free.usda", "--order"], "--order is for mesh files only"),
+        (["demo", "--output", "free.usda", "--max-strain", "0.5"], "--max-strain is for mesh files only"),
+        (["balls.obj", "--output", "free.obj", "--previous", "first.obj"], "--previous: the files must have the faces"),
+        (["balls.obj", "--output", "free.obj", "--previous", "balls.off"], "--previous must not cross"),
+        (["first.obj", "--output", "free.obj", "--previous", "first.ply"], "--previous must have the type"),
+        (["balls.obj", "--output", "free.obj", "--min-distance", "-1"], "argument --min-distance: must be a finite"),
+    ],
+)
+def test_errors(folder, capsys, arguments, error):
+    before = sorted(os.listdir())
+    assert fail(capsys, *arguments).startswith(error)
+    assert sorted(os.listdir()) == before
+
+
+def test_two_files_of_one_name_do_not_replace_each_other(folder, capsys):
+    os.mkdir("other")
+    os.mkdir("free")
+    SECOND.export("other/first.obj")
+    error = fail(capsys, "first.obj", "other/first.obj", "--output", "free")
+    assert error == "free/first.obj: named twice, or read; write to another file" and not os.listdir("free")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="root may write everywhere but to /proc")
+def test_a_folder_that_is_not_writable(folder, capsys):
+    assert fail(capsys, "balls.obj", "--output", "/proc/free.obj").startswith("/proc/free.obj: ")
+
+
+def test_an_error_while_writing_leaves_no_file(folder, capsys, monkeypatch):
+    (folder / "free.obj").write_text("of an earlier run")
+    before = sorted(os.listdir())
+
+    def stop(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(OutputFile, "write", stop)
+    assert "No space left on device" in fail(capsys, "balls.obj", "--output", "free.obj")
+    assert sorted(os.listdir()) == before and (folder / "free.obj").read_text() == "of an earlier run"
+
+
+def test_what_was_written_is_judged_not_what_was_to_be(folder, capsys, monkeypatch):
+    """A file that another program has changed meanwhile."""
+    commit = OutputFile.commit
+
+    def changed(file):
+        file.truncate(0)
+        file.write((folder / "balls.obj").read_bytes())
+        commit(file)
+
+    monkeypatch.setattr(OutputFile, "commit", changed)
+    facts = facts_of(capsys, "balls.obj", "--output", "free.obj", "--fail-on", "remaining", status=1)
+    assert facts["remaining"] == {"intersections": CROSSING} and facts["certified"] is False

@@ -1,0 +1,109 @@
+"""Reads OBJ, OFF and STL files, and the lines of text files. Errors are ValueErrors, which name the line."""
+
+import re
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+KEPT_NORMALS = "its normals are kept, also where vertices move"
+_DOUBLE = np.dtype(np.float64)
+_OBJ_STATEMENT = re.compile(rb"^[ \t]*(v|f)[ \t]+([^\r\n#]*)", re.MULTILINE)
+_OBJ_UNCHECKED = re.compile(rb"^[ \t]*(?:l|p|curv|curv2|surf)[ \t]", re.MULTILINE)
+_STL_STATEMENT = re.compile(rb"^[ \t]*(vertex|endloop)\b([^\r\n]*)", re.MULTILINE)
+_LINE = re.compile(rb"[^\r\n]*[^\s][^\r\n]*")
+_WORD = re.compile(rb"\S+")
+
+
+Contents = tuple[Sequence | np.ndarray, np.dtype, bool, Sequence | np.ndarray, Sequence | np.ndarray, list[str]]
+"""The first byte of x, y and z of each point and the byte after it, their type, whether they are text; the number of
+corners of each polygon, and the points of all corners; notes on what is not checked, or kept although it may not fit.
+"""
+
+
+def read_obj(data: bytes) -> Contents:
+    """Returns the contents of an OBJ file."""
+    text = data.replace(b"\\\r\n", b"   ").replace(b"\\\n", b"  ")  # as long as before
+    places, counts, corners = [], [], []
+    for statement in _OBJ_STATEMENT.finditer(text):
+        if statement[1] == b"v":
+            places += coordinates(text, statement.span(2))
+            continue
+        words = [word.split(b"/", 1)[0] for word in statement[2].split()]
+        counts.append(len(words))
+        for number in integers(text, statement.start(), words, len(words)):
+            corners.append(number - 1 if number >= 0 else number + len(places) // 3)
+    notes = [KEPT_NORMALS] if re.search(rb"^[ \t]*vn[ \t]", data, re.MULTILINE) else []
+    if unchecked := len(_OBJ_UNCHECKED.findall(data)):
+        notes.append(f"lines, points, curves and surfaces are not checked: {unchecked:,}")
+    return (places, _DOUBLE, True, counts, corners, notes)
+
+
+def read_off(data: bytes) -> Contents:
+    """Returns the contents of an OFF file in text form."""
+    text = re.sub(rb"#[^\r\n]*", lambda comment: b" " * len(comment[0]), data)  # as long as before
+    header = re.match(rb"\s*(?:ST)?C?(N?)OFF\b", text)
+    if not header:
+        raise ValueError("it does not begin with OFF")
+    lines = lines_of(text, header.end())
+    start, end = next(lines)
+    vertex_count, face_count = integers(text, start, text[start:end].split(), 2)
+    places = [place for _ in range(vertex_count) for place in coordinates(text, next(lines))]
+    counts, corners = [], []
+    for _ in range(face_count):
+        start, end = next(lines)
+        words = text[start:end].split()
+        counts += integers(text, start, words, 1)
+        corners += integers(text, start, words[1:], counts[-1])
+    return (places, _DOUBLE, True, counts, corners, [KEPT_NORMALS] if header[1] else [])
+
+
+def read_stl(data: bytes) -> Contents:
+    """Returns the contents of an STL file, binary or text."""
+    count = int.from_bytes(data[80:84], "little")
+    if len(data) == 84 + 50 * count:
+        starts = 96 + 50 * np.arange(count)[:, None] + 4 * np.arange(9)
+        places = np.stack([starts, starts + 4], axis=2)
+        return (places, np.dtype("<f4"), False, np.full(count, 3), np.arange(3 * count), [KEPT_NORMALS])
+    if not data.lstrip().startswith(b"solid"):
+        raise ValueError("it is neither a text STL nor a binary one of the length that its count of facets says")
+    places, ends = [], [0]
+    for statement in _STL_STATEMENT.finditer(data):
+        if statement[1] == b"vertex":
+            places += coordinates(data, statement.span(2))
+        else:
+            ends.append(len(places) // 3)
+    if len(places) != 3 * ends[-1]:
+        raise ValueError("it ends within a facet")
+    return (places, _DOUBLE, True, np.diff(ends), range(ends[-1]), [KEPT_NORMALS])
+
+
+def lines_of(text: bytes, at: int) -> Iterator[tuple[int, int]]:
+    """Yields the places of the lines that are not empty, from a byte on; an error in place of the end."""
+    for line in _LINE.finditer(text, at):
+        yield line.span()
+    raise ValueError("it ends before its last vertex or face")
+
+
+def coordinates(text: bytes, place: tuple[int, int], columns: Sequence[int] = (0, 1, 2)) -> list[tuple[int, int]]:
+    """Returns the places of three numbers of a line."""
+    words = [word.span() for word in _WORD.finditer(text, *place)]
+    try:
+        found = [words[column] for column in columns]
+        for start, end in found:
+            float(text[start:end])
+    except (IndexError, ValueError):
+        raise bad_line(text, place[0], "a vertex must have three coordinates, all of them numbers") from None
+    return found
+
+
+def integers(text: bytes, at: int, words: Sequence[bytes], count: int) -> list[int]:
+    """Returns the integers that the first words of a line are."""
+    try:
+        return [int(words[i]) for i in range(count)]
+    except (IndexError, ValueError):
+        raise bad_line(text, at, "a count or a corner of a face is missing or no integer") from None
+
+
+def bad_line(data: bytes, at: int, problem: str) -> ValueError:
+    """Returns an error that names the line of a byte."""
+    return ValueError(f"line {data[:at].count(10) + 1}: {problem}")
