@@ -108,6 +108,17 @@ def test_files_that_are_kept_are_obstacles(folder, capsys):
     assert (folder / "first.obj").read_bytes() == before
 
 
+def test_what_crosses_among_obstacles_does_not_count(folder, capsys):
+    """A ball that crosses another one, both of them obstacles, under a third."""
+    SECOND.apply_translation([0.0, 1.8, 0.0]).export("third.obj")
+    SECOND.apply_translation([0.0, -1.8, 0.0])
+    arguments = ["balls.obj", "third.obj", "--keep", "balls.obj", "--output", "free.obj", "--fail-on", "remaining"]
+    facts = facts_of(capsys, *arguments)
+    assert facts["before"]["intersections"] > 0 == facts["remaining"]["intersections"] and facts["certified"]
+    assert facts["notes"] == [f"in and among obstacles, {CROSSING} edges meet faces; they do not count"]
+    assert crossings("balls.obj", "free.obj") == CROSSING
+
+
 def test_several_files_that_move_are_written_to_a_folder(folder, capsys):
     os.mkdir("free")
     facts = facts_of(capsys, "first.obj", "second.stl", "--output", "free")

@@ -1,10 +1,12 @@
 """The Python code of the documentation runs, page by page, and prints what its comments say."""
 
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from warp_bsc.cli.main import main
 
@@ -146,6 +148,31 @@ def test_repair(tmp_path, capsys):
     moved, strain = map(float, lines[1].split())
     assert lines[0] == "72 0 True" and lines[2] == "42 0 60 0"
     assert round(moved, 2) == 0.03 and round(strain, 3) == 0.015
+
+
+def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
+    """On files of these names: balls as a body, and garments that cross it and each other."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "free").mkdir()
+    ball = trimesh.creation.icosphere(2)
+    dent = np.exp(-40.0 * ((ball.vertices - [1.0, 0.0, 0.0]) ** 2).sum(axis=1))[:, None] * [-0.05, 0.0, 0.0]
+    for name, radius, moves in (
+        ("body.obj", 1.0, 0.0),
+        ("frame_11.obj", 1.02, 0.0),
+        ("garment.obj", 1.02, dent),
+        ("shirt.ply", 1.02, dent),
+        ("coat.stl", 1.04, dent),
+    ):
+        trimesh.Trimesh(radius * ball.vertices + moves, ball.faces).export(name)
+    section = (DOCS / "usd" / "repair.md").read_text().partition("## Positions")[0]
+    commands = [line for block in re.findall(r"```sh\n(.*?)```", section, re.DOTALL) for line in block.splitlines()]
+    assert len(commands) == 4
+    for number, command in enumerate(commands):
+        assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
+        said = capsys.readouterr().out
+        assert " 0 remain." in said and "read again: certified." in said
+        assert ("Intersections: 0 before" in said) == (number in (0, 3))  # the garment alone
+    assert sorted(path.name for path in tmp_path.glob("free/*")) == ["coat.stl", "shirt.ply"]
 
 
 def test_replay(tmp_path, capsys, monkeypatch):

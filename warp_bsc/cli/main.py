@@ -21,7 +21,7 @@ examples:
 
 _COMMANDS = {
     "replay": "find the collisions in a USD scene",
-    "repair": "move the meshes of a USD scene so that they do not collide",
+    "repair": "move the meshes of a USD scene or of mesh files so that they do not collide",
     "query": "decide queries of CSV files",
     "bench": "measure detection, SolverCCD and repair",
 }

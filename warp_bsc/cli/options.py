@@ -50,12 +50,6 @@ def add_command(
     return command
 
 
-def add_scene(command: argparse.ArgumentParser, *, optional: bool = False) -> None:
-    """Adds the scene, whose value is for :func:`scene_path`."""
-    text = "a .usd, .usda, .usdc or .usdz file; demo for a recorded cloth that comes with warp-bsc"
-    command.add_argument("scene", metavar="SCENE", nargs="?" if optional else None, help=text)
-
-
 def scene_path(name: str) -> str:
     """Returns the path of a scene: for demo that of the package's own, unless there is a file of this name."""
     if name != "demo" or os.path.exists(name):

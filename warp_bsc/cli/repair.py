@@ -76,8 +76,7 @@ def add_to(commands: Commands, summary: str) -> None:
     command = add_command(commands, "repair", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
     command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or one or several mesh files")
     which = command.add_argument_group("selection")
-    kept = "obstacles: do not move meshes at or below these prims, or these mesh files; * matches any text"
-    add_options(which, {"--keep": patterns(kept)})
+    add_options(which, {"--keep": patterns("obstacles: prims, and all below, or files that stay; * matches any text")})
     add_scene_selection(which)
     how = command.add_argument_group("repair")
     add_options(
@@ -104,8 +103,9 @@ def add_to(commands: Commands, summary: str) -> None:
     )
     previous = "the files of a time before at which nothing crosses, such as the last frame, in the same order"
     files = command.add_argument_group("repair of mesh files")
-    strain = "largest change of the length of an edge that is sought, as a share of it (default: %(default)s)"
-    add_options(files, {"--max-strain": number(positive_real, strain, default=0.1, metavar="S")})
+    add_options(
+        files, {"--max-strain": number(positive_real, "largest strain sought (default: %(default)s)", default=0.1)}
+    )
     add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
     add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
     command.set_defaults(default_of=command.get_default)
@@ -133,14 +133,13 @@ def _run(arguments: argparse.Namespace) -> int:
     for name, value in vars(arguments).items():
         if name not in _OF_BOTH and (name in _OF_FILES) != is_of_files and value != arguments.default_of(name):
             raise ValueError(f"--{name.replace('_', '-')} is for {'USD scenes' if is_of_files else 'mesh files'} only")
-    if arguments.output == STDOUT:
-        raise ValueError("--output must be a file, not standard output")
+    for name in ("output", "report"):
+        if getattr(arguments, name) == STDOUT:
+            raise ValueError(f"--{name} must be a file, not standard output")
     if is_of_files:
         return repair_files(arguments)
     if len(arguments.scene) > 1:
         raise ValueError("only mesh files can be several")
-    if arguments.report == STDOUT:
-        raise ValueError("--report must be a file, not standard output")
     written = [file for file in (arguments.output, arguments.report) if file]
     written.append(str(unfinished_path(arguments.output)))
     arguments.scene = scene_path(arguments.scene[0])

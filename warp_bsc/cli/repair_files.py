@@ -3,16 +3,18 @@
 import argparse
 import contextlib
 import fnmatch
+import itertools
 import json
 import os
 
 import numpy as np
+import warp as wp
 
 from .._atomic_file import OutputFile
 from ..bench.tables import LONGEST, Column, count
 from ..detection.at_rest.intersections import find_intersections
 from ..detection.mesh import CollisionMesh
-from ..mesh_files.mesh_file import MeshScene
+from ..mesh_files.mesh_file import MeshFile, MeshScene
 from ..repairing.repair import repair
 from ..repairing.surface import weld_borders, welded
 from .device import find_device, loading_kernels
@@ -20,8 +22,7 @@ from .exit_status import ExitStatus
 from .tables import Console, print_table, say, say_list
 
 _FILES = (
-    Column("vertices", "vertices"),
-    Column("moved", "moved"),
+    Column("moved vertices", "moved"),
     Column("largest move", "largest_move", ".3g"),
     Column("written to", "output", kind="text"),
 )
@@ -35,35 +36,39 @@ def repair_files(arguments: argparse.Namespace) -> int:
     previous = MeshScene(arguments.previous) if arguments.previous else None
     if previous and not np.array_equal(previous.faces, scene.faces):
         raise ValueError("--previous: the files must have the faces of the scene")
-    mesh = CollisionMesh(scene.faces, len(scene.x), device=device)
-    with loading_kernels(device):
-        result = repair(
-            mesh,
-            scene.x,
-            fixed=np.array([output is None for output in outputs])[scene.file_of],
-            order=scene.file_of if arguments.order else None,
-            x_previous=previous.x if previous else None,
-            min_distance=arguments.min_distance,
-            max_strain=arguments.max_strain,
-        )
+    kept = np.array([output is None for output in outputs])
+    mesh = _mesh_of(scene, kept, device)
     with contextlib.ExitStack() as stack:
         files = []
-        for file, x, output in zip(scene.files, scene.of_files(result.x), outputs, strict=True):
-            if output is not None:
-                files.append(OutputFile(output))
-                stack.callback(files[-1].discard)
-                files[-1].write(file.with_positions(x))
+        for output in filter(None, outputs):
+            files.append(OutputFile(output))  # fails before anything is repaired
+            stack.callback(files[-1].discard)
+        with loading_kernels(device):
+            result = repair(
+                mesh,
+                scene.x,
+                fixed=kept[scene.file_of],
+                order=scene.file_of if arguments.order else None,
+                x_previous=previous.x if previous else None,
+                min_distance=arguments.min_distance,
+                max_strain=arguments.max_strain,
+            )
+        contents = map(MeshFile.with_positions, scene.files, scene.of_files(np.asarray(result.x)))
+        for file, data in zip(files, itertools.compress(contents, ~kept), strict=True):
+            file.write(data)
         for file in files:
             file.commit()
     written = MeshScene([output or file.path for file, output in zip(scene.files, outputs, strict=True)])
-    again = CollisionMesh(written.faces, len(written.x), device=device)
-    again = welded(again, weld_borders(again, written.x, np.zeros((len(written.x), 1), int)))
-    meeting = [len(find_intersections(again, x)) for x in (written.x, written.x.astype(np.float32))]
+    again = _mesh_of(written, kept, device)
+    meeting = [_count_meeting(again, x) for x in (written.x, written.x.astype(np.float32))]
+    among_kept = CollisionMesh(scene.faces[kept[scene.file_of[scene.faces[:, 0]]]], len(scene.x), device=device)
     found, remaining = {"intersections": result.crossings_before}, {"intersections": meeting[0]}
     if arguments.min_distance:
         name = f"pairs nearer than {arguments.min_distance:g}"
         found[name], remaining[name] = result.near_before, result.near
     notes = [f"{file.path}: {note}" for file in scene.files for note in file.notes]
+    if unseen := _count_meeting(among_kept, scene.x):
+        notes.append(f"in and among obstacles, {unseen:,} edges meet faces; they do not count")
     if meeting[1] > meeting[0]:
         notes.append(f"rounded to single precision, as some programs read it, {meeting[1]:,} edges meet faces")
     unresolved = []
@@ -74,7 +79,7 @@ def repair_files(arguments: argparse.Namespace) -> int:
     rows = []
     for file, output, moved in zip(scene.files, outputs, scene.of_files(result.moved), strict=True):
         moves = {"moved": int((moved > 0.0).sum()), "largest_move": float(moved.max(initial=0.0))}
-        rows.append({"file": file.path, "output": output, "vertices": len(moved)} | moves)
+        rows.append({"file": file.path, "output": output} | moves)
     certified = result.certified and not meeting[0]
     if arguments.json:
         facts = {"device": str(device), "certified": certified, "before": found, "remaining": remaining}
@@ -94,6 +99,18 @@ def repair_files(arguments: argparse.Namespace) -> int:
             say_list(console, lines, "")
         say(console, f"What was written has been read again: {'' if certified else 'not '}certified.")
     return ExitStatus.FOUND if arguments.fail_on and any(remaining.values()) else ExitStatus.DONE
+
+
+def _mesh_of(scene: MeshScene, kept: np.ndarray, device: wp.Device) -> CollisionMesh:
+    """Returns the mesh of a scene, in which files that are kept do not meet each other or themselves."""
+    is_kept = kept[scene.file_of].astype(int)
+    return CollisionMesh(scene.faces, len(scene.x), group=1 + is_kept, mask=3 - 2 * is_kept, device=device)
+
+
+def _count_meeting(mesh: CollisionMesh, x: np.ndarray) -> int:
+    """Returns the number of edges that meet faces, where double vertices of borders are one."""
+    label = np.zeros(len(x), int) if mesh.group is None else mesh.group
+    return len(find_intersections(welded(mesh, weld_borders(mesh, x, label[:, None])), x))
 
 
 def _outputs(scene: MeshScene, arguments: argparse.Namespace) -> list[str | None]:

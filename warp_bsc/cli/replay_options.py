@@ -22,7 +22,6 @@ from .options import (
     Options,
     add_fail_on,
     add_options,
-    add_scene,
     detection_options,
     distance,
     file_option,
@@ -78,7 +77,8 @@ examples:
 
 def add_replay_options(command: argparse.ArgumentParser) -> None:
     """Adds the options of the command."""
-    add_scene(command, optional=True)
+    text = "a .usd, .usda, .usdc or .usdz file; demo for a recorded cloth that comes with warp-bsc"
+    command.add_argument("scene", metavar="SCENE", nargs="?", help=text)
 
     which = command.add_argument_group("selection")
     add_scene_selection(which)

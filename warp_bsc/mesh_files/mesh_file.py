@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -80,8 +79,7 @@ class MeshFile:
             with np.errstate(over="ignore"):
                 return np.array(numbers).reshape(-1, 3).astype(self._dtype)
         rows = self._places[..., :1] + np.arange(self._dtype.itemsize)
-        points = np.frombuffer(self._data, np.uint8)[rows].view(self._dtype)[..., 0]
-        return points.astype(self._dtype.newbyteorder("="))
+        return np.frombuffer(self._data, np.uint8)[rows].view(self._dtype)[..., 0].astype(self._dtype.newbyteorder("="))
 
 
 class MeshScene:
@@ -108,7 +106,7 @@ class MeshScene:
         """Returns values of all vertices by file."""
         return [values[self.file_of == number] for number in range(len(self.files))]
 
-    def name(self, edge: np.ndarray, face: int) -> dict[str, Any]:
+    def name(self, edge: np.ndarray, face: int) -> dict[str, object]:
         """Returns an edge, given its ends, and a face with their numbers in their files, which count from 0."""
         one, other = self.file_of[edge[0]], self.file_of[self.faces[face, 0]]
         ends, polygon = (edge - self._starts[one]).tolist(), int(self._polygons[face])

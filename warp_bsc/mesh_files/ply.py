@@ -3,7 +3,6 @@
 import itertools
 import re
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -35,8 +34,7 @@ def read_ply(data: bytes) -> Contents:
                 raise ValueError("its vertices must have x, y and z, all of type float or all of type double")
         for start, run in _runs(data, at, count, properties, order) if order else ():
             if element == "vertex":
-                fields: Any = run.dtype.fields
-                offsets = [fields[names[row]][1] for row in wanted]
+                offsets = [run.dtype.fields[names[row]][1] for row in wanted]  # pyright: ignore
                 places.append(start + run.itemsize * np.arange(len(run))[:, None] + offsets)
             elif wanted:
                 counts += [run[names[wanted[0]]].shape[1]] * len(run)

@@ -9,7 +9,7 @@ KEPT_NORMALS = "its normals are kept, also where vertices move"
 _DOUBLE = np.dtype(np.float64)
 _OBJ_STATEMENT = re.compile(rb"^[ \t]*(v|f)[ \t]+([^\r\n#]*)", re.MULTILINE)
 _OBJ_UNCHECKED = re.compile(rb"^[ \t]*(?:l|p|curv|curv2|surf)[ \t]", re.MULTILINE)
-_STL_STATEMENT = re.compile(rb"^[ \t]*(vertex|endloop)\b([^\r\n]*)", re.MULTILINE)
+_STL_VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE)
 _LINE = re.compile(rb"[^\r\n]*[^\s][^\r\n]*")
 _WORD = re.compile(rb"\S+")
 
@@ -66,15 +66,11 @@ def read_stl(data: bytes) -> Contents:
         return (places, np.dtype("<f4"), False, np.full(count, 3), np.arange(3 * count), [KEPT_NORMALS])
     if not data.lstrip().startswith(b"solid"):
         raise ValueError("it is neither a text STL nor a binary one of the length that its count of facets says")
-    places, ends = [], [0]
-    for statement in _STL_STATEMENT.finditer(data):
-        if statement[1] == b"vertex":
-            places += coordinates(data, statement.span(2))
-        else:
-            ends.append(len(places) // 3)
-    if len(places) != 3 * ends[-1]:
+    places = [place for vertex in _STL_VERTEX.finditer(data) for place in coordinates(data, vertex.span(1))]
+    *counts, rest = (len(_STL_VERTEX.findall(loop)) for loop in data.split(b"endloop"))
+    if rest:
         raise ValueError("it ends within a facet")
-    return (places, _DOUBLE, True, np.diff(ends), range(ends[-1]), [KEPT_NORMALS])
+    return (places, _DOUBLE, True, counts, range(sum(counts)), [KEPT_NORMALS])
 
 
 def lines_of(text: bytes, at: int) -> Iterator[tuple[int, int]]:
