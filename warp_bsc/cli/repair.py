@@ -103,9 +103,7 @@ def add_to(commands: Commands, summary: str) -> None:
     )
     previous = "the files of a time before at which nothing crosses, such as the last frame, in the same order"
     files = command.add_argument_group("repair of mesh files")
-    add_options(
-        files, {"--max-strain": number(positive_real, "largest strain sought (default: %(default)s)", default=0.1)}
-    )
+    add_options(files, {"--max-strain": number(positive_real, "strain to keep to (default: %(default)s)", default=0.1)})
     add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
     add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
     command.set_defaults(default_of=command.get_default)
