@@ -133,6 +133,13 @@ def test_a_minimum_distance(folder, capsys):
     assert bsc.CollisionDetector(mesh).least_distance(MeshFile("free.obj").x) >= 0.01
 
 
+def test_a_minimum_distance_is_not_certified_for_rounded_coordinates(folder, capsys):
+    """A file of single precision in a scene of double precision."""
+    arguments = ["first.obj", "second.ply", "--keep", "first.obj", "--output", "free.ply"]
+    assert facts_of(capsys, *arguments)["certified"] is True
+    assert facts_of(capsys, *arguments, "--min-distance", "0.01")["certified"] is False
+
+
 def test_order_and_previous_free_sheets_that_have_changed_places(folder, capsys):
     """A sheet that is through another one from border to border."""
     corner = KNOWN["corner"]()

@@ -57,6 +57,15 @@ def test_obj_is_read_as_it_is(tmp_path):
     assert "fan" in mesh.notes[2]
 
 
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_obj_with_a_byte_order_mark_and_any_line_ends(tmp_path, end):
+    data = b"\xef\xbb\xbfv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n".replace(b"\n", end)
+    mesh = MeshFile(write(tmp_path, "a.obj", data))
+    assert mesh.x.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]] and mesh.faces.tolist() == [[0, 1, 2]]
+    expected = b"\xef\xbb\xbfv 0 0 0\nv 1.5 0 0\nv 0 1.5 0\nf 1 2 3\n".replace(b"\n", end)
+    assert mesh.with_positions(1.5 * mesh.x) == expected
+
+
 def test_only_coordinates_that_change_are_replaced(tmp_path):
     mesh = MeshFile(write(tmp_path, "a.obj", OBJ))
     assert mesh.with_positions(mesh.x) == OBJ
@@ -185,6 +194,7 @@ XYZ = b"property float x\nproperty float y\nproperty float z\n"
         ("a.obj", TETRAHEDRON + b"f 1 2 4\n", "face 0, counted from 0, has .* no vertex"),
         ("a.obj", TETRAHEDRON + b"f 1 2 3\nf 1 2 0\n", "face 1, counted from 0, has .* no vertex"),
         ("a.obj", TETRAHEDRON + b"f -1 -2 -4\n", "face 0, counted from 0, has .* no vertex"),
+        ("a.obj", TETRAHEDRON + b"f 1 2 99999999999999999999\n", "too large"),
         ("a.obj", TETRAHEDRON + b"f 1 2\n", "face 0, counted from 0, has less than three corners"),
         ("a.obj", TETRAHEDRON + b"f 1 2 x\n", "line 4: a count or a corner"),
         ("a.obj", b"\r\n# x\r\nv 0 0\r\n", "line 3: a vertex must have three coordinates"),

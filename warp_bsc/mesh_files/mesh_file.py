@@ -44,7 +44,7 @@ class MeshFile:
             counts, corners = np.asarray(counts, np.int64), np.asarray(corners, np.int64)
             self._points = points = self._read_points()
             _check(points, counts, corners)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise ValueError(f"{path}: {error}") from None
         self.notes = notes + ["a face of more corners is checked as a fan from the first"] * bool((counts > 3).any())
         self.x, self._vertices = points, np.arange(len(points))

@@ -7,7 +7,7 @@ import numpy as np
 
 KEPT_NORMALS = "its normals are kept, also where vertices move"
 _DOUBLE = np.dtype(np.float64)
-_OBJ_STATEMENT = re.compile(rb"^[ \t]*(v|f)[ \t]+([^\r\n#]*)", re.MULTILINE)
+_OBJ_STATEMENT = re.compile(rb"(?:^|(?<=\r))(?:\xef\xbb\xbf)?[ \t]*(v|f)[ \t]+([^\r\n#]*)", re.MULTILINE)
 _OBJ_UNCHECKED = re.compile(rb"^[ \t]*(?:l|p|curv|curv2|surf)[ \t]", re.MULTILINE)
 _STL_VERTEX = re.compile(rb"^[ \t]*vertex\b([^\r\n]*)", re.MULTILINE)
 _LINE = re.compile(rb"[^\r\n]*[^\s][^\r\n]*")
