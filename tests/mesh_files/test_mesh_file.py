@@ -18,7 +18,7 @@ vt 0 0
 vn 0 0 1
 usemtl cloth
 f 1/1/1 2/1/1 3/1/1
-v nan 7 7
+v NaN 7 7
 o second
 v 0 1 0
 v 0 2 0 \\
@@ -148,6 +148,19 @@ def test_text_ply_of_single_precision_has_the_same_bits_for_readers_of_either_pr
     read = np.array([line.split()[:3] for line in words[: len(x)]], dtype=np.float64)
     changed = x != mesh.x
     assert (read[changed] == x[changed]).all() and (read.astype(np.float32) == x).all()
+
+
+def test_text_ply_with_coordinates_in_another_order(tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 3", "property double z", "property uchar red"]
+    lines += ["property double x", "property double y", "element face 1", "property float weight"]
+    lines += ["property list uchar int vertex_indices", "element edge 1", "property int a", "end_header"]
+    data = "\n".join([*lines, "3 9 1 2", "6 9 4 5", "9 9 7 8", "0.5 3 0 1 2 ", "7", ""]).encode()
+    mesh = MeshFile(write(tmp_path, "a.ply", data))
+    assert mesh.x.tolist() == [[1, 2, 3], [4, 5, 6], [7, 8, 9]] and mesh.faces.tolist() == [[0, 1, 2]]
+    x = mesh.x + np.array([0.25, 0.0, 0.5])
+    assert mesh.with_positions(x) == data.replace(b"3 9 1 2", b"3.5 9 1.25 2").replace(
+        b"6 9 4 5", b"6.5 9 4.25 5"
+    ).replace(b"9 9 7 8", b"9.5 9 7.25 8")
 
 
 def test_equal_corners_of_a_soup_are_one_vertex_and_stay_one(tmp_path):
