@@ -150,17 +150,32 @@ def test_order_and_previous_free_sheets_that_have_changed_places(folder, capsys)
         mesh.export(f"{name}.obj", digits=17)
     os.mkdir("free")
     scene = ["low.obj", "high.obj", "--output", "free"]
+    moves = []
+    for options in ([], ["--order"], ["--previous", "low.obj", "before.obj"]):
+        facts = facts_of(capsys, *scene, *options, "--fail-on", "remaining")
+        assert facts["certified"] and crossings("free/low.obj", "free/high.obj") == 0
+        assert any(note.endswith("inside to outside: high.obj, low.obj") for note in facts["notes"]) == (not options)
+        moves.append(max(row["largest_move"] for row in facts["files"]))
+    assert moves[0] < 0.6 * min(moves[1:])
+
+
+def test_what_is_not_freed_is_named(folder, capsys):
+    """A panel that is there twice, which have their border in common."""
+    x, faces = np.mgrid[0:1:4j, 0:1:4j].reshape(2, -1).T, []
+    for i in (0, 1, 2, 4, 5, 6, 8, 9, 10):
+        faces += [[i, i + 1, i + 5], [i, i + 5, i + 4]]
+    for name in ("low", "high"):
+        trimesh.Trimesh(np.column_stack([x, 0.0 * x[:, 0]]), faces, process=False).export(f"{name}.obj", digits=17)
+    os.mkdir("free")
+    scene = ["low.obj", "high.obj", "--output", "free"]
     facts = facts_of(capsys, *scene, "--fail-on", "remaining", status=1)
     (contour,) = facts["unresolved"]
-    assert "--order or --previous would tell" in contour["reason"] and facts["certified"] is False
+    assert "--order or --previous may tell" in contour["reason"] and facts["certified"] is False
     assert {element["of"] for element in contour["elements"]} == {"low.obj", "high.obj"}
-    assert crossings("free/low.obj", "free/high.obj") == facts["remaining"]["intersections"] == len(contour["elements"])
+    assert facts["remaining"]["intersections"] == len(contour["elements"]) > 0
     assert repair(*scene) == 0
     said = capsys.readouterr().out
     assert "Not repaired: " in said and "edge [" in said and "not certified." in said
-    for options in (["--order"], ["--previous", "low.obj", "before.obj"]):
-        assert facts_of(capsys, *scene, *options, "--fail-on", "remaining")["certified"]
-        assert crossings("free/low.obj", "free/high.obj") == 0
 
 
 def test_what_rounding_does_is_said(folder, capsys):
@@ -257,3 +272,12 @@ def test_what_was_written_is_judged_not_what_was_to_be(folder, capsys, monkeypat
     monkeypatch.setattr(OutputFile, "commit", changed)
     facts = facts_of(capsys, "balls.obj", "--output", "free.obj", "--fail-on", "remaining", status=1)
     assert facts["remaining"] == {"intersections": CROSSING} and facts["certified"] is False
+
+
+def test_what_single_precision_cannot_hold_is_repaired_as_any_other(folder, capsys):
+    x = 1e60 * np.array(
+        [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.3, 0.3, -1.0], [0.4, 0.3, 0.1], [0.3, 0.4, 1.0]]
+    )
+    with open("huge.off", "w", encoding="utf-8") as file:
+        file.write("OFF\n6 2 0\n" + "".join(f"{a!r} {b!r} {c!r}\n" for a, b, c in x.tolist()) + "3 0 1 2\n3 3 4 5\n")
+    assert facts_of(capsys, "huge.off", "--output", "free.off")["certified"]

@@ -59,7 +59,10 @@ def repair_files(arguments: argparse.Namespace) -> int:
         for file in files:
             file.commit()
     written = MeshScene([output or file.path for file, output in zip(scene.files, outputs, strict=True)])
-    meeting = [_count_meeting(_mesh_of(written, kept, device), x) for x in (written.x, written.x.astype(np.float32))]
+    with np.errstate(over="ignore"):
+        rounded = written.x.astype(np.float32)
+    positions = [written.x, rounded] if np.isfinite(rounded).all() else [written.x]
+    meeting = [_count_meeting(_mesh_of(written, kept, device), x) for x in positions]
     among_kept = CollisionMesh(scene.faces[kept[scene.file_of[scene.faces[:, 0]]]], len(scene.x), device=device)
     found, remaining = {"intersections": result.crossings_before}, {"intersections": meeting[0]}
     if arguments.min_distance:
@@ -68,8 +71,12 @@ def repair_files(arguments: argparse.Namespace) -> int:
     notes = [f"{file.path}: {note}" for file in scene.files for note in file.notes]
     if unseen := _count_meeting(among_kept, scene.x):
         notes.append(f"in and among obstacles, {unseen:,} edges meet faces; they do not count")
-    if meeting[1] > meeting[0]:
-        notes.append(f"rounded to single precision, as some programs read it, {meeting[1]:,} edges meet faces")
+    if result.order is not None:
+        sheets = [np.unique(scene.file_of[result.order == number]) for number in range(result.order.max() + 1)]
+        names = ", ".join(scene.files[number].path for number in np.concatenate(sheets))
+        notes.append(f"sheets that had changed places are in this order, from inside to outside: {names}")
+    if meeting[-1] > meeting[0]:
+        notes.append(f"rounded to single precision, as some programs read it, {meeting[-1]:,} edges meet faces")
     unresolved = []
     for contour in result.unresolved:
         elements = [scene.name(mesh.edges[edge], face) for edge, face in contour.elements]
