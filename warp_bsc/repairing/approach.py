@@ -8,8 +8,8 @@ from .motion import move_freely
 from .surface import Surface
 
 _ROUNDS = 24
-_SWEEPS, _MORE_SWEEPS = 40, 640
-"""Sweeps of a round in which strains are below the limit at its start, and above it."""
+_SWEEPS, _MORE_SWEEPS, _MOST_SWEEPS = 40, 160, 640
+"""Sweeps of a round in which strains are below the limit at its start, above it, and once such rounds do no more."""
 _RINGS = 10
 """Edges around vertices in contact within which springs move others."""
 _SETTLED = 2.0**-10
@@ -39,12 +39,12 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
-    held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
+    held, stalled, known, more = np.zeros(len(x), dtype=bool), 0, Contacts.none(), _MORE_SWEEPS
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         if held.any():
             around = springs.around(held, _RINGS)
-            sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
+            sweeps = more if score[0] else _SWEEPS
             goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
             goal = projected(surface.fixed, goal, known, device=surface.device)
         goal = surface.rounded(goal)
@@ -58,7 +58,9 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         if score < best_score:
             best, best_score = x, score
         if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1) or surface.is_late:
-            break
+            if not score[0] or more == _MOST_SWEEPS or surface.is_late:
+                break
+            more, stalled = _MOST_SWEEPS, 0
     goes_home = surface.moves(best) < _SMALL * surface.edge
     while True:
         goal = surface.rounded(np.where(goes_home[:, None], surface.home, best))

@@ -125,7 +125,7 @@ def free_by_order(
         surface: The surface.
         x: Where the search begins, in units, shape [n, 3].
         max_strain: Largest strain that is sought.
-        rank: Tells how good positions are: whether they are wrecked, what crosses, and what follows; less is better.
+        rank: Tells whether positions are wrecked, how much crosses, the strain above the limit, and the squared moves.
         chosen: Sheet of each vertex from inside to outside, -1 for none, int, shape [n]; those that are chosen are
             written.
     """
@@ -141,9 +141,9 @@ def free_by_order(
         found = []
         for inner, outer in (pairs[0], pairs[0][::-1]):
             sheet = np.where(piece == inner, 0, np.where(piece == outer, 1, -1))
-            y = free_in_order(surface, sheet, x, max_strain)
+            y = free_in_order(surface, sheet, np.where(sheet[:, None] < 0, x, surface.home), max_strain)
             found.append((rank(y), inner, outer, y))
-        best, inner, outer, y = min(found, key=lambda each: each[0])
+        best, inner, outer, y = min(found, key=lambda each: (each[0][:2], each[0][-1]))
         if best[:2] < rank(x)[:2]:
             x = y
             chosen[(piece == inner) & (chosen < 0)] = 0
