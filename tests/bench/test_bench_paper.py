@@ -118,9 +118,9 @@ def test_wrong_answers_are_counted(monkeypatch):
         monkeypatch.setattr(checker, kind.label, lambda points, truth=truth: ~truth(points))
     places = find_places([wp.get_device("cpu")])[:1]
     found = benchmark_scene("cloth:1000", load_intervals("cloth:1000", most=1), places, TINY)
-    exact = found.errors["exact"]
-    assert exact.false_positives == exact.hits > 0
-    assert exact.false_negatives == found.checked - exact.hits == found.sample
+    exact = found["errors"]["exact"]
+    assert exact["false_positives"] == exact["hits"] > 0
+    assert exact["false_negatives"] == found["checked"] - exact["hits"] == found["sample"]
 
 
 def test_usd_scene_has_intervals(request):
@@ -139,9 +139,8 @@ def test_worst_query_is_one_of_those_asked():
     with cores(1):
         worst = find_worst(queries[PairKind.EDGE_EDGE], wp.get_device("cpu"), repeat=1)
     assert list(worst) == list(METHODS)
-    for method, query in worst.items():
-        assert query.method == method
-        assert np.array_equal(query.points, queries[PairKind.EDGE_EDGE].points([query.index])[0])
+    for query in worst.values():
+        assert np.array_equal(query["points"], queries[PairKind.EDGE_EDGE].points([query["number"]])[0])
 
 
 def test_scenes_come_with_a_checkout(capsys, monkeypatch, tmp_path):

@@ -226,7 +226,7 @@ def run_paper(arguments: argparse.Namespace) -> None:
             figure.discard()
 
 
-def _measure_scenes(scenes: list, places: list[paper.Place], effort: paper.Effort) -> list[paper.SceneBenchmark]:
+def _measure_scenes(scenes: list, places: list[paper.Place], effort: paper.Effort) -> list[dict[str, Any]]:
     """Measures the paper's benchmarks scene by scene, and shows the progress."""
     compare = ipc_toolkit.is_installed()
     parts = 4 + len({str(place.device) for place in places}) + len(places) + 2 * compare
@@ -259,7 +259,7 @@ def run_detector(arguments: argparse.Namespace) -> None:
     device = find_device(arguments.device)
     options = {name: getattr(arguments, name) for name in ("method", "repeat", "compare")}
 
-    def measure() -> Generator[detector.DetectorBenchmark, None, None]:
+    def measure() -> Generator[dict[str, Any], None, None]:
         with loading_kernels(device):
             for dtype in {scene.x0.dtype for scene in scenes}:
                 load_detector(arguments.method, dtype, device)
@@ -312,7 +312,7 @@ def _measure_files(arguments: argparse.Namespace, device: wp.Device) -> None:
             points.setdefault((path, kinds[given.kind]), []).append(given.points)
     threads, measure_kind = count_threads(), given_queries.benchmark_given_queries
 
-    def measure() -> Generator[given_queries.GivenQueries, None, None]:
+    def measure() -> Generator[dict[str, Any], None, None]:
         with cores(threads):
             with loading_kernels(device):
                 for kind in {kind for _, kind in points}:

@@ -4,7 +4,7 @@ import os
 import statistics
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,9 @@ import warp as wp
 from ..._arguments import checked_integer
 from ...detection.detector import CollisionDetector
 from ...detection.mesh import CollisionMesh
-from ...detection.results.collisions import DetectionStats, PhaseCounts
+from ...detection.results.collisions import DetectionStats
 from ...detection.run.settings import Method
-from ..peers.ipc_toolkit import IpcToolkitBenchmark, benchmark_ipc_toolkit
+from ..peers.ipc_toolkit import benchmark_ipc_toolkit, ipc_milliseconds
 from ..record import name_place, shorten_path
 from ..scenes.detector import BenchmarkScene
 from ..tables import Column, Table, count
@@ -59,82 +59,6 @@ _COMPARED = (
 _GRAPH_REPLAYS = 20
 
 
-@dataclass(frozen=True)
-class DetectorBenchmark:
-    """Counts and times of the detector on a scene.
-
-    Attributes:
-        scene: The scene.
-        precision: Bits of a coordinate, 32 or 64.
-        vertex_face: Number of vertex-face pairs that entered or left each phase.
-        edge_edge: Number of edge-edge pairs that entered or left each phase.
-        hits: Number of pairs that the method reports.
-        earliest_toi: The earliest time of impact, 2.0 if there is none.
-        certified: Whether no collision can be missing.
-        detect_milliseconds: Median time from positions on the device to results on the device [ms]; to results on the
-            host if the host decides pairs that are too wide for the device.
-        read_milliseconds: Median time from positions on the device to results on the host [ms].
-        graph_milliseconds: Median time of a replay as a CUDA graph [ms], None on the CPU.
-        stage_milliseconds: Median time by phase [ms].
-        memory: Device memory of mesh and detector, queues included [bytes], None where Warp does not count it.
-        ipc_toolkit: The IPC Toolkit's measurements, None if it was not measured.
-    """
-
-    scene: BenchmarkScene
-    precision: int
-    vertex_face: PhaseCounts
-    edge_edge: PhaseCounts
-    hits: int
-    earliest_toi: float
-    certified: bool
-    detect_milliseconds: float
-    read_milliseconds: float
-    graph_milliseconds: float | None
-    stage_milliseconds: dict[str, float]
-    memory: int | None
-    ipc_toolkit: IpcToolkitBenchmark | None
-
-    @property
-    def candidates(self) -> int:
-        """Number of candidate pairs."""
-        return self.vertex_face.candidates + self.edge_edge.candidates
-
-    @property
-    def survivors(self) -> int:
-        """Number of candidate pairs that no cull decides."""
-        return self.vertex_face.survivors + self.edge_edge.survivors
-
-    @property
-    def unsure(self) -> int:
-        """Number of pairs that floating point could not certify."""
-        return self.vertex_face.unsure + self.edge_edge.unsure
-
-    @property
-    def candidates_per_second(self) -> float:
-        """Candidate pairs a second, from positions to results on the device."""
-        return 1e3 * self.candidates / self.detect_milliseconds
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the measurement as plain data for JSON."""
-        names = "precision", "candidates", "survivors", "hits", "unsure", "certified", "candidates_per_second"
-        return {name: getattr(self, name) for name in names} | {
-            "scene": shorten_path(self.scene.name),
-            "triangles": len(self.scene.faces),
-            "vertices": len(self.scene.x0),
-            "vertex_face": asdict(self.vertex_face),
-            "edge_edge": asdict(self.edge_edge),
-            "earliest_toi": self.earliest_toi if self.hits else None,
-            "milliseconds": {
-                "detect": self.detect_milliseconds,
-                "detect_and_read": self.read_milliseconds,
-                "cuda_graph": self.graph_milliseconds,
-                "stages": self.stage_milliseconds,
-            },
-            "memory_bytes": self.memory,
-            "ipc_toolkit": asdict(self.ipc_toolkit) if self.ipc_toolkit else None,
-        }
-
-
 def benchmark_detector(
     scene: BenchmarkScene,
     *,
@@ -142,7 +66,7 @@ def benchmark_detector(
     device: wp.DeviceLike = None,
     repeat: int = 5,
     compare: bool = False,
-) -> DetectorBenchmark:
+) -> dict[str, Any]:
     """Measures a detector on a scene, with positions on the device.
 
     A first detection, which makes the queues large enough, is not timed.
@@ -153,6 +77,19 @@ def benchmark_detector(
         device: Warp device; default: Warp's default.
         repeat: Number of repetitions; their medians count.
         compare: Whether to measure the IPC Toolkit as well.
+
+    Returns:
+        Plain data for JSON: ``precision``, the bits of a coordinate, 32 or 64; ``candidates``, the number of candidate
+        pairs, and ``candidates_per_second``, from positions to results on the device; ``survivors``, those that no cull
+        decides; ``hits``, the pairs that the method reports; ``unsure``, those that floating point could not certify;
+        ``certified``, whether no collision can be missing; ``scene``, ``triangles`` and ``vertices``; ``vertex_face``
+        and ``edge_edge``, the numbers of pairs that entered or left each phase; ``earliest_toi``, None if there is no
+        hit; ``milliseconds``; ``memory_bytes``, those of mesh and detector on the device, queues included, None where
+        Warp does not count them; ``ipc_toolkit``, what :func:`.benchmark_ipc_toolkit` measures, None without.
+
+        The median times [ms] are: ``detect``, from positions on the device to results on the device, to results on the
+        host if the host decides pairs that are too wide for the device; ``detect_and_read``, to results on the host;
+        ``cuda_graph``, that of a replay, None on the CPU; ``stages``, by phase.
 
     Raises:
         TypeError: If ``repeat`` is no integer.
@@ -181,21 +118,32 @@ def benchmark_detector(
         stats = collisions.stats  # reads everything else with it
         read.append(1e3 * (time.perf_counter() - start))
         phases.append(stats.milliseconds)
-    return DetectorBenchmark(
-        scene=scene,
-        precision=8 * scene.x0.itemsize,
-        vertex_face=stats.vertex_face,
-        edge_edge=stats.edge_edge,
-        hits=len(collisions.vertex_face) + len(collisions.edge_edge),
-        earliest_toi=collisions.earliest_toi,
-        certified=collisions.certified,
-        detect_milliseconds=statistics.median(detect),
-        read_milliseconds=statistics.median(read),
-        graph_milliseconds=_replay_detection(detector, x0, x1, stats) if device.is_cuda else None,
-        stage_milliseconds={phase: statistics.median(run[phase] for run in phases) for phase in phases[0]},
-        memory=memory,
-        ipc_toolkit=benchmark_ipc_toolkit(scene, mesh.edges, repeat=repeat) if compare else None,
-    )
+    kinds = stats.vertex_face, stats.edge_edge
+    hits, took = len(collisions.vertex_face) + len(collisions.edge_edge), statistics.median(detect)
+    candidates = sum(counts.candidates for counts in kinds)
+    return {
+        "precision": 8 * scene.x0.itemsize,
+        "candidates": candidates,
+        "survivors": sum(counts.survivors for counts in kinds),
+        "hits": hits,
+        "unsure": sum(counts.unsure for counts in kinds),
+        "certified": collisions.certified,
+        "candidates_per_second": 1e3 * candidates / took,
+        "scene": shorten_path(scene.name),
+        "triangles": len(scene.faces),
+        "vertices": len(scene.x0),
+        "vertex_face": asdict(stats.vertex_face),
+        "edge_edge": asdict(stats.edge_edge),
+        "earliest_toi": collisions.earliest_toi if hits else None,
+        "milliseconds": {
+            "detect": took,
+            "detect_and_read": statistics.median(read),
+            "cuda_graph": _replay_detection(detector, x0, x1, stats) if device.is_cuda else None,
+            "stages": {phase: statistics.median(run[phase] for run in phases) for phase in phases[0]},
+        },
+        "memory_bytes": memory,
+        "ipc_toolkit": benchmark_ipc_toolkit(scene, mesh.edges, repeat=repeat) if compare else None,
+    }
 
 
 def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, stats: DetectionStats) -> float:
@@ -211,19 +159,14 @@ def _replay_detection(detector: CollisionDetector, x0: wp.array, x1: wp.array, s
     return milliseconds
 
 
-def ipc_milliseconds(took: dict[str, Any]) -> float:
-    """Returns the time of the IPC Toolkit from positions to the step size [ms]."""
-    return took["build_milliseconds"] + took["step_milliseconds"]
-
-
 def phase_columns(phases: Iterable[str], key: str) -> list[Column]:
     """Returns columns of the times of the phases of detections, which a row has at a key."""
     return [Column("\n".join(phase.rsplit(" ", 1)), f"{key}.{phase}", ",.2f", title=phase) for phase in phases]
 
 
-def to_dict(benchmarks: list[DetectorBenchmark], **settings: Any) -> dict[str, Any]:
+def to_dict(benchmarks: list[dict[str, Any]], **settings: Any) -> dict[str, Any]:
     """Returns the measurements of scenes as plain data for JSON, with settings."""
-    return settings | {"scenes": [found.to_dict() for found in benchmarks]}
+    return settings | {"scenes": benchmarks}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

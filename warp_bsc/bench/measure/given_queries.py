@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,29 +40,10 @@ COLUMNS = (
         for method in ("float", "exact")
     ),
 )
-"""Columns of the JSON of :class:`GivenQueries`."""
+"""Columns of what :func:`benchmark_given_queries` returns."""
 
 _SMALLEST_LAUNCH = {False: 2**18, True: 2**22}
 """Queries of a launch on a CPU and on a GPU: fewer are repeated."""
-
-
-@dataclass(frozen=True)
-class GivenQueries:
-    """The measurements of some queries of one kind.
-
-    Attributes:
-        name: Name of the queries.
-        kind: Kind of pair.
-        queries: Number of queries.
-        hits: Number of queries that collide, by method "exact".
-        nanoseconds: Time of a query by method, the fastest turn; on a CPU processor time, that of all cores [ns].
-    """
-
-    name: str
-    kind: PairKind
-    queries: int
-    hits: int
-    nanoseconds: dict[str, float]
 
 
 def _nanoseconds(run: MethodRun) -> float:
@@ -77,7 +57,7 @@ def _nanoseconds(run: MethodRun) -> float:
 
 def benchmark_given_queries(
     name: str, kind: PairKind, points: np.ndarray, *, device: wp.DeviceLike = None, repeat: int = 20
-) -> GivenQueries:
+) -> dict[str, Any]:
     """Measures all methods on queries, in turns; the fastest counts, as other work can only slow a turn down.
 
     The first launch of each method, which loads its kernels, is not timed.
@@ -88,6 +68,11 @@ def benchmark_given_queries(
         points: Positions, as of :func:`warp_bsc.query_vertex_face`, NumPy array, shape [n, 8, 3], n more than 0.
         device: Warp device; default: Warp's default.
         repeat: Number of turns.
+
+    Returns:
+        Plain data for JSON: ``name``; ``kind``; ``queries``, the number of queries; ``hits``, the number of them that
+        collide, by method "exact"; ``nanoseconds``, the time of a query by method, on a CPU processor time, that of all
+        cores [ns].
 
     Raises:
         TypeError: If ``repeat`` is no integer.
@@ -104,12 +89,13 @@ def benchmark_given_queries(
         run.launch()
     turns = [{method: _nanoseconds(run) for method, run in runs.items()} for _ in range(repeat)]
     fastest = {method: min(turn[method] for turn in turns) for method in METHODS}
-    return GivenQueries(name, kind, len(queries), int(exact.find_hits().sum()), fastest)
+    hits = int(exact.find_hits().sum())
+    return {"name": name, "kind": kind.display_name, "queries": len(queries), "hits": hits, "nanoseconds": fastest}
 
 
-def to_dict(measured: list[GivenQueries], **settings: Any) -> dict[str, Any]:
+def to_dict(measured: list[dict[str, Any]], **settings: Any) -> dict[str, Any]:
     """Returns measurements as plain data for JSON, with settings."""
-    return settings | {"queries": [vars(found) | {"kind": found.kind.display_name} for found in measured]}
+    return settings | {"queries": measured}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -9,7 +9,7 @@ the methods disagree about, and a random sample of the others.
 
 import contextlib
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ from ...detection.run.launch import cores
 from ...detection.run.settings import PairKind
 from ...kernels.signs import UNSURE
 from ..peers import ipc_toolkit
-from ..peers.ipc_toolkit import CCD_CLASSES, IpcQueryTiming, decide_queries, time_queries
+from ..peers.ipc_toolkit import CCD_CLASSES, decide_queries, time_queries
 from ..record import shorten_path
 from ..scenes.detector import BenchmarkScene, find_overlapping
 from ..timing import count_threads
 from .detector import benchmark_detector
 from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
-from .worst_case import WorstQuery, adversarial_queries, find_worst
+from .worst_case import adversarial_queries, find_worst
 
 SEED = 0
 _TURNS = 8  # of timing all methods
@@ -84,115 +84,18 @@ class Place:
         return cores(1) if self.cores == 1 else contextlib.nullcontext()
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Times of the methods at one place.
-
-    Attributes:
-        place: The place.
-        nanoseconds: Mean time of a query by method [ns].
-        worst: The slowest query of each method; empty where it was not searched for.
-    """
-
-    place: Place
-    nanoseconds: dict[str, float]
-    worst: dict[str, WorstQuery]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the times as plain data for JSON."""
-        place = self.place
-        where = {"place": place.name, "device": str(place.device), "device_name": place.device.name}
-        took = {"nanoseconds": self.nanoseconds, "worst": _worst_to_dict(self.worst)}
-        return where | {"cores": place.cores} | took
-
-
-@dataclass(frozen=True)
-class Errors:
-    """The results of a method, compared with the truth.
-
-    Attributes:
-        hits: Number of queries that it calls collisions; all of them were checked.
-        false_positives: Number of hits that are free.
-        false_negatives: Number of collisions among the checked queries that it calls free.
-    """
-
-    hits: int
-    false_positives: int
-    false_negatives: int
-
-
-@dataclass(frozen=True)
-class SceneBenchmark:
-    """The measurements of a scene.
-
-    Attributes:
-        name: Name of the scene.
-        triangles: Number of triangles in the largest mesh of its intervals.
-        precision: Bits of a coordinate, 32 or 64.
-        intervals: The numbers of the intervals that were measured.
-        overlapping: Number of their pairs of elements that share no vertex and whose swept boxes overlap.
-        queries: Number of these pairs that are measured, by kind.
-        collisions: Number of checked queries that collide.
-        unsure: Number of queries that floating point could not certify.
-        checked: Number of queries compared with the truth: all that any method calls a collision, ``sample`` others.
-        sample: Number of checked queries that no method calls a collision.
-        errors: Errors by method.
-        disagreeing: Number of results of a method that differ between devices, which should be 0.
-        decided_by: Number of queries that each of :data:`PHASES` decides.
-        timings: Times by place.
-        stage_milliseconds: Mean time of a detection with method "exact" by phase, on the last place's device [ms].
-        frame_milliseconds: Mean time of a detection with method "exact" [ms].
-        ipc_toolkit: Measurements of the IPC Toolkit by method; empty if it was not measured.
-    """
-
-    name: str
-    triangles: int
-    precision: int
-    intervals: list[int]
-    overlapping: int
-    queries: dict[PairKind, int]
-    collisions: int
-    unsure: int
-    checked: int
-    sample: int
-    errors: dict[str, Errors]
-    disagreeing: int
-    decided_by: dict[str, int]
-    timings: list[Timing]
-    stage_milliseconds: dict[str, float]
-    frame_milliseconds: float
-    ipc_toolkit: dict[str, IpcQueryTiming]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the measurements as plain data for JSON."""
-        return vars(self) | {
-            "scene": shorten_path(self.name),
-            "name": ",".join(
-                Path(path).stem if "/" in path or path.endswith(".usd") else path for path in self.name.split(",")
-            ),
-            "queries": {kind.label: number for kind, number in self.queries.items()},
-            "errors": {method: asdict(errors) for method, errors in self.errors.items()},
-            "timings": [timing.to_dict() for timing in self.timings],
-            "ipc_toolkit": {method: asdict(took) for method, took in self.ipc_toolkit.items()},
-        }
-
-
 def to_dict(
-    benchmarks: list[SceneBenchmark], adversarial: list[tuple[Place, dict[str, WorstQuery]]], *, quick: bool
+    benchmarks: list[dict[str, Any]], adversarial: list[tuple[Place, dict[str, Any]]], *, quick: bool
 ) -> dict[str, Any]:
     """Returns measurements of scenes and of :func:`find_adversarial_worst` as plain data for JSON."""
     return {
         "benchmark": "paper",
         "quick": quick,
         "methods": list(METHODS),
-        "ipc_toolkit": ipc_toolkit.version() if any(found.ipc_toolkit for found in benchmarks) else None,
-        "scenes": [found.to_dict() for found in benchmarks],
-        "adversarial": [{"place": place.name, "worst": _worst_to_dict(worst)} for place, worst in adversarial],
+        "ipc_toolkit": ipc_toolkit.version() if any(found["ipc_toolkit"] for found in benchmarks) else None,
+        "scenes": benchmarks,
+        "adversarial": [{"place": place.name, "worst": worst} for place, worst in adversarial],
     }
-
-
-def _worst_to_dict(worst: dict[str, WorstQuery]) -> dict[str, Any]:
-    return {method: query.to_dict() for method, query in worst.items()}
 
 
 def find_places(devices: list[wp.Device]) -> list[Place]:
@@ -217,7 +120,7 @@ def benchmark_scene(
     *,
     compare: bool = False,
     progress: Callable[[str], None] = lambda doing: None,
-) -> SceneBenchmark:
+) -> dict[str, Any]:
     """Measures all methods on a scene.
 
     Args:
@@ -227,6 +130,18 @@ def benchmark_scene(
         effort: How much to measure.
         compare: Whether to measure the IPC Toolkit as well.
         progress: Called before each part with its name.
+
+    Returns:
+        Plain data for JSON: ``name`` and ``scene``, the name in tables and the path; ``triangles``, the number in the
+        largest mesh of its intervals; ``precision``, the bits of a coordinate, 32 or 64; ``intervals``, their numbers;
+        ``overlapping``, the number of pairs of elements that share no vertex and whose swept boxes overlap;
+        ``queries``, the number of these that are measured, by kind; ``collisions``, the number of checked queries that
+        collide; ``unsure``, the number of queries that floating point could not certify; ``checked``, the number of
+        queries compared with the truth: all that any method calls a collision, and ``sample`` others; ``errors``, by
+        method; ``disagreeing``, the number of results of a method that differ between devices, which should be 0;
+        ``decided_by``, the number of queries that each of :data:`PHASES` decides; ``timings``, by place;
+        ``stage_milliseconds`` and ``frame_milliseconds``, the mean time of a detection with method "exact", by phase
+        and in all, on the last place's device [ms]; ``ipc_toolkit``, measurements by its methods; empty without.
 
     Raises:
         ValueError: If no swept boxes overlap.
@@ -250,31 +165,34 @@ def benchmark_scene(
     progress("detections")
     scenes = [scene for _, scene in intervals]
     frames = [benchmark_detector(s, method="exact", device=places[-1].device, repeat=3) for s in scenes]
-    by_phase = [frame.stage_milliseconds for frame in frames]
+    took = [frame["milliseconds"] for frame in frames]
     compared = {}
     if compare:
         for method in CCD_CLASSES:
             progress(f"IPC Toolkit, {method}")
             compared[method] = _time_ipc_toolkit(method, queries, truth, effort)
-    return SceneBenchmark(
-        name=name,
-        triangles=max(len(scene.faces) for scene in scenes),
-        precision=8 * scenes[0].x0.itemsize,
-        intervals=[number for number, _ in intervals],
-        overlapping=overlapping,
-        queries={kind: len(found) for kind, found in queries.items()},
-        collisions=collisions,
-        unsure=unsure,
-        checked=checked,
-        sample=sample,
-        errors=errors,
-        disagreeing=disagreeing,
-        decided_by=dict(zip(PHASES, decided_by.tolist(), strict=True)),
-        timings=timings,
-        stage_milliseconds={phase: float(np.mean([found[phase] for found in by_phase])) for phase in by_phase[0]},
-        frame_milliseconds=float(np.mean([frame.detect_milliseconds for frame in frames])),
-        ipc_toolkit=compared,
-    )
+    return {
+        "name": ",".join(Path(path).stem if "/" in path or path.endswith(".usd") else path for path in name.split(",")),
+        "triangles": max(len(scene.faces) for scene in scenes),
+        "precision": 8 * scenes[0].x0.itemsize,
+        "intervals": [number for number, _ in intervals],
+        "overlapping": overlapping,
+        "queries": {kind.label: len(found) for kind, found in queries.items()},
+        "collisions": collisions,
+        "unsure": unsure,
+        "checked": checked,
+        "sample": sample,
+        "errors": errors,
+        "disagreeing": disagreeing,
+        "decided_by": dict(zip(PHASES, decided_by.tolist(), strict=True)),
+        "timings": timings,
+        "stage_milliseconds": {
+            phase: float(np.mean([found["stages"][phase] for found in took])) for phase in took[0]["stages"]
+        },
+        "frame_milliseconds": float(np.mean([found["detect"] for found in took])),
+        "ipc_toolkit": compared,
+        "scene": shorten_path(name),
+    }
 
 
 def gather_queries(
@@ -330,12 +248,13 @@ def _find_hits(
 
 def _compare(
     queries: dict[PairKind, Queries], found_hits: dict[tuple[PairKind, str], np.ndarray], effort: Effort
-) -> tuple[dict[str, Errors], int, int, int, dict[PairKind, tuple[np.ndarray, np.ndarray]]]:
+) -> tuple[dict[str, dict[str, int]], int, int, int, dict[PairKind, tuple[np.ndarray, np.ndarray]]]:
     """Compares the results with the truth.
 
     Returns:
-        Errors by method; numbers of collisions, of checked queries and of those in the random sample; and by kind the
-        indices of the checked queries with their truth.
+        Errors by method: its hits, all of which were checked, those that are free, and the collisions among the checked
+        queries that it calls free; numbers of collisions, of checked queries and of those in the random sample; and by
+        kind the indices of the checked queries with their truth.
     """
     random = np.random.default_rng(SEED)
     total = sum(map(len, queries.values()))
@@ -356,11 +275,14 @@ def _compare(
         for method, hits in by_method.items():
             hit = hits[indices]
             wrong[method] += [int(hits.sum()), int((hit & ~truth).sum()), int((~hit & truth).sum())]
-    errors = {method: Errors(*map(int, counts)) for method, counts in wrong.items()}
+    names = "hits", "false_positives", "false_negatives"
+    errors: dict[str, dict[str, int]] = {}
+    for method, counts in wrong.items():
+        errors[method] = dict(zip(names, counts.tolist(), strict=True))
     return errors, collisions, checked, sample, truths
 
 
-def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Place, dict[str, WorstQuery]]]:
+def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Place, dict[str, Any]]]:
     """Finds the slowest adversarial query of each method, on one core and on GPUs.
 
     Args:
@@ -376,18 +298,18 @@ def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Pl
     return found
 
 
-def _find_slowest(queries: Iterable[Queries], place: Place, effort: Effort) -> dict[str, WorstQuery]:
+def _find_slowest(queries: Iterable[Queries], place: Place, effort: Effort) -> dict[str, dict[str, Any]]:
     slowest = {}
     for of_kind in queries:
         for method, query in find_worst(of_kind, place.device, repeat=effort.repeat).items():
             known = slowest.get(method)
-            if known is None or query.nanoseconds[method] > known.nanoseconds[method]:
+            if known is None or query["nanoseconds"][method] > known["nanoseconds"][method]:
                 slowest[method] = query
     return slowest
 
 
-def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> Timing:
-    """Returns the mean times of the methods at a place, and their slowest queries on one core and on GPUs."""
+def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort) -> dict[str, Any]:
+    """Returns the mean times of a query by method at a place [ns], and the slowest queries on one core and on GPUs."""
     total = sum(map(len, queries.values()))
     nanoseconds = dict.fromkeys(METHODS, 0.0)
     with place.limited():
@@ -403,13 +325,19 @@ def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort
             for method in METHODS:
                 nanoseconds[method] += min(turn[method] for turn in took) * len(found) / total
         worst = _find_slowest(queries.values(), place, effort) if place.cores in (1, None) else {}
-    return Timing(place, nanoseconds, worst)
+    where = {"place": place.name, "device": str(place.device), "device_name": place.device.name, "cores": place.cores}
+    return where | {"nanoseconds": nanoseconds, "worst": worst}
 
 
 def _time_ipc_toolkit(
     method: str, queries: dict[PairKind, Queries], truths: dict[PairKind, tuple[np.ndarray, np.ndarray]], effort: Effort
-) -> IpcQueryTiming:
-    """Measures a method of the IPC Toolkit, on one core: Python calls it query by query."""
+) -> dict[str, Any]:
+    """Measures a method of the IPC Toolkit, on one core: Python calls it query by query.
+
+    Returns:
+        The number of queries that were timed, a random part; the mean times of a query and of a call from Python, which
+        is not in it [ns]; the number of queries compared with the truth, and of its errors.
+    """
     random = np.random.default_rng(SEED)
     total = sum(map(len, queries.values()))
     number = nanoseconds = call = 0
@@ -425,4 +353,5 @@ def _time_ipc_toolkit(
         part = random.permutation(len(indices))[: int(np.ceil(effort.ipc_queries * share))]
         hit, truth = decide_queries(method, kind, found.points(indices[part])), truth[part]
         wrong += [len(part), int((hit & ~truth).sum()), int((~hit & truth).sum())]
-    return IpcQueryTiming(number, nanoseconds, call, *map(int, wrong))
+    checked = dict(zip(("checked", "false_positives", "false_negatives"), wrong.tolist(), strict=True))
+    return {"queries": number, "nanoseconds": nanoseconds, "call_nanoseconds": call} | checked

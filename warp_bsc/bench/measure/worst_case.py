@@ -6,7 +6,6 @@ itself, in a launch of copies that is long compared with the start of a kernel. 
 On a GPU the copies fill the device, so that all threads of a warp have the same query.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,31 +21,7 @@ _GPU_COPIES = 2**18
 _CPU_NANOSECONDS = 4e6  # shortest launch of copies on the CPU, unless it would need too many copies
 
 
-@dataclass(frozen=True)
-class WorstQuery:
-    """The slowest query of a method.
-
-    Attributes:
-        method: The method.
-        kind: Its kind of pair.
-        index: Its index among the queries of its kind.
-        points: Its points, rows as of :func:`warp_bsc.query_vertex_face`, shape [8, 3].
-        nanoseconds: Its time by each method [ns].
-    """
-
-    method: str
-    kind: PairKind
-    index: int
-    points: np.ndarray
-    nanoseconds: dict[str, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the query as plain data for JSON."""
-        own = {"kind": self.kind.label, "number": self.index, "points": self.points.tolist()}
-        return own | {"nanoseconds": self.nanoseconds}
-
-
-def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str, WorstQuery]:
+def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str, dict[str, Any]]:
     """Finds the slowest query of each method.
 
     Args:
@@ -55,7 +30,9 @@ def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str,
         repeat: Number of repetitions; the shortest counts.
 
     Returns:
-        The slowest queries by method.
+        The slowest query by method, as plain data for JSON: ``kind``, the label of its kind of pair; ``number``, its
+        index among the queries; ``points``, a row as of :func:`warp_bsc.query_vertex_face`; ``nanoseconds``, its time
+        by each method [ns].
     """
     kind = queries.kind
     on_device = QuerySet(queries, device)
@@ -66,7 +43,7 @@ def find_worst(queries: Queries, device: wp.Device, *, repeat: int) -> dict[str,
         index = int(suspects[np.argmax(times)])
         points = queries.points([index])[0]
         took = {other: _time_alone(other, kind, points, device, repeat) for other in METHODS}
-        slowest[method] = WorstQuery(method, kind, index, points, took)
+        slowest[method] = {"kind": kind.label, "number": index, "points": points.tolist(), "nanoseconds": took}
     return slowest
 
 

@@ -10,7 +10,7 @@ import importlib.util
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,57 +22,6 @@ CCD_CLASSES = {"tight inclusion": "TightInclusionCCD", "additive": "AdditiveCCD"
 """Methods of the IPC Toolkit, with the names of their classes, which are used with their default settings."""
 
 _FAR = 1e3
-
-
-@dataclass(frozen=True)
-class IpcQueryTiming:
-    """The results of one method of the IPC Toolkit, compared with the truth, and their time.
-
-    Attributes:
-        queries: Number of queries that were timed, a random part of the scene's.
-        nanoseconds: Mean time of a query, without the call from Python [ns].
-        call_nanoseconds: Mean time of a call from Python, which was subtracted [ns].
-        checked: Number of queries that were compared with the truth.
-        false_positives: Number of them that are wrongly collisions.
-        false_negatives: Number of them that are wrongly free.
-    """
-
-    queries: int
-    nanoseconds: float
-    call_nanoseconds: float
-    checked: int
-    false_positives: int
-    false_negatives: int
-
-
-@dataclass(frozen=True)
-class IpcToolkitBenchmark:
-    """The IPC Toolkit's times for a step. It finds the earliest time of impact only, not each pair's.
-
-    Attributes:
-        version: Version of the package ``ipctk``.
-        threads: Number of threads that it could use.
-        broad_phase: The one of its broad phases with which the whole took the shortest time.
-        vertex_face_candidates: Number of vertex-face pairs that its broad phase found.
-        edge_edge_candidates: Number of edge-edge pairs that its broad phase found.
-        build_milliseconds: Median time to find the candidates [ms].
-        step_milliseconds: Median time to find the collision-free step size from the candidates [ms].
-        step_size: The collision-free share of the step, 1 if nothing collides.
-    """
-
-    version: str
-    threads: int
-    broad_phase: str
-    vertex_face_candidates: int
-    edge_edge_candidates: int
-    build_milliseconds: float
-    step_milliseconds: float
-    step_size: float
-
-    @property
-    def milliseconds(self) -> float:
-        """Time from positions to the step size [ms]."""
-        return self.build_milliseconds + self.step_milliseconds
 
 
 def is_installed() -> bool:
@@ -150,17 +99,24 @@ def _mean_nanoseconds(ccd: Callable, queries: list[tuple], repeat: int) -> float
     return 1e9 * statistics.median(times) / len(queries)
 
 
-def benchmark_ipc_toolkit(scene: BenchmarkScene, edges: np.ndarray, *, repeat: int = 5) -> IpcToolkitBenchmark:
+def benchmark_ipc_toolkit(scene: BenchmarkScene, edges: np.ndarray, *, repeat: int = 5) -> dict[str, Any]:
     """Measures the IPC Toolkit's candidates and collision-free step size.
 
-    It may use a thread for each core of the process. Both its hierarchy and its grid are measured, because the
-    order of their candidates affects the step size as well, and the one that is faster in all is returned. A first run
-    of each, in which it allocates its memory, is not timed.
+    It finds the earliest time of impact only, not each pair's, and may use a thread for each core of the process. Both
+    its hierarchy and its grid are measured, because the order of their candidates affects the step size as well, and
+    the one that is faster in all is returned. A first run of each, in which it allocates its memory, is not timed.
 
     Args:
         scene: The scene.
         edges: Vertex indices of the edges, int32, shape [edge_count, 2].
         repeat: Number of repetitions; their medians count.
+
+    Returns:
+        Plain data for JSON: ``version`` of the package ``ipctk``; ``threads``, the number that it could use;
+        ``broad_phase``, the one of its broad phases with which the whole took the shortest time;
+        ``vertex_face_candidates`` and ``edge_edge_candidates``, the numbers of pairs that this found;
+        ``build_milliseconds`` and ``step_milliseconds``, median times to find the candidates, and the step size from
+        them [ms]; ``step_size``, the collision-free share of the step, 1 if nothing collides.
     """
     import ipctk  # noqa: PLC0415 (optional)
 
@@ -181,15 +137,20 @@ def benchmark_ipc_toolkit(scene: BenchmarkScene, edges: np.ndarray, *, repeat: i
             build.append(1e3 * (built - start))
             step.append(1e3 * (time.perf_counter() - built))
         measured.append(
-            IpcToolkitBenchmark(
-                version=importlib.metadata.version("ipctk"),
-                threads=threads,
-                broad_phase=type(broad_phase).__name__,
-                vertex_face_candidates=len(candidates.fv_candidates),
-                edge_edge_candidates=len(candidates.ee_candidates),
-                build_milliseconds=statistics.median(build[1:]),
-                step_milliseconds=statistics.median(step[1:]),
-                step_size=step_size,
-            )
+            {
+                "version": importlib.metadata.version("ipctk"),
+                "threads": threads,
+                "broad_phase": type(broad_phase).__name__,
+                "vertex_face_candidates": len(candidates.fv_candidates),
+                "edge_edge_candidates": len(candidates.ee_candidates),
+                "build_milliseconds": statistics.median(build[1:]),
+                "step_milliseconds": statistics.median(step[1:]),
+                "step_size": step_size,
+            }
         )
-    return min(measured, key=lambda benchmark: benchmark.milliseconds)
+    return min(measured, key=ipc_milliseconds)
+
+
+def ipc_milliseconds(took: dict[str, Any]) -> float:
+    """Returns the time of the IPC Toolkit from positions to the step size [ms]."""
+    return took["build_milliseconds"] + took["step_milliseconds"]
