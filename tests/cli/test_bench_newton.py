@@ -7,7 +7,7 @@ import pytest
 from bench_commands import check_interrupt, check_json_file, check_wrong_use, runner
 
 from warp_bsc.bench.measure import newton_examples
-from warp_bsc.bench.measure.newton_examples import ExampleMeasurement, ExampleRun, StageTotals
+from warp_bsc.bench.measure.newton_examples import STAGE_TOTALS, ExampleRun, describe_times
 
 
 def measurement(**others):
@@ -18,7 +18,6 @@ def measurement(**others):
         "tetrahedra": 0,
         "shapes": 3,
         "frames": 6,
-        "frame_milliseconds": [10.0, 12.0, 11.0, 2000.0],
         "crossings_at_start": 0,
         "most_crossings": 1234,
         "first_frame_with_crossings": 4,
@@ -26,14 +25,19 @@ def measurement(**others):
         "stage": None,
         "test_final": "ok",
         "test_post_step": None,
+        "milliseconds": describe_times([10.0, 12.0, 11.0, 2000.0]),
     }
-    return ExampleMeasurement(**values | others)
+    return values | others
+
+
+def totals(*numbers):
+    return dict(zip(STAGE_TOTALS, numbers, strict=True))
 
 
 RUNS = {
     ("cloth_twist", "plain"): measurement(),
-    ("cloth_twist", "stage"): measurement(most_crossings=0, stage=StageTotals(60, 1, 2, 3)),
-    ("cloth_twist", "implicit"): measurement(most_crossings=0, stage=StageTotals(60, 0, 0, 0)),
+    ("cloth_twist", "stage"): measurement(most_crossings=0, stage=totals(60, 1, 2, 3)),
+    ("cloth_twist", "implicit"): measurement(most_crossings=0, stage=totals(60, 0, 0, 0)),
     ("cloth_hanging --width 9", "plain"): measurement(
         test_final="particles are low [red]", test_post_step="deep", first_frame_not_finite=4
     ),

@@ -38,16 +38,12 @@ class Run:
     """A run of which there may be no measurement; other fields say which one it is.
 
     Attributes:
-        measured: The measurement, a dataclass with ``to_dict``; None if there is none.
+        measured: The measurement, plain data for JSON; None if there is none.
         problem: Why there is no measurement; None if there is one.
     """
 
     measured: Any = None
     problem: str | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the run as plain data for JSON."""
-        return vars(self) | {"measured": self.measured.to_dict() if self.measured else None}
 
 
 def describe_run(command: Sequence[str], devices: Iterable[wp.Device] = ()) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -77,88 +77,44 @@ CPU_FRAMES = 10
 """Largest default number of frames on the CPU."""
 
 
-@dataclass(frozen=True)
-class StageTotals:
-    """Totals of the reports of all stages of a run, see :class:`warp_bsc.SolverReport`.
+STAGE_TOTALS = ("steps", "uncertified_steps", "truncated_steps", "frozen_steps")
+"""Totals of the reports of all stages of a run, see :class:`warp_bsc.SolverReport`: steps, those that were not
+certified, in which a path was truncated, and in which a vertex was frozen.
 
-    A stage behind an entry of a coupled solver takes a step for each substep of the entry and each pass of the coupler.
-    It certifies the motion of what the entry sees in the state of the program; crossings are counted in the whole
-    model.
-
-    Attributes:
-        steps: Steps.
-        uncertified_steps: Steps that were not certified.
-        truncated_steps: Steps in which a path was truncated.
-        frozen_steps: Steps in which a vertex was frozen.
-    """
-
-    steps: int
-    uncertified_steps: int
-    truncated_steps: int
-    frozen_steps: int
-
-
-@dataclass(frozen=True)
-class ExampleMeasurement:
-    """Times of an example's frames, and its crossings.
-
-    A crossing is an edge that meets a face without a common vertex, found in exact arithmetic; at least one of the two
-    belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not counted.
-
-    Attributes:
-        device: The Warp device.
-        particles: Number of particles.
-        triangles: Number of triangles of cloth and of the surfaces of soft bodies that the model lists.
-        tetrahedra: Number of tetrahedra.
-        shapes: Number of rigid shapes.
-        frames: Number of frames.
-        frame_milliseconds: Time of each frame but the first :data:`WARM_UP` [ms]; drawing is not in it.
-        crossings_at_start: Number of crossings before the first frame.
-        most_crossings: Largest number of crossings at a checked frame end.
-        first_frame_with_crossings: The first checked frame, counted from 0, with more crossings than the start; None if
-            there is none.
-        first_frame_not_finite: The first checked frame, counted from 0, with positions that are not finite; None if
-            there is none. No later frame is checked for crossings.
-        stage: What the stage or :class:`warp_bsc.SolverImplicit` reports; None without both.
-        test_final: What the example's ``test_final`` finds: "ok" or the first line of its message; None without one.
-        test_post_step: The same of ``test_post_step``, which is called after each frame until it fails.
-    """
-
-    device: str
-    particles: int
-    triangles: int
-    tetrahedra: int
-    shapes: int
-    frames: int
-    frame_milliseconds: list[float]
-    crossings_at_start: int
-    most_crossings: int
-    first_frame_with_crossings: int | None
-    first_frame_not_finite: int | None
-    stage: StageTotals | None
-    test_final: str | None
-    test_post_step: str | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the measurement as plain data for JSON."""
-        values = asdict(self)
-        frames = values.pop("frame_milliseconds")
-        median, percentile_95 = (float(np.percentile(frames, share)) for share in (50, 95))
-        times = {"median": median, "percentile_95": percentile_95, "worst": max(frames), "frames": frames}
-        return values | {"milliseconds": times}
+A stage behind an entry of a coupled solver takes a step for each substep of the entry and each pass of the coupler. It
+certifies the motion of what the entry sees in the state of the program; crossings are counted in the whole model.
+"""
 
 
 @dataclass(frozen=True)
 class ExampleRun(Run):
     """A run of an example in a mode.
 
+    A crossing is an edge that meets a face without a common vertex, found in exact arithmetic; at least one of the two
+    belongs to cloth or a soft body. Crossings within a step, and at frame ends that are not checked, are not counted.
+
     Attributes:
         example: Name and options of the example.
         mode: One of :data:`MODES`.
+        measured: ``device``, that of Warp; numbers of ``particles``, of ``triangles`` of cloth and of the surfaces of
+            soft bodies that the model lists, of ``tetrahedra``, rigid ``shapes`` and ``frames``;
+            ``crossings_at_start``, before the first frame; ``most_crossings``, the largest number at a checked frame
+            end; ``first_frame_with_crossings``, the first checked frame, counted from 0, with more crossings than the
+            start, and ``first_frame_not_finite``, that with positions that are not finite, after which no frame is
+            checked, each None if there is none; ``stage``, the :data:`STAGE_TOTALS` of the stages, or of
+            :class:`warp_bsc.SolverImplicit`, None without both; ``test_final``, what the example's test of this name
+            finds: "ok" or the first line of its message, None without one; ``test_post_step``, the same of the one
+            that is called after each frame until it fails; ``milliseconds``, as of :func:`describe_times`.
     """
 
     example: str
     mode: str
+
+
+def describe_times(frames: list[float]) -> dict[str, Any]:
+    """Returns times of frames [ms], but the first :data:`WARM_UP`, with their median, 95th percentile and maximum."""
+    median, percentile_95 = (float(np.percentile(frames, share)) for share in (50, 95))
+    return {"median": median, "percentile_95": percentile_95, "worst": max(frames), "frames": frames}
 
 
 def measure_example(
@@ -214,10 +170,7 @@ def measure_example(
             if "frame" in reply and progress:
                 progress(reply["frame"], reply["frames"])
         if "measured" in last:
-            values = last["measured"]
-            totals = values["stage"]
-            values["stage"] = None if totals is None else StageTotals(**totals)
-            return ExampleRun(example.title, mode, measured=ExampleMeasurement(**values))
+            return ExampleRun(example.title, mode, measured=last["measured"])
         problem = last.get("problem")
         if problem is None:
             problem = _describe_end(last["status"], _last_line(errors))
@@ -266,7 +219,7 @@ def _describe_end(status: int, line: str) -> str:
 
 def to_dict(runs: list[ExampleRun]) -> dict[str, Any]:
     """Returns runs as plain data for JSON."""
-    return {"frames_left_out": WARM_UP, "runs": [run.to_dict() for run in runs]}
+    return {"frames_left_out": WARM_UP, "runs": [vars(run) for run in runs]}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:

@@ -11,14 +11,13 @@ import runpy
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, fields
 from typing import Any
 
 import warp as wp
 
 from ..._garbage import paused_collection
 from ..scenes.newton_examples import describe_download
-from .newton_examples import CPU_FRAMES, FRAMES, WARM_UP, ExampleMeasurement, StageTotals
+from .newton_examples import CPU_FRAMES, FRAMES, STAGE_TOTALS, WARM_UP, describe_times
 
 SOLVERS = ("SolverVBD", "SolverXPBD", "SolverStyle3D", "SolverSemiImplicit")
 """The solvers of Newton that move cloth and soft bodies."""
@@ -58,10 +57,10 @@ def serve(request: dict[str, Any], reply: Callable[[dict[str, Any]], None]) -> N
         else:
             reply({"problem": f"failed: {_describe_error(error)}"})
     else:
-        reply({"measured": asdict(measured)})
+        reply({"measured": measured})
 
 
-def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None]) -> ExampleMeasurement:
+def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None]) -> dict[str, Any]:
     """Runs an example as the main module, with the frame loop that measures."""
     with paused_collection():
         import newton.examples  # noqa: PLC0415 (slow)
@@ -69,7 +68,7 @@ def _measure_here(request: dict[str, Any], progress: Callable[[int, int], None])
 
         from ..._private_names.of_newton import replace_name  # noqa: PLC0415 (imports Newton)
 
-    measurements: list[ExampleMeasurement] = []
+    measurements: list[dict[str, Any]] = []
     stages: list[Any] = []
     replaced = {"plain": (), "stage": SOLVERS, "implicit": SOLVERS[:1]}[request["mode"]]
 
@@ -166,7 +165,7 @@ def _replace_solvers(replaced: Sequence[str], kind: type[_StagedType], stages: l
 
 def _measure_frames(
     example: Any, frames: int, check_every: int, stages: list[Any], progress: Callable[[int, int], None]
-) -> ExampleMeasurement:
+) -> dict[str, Any]:
     """Runs the frames of an example as ``newton.examples.run`` does, and its tests.
 
     Args:
@@ -203,25 +202,25 @@ def _measure_frames(
     final = _Test(example, "test_final")
     final.run()
     totals = [
-        {total.name: getattr(stage.report.totals, total.name) for total in fields(StageTotals)}  # each reads the device
+        [getattr(stage.report.totals, name) for name in STAGE_TOTALS]  # each reads the device
         for stage in stages
     ]
-    return ExampleMeasurement(
-        device=str(model.device),
-        particles=model.particle_count,
-        triangles=model.tri_count,
-        tetrahedra=model.tet_count,
-        shapes=model.shape_count,
-        frames=frames,
-        frame_milliseconds=[1e3 * took for took in seconds[WARM_UP:]],
-        crossings_at_start=at_start,
-        most_crossings=most,
-        first_frame_with_crossings=first_crossed,
-        first_frame_not_finite=first_not_finite,
-        stage=StageTotals(**{name: sum(total[name] for total in totals) for name in totals[0]}) if totals else None,
-        test_final=final.result,
-        test_post_step=post_step.result,
-    )
+    return {
+        "device": str(model.device),
+        "particles": model.particle_count,
+        "triangles": model.tri_count,
+        "tetrahedra": model.tet_count,
+        "shapes": model.shape_count,
+        "frames": frames,
+        "crossings_at_start": at_start,
+        "most_crossings": most,
+        "first_frame_with_crossings": first_crossed,
+        "first_frame_not_finite": first_not_finite,
+        "stage": dict(zip(STAGE_TOTALS, map(sum, zip(*totals, strict=True)), strict=True)) if totals else None,
+        "test_final": final.result,
+        "test_post_step": post_step.result,
+        "milliseconds": describe_times([1e3 * took for took in seconds[WARM_UP:]]),
+    }
 
 
 class _Test:

@@ -159,56 +159,20 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True)
-class PenetrationMeasurement:
-    """What exact detection finds in the states of a simulator, and what the run cost.
-
-    Attributes:
-        device: The Warp device of Newton's solvers, "cpu" for MuJoCo, "cuda" for libuipc.
-        version: Version of the distribution that the simulator comes with.
-        particles: Number of particles.
-        triangles: Number of triangles of cloth and of the surfaces of soft bodies.
-        frames: Number of frames.
-        steps: Number of steps.
-        crossings: Edges that pass through faces, at the end of each frame; pairs of two shapes do not count.
-        shape_crossings: Those of them in which one of the two belongs to a fixed shape.
-        collisions: Vertex-face and edge-edge pairs that meet on the straight way from each state to the next, all.
-        colliding_steps: Steps in which there are such pairs.
-        inverted: Tetrahedra that are inverted, at the end of each frame.
-        speed_kept: Share of its speed that a freely flying body keeps before it meets anything; None where nothing
-            flies for a step.
-        stretch: Largest elongation of an edge beyond its length at rest, of all frame ends [%].
-        uncertified_steps: Steps that were not certified; None without a stage.
-        milliseconds: Median and mean time of a step but the first :data:`WARM_UP` [ms].
-    """
-
-    device: str
-    version: str
-    particles: int
-    triangles: int
-    frames: int
-    steps: int
-    crossings: tuple[int, ...]
-    shape_crossings: tuple[int, ...]
-    collisions: int
-    colliding_steps: int
-    inverted: tuple[int, ...]
-    speed_kept: float | None
-    stretch: float
-    uncertified_steps: int | None
-    milliseconds: tuple[float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the measurement as plain data for JSON."""
-        return asdict(self) | {"milliseconds": dict(zip(("median", "mean"), self.milliseconds, strict=True))}
-
-
-@dataclass(frozen=True)
 class PenetrationRun(Run):
     """A run of a scene with a simulator.
 
     Attributes:
         scene: A key of :data:`SCENES`.
         simulator: A key of :data:`SIMULATORS`.
+        measured: ``device``, that of Newton's solvers, "cpu" for MuJoCo, "cuda" for libuipc; ``version``, that of the
+            distribution that the simulator comes with; numbers of ``particles``, of ``triangles`` of cloth and of the
+            surfaces of soft bodies, of ``frames`` and ``steps``; ``crossings``, ``shape_crossings`` and ``inverted`` of
+            each frame end, and ``stretch``, as of :class:`.judge.Judgement`; ``collisions``, the pairs that meet on the
+            straight way from each state to the next, all, and ``colliding_steps``, the steps in which there are such
+            pairs; ``speed_kept``, the share of its speed that a freely flying body keeps before it meets anything, None
+            where nothing flies for a step; ``uncertified_steps``, None without a stage; ``milliseconds``, the median
+            and mean time of a step but the first :data:`WARM_UP` [ms].
     """
 
     scene: str
@@ -258,7 +222,7 @@ def measure_penetration(
     return PenetrationRun(scene, simulator, measured=measured)
 
 
-def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int, int], None]) -> PenetrationMeasurement:
+def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int, int], None]) -> dict[str, Any]:
     """Runs and judges a scene on the current device."""
     from ..scenes.penetration import build_penetration_scene  # noqa: PLC0415 (imports Newton)
     from .judge import Judge  # noqa: PLC0415 (imports Newton)
@@ -271,23 +235,23 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
     states, timed = trajectory.states, trajectory.milliseconds[WARM_UP:] or trajectory.milliseconds
     steps = len(states) - 1
     judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE, lambda done: progress(steps + done, 2 * steps))
-    return PenetrationMeasurement(
-        device=device,
-        version=version_of(simulator.package) or "of unknown version",  # built from source
-        particles=model.particle_count,
-        triangles=model.tri_count,
-        frames=len(judgement.crossings),
-        steps=steps,
-        crossings=judgement.crossings,
-        shape_crossings=judgement.shape_crossings,
-        collisions=sum(judgement.collisions),
-        colliding_steps=sum(found > 0 for found in judgement.collisions),
-        inverted=judgement.inverted,
-        speed_kept=find_speed_kept(built, states, simulator.rate),
-        stretch=judgement.stretch,
-        uncertified_steps=trajectory.uncertified_steps,
-        milliseconds=(float(np.median(timed)), float(np.mean(timed))),
-    )
+    return {
+        "device": device,
+        "version": version_of(simulator.package) or "of unknown version",  # built from source
+        "particles": model.particle_count,
+        "triangles": model.tri_count,
+        "frames": len(judgement.crossings),
+        "steps": steps,
+        "crossings": judgement.crossings,
+        "shape_crossings": judgement.shape_crossings,
+        "collisions": sum(judgement.collisions),
+        "colliding_steps": sum(found > 0 for found in judgement.collisions),
+        "inverted": judgement.inverted,
+        "speed_kept": find_speed_kept(built, states, simulator.rate),
+        "stretch": judgement.stretch,
+        "uncertified_steps": trajectory.uncertified_steps,
+        "milliseconds": {"median": float(np.median(timed)), "mean": float(np.mean(timed))},
+    }
 
 
 def _simulate(built, name: str, seconds: float, progress: Callable[[int, int], None]):
@@ -329,7 +293,7 @@ def to_dict(runs: list[PenetrationRun]) -> dict[str, Any]:
         "steps_left_out": WARM_UP,
         "scenes": {name: SCENES[name] for name in grouped(runs, "scene")},
         "simulators": {name: asdict(SIMULATORS[name]) for name in grouped(runs, "simulator")},
-        "runs": [run.to_dict() for run in runs],
+        "runs": [vars(run) for run in runs],
     }
 
 

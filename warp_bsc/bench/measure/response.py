@@ -344,7 +344,11 @@ def to_dict(runs: list[ResponseRun]) -> dict[str, Any]:
         other = converged.get(run.scene)
         return run.measured.distance_from(other) if run.measured and other else None
 
-    return {"steps_left_out": WARM_UP, "runs": [run.to_dict() | {"from_converged": distance(run)} for run in runs]}
+    rows = [
+        vars(run) | {"measured": run.measured and run.measured.to_dict(), "from_converged": distance(run)}
+        for run in runs
+    ]
+    return {"steps_left_out": WARM_UP, "runs": rows}
 
 
 def show(found: dict[str, Any]) -> Iterator[Table | str]:
