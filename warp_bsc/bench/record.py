@@ -38,7 +38,7 @@ class Run:
     """A run of which there may be no measurement; other fields say which one it is.
 
     Attributes:
-        measured: The measurement, plain data for JSON; None if there is none.
+        measured: The measurement; None if there is none.
         problem: Why there is no measurement; None if there is one.
     """
 

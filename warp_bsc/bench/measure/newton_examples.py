@@ -96,15 +96,15 @@ class ExampleRun(Run):
     Attributes:
         example: Name and options of the example.
         mode: One of :data:`MODES`.
-        measured: ``device``, that of Warp; numbers of ``particles``, of ``triangles`` of cloth and of the surfaces of
-            soft bodies that the model lists, of ``tetrahedra``, rigid ``shapes`` and ``frames``;
+        measured: Plain data for JSON. ``device``, that of Warp; numbers of ``particles``, of ``triangles`` of cloth and
+            of the surfaces of soft bodies that the model lists, of ``tetrahedra``, rigid ``shapes`` and ``frames``;
             ``crossings_at_start``, before the first frame; ``most_crossings``, the largest number at a checked frame
             end; ``first_frame_with_crossings``, the first checked frame, counted from 0, with more crossings than the
             start, and ``first_frame_not_finite``, that with positions that are not finite, after which no frame is
             checked, each None if there is none; ``stage``, the :data:`STAGE_TOTALS` of the stages, or of
             :class:`warp_bsc.SolverImplicit`, None without both; ``test_final``, what the example's test of this name
-            finds: "ok" or the first line of its message, None without one; ``test_post_step``, the same of the one
-            that is called after each frame until it fails; ``milliseconds``, as of :func:`describe_times`.
+            finds: "ok" or the first line of its message, None without one; ``test_post_step``, the same of the one that
+            is called after each frame until it fails; ``milliseconds``, as of :func:`describe_times`.
     """
 
     example: str

@@ -84,9 +84,7 @@ class Place:
         return cores(1) if self.cores == 1 else contextlib.nullcontext()
 
 
-def to_dict(
-    benchmarks: list[dict[str, Any]], adversarial: list[tuple[Place, dict[str, Any]]], *, quick: bool
-) -> dict[str, Any]:
+def to_dict(benchmarks: list[dict[str, Any]], adversarial: list[dict[str, Any]], *, quick: bool) -> dict[str, Any]:
     """Returns measurements of scenes and of :func:`find_adversarial_worst` as plain data for JSON."""
     return {
         "benchmark": "paper",
@@ -94,7 +92,7 @@ def to_dict(
         "methods": list(METHODS),
         "ipc_toolkit": ipc_toolkit.version() if any(found["ipc_toolkit"] for found in benchmarks) else None,
         "scenes": benchmarks,
-        "adversarial": [{"place": place.name, "worst": worst} for place, worst in adversarial],
+        "adversarial": adversarial,
     }
 
 
@@ -282,19 +280,22 @@ def _compare(
     return errors, collisions, checked, sample, truths
 
 
-def find_adversarial_worst(places: list[Place], effort: Effort) -> list[tuple[Place, dict[str, Any]]]:
+def find_adversarial_worst(places: list[Place], effort: Effort) -> list[dict[str, Any]]:
     """Finds the slowest adversarial query of each method, on one core and on GPUs.
 
     Args:
         places: The places at which to time the methods; other places are skipped.
         effort: How much to measure.
+
+    Returns:
+        Plain data for JSON, of each place: ``place``, its name, and ``worst``, by method.
     """
     found = []
     for place in places:
         if place.cores in (1, None):
             queries = [adversarial_queries(kind, effort.adversaries) for kind in PairKind]
             with place.limited():
-                found.append((place, _find_slowest(queries, place, effort)))
+                found.append({"place": place.name, "worst": _find_slowest(queries, place, effort)})
     return found
 
 

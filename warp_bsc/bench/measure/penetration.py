@@ -165,14 +165,15 @@ class PenetrationRun(Run):
     Attributes:
         scene: A key of :data:`SCENES`.
         simulator: A key of :data:`SIMULATORS`.
-        measured: ``device``, that of Newton's solvers, "cpu" for MuJoCo, "cuda" for libuipc; ``version``, that of the
-            distribution that the simulator comes with; numbers of ``particles``, of ``triangles`` of cloth and of the
-            surfaces of soft bodies, of ``frames`` and ``steps``; ``crossings``, ``shape_crossings`` and ``inverted`` of
-            each frame end, and ``stretch``, as of :class:`.judge.Judgement`; ``collisions``, the pairs that meet on the
-            straight way from each state to the next, all, and ``colliding_steps``, the steps in which there are such
-            pairs; ``speed_kept``, the share of its speed that a freely flying body keeps before it meets anything, None
-            where nothing flies for a step; ``uncertified_steps``, None without a stage; ``milliseconds``, the median
-            and mean time of a step but the first :data:`WARM_UP` [ms].
+        measured: Plain data for JSON. ``device``, that of Newton's solvers, "cpu" for MuJoCo, "cuda" for libuipc;
+            ``version``, that of the distribution that the simulator comes with; numbers of ``particles``, of
+            ``triangles`` of cloth and of the surfaces of soft bodies, of ``frames`` and ``steps``; ``crossings``,
+            ``shape_crossings`` and ``inverted`` of each frame end, and ``stretch``, as of :class:`.judge.Judgement`;
+            ``collisions``, the pairs that meet on the straight way from each state to the next, all, and
+            ``colliding_steps``, the steps in which there are such pairs; ``speed_kept``, the share of its speed that a
+            freely flying body keeps before it meets anything, None where nothing flies for a step;
+            ``uncertified_steps``, None without a stage; ``milliseconds``, the median and mean time of a step but the
+            first :data:`WARM_UP` [ms].
     """
 
     scene: str

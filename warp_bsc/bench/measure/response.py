@@ -195,6 +195,7 @@ class ResponseRun(Run):
         scene: One of :data:`SCENES`.
         solver: One of :data:`SOLVERS`.
         configuration: One of :data:`CONFIGURATIONS`.
+        measured: A :class:`ResponseMeasurement`; None if there is none.
     """
 
     scene: str
