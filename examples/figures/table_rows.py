@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from warp_bsc.bench.measure import given_queries as given
-from warp_bsc.bench.measure.detector import ipc_milliseconds, phase_columns
+from warp_bsc.bench.measure.detector import phase_columns
 from warp_bsc.bench.measure.penetration import SIMULATORS
 from warp_bsc.bench.measure.repair import FILE, KNOWN_MESH, STRAIN, RepairRun, summarize
+from warp_bsc.bench.peers.ipc_toolkit import ipc_milliseconds
 from warp_bsc.bench.tables import Column, grouped, two
 
 Found = dict[str, Any]
