@@ -147,7 +147,13 @@ LIBRARIES = {
     "ipctk": {"bench"},
     "mujoco": {"bench"},
     "uipc": {"bench"},
-    "trimesh": {"bench", "response", "usd", "warp_bsc/repairing/repair.py"},  # the last for type checkers alone
+    "trimesh": {
+        "bench",
+        "response",
+        "usd",
+        "warp_bsc/repairing/repair.py",
+        "warp_bsc/repairing/check.py",
+    },  # for type checkers alone
     "warp": {
         "kernels",
         "detection",

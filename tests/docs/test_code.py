@@ -165,14 +165,17 @@ def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
     ):
         trimesh.Trimesh(radius * ball.vertices + moves, ball.faces).export(name)
     section = (DOCS / "usd" / "repair.md").read_text().partition("## Positions")[0]
-    commands = [line for block in re.findall(r"```sh\n(.*?)```", section, re.DOTALL) for line in block.splitlines()]
-    assert len(commands) == 4
+    commands, checks = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", section, re.DOTALL))
+    assert len(commands) == len(checks) == 4
     for number, command in enumerate(commands):
         assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
         said = capsys.readouterr().out
         assert " 0 remain." in said and "read again: certified." in said
         assert ("Intersections: 0 before" in said) == (number in (0, 3))  # the garment alone
     assert sorted(path.name for path in tmp_path.glob("free/*")) == ["coat.stl", "shirt.ply"]
+    for command in checks:
+        assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
+        capsys.readouterr()
 
 
 def test_replay(tmp_path, capsys, monkeypatch):

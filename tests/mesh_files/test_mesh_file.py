@@ -191,7 +191,8 @@ def test_several_files_are_one_scene(tmp_path):
     scene = MeshScene(paths)
     assert scene.x.dtype == np.float64 and scene.file_of.tolist() == [0] * 6 + [1] * 6
     assert scene.faces[6:].min() == 6 and [len(x) for x in scene.of_files(scene.x)] == [6, 6]
-    assert scene.name(np.array([8, 11]), 5) == {"edge": [2, 5], "of": paths[1], "face": 2, "of_face": paths[0]}
+    assert scene.element("edge", np.array([8, 11])) == {"edge": [2, 5], "of": paths[1], "at": scene.x[8].tolist()}
+    assert scene.element("face", 5) == {"face": 2, "of": paths[0], "at": [0.0, 0.1, 0.0]}
 
 
 TETRAHEDRON = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"

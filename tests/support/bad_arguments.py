@@ -404,6 +404,15 @@ def calls() -> dict[str, Call]:
             "device": {"beside a mesh": "cpu"},
         },
     )
+    found["check"] = Call(
+        bsc.check,
+        {"mesh": mesh, "x": X},
+        {
+            "mesh": without(OBJECTS, "None") | {"negative": -FACES, "columns": np.zeros((2, 4), int)},
+            "x": COORDINATES,
+            "device": {"beside a mesh": "cpu"},
+        },
+    )
     found |= calls_of_scenes() | calls_of_solvers()
     return found
 
@@ -661,6 +670,7 @@ RESULTS = {
     "IntervalResult",
     "IntervalSummary",
     "QueryResult",
+    "MeshCheck",
     "RepairResult",
     "SceneContacts",
     "SceneIntersections",

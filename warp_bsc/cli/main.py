@@ -22,6 +22,7 @@ examples:
 _COMMANDS = {
     "replay": "find the collisions in a USD scene",
     "repair": "move the meshes of a USD scene or of mesh files so that they do not collide",
+    "check": "find what crosses, touches or is not sound in mesh files",
     "query": "decide queries of CSV files",
     "bench": "measure detection, SolverCCD and repair",
 }

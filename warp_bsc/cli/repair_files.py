@@ -6,17 +6,17 @@ import fnmatch
 import itertools
 import json
 import os
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from .._atomic_file import OutputFile
 from ..bench.tables import LONGEST, Column, count
-from ..detection.at_rest.intersections import find_intersections
 from ..detection.mesh import CollisionMesh
 from ..mesh_files.mesh_file import MeshFile, MeshScene
+from ..repairing.check import find_meeting
 from ..repairing.repair import repair
-from ..repairing.surface import weld_borders, welded
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus
 from .tables import Console, print_table, say, say_list
@@ -62,14 +62,15 @@ def repair_files(arguments: argparse.Namespace) -> int:
     with np.errstate(over="ignore"):
         rounded = written.x.astype(np.float32)
     positions = [written.x, rounded] if np.isfinite(rounded).all() else [written.x]
-    meeting = [_count_meeting(_mesh_of(written, kept, device), x) for x in positions]
+    again = _mesh_of(written, kept, device)
+    meeting = [len(find_meeting(again, x)[1].pairs) for x in positions]
     among_kept = CollisionMesh(scene.faces[kept[scene.file_of[scene.faces[:, 0]]]], len(scene.x), device=device)
     found, remaining = {"intersections": result.crossings_before}, {"intersections": meeting[0]}
     if arguments.min_distance:
         name = f"pairs nearer than {arguments.min_distance:g}"
         found[name], remaining[name] = result.near_before, result.near
     notes = [f"{file.path}: {note}" for file in scene.files for note in file.notes]
-    if unseen := _count_meeting(among_kept, scene.x):
+    if unseen := len(find_meeting(among_kept, scene.x)[1].pairs):
         notes.append(f"in and among obstacles, {unseen:,} edges meet faces; they do not count")
     if result.order is not None:
         sheets = [np.unique(scene.file_of[result.order == number]) for number in range(result.order.max() + 1)]
@@ -79,7 +80,7 @@ def repair_files(arguments: argparse.Namespace) -> int:
         notes.append(f"rounded to single precision, as some programs read it, {meeting[-1]:,} edges meet faces")
     unresolved = []
     for contour in result.unresolved:
-        elements = [scene.name(mesh.edges[edge], face) for edge, face in contour.elements]
+        elements = [[scene.element("edge", mesh.edges[e]), scene.element("face", f)] for e, f in contour.elements]
         reason = contour.reason.replace("order or x_previous", "--order or --previous")
         unresolved.append({"kind": contour.kind, "reason": reason, "elements": elements})
     rows = []
@@ -101,23 +102,24 @@ def repair_files(arguments: argparse.Namespace) -> int:
             say(console, f"{what.capitalize()}: {number:,} before, {remaining[what]:,} remain.")
         say(console, f"Lengths of edges change by at most {100.0 * result.max_strain:.3g}%.")
         for contour in unresolved[:LONGEST]:
-            lines = ["edge {edge} of {of}, face {face} of {of_face}".format_map(e) for e in contour["elements"]]
+            lines = [in_words(elements) for elements in contour["elements"]]
             say(console, f"Not repaired: {count(len(lines), 'edge')} through faces: {contour['reason']}.")
             say_list(console, lines, "")
         say(console, f"What was written has been read again: {'' if certified else 'not '}certified.")
     return ExitStatus.FOUND if arguments.fail_on and any(remaining.values()) else ExitStatus.DONE
 
 
+def in_words(elements: list[dict[str, Any]]) -> str:
+    """Returns elements, as of :meth:`.MeshScene.element`, as a text."""
+    numbers = [(next(iter(element)), element["of"], next(iter(element.values()))) for element in elements]
+    place = " ".join(f"{coordinate:.4g}" for coordinate in elements[0]["at"])
+    return ", ".join(f"{kind} {number} of {path}" for kind, path, number in numbers) + f", at {place}"
+
+
 def _mesh_of(scene: MeshScene, kept: np.ndarray, device: wp.Device) -> CollisionMesh:
     """Returns the mesh of a scene, in which files that are kept do not meet each other or themselves."""
     is_kept = kept[scene.file_of].astype(int)
     return CollisionMesh(scene.faces, len(scene.x), group=1 + is_kept, mask=3 - 2 * is_kept, device=device)
-
-
-def _count_meeting(mesh: CollisionMesh, x: np.ndarray) -> int:
-    """Returns the number of edges that meet faces, where double vertices of borders are one."""
-    label = np.zeros(len(x), int) if mesh.group is None else mesh.group
-    return len(find_intersections(welded(mesh, weld_borders(mesh, x, label[:, None])), x))
 
 
 def _outputs(scene: MeshScene, arguments: argparse.Namespace) -> list[str | None]:

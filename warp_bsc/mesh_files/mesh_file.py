@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -106,11 +107,17 @@ class MeshScene:
         """Returns values of all vertices by file."""
         return [values[self.file_of == number] for number in range(len(self.files))]
 
-    def name(self, edge: np.ndarray, face: int) -> dict[str, object]:
-        """Returns an edge, given its ends, and a face with their numbers in their files, which count from 0."""
-        one, other = self.file_of[edge[0]], self.file_of[self.faces[face, 0]]
-        ends, polygon = (edge - self._starts[one]).tolist(), int(self._polygons[face])
-        return {"edge": ends, "of": self.files[one].path, "face": polygon, "of_face": self.files[other].path}
+    def element(self, kind: str, number: Any) -> dict[str, Any]:
+        """Returns a vertex, an edge or a face with its numbers in its file, from 0, the file, and a point of it.
+
+        Args:
+            kind: "vertex", "edge" or "face".
+            number: The vertex, the ends of the edge, or the number of the triangle.
+        """
+        first = self.faces[number, 0] if kind == "face" else np.ravel(number)[0]
+        file = self.file_of[first]
+        local = self._polygons[number] if kind == "face" else number - self._starts[file]
+        return {kind: np.asarray(local).tolist(), "of": self.files[file].path, "at": self.x[first].tolist()}
 
 
 def is_mesh_file(path: str) -> bool:
