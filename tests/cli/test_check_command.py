@@ -40,7 +40,7 @@ def test_elements_have_their_numbers_in_the_file(folder, capsys):
     assert [[element["face"] for element in row] for row in findings["duplicates"]] == [[2, 0]]
     said = run(capsys, "quad.obj")
     assert "edge [" in said and " of quad.obj" in " ".join(said.split()) and "quad.obj: one configuration" in said
-    assert "checked as a fan" in said
+    assert "checked as fans" in said
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ class MeshFile:
             _check(points, counts, corners)
         except (ValueError, OverflowError) as error:
             raise ValueError(f"{path}: {error}") from None
-        self.notes = notes + ["faces of more than three corners are checked as fans from the first"] * bool((counts > 3).any())
+        self.notes = notes + ["polygons are checked as fans from the first corner"] * bool((counts > 3).any())
         self.x, self._vertices = points, np.arange(len(points))
         if suffix == ".stl":
             self.x, vertices = np.unique(points, axis=0, return_inverse=True)
