@@ -142,7 +142,7 @@ def test_a_minimum_distance_is_not_certified_for_rounded_coordinates(folder, cap
 
 def test_order_and_previous_free_sheets_that_have_changed_places(folder, capsys):
     """A sheet that is through another one from border to border."""
-    corner = KNOWN["corner"]()
+    corner = KNOWN["corner"](24)
     assert corner.free is not None
     for name, x, number in (("low", corner.x, 0), ("high", corner.x, 1), ("before", corner.free, 1)):
         faces = corner.faces[(corner.sheet[corner.faces] == number).all(axis=1)]

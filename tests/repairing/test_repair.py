@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import warp_bsc as bsc
 from warp_bsc import checker
-from warp_bsc.bench.scenes.repair import KINDS, KNOWN, TangledMesh, damaged
+from warp_bsc.bench.scenes.repair import KINDS, KNOWN, damaged
 from warp_bsc.repairing.closest import closest_points, exit_distances
 from warp_bsc.repairing.surface import Surface
 
@@ -27,15 +27,6 @@ def grid_faces(n, m):
     i = np.arange(n * m).reshape(n, m)
     a, b, c, d = (corners.ravel() for corners in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-
-
-def corner(n=24):
-    """A sheet of n by n vertices through another one, from border to border."""
-    u, v = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, n)] * 2, indexing="ij")).reshape(2, -1)
-    flat, slope = np.stack([u, v, 0.0 * u], 1), np.stack([u + 0.013, v + 0.0071, 0.3 * (u - 0.7) + 0.0003], 1)
-    sheet, x = np.repeat([0, 1], n * n), np.concatenate([flat, slope])
-    faces = np.concatenate([grid_faces(n, n), grid_faces(n, n) + n * n])
-    return TangledMesh(faces, x, x + [0.0, 0.0, 0.3] * sheet[:, None], np.zeros(len(x), bool), sheet)
 
 
 def bottle(n, m):
@@ -87,7 +78,7 @@ def test_known_tangles_come_free_with_little_strain(name, dtype):
 
 
 def test_sheets_that_have_changed_places_are_put_into_the_nearer_order_which_is_told():
-    scene = corner()
+    scene = KNOWN["corner"](24)
     result = repair(scene, scene.x)
     assert result.certified and result.max_strain <= 0.1
     told, other = (repair(scene, scene.x, order=order) for order in (result.order, 1 - result.order))
@@ -96,7 +87,7 @@ def test_sheets_that_have_changed_places_are_put_into_the_nearer_order_which_is_
 
 
 def test_a_contour_from_border_to_border_is_named():
-    scene = corner()
+    scene = KNOWN["corner"](24)
     edges = bsc.CollisionMesh(scene.faces, len(scene.x), device="cpu")
     borders = edges.edges[np.bincount(edges.face_edges.ravel()) == 1]
     held = replace(scene, fixed=np.isin(np.arange(len(scene.x)), borders) | (scene.sheet == 0))

@@ -223,9 +223,9 @@ def _sheets() -> TangledMesh:
     return _of_sheets(flat, waves, np.array([0.0, 0.0, 0.1]))
 
 
-def _corner() -> TangledMesh:
-    flat = _grid(40, 40, lambda u, v: np.stack([u, v, 0 * u], -1))
-    slope = _grid(40, 40, lambda u, v: np.stack([u + 0.013, v + 0.0071, 0.3 * (u - 0.7) + 0.0003], -1))
+def _corner(n: int = 40) -> TangledMesh:
+    flat = _grid(n, n, lambda u, v: np.stack([u, v, 0 * u], -1))
+    slope = _grid(n, n, lambda u, v: np.stack([u + 0.013, v + 0.0071, 0.3 * (u - 0.7) + 0.0003], -1))
     return _of_sheets(flat, slope, np.array([0.0, 0.0, 0.3]))
 
 
@@ -252,7 +252,7 @@ def _folded() -> TangledMesh:
     return TangledMesh(faces, x, free, np.zeros(len(x), bool), np.full(len(x), -1))
 
 
-KNOWN = {"sheets": _sheets, "folded": _folded, "corner": _corner}
+KNOWN: dict[str, Callable[..., TangledMesh]] = {"sheets": _sheets, "folded": _folded, "corner": _corner}
 """Known meshes: two sheets through each other in islands, a sunk fold, one sheet through another from border to border.
 """
 
