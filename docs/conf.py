@@ -47,7 +47,7 @@ add_module_names = False
 nitpicky = True
 nitpick_ignore_regex = [
     # of other projects, whose inventories would be downloaded
-    (r"py:.*", r"(warp|wp|newton|numpy|torch|jax|copy|multiprocessing|collections|os|Usd|Sdf)\b.*"),
+    (r"py:.*", r"(warp|wp|newton|numpy|np|trimesh|torch|jax|copy|multiprocessing|collections|os|Usd|Sdf)\b.*"),
     # types of annotations, and words that stand where a type may
     (r"py:class", r"(warp_bsc\..*|[^.]*|(state\.structs|contacts\.rules|inside)\.\w+)"),
     # modules behind those that the reference cites
