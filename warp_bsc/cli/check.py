@@ -117,7 +117,7 @@ def _find_in_motion(start: MeshScene, end: MeshScene, device: wp.Device) -> dict
     """Returns the collisions of a motion, and what crosses or touches at its ends."""
     x0, x1 = (x.astype(np.result_type(start.x, end.x)) for x in (start.x, end.x))
     mesh = CollisionMesh(start.faces, len(x0), device=device)
-    mesh = welded(mesh, weld_borders(mesh, np.hstack([x0, x1]), np.zeros((len(x0), 1), int)))
+    mesh = welded(mesh, weld_borders(mesh, np.hstack([x0, x1])))
     found = CollisionDetector(mesh, method="exact").detect(x0, x1)
     collisions = [[start.element("vertex", v), start.element("face", f)] for v, f in found.vertex_face]
     collisions += [[start.element("edge", ends) for ends in mesh.edges[pair]] for pair in found.edge_edge]

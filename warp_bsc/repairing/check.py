@@ -106,8 +106,7 @@ def find_meeting(mesh: CollisionMesh, x: np.ndarray) -> tuple[CollisionMesh, Int
         mesh: The mesh.
         x: Positions, finite, shape [vertex_count, 3].
     """
-    labels = [bits for bits in (mesh.world, mesh.group, mesh.mask) if bits is not None]
-    surface = welded(mesh, weld_borders(mesh, x, np.column_stack([np.zeros(len(x), int), *labels])))
+    surface = welded(mesh, weld_borders(mesh, x))
     return surface, IntersectionFinder(surface).find(x)
 
 

@@ -88,7 +88,7 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
     crossings = surface.crossings(start)
     first, second = (piece[of[crossings[:, k], 0]] for k, of in enumerate((surface.mesh.edges, surface.mesh.faces)))
     crossing = first[(first == second) & ~surface.are_fixed(crossings)]
-    if not len(crossing) or surface.is_late:
+    if not len(crossing):
         return start
     springs, x = Springs(surface, np.isin(piece, crossing) & ~surface.fixed), start
     sizes = np.bincount(piece, minlength=len(x))[:, None]
@@ -107,6 +107,8 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
         opened = surface.rounded(np.where(is_whole[:, None], placed, x))
         if surface.are_fixed(surface.crossings(opened)).all():
             return approach(surface, opened, springs, max_strain)
+        if surface.is_late:
+            break
     return start
 
 

@@ -55,7 +55,7 @@ class ModelSurface:
         self.mesh, self._x, self._shape, self._world = _with_planes(of_model, x, self._planes)
         more = len(self._x) - model.particle_count
         self.sheet = np.append(sheet, np.full(more, -1))
-        self.weld = weld_borders(self.mesh, self._x, np.column_stack([self.sheet, self._world, self._shape]))
+        self.weld = weld_borders(self.mesh, self._x, self.sheet, self._world, self._shape)
         self._soft_body = np.full(len(self._x), -1)
         self._soft_body[self.tetrahedra] = connect_cells(self.tetrahedra, model.particle_count)[self.tetrahedra]
         movable = np.append(of_model.inverse_masses.numpy() > 0.0, np.zeros(len(self._x) - len(x), dtype=bool))

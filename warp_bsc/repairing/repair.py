@@ -89,7 +89,7 @@ def repair(
     distance = checked_distance(min_distance, "min_distance")
     strain = checked_number(max_strain, "max_strain", 0.0, above=True)
     limit = np.inf if time_limit is None else checked_number(time_limit, "time_limit", 0.0, above=True)
-    weld = weld_borders(mesh, np.hstack([given, previous]), _labels(mesh, sheet))
+    weld = weld_borders(mesh, np.hstack([given, previous]), sheet)
     welded_mesh = welded(mesh, weld)
     is_fixed = np.bincount(weld, fixed_mask, len(given)) > 0
     surface = Surface(welded_mesh, given, is_fixed, distance)
@@ -134,11 +134,6 @@ def _checked_previous(x_previous: np.ndarray | wp.array, x: np.ndarray, mesh: Co
     return previous
 
 
-def _labels(mesh: CollisionMesh, sheet: np.ndarray) -> np.ndarray:
-    """Returns what the vertices that are welded have in common beside their position, int, shape [n, k]."""
-    return np.column_stack([sheet, *(bits for bits in (mesh.world, mesh.group, mesh.mask) if bits is not None)])
-
-
 def _repaired(
     surface: Surface,
     before: np.ndarray,
@@ -166,11 +161,13 @@ def _repaired(
             x = free(surface, start, surface.crossings(start), max_strain, movable=differ(start, surface.home))
         if start is surface.home or score_of(surface, x, max_strain)[0]:
             x = min(x, free(surface, surface.home, before, max_strain), key=rank)
-        x = free_by_order(surface, x, max_strain, rank, chosen)
-        x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
     else:
         x = free_in_order(surface, sheet, surface.home, max_strain)
     left = surface.crossings(x)
+    if sheet is None and not surface.are_fixed(left).all():
+        x = free_by_order(surface, x, max_strain, rank, chosen)
+        x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
+        left = surface.crossings(x)
     if not len(left):
         return x, left
     restored = restore_parts(surface, x, (before, left))

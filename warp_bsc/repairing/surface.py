@@ -13,22 +13,23 @@ _WRECKED = 0.25
 """Median strain of edges that have moved above which a surface is no result."""
 
 
-def weld_borders(mesh: CollisionMesh, positions: np.ndarray, label: np.ndarray) -> np.ndarray:
+def weld_borders(mesh: CollisionMesh, positions: np.ndarray, *labels: np.ndarray) -> np.ndarray:
     """Returns for each vertex the first one that it is welded to, int, shape [n].
 
-    The two sides of a seam are borders whose vertices have the same positions. Vertices inside a surface are not
-    welded: there, two surfaces touch.
+    The two sides of a seam are borders whose vertices have the same positions, world, groups and mask. Vertices inside
+    a surface are not welded: there, two surfaces touch.
 
     Args:
         mesh: The mesh.
         positions: Positions of the vertices in one configuration or several, finite, shape [n, 3 k].
-        label: Only vertices of the same labels are welded, int, shape [n, m].
+        labels: Only vertices of the same labels are welded, int, each of shape [n].
     """
     weld = np.arange(len(positions))
     border = np.bincount(mesh.face_edges.ravel() + 1, minlength=len(mesh.edges) + 1)[1:] == 1
     vertices = np.unique(mesh.edges[border])
     if len(vertices):
-        keys = np.column_stack([positions[vertices], label[vertices]])
+        bits = [values for values in (mesh.world, mesh.group, mesh.mask) if values is not None]
+        keys = np.column_stack([values[vertices] for values in (positions, *labels, *bits)])
         _, firsts, numbers = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         weld[vertices] = vertices[firsts[numbers.reshape(-1)]]
     return weld

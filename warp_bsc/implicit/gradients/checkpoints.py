@@ -17,7 +17,7 @@ from ..._private_names.of_warp import paused_tape
 from ..._private_names.tape_access import Access, access_to, arrays_of_launch, overlap
 from ...response.drive.snapshot import Snapshot
 from ...response.state.status import Loop
-from .kernels import Count
+from .kernels import Count, add_to
 from .step_gradients import StepGradients
 
 wp.set_module_options({"enable_backward": False})
@@ -28,12 +28,6 @@ _ENDS = "particle_q", "particle_qd", "body_q", "body_qd"
 """Arrays of a state that steps lead to."""
 _TYPES = wp.float32, wp.vec2, wp.vec3, wp.vec4, wp.quat, wp.transform, wp.spatial_vector, wp.mat33
 """Types of arrays of a state that have gradients."""
-
-
-@wp.kernel
-def _add(values: wp.array[float], sums: wp.array[float]):
-    i = wp.tid()
-    sums[i] = sums[i] + values[i]
 
 
 @wp.kernel
@@ -192,7 +186,7 @@ class Checkpoints:
             of_states = _gradients_of(border)
             for name, gradient in _gradients_of(state_in).items():
                 values, sums = _flat(of_states[name], float), _flat(gradient, float)
-                self._launch(_add, len(sums), [values], [sums])
+                self._launch(add_to, len(sums), [values], [sums])
             self._restart(after)
             gradients.report.copy_counts()
 
