@@ -74,7 +74,7 @@ def test_two_files_of_the_same_faces_are_a_motion(folder, capsys):
 def test_errors(folder, capsys):
     for arguments, error in (
         (["none.obj"], "none.obj: No such file or directory"),
-        (["ball.glb"], "ball.glb: the name of a mesh file must end in"),
+        (["ball.gltf"], "ball.gltf: the name of a mesh file must end in"),
         (["ball.obj", "--fail-on", "new"], "argument --fail-on: must be of collisions, intersections,"),
     ):
         assert main(["check", *arguments]) == 2

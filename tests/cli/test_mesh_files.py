@@ -25,7 +25,7 @@ CROSSING = 72
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, mesh in {"first": FIRST, "second": SECOND, "balls": BALLS}.items():
-        for suffix in ("obj", "off", "ply", "stl"):
+        for suffix in ("glb", "obj", "off", "ply", "stl"):
             mesh.export(f"{name}.{suffix}")
     return tmp_path
 
@@ -58,7 +58,7 @@ def crossings(*paths):
     return len(bsc.CollisionDetector(mesh).find_intersections(x))
 
 
-@pytest.mark.parametrize("suffix", ["obj", "off", "ply", "stl"])
+@pytest.mark.parametrize("suffix", ["glb", "obj", "off", "ply", "stl"])
 def test_what_is_written_is_free_for_another_reader(folder, capsys, suffix):
     assert crossings(f"balls.{suffix}") == CROSSING
     assert repair(f"balls.{suffix}", "--output", f"free.{suffix}") == 0
@@ -209,8 +209,8 @@ def test_seams_stay_closed(folder, capsys):
     ("arguments", "error"),
     [
         (["none.obj", "--output", "free.obj"], "none.obj: No such file or directory"),
-        (["balls.glb", "--output", "free.glb"], "balls.glb: "),
-        (["balls.obj", "balls.usd", "--output", "free.obj"], "balls.usd: the name of a mesh file must end in .obj,"),
+        (["balls.gltf", "--output", "free.gltf"], "balls.gltf: "),
+        (["balls.obj", "balls.usd", "--output", "free.obj"], "balls.usd: the name of a mesh file must end in .glb,"),
         (["a.usda", "b.usda", "--output", "free.usda"], "only mesh files can be several"),
         (["balls.obj", "--output", "free.ply"], "free.ply: must end as balls.obj does"),
         (["balls.obj", "--output", "./balls.obj"], "./balls.obj: named twice, or read"),

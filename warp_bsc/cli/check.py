@@ -10,8 +10,8 @@ import warp as wp
 from ..bench.tables import Column
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..mesh_files.check import check
 from ..mesh_files.mesh_file import MeshScene
-from ..repairing.check import check
 from ..repairing.surface import weld_borders, welded
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses

@@ -14,8 +14,8 @@ import warp as wp
 from .._atomic_file import OutputFile
 from ..bench.tables import LONGEST, Column, count
 from ..detection.mesh import CollisionMesh
+from ..mesh_files.check import find_meeting
 from ..mesh_files.mesh_file import MeshFile, MeshScene
-from ..repairing.check import find_meeting
 from ..repairing.repair import repair
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus
