@@ -115,7 +115,9 @@ def test_positions_and_their_bounds_change_and_nothing_else(tmp_path, indent):
     assert json.loads(parts_of(new)[0]) == expected
     words = [re.findall(r"[^\s,\]]+", parts_of(each)[0]) for each in (data, new)]
     changed_bounds = [bounds(rows)[key] for rows in (X, X[5:], x, x[5:]) for key in ("min", "max")]
-    assert sum(a != b for a, b in zip(*words, strict=True)) == (np.array(changed_bounds[:4]) != changed_bounds[4:]).sum()
+    assert (
+        sum(a != b for a, b in zip(*words, strict=True)) == (np.array(changed_bounds[:4]) != changed_bounds[4:]).sum()
+    )
     for number in (0, 5):
         rows = x if not number else x[5:]
         accessor = json.loads(parts_of(new)[0])["accessors"][number]

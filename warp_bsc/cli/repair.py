@@ -4,12 +4,17 @@ import argparse
 import contextlib
 import json
 import os
+from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
+from ..mesh_files.file_scene import FileScene, FrameFiles
+from ..mesh_files.frames import find_frames
 from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
+from ..usd.scene import Scene
+from ..usd.write.points_layer import PointsLayer
 from .device import find_device, load_detector, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import (
@@ -27,7 +32,7 @@ from .options import (
     positive_real,
     scene_path,
 )
-from .repair_files import repair_files
+from .repair_files import read_frames, repair_files
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
 from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
@@ -66,9 +71,10 @@ examples:
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
 
-_OF_BOTH = {"command_line", "scene", "output", "keep", "min_distance", "json", "fail_on", "device"}
-_OF_FILES = {"max_strain", "order", "previous"}
-"""The options for USD scenes and mesh files, and for mesh files alone. The others are for USD scenes alone."""
+_OF_ALL = {"command_line", "scene", "output", "report", "keep", "min_distance", "json", "fail_on", "device"}
+_OF_ONE_FRAME = {"max_strain", "order", "previous"}
+_OF_FRAMES = {"max_move", "resume"}
+"""The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""
 
 
 def add_to(commands: Commands, summary: str) -> None:
@@ -127,30 +133,27 @@ def add_to(commands: Commands, summary: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    is_of_files = any(map(is_mesh_file, arguments.scene))
+    frames = find_frames(arguments.scene) if any(map(is_mesh_file, arguments.scene)) else None
+    kind, options = "USD scenes", vars(arguments).keys() - _OF_ONE_FRAME
+    if frames:
+        of_one = len(frames.numbers) == 1
+        kind = "mesh files" if of_one else "frames of mesh files"
+        options = _OF_ALL | (_OF_ONE_FRAME if of_one else _OF_FRAMES)
     for name, value in vars(arguments).items():
-        if name not in _OF_BOTH and (name in _OF_FILES) != is_of_files and value != arguments.default_of(name):
-            raise ValueError(f"--{name.replace('_', '-')} is for {'USD scenes' if is_of_files else 'mesh files'} only")
+        if name not in options and value != arguments.default_of(name):
+            raise ValueError(f"--{name.replace('_', '-')} is not for {kind}")
     for name in ("output", "report"):
         if getattr(arguments, name) == STDOUT:
             raise ValueError(f"--{name} must be a file, not standard output")
-    if is_of_files:
-        return repair_files(arguments)
-    if len(arguments.scene) > 1:
-        raise ValueError("only mesh files can be several")
-    written = [file for file in (arguments.output, arguments.report) if file]
-    written.append(str(unfinished_path(arguments.output)))
-    arguments.scene = scene_path(arguments.scene[0])
-    paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise ValueError(f"{path}: named twice, as two files of a repair")
+    if frames and kind == "mesh files":
+        return repair_files(frames, arguments)
     device = find_device(arguments.device)
     chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
-    scene = read_scene(arguments.scene, arguments, **chosen)
-    for file in written:
-        if file in scene.files:
-            raise ValueError(f"{file}: the scene is read from this file; write to another one")
+    if frames:
+        scene, outputs = read_frames(frames), frames.outputs(arguments.keep, arguments.output)
+        arguments.include_initial = True  # frames have no scene in which parts of a body are meant to cross
+    else:
+        scene, outputs = _open_usd(arguments, chosen), []
     kept = kept_meshes(scene, arguments.keep)
     with loading_kernels(device):
         load_detector("exact", scene.dtype, device, intersections=True, strands=scene.has_strands)
@@ -162,11 +165,18 @@ def _run(arguments: argparse.Namespace) -> int:
         if arguments.report:
             page = RepairPage(arguments.report)
             stack.callback(page.discard)
-        run = stack.enter_context(contextlib.closing(RepairRun(scene, arguments, str(device), facts)))
+        if isinstance(scene, FileScene):
+            layer = FrameFiles(scene, outputs)
+        else:
+            layer = PointsLayer(arguments.output, scene=scene)
+        run = stack.enter_context(contextlib.closing(RepairRun(scene, layer, arguments, str(device), facts)))
         run.run()
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and run.is_written:
-            fixed = read_scene(arguments.output, arguments, **chosen)
+            if isinstance(layer, FrameFiles):
+                fixed = read_frames(layer.frames)
+            else:
+                fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
             after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].unrepaired_pairs)
         if page and run.journal.findings is not None:
@@ -184,3 +194,25 @@ def _run(arguments: argparse.Namespace) -> int:
     if "remaining" in arguments.fail_on and any(remaining.values()):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
+
+
+def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:
+    """Opens a USD scene, given the selection and the frames.
+
+    Raises:
+        ValueError: If the options do not fit together, or the file is broken.
+    """
+    if len(arguments.scene) > 1:
+        raise ValueError("only mesh files can be several")
+    written = [file for file in (arguments.output, arguments.report) if file]
+    written.append(str(unfinished_path(arguments.output)))
+    arguments.scene = scene_path(arguments.scene[0])
+    paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path}: named twice, as two files of a repair")
+    scene = read_scene(arguments.scene, arguments, **chosen)
+    for file in written:
+        if file in scene.files:
+            raise ValueError(f"{file}: the scene is read from this file; write to another one")
+    return scene

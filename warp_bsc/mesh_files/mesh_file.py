@@ -51,8 +51,9 @@ class MeshFile:
         self.notes = notes + ["polygons are checked as fans from the first corner"] * bool((counts > 3).any())
         self.x, self._vertices = points, np.arange(len(points))
         if suffix == ".stl":
-            self.x, vertices = np.unique(points, axis=0, return_inverse=True)
-            self._vertices = vertices.reshape(-1)  # NumPy 2.0 shapes it otherwise
+            _, first, vertices = np.unique(points, axis=0, return_index=True, return_inverse=True)
+            order = np.sort(first)  # as in the file, so that frames of one soup have the same faces
+            self.x, self._vertices = points[order], np.searchsorted(order, first[vertices.reshape(-1)])
         in_face = counts - 2
         self.polygons = np.repeat(np.arange(len(counts)), in_face)
         first = (np.cumsum(counts) - counts)[self.polygons]

@@ -206,6 +206,14 @@ class UsdMesh:
         self.states = dict(sorted((kept | {since: None} | last).items()))
 
     @property
+    def is_rigid(self) -> bool:
+        """Whether it always has the same points in a space of its own, which a transform places in the world.
+
+        False as well for instances of point instancers, which are read together otherwise.
+        """
+        return not (self.deforms or self.is_skinned or self.may_jump or self.is_placed or self.instanced_prim)
+
+    @property
     def why_not_written(self) -> str | None:
         """Why a layer over the scene cannot give the mesh points of its own, in words; None if it can."""
         if self.instance:
