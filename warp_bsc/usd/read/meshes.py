@@ -207,10 +207,7 @@ class UsdMesh:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether it always has the same points in a space of its own, which a transform places in the world.
-
-        False as well for instances of point instancers, which are read together otherwise.
-        """
+        """Whether only its transform moves its points, and no point instancer places it."""
         return not (self.deforms or self.is_skinned or self.may_jump or self.is_placed or self.instanced_prim)
 
     @property
