@@ -1,7 +1,10 @@
-"""A Blender add-on that checks meshes for what crosses, goes from finding to finding, and moves vertices until none does.
+"""A Blender add-on that checks meshes, goes from finding to finding, and moves vertices until nothing crosses.
 
 Blender's Python must have warp-bsc: docs/blender.md says how.
 """
+
+from types import SimpleNamespace
+from typing import ClassVar
 
 import bmesh
 import bpy
@@ -18,9 +21,12 @@ bl_info = {
     "doc_url": "https://warp-bsc.github.io/warp-bsc/blender.html",
 }
 
-_findings = []  # of the last check: a kind, and the vertices of each object by its name
-_said = []  # kind and text of the last message
-_shown = -1  # number of the finding that was shown last
+_last = SimpleNamespace(
+    findings=[],  # of the last check: a kind, and the vertices of each object by its name
+    counts={},  # numbers of vertices of the objects then
+    shown=-1,  # number of the finding that was shown last
+    said=("", ""),  # kind and text of the last message
+)
 
 _PAIRS = {"crossings": "edge through a face", "touching": "edge that only touches a face"}
 _FACES = {"degenerate_faces": "face without area", "doubled_faces": "doubled face"}
@@ -150,14 +156,14 @@ class _Operator(bpy.types.Operator):
 
     def execute(self, context):
         try:
-            return self.run(context)
+            return self._run(context)
         except (ValueError, np.linalg.LinAlgError) as error:
             self.say("ERROR", str(error))
             return {"CANCELLED"}
 
     def say(self, kind, text):
         """Shows a message in the status bar, and in the panel until the next one."""
-        _said[:] = kind, text
+        _last.said = kind, text
         self.report({kind}, text)
 
 
@@ -166,16 +172,16 @@ class WARP_BSC_OT_check(_Operator):
 
     bl_idname, bl_label = "warp_bsc.check", "Check"
 
-    def run(self, context):
-        global _shown
+    def _run(self, context):
         surface = Surface(_chosen(context))
         found = _library().check(surface.faces, surface.x)
-        _shown, kinds = -1, {}
-        _findings.clear()
+        kinds = {}
+        _last.shown, _last.findings = -1, []
+        _last.counts = dict((obj.name, len(obj.data.vertices)) for obj in surface.objects)
 
         def add(kind, vertices):
             kinds[kind] = kinds.get(kind, 0) + 1
-            _findings.append((kind, surface.vertices(vertices)))
+            _last.findings.append((kind, surface.vertices(vertices)))
 
         for name, kind in _PAIRS.items():
             for edge, face in getattr(found, name):
@@ -197,20 +203,19 @@ class WARP_BSC_OT_next(_Operator):
     """Selects the vertices of the next finding in edit mode, and shows them."""
 
     bl_idname, bl_label = "warp_bsc.next", "Next Finding"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
 
-    def run(self, context):
-        global _shown
-        if not _findings:
+    def _run(self, context):
+        if not _last.findings:
             raise ValueError("there is no finding; check first")
-        number = (_shown + 1) % len(_findings)
-        kind, places = _findings[number]
-        objects = [context.view_layer.objects.get(name) for name in places]
-        for obj, vertices in zip(objects, places.values(), strict=True):
-            if obj is None or obj.type != "MESH" or len(obj.data.vertices) <= max(vertices) or obj.hide_get():
-                raise ValueError("the meshes have changed since the check, or are hidden; check again")
+        number = (_last.shown + 1) % len(_last.findings)
+        kind, places = _last.findings[number]
         if context.view_layer.objects.active and context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
+        objects = [context.view_layer.objects.get(name) for name in places]
+        for obj, name in zip(objects, places, strict=True):
+            if obj is None or obj.type != "MESH" or len(obj.data.vertices) != _last.counts[name] or obj.hide_get():
+                raise ValueError(f"{name} has changed since the check, or is hidden; check again")
         for obj in context.selected_objects:
             obj.select_set(False)
         for obj, vertices in zip(objects, places.values(), strict=True):
@@ -228,22 +233,22 @@ class WARP_BSC_OT_next(_Operator):
                 region = next(region for region in area.regions if region.type == "WINDOW")
                 with context.temp_override(area=area, region=region):
                     bpy.ops.view3d.view_selected()
-        _shown = number
-        self.say("INFO", f"{number + 1} of {len(_findings):,}: {kind}, of {' and '.join(places)}")
+        _last.shown = number
+        self.say("INFO", f"{number + 1} of {len(_last.findings):,}: {kind}, of {' and '.join(places)}")
         return {"FINISHED"}
 
 
 class WARP_BSC_OT_repair(_Operator):
-    """Moves vertices until no edge meets a face: in edit mode those that are selected, else all of the active object."""
+    """Moves vertices until no edge meets a face: selected ones in edit mode, else all of the active object."""
 
     bl_idname, bl_label = "warp_bsc.repair", "Repair"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     time_limit: bpy.props.FloatProperty(
         name="Time Limit", description="Time after which the search ends [s]", default=60.0, min=1.0
     )
 
-    def run(self, context):
+    def _run(self, context):
         bsc = _library()
         surface = Surface(_chosen(context))
         if context.mode == "EDIT_MESH":
@@ -291,9 +296,10 @@ class WARP_BSC_PT_panel(bpy.types.Panel):
     bl_space_type, bl_region_type, bl_category = "VIEW_3D", "UI", "warp-bsc"
 
     def draw(self, context):
+        """Draws the commands and the last message."""
         for operator in (WARP_BSC_OT_check, WARP_BSC_OT_next, WARP_BSC_OT_repair):
             self.layout.operator(operator.bl_idname)
-        for line in _said[1:] and _said[1].split("; "):
+        for line in _last.said[1].split("; "):
             self.layout.label(text=line)
 
 
