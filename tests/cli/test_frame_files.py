@@ -155,6 +155,8 @@ def test_where_nothing_collides_the_frames_are_copied(folder, capsys):
         (["--output", "f_#.ply", "--previous", "body.obj"], "--previous is not for frames of mesh files"),
         (["--output", "f_#.ply", "--frames", "1:2"], "--frames is not for frames of mesh files"),
         (["--output", "f_#.ply", "--keep", "x"], "--keep: no"),
+        (["--output", "f_#.ply", "--report", "body.obj"], "--report must be a file of its own, .html, not body.obj"),
+        (["--output", "f_#.ply", "--report", "-"], "--report must be a file of its own, .html, not standard output"),
     ],
 )
 def test_errors_of_frames(folder, capsys, arguments, error):

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from replay_files import Page
 
 import warp_bsc as bsc
 from warp_bsc._atomic_file import OutputFile
@@ -168,7 +169,9 @@ def test_what_is_not_freed_is_named(folder, capsys):
         trimesh.Trimesh(np.column_stack([x, 0.0 * x[:, 0]]), faces, process=False).export(f"{name}.obj", digits=17)
     os.mkdir("free")
     scene = ["low.obj", "high.obj", "--output", "free"]
-    facts = facts_of(capsys, *scene, "--fail-on", "remaining", status=1)
+    facts = facts_of(capsys, *scene, "--fail-on", "remaining", "--report", "page.html", status=1)
+    page = Page((folder / "page.html").read_text()).data
+    assert page["tiles"][-1] == ["all but 1", "moved frames certified"]
     (contour,) = facts["unresolved"]
     assert "--order or --previous may tell" in contour["reason"] and facts["certified"] is False
     assert {element["of"] for pair in contour["elements"] for element in pair} == {"low.obj", "high.obj"}

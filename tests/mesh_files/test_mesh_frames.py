@@ -107,6 +107,15 @@ def test_the_motion_from_frame_to_frame_is_replayed(folder, name):
     assert not results[1].summary.intersections[1].crossings
 
 
+def test_frames_of_a_soup_that_turns_have_the_same_faces(folder):
+    for number in range(3):
+        BALL.copy().apply_transform(trimesh.transformations.rotation_matrix(number, [1, 2, 3])).export(
+            f"b_{number}.stl"
+        )
+    scene = FileScene(find_frames(["b_#.stl"]))
+    assert len(scene) == 2 and not any("other faces" in warning for warning in scene.warnings)
+
+
 def test_single_precision_stays(folder):
     write_frames({1: 0.0, 2: 0.1})
     scene = FileScene(find_frames(["ball_##.ply"]))

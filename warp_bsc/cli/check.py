@@ -22,7 +22,7 @@ from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import DEVICE, JSON, Commands, add_command, add_fail_on, add_options, file_option, several
 from .progress import RunProgress
-from .repair_files import in_words, read_frames
+from .repair_files import check_page, in_words, read_frames
 from .tables import Console, print_table, say
 
 _DESCRIPTION = """\
@@ -78,6 +78,7 @@ def add_to(commands: Commands, summary: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    check_page(arguments.report)
     frames = _with_motion(find_frames(arguments.files))
     is_motion = len(frames.numbers) > 1
     device = find_device(arguments.device)

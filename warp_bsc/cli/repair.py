@@ -32,7 +32,7 @@ from .options import (
     positive_real,
     scene_path,
 )
-from .repair_files import read_frames, repair_files
+from .repair_files import check_page, read_frames, repair_files
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
 from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
@@ -54,9 +54,10 @@ of its own. The layer is then replayed, and what remains is named.
 If Ctrl-C, SIGTERM, SIGHUP, an error or a full disk stops the run, the layer
 ends at the last repaired frame, and is marked partial. If it is killed too, a
 file beside the layer remains from which --resume continues.
-Mesh files (.obj, .off, .ply, .stl) are one configuration: they are written again
-with coordinates at which no edge meets a face, all else as it was, and what was
-written is read and checked exactly. Several files are one scene."""
+Mesh files (.glb, .obj, .off, .ply, .stl) are written again with coordinates at
+which no edge meets a face, all else as it was, and what was written is read and
+checked exactly. Several files are one scene. Files with numbers, such as
+'coat_####.ply', are frames of a shot, which is repaired as one of USD."""
 
 _EPILOG = f"""\
 examples:
@@ -68,6 +69,7 @@ examples:
   warp-bsc repair shot.usd --output fixed.usdc --fail-on remaining --json > done.json
   warp-bsc repair garment.obj --output free.obj
   warp-bsc repair body.obj garment.obj --keep body.obj --output free.obj
+  warp-bsc repair body.obj 'coat_####.ply' --output 'free/coat_####.ply'
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
 
@@ -80,7 +82,7 @@ _OF_FRAMES = {"max_move", "resume"}
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
     command = add_command(commands, "repair", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or one or several mesh files")
+    command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or mesh files, # for digits")
     which = command.add_argument_group("selection")
     add_options(which, {"--keep": patterns("obstacles: prims, and all below, or files that stay; * matches any text")})
     add_scene_selection(which)
@@ -108,7 +110,7 @@ def add_to(commands: Commands, summary: str) -> None:
         },
     )
     previous = "the files of a time before at which nothing crosses, such as the last frame, in the same order"
-    files = command.add_argument_group("repair of mesh files")
+    files = command.add_argument_group("repair of mesh files of one frame")
     add_options(files, {"--max-strain": number(positive_real, "strain to keep to (default: %(default)s)", default=0.1)})
     add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
     add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
@@ -117,7 +119,9 @@ def add_to(commands: Commands, summary: str) -> None:
     add_options(
         out,
         {
-            "--output": file_option("the USD layer, .usda, .usdc or .usd; or a mesh file, or a folder", required=True),
+            "--output": file_option(
+                "the USD layer, .usda, .usdc or .usd; or a mesh file, # for digits, or a folder", required=True
+            ),
             "--report": file_option(
                 "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
             ),
@@ -142,9 +146,9 @@ def _run(arguments: argparse.Namespace) -> int:
     for name, value in vars(arguments).items():
         if name not in options and value != arguments.default_of(name):
             raise ValueError(f"--{name.replace('_', '-')} is not for {kind}")
-    for name in ("output", "report"):
-        if getattr(arguments, name) == STDOUT:
-            raise ValueError(f"--{name} must be a file, not standard output")
+    check_page(arguments.report)
+    if arguments.output == STDOUT:
+        raise ValueError("--output must be a file, not standard output")
     if frames and kind == "mesh files":
         return repair_files(frames, arguments)
     device = find_device(arguments.device)

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .._atomic_file import OutputFile, naming
+from .._atomic_file import STDOUT, OutputFile, naming
 from ..bench.tables import LONGEST, Column, count
 from ..detection.mesh import CollisionMesh
 from ..mesh_files.check import find_meeting
 from ..mesh_files.file_scene import FileScene
 from ..mesh_files.frames import Frames
-from ..mesh_files.mesh_file import MeshFile, MeshScene
+from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
 from ..repairing.repair import repair
+from ..repairing.results import RepairResult
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
 from ..repairing.shot.stretch import FollowedMesh, ShotFrame, StretchRecorder
@@ -32,6 +33,14 @@ _FILES = (
     Column("largest move", "largest_move", ".3g"),
     Column("written to", "output", kind="text"),
 )
+
+
+def check_page(path: str | None) -> None:
+    """Raises a ValueError if a page would be written to standard output, or over a mesh."""
+    if path == STDOUT or (path and is_mesh_file(path)):
+        raise ValueError(
+            f"--report must be a file of its own, .html, not {'standard output' if path == STDOUT else path}"
+        )
 
 
 def read_frames(frames: Frames) -> FileScene:
@@ -68,15 +77,15 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
                 min_distance=arguments.min_distance,
                 max_strain=arguments.max_strain,
             )
-        contents = map(MeshFile.with_positions, scene.files, scene.of_files(np.asarray(result.x)))
+        xs = scene.of_files(np.asarray(result.x))
+        contents = map(MeshFile.with_positions, scene.files, xs)
         for file, data in zip(files, itertools.compress(contents, ~kept), strict=True):
             file.write(data)
         for file in files:
             file.commit()
         paths = [output or file.path for file, output in zip(scene.files, outputs, strict=True)]
         if page:
-            reasons = [contour.reason for contour in result.unresolved]
-            _write_page(page, frames, frames._replace(paths=[paths]), reasons, arguments)
+            _write_page(page, read_frames(frames), read_frames(frames._replace(paths=[paths])), xs, result, arguments)
     written = MeshScene(paths)
     with np.errstate(over="ignore"):
         rounded = written.x.astype(np.float32)
@@ -131,33 +140,34 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
 
 
 def _write_page(
-    page: RepairPage, frames: Frames, written: Frames, reasons: list[str], arguments: argparse.Namespace
+    page: RepairPage,
+    before: FileScene,
+    after: FileScene,
+    xs: list[np.ndarray],
+    result: RepairResult,
+    arguments: argparse.Namespace,
 ) -> None:
-    """Writes the page of a repair of one frame, given the files before and after, and why something remains."""
-    before, after = read_frames(frames), read_frames(written)
+    """Writes the page of a repair of one frame, given the files before and after, and the positions of each file."""
     device, kept = str(find_device(arguments.device)), kept_meshes(before, arguments.keep)
-    findings = [
-        find(scene, activity, arguments, device, ()) for scene, activity in ((before, "Finding"), (after, "Checking"))
-    ]
     segment, time = before.segment(0), before.times[0]
     given = segment.start_positions
     x, is_movable = given.copy(), np.zeros(len(given), bool)
     for number, mesh in enumerate(segment.meshes):
-        x[segment.vertices_of(number)] = after.read(number, time).x[mesh.points]
+        x[segment.vertices_of(number)] = xs[number][mesh.points]
         is_movable[segment.vertices_of(number)] = mesh.name not in kept
     edges = CollisionMesh(segment.faces, len(given), device=device).edges
     length = float(np.median(np.linalg.norm(given[edges[:, 0]] - given[edges[:, 1]], axis=1)))
     recorder = StretchRecorder(FollowedMesh(is_movable, edges, length))
     (vertices,) = np.nonzero((x != given).any(axis=1))
     moved = MovedFrame(time, False, segment, vertices, x[vertices].astype(np.float64))
-    recorder.add(ShotFrame(given, x, x - given), moved)
-    stretches = [recorder.finish(reasons)]
+    recorder.add(ShotFrame(given, x, x - given, result.certified), moved)
+    stretches = [recorder.finish([contour.reason for contour in result.unresolved])]
     with naming(page.file.name):
         page.write(
             before,
             stretches=lambda: stretches,
-            before=findings[0],
-            after=findings[1],
+            before=find(before, "Finding", arguments, device, ()),
+            after=find(after, "Checking", arguments, device, ()),
             kept=kept,
             min_distance=arguments.min_distance,
         )

@@ -1,6 +1,7 @@
 """Reads GLB files, glTF 2.0 in one binary file. Errors are ValueErrors that name what cannot be kept exactly."""
 
 import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from .text_formats import KEPT_NORMALS, Contents
 
+_BLANKS = re.compile(r"[ \t\r\n]*")
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _TRIANGLES: dict[int, Callable[[np.ndarray], list[np.ndarray]]] = {  # corners of each, by mode, given their numbers
@@ -153,71 +155,56 @@ class _Glb:
 
     def _with_bounds(self, data: bytes) -> bytes:
         """Returns the file with the least and largest coordinates of its accessors of positions as they are now."""
-        edits = []
+        edits, text = [], self._text
+        root = _members(text, _after_blanks(text, 0))
+        accessors = _members(text, root["accessors"][0])
         for number in self._positions:
             new, old = self._array(number, "", data), self._array(number, "")
             if np.array_equal(new, old, equal_nan=True):
                 continue
-            accessor = _members(self._text, _place(self._text, ["accessors", number]))
+            accessor = _members(text, accessors[number][0])
             for key, values in (("min", np.fmin.reduce(new)), ("max", np.fmax.reduce(new))):
-                spans = _members(self._text, accessor[key][0]).values() if key in accessor else ()
+                spans = _members(text, accessor[key][0]).values() if key in accessor else ()
                 for (start, end), value in zip(spans, values.tolist(), strict=False):
-                    if np.float32(self._text[start:end]) != np.float32(value):
+                    if np.float32(text[start:end]) != np.float32(value):
                         edits.append((start, end, repr(value)))
         parts, at = [], 0
         for start, end, number in sorted(edits):
-            parts += self._text[at:start], number
+            parts += text[at:start], number
             at = end
-        text = "".join([*parts, self._text[at:]]).encode()
-        text += b" " * (-len(text) % 4)
-        rest = data[self._start - 8 :]
-        sizes = [int.from_bytes(data[8:12], "little") + len(text) - (self._start - 28), len(text)]
+        chunk = "".join([*parts, text[at:]]).encode()
+        chunk += b" " * (-len(chunk) % 4)
+        sizes = [int.from_bytes(data[8:12], "little") + len(chunk) - (self._start - 28), len(chunk)]
         head = [data[:8], *(size.to_bytes(4, "little") for size in sizes), data[16:20]]
-        return b"".join([*head, text, rest]) if edits else data
+        return b"".join([*head, chunk, data[self._start - 8 :]]) if edits else data
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
     """Returns the transform of a node to its parent, shape [4, 4]."""
+    from trimesh.transformations import quaternion_matrix, translation_matrix  # noqa: PLC0415 (slow)
+
     if "matrix" in node:
         return np.array(node["matrix"], float).reshape(4, 4).T
     x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(turn, float) * np.array(node.get("scale", (1, 1, 1)), float)
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
-
-
-def _place(text: str, keys: list[str | int]) -> int:
-    """Returns where the value of a path of keys begins in JSON."""
-    at = _blank(text, 0)
-    for key in keys:
-        at = _members(text, at)[key][0]
-    return at
+    scale = np.diag([*node.get("scale", (1, 1, 1)), 1])
+    return translation_matrix(node.get("translation", (0, 0, 0))) @ quaternion_matrix((w, x, y, z)) @ scale
 
 
 def _members(text: str, at: int) -> dict[str | int, tuple[int, int]]:
     """Returns the first character and that after the last of the members of an object or array at a place of JSON."""
     decode, is_object, found = json.JSONDecoder().raw_decode, text[at] == "{", {}
-    at = _blank(text, at + 1)
+    at = _after_blanks(text, at + 1)
     while text[at] not in "]}":
         key = len(found)
         if is_object:
             key, at = decode(text, at)
-            at = _blank(text, _blank(text, at) + 1)  # after the colon
+            at = _after_blanks(text, _after_blanks(text, at) + 1)  # and the colon
         _, end = decode(text, at)
         found[key] = at, end
-        at = _blank(text, end)
-        at = _blank(text, at + 1) if text[at] == "," else at
+        at = _after_blanks(text, end)
+        at = _after_blanks(text, at + 1) if text[at] == "," else at
     return found
 
 
-def _blank(text: str, at: int) -> int:
-    """Returns the place of the next character that is not blank."""
-    while text[at] in " \t\r\n":
-        at += 1
-    return at
+def _after_blanks(text: str, at: int) -> int:
+    return _BLANKS.match(text, at).end()  # pyright: ignore (it always matches)
