@@ -137,6 +137,24 @@ def test_an_error_while_a_frame_is_written_leaves_the_frames_before(folder, monk
     assert all(len(MeshFile(f"free/{name}").x) == len(SHEET.vertices) for name in os.listdir("free"))
 
 
+def test_frames_before_and_after_a_change_of_faces_are_repaired(folder, capsys):
+    for number in range(7, 13):
+        mesh = trimesh.creation.icosphere(3 if number < 10 else 2, radius=0.5)
+        mesh.apply_translation([0.0, 0.0, 0.05 + 0.001 * number]).export(f"coat_{number:04}.ply")
+    for number in {*HEIGHTS} - {*range(7, 13)}:
+        os.remove(f"coat_{number:04}.ply")
+    assert run("repair", "--output", "free/", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (
+        facts["before"]["intersections"] > 0 == facts["remaining"]["intersections"] == facts["remaining"]["collisions"]
+    )
+    assert {frame["time"] for stretch in facts["stretches"] for frame in stretch["frames"]} == set(range(7, 13))
+    for number in range(7, 13):
+        before, after = MeshFile(f"coat_{number:04}.ply"), MeshFile(f"free/coat_{number:04}.ply")
+        assert (before.faces == after.faces).all()
+        assert 0.0 < np.abs(after.x - before.x).max() < 0.1
+
+
 def test_where_nothing_collides_the_frames_are_copied(folder, capsys):
     capsys.readouterr()
     assert main(["repair", "coat_000[1-5].ply", "--output", "free/", "--device", "cpu"]) == 0
