@@ -1,6 +1,7 @@
 """The add-on for Blender, in Blender as a module: what it checks, what it moves, and what it leaves alone."""
 
 import importlib.util
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ pytestmark = pytest.mark.skipif(not importlib.util.find_spec("bpy"), reason="nee
 
 START = f"""
 import sys
+from types import SimpleNamespace
 sys.path.append({str(ADDON.parent)!r})
 import bpy, numpy as np, warp_bsc as bsc, warp_bsc_addon as addon
 bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -61,8 +63,9 @@ check, following, repair = bpy.ops.warp_bsc.check, bpy.ops.warp_bsc.next, bpy.op
 """
 
 
-def run(code):
-    found = subprocess.run([sys.executable, "-c", START + code], capture_output=True, text=True, check=False)
+def run(code, start=START, **environment):
+    command, environment = [sys.executable, "-c", start + code], os.environ | environment
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert found.returncode == 0, f"{found.stdout}\n{found.stderr}"
 
 
@@ -79,6 +82,10 @@ for number in range(count + 1):
     obj.update_from_editmode()
     selected = {v.index for v in obj.data.vertices if v.select}
     assert selected == set(last.findings[number % count][1]["First"]) and 3 <= len(selected) <= 5
+shown = []
+layout = SimpleNamespace(operator=shown.append, label=lambda text: shown.append(text))
+addon.WARP_BSC_PT_panel.draw(SimpleNamespace(layout=layout), None)
+assert shown == ["warp_bsc.check", "warp_bsc.next", "warp_bsc.repair", f"1 of {count}: edge through a face, of First"]
 bpy.ops.mesh.delete(type="VERT")
 bpy.ops.mesh.select_all(action="SELECT")
 bpy.ops.mesh.delete(type="VERT")
@@ -232,3 +239,20 @@ fails("warp-bsc is missing in Blender's Python", check)
 addon.unregister()
 assert not hasattr(bpy.types, "WARP_BSC_OT_check")
 """)
+
+
+def test_blender_installs_it(tmp_path):
+    run(
+        f"""
+import bpy
+bpy.ops.preferences.addon_install(filepath={str(ADDON)!r})
+assert bpy.ops.preferences.addon_enable(module="warp_bsc_addon") == {{"FINISHED"}}
+assert bpy.types.WARP_BSC_PT_panel.bl_category == "warp-bsc"
+assert bpy.ops.preferences.addon_disable(module="warp_bsc_addon") == {{"FINISHED"}}
+assert not hasattr(bpy.types, "WARP_BSC_PT_panel")
+""",
+        start="",
+        BLENDER_USER_SCRIPTS=str(tmp_path / "scripts"),
+        BLENDER_USER_CONFIG=str(tmp_path / "config"),
+    )
+    assert list(tmp_path.rglob("warp_bsc_addon.py"))

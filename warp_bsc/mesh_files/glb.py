@@ -115,18 +115,19 @@ class _Glb:
 
     def _places(self, points: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the places of the coordinates of all points in the file, each once, and the number of each point."""
-        starts, is_position = np.zeros(points, np.int64), np.zeros(len(self._data), bool)
+        starts = np.zeros(points, np.int64)
         for number, first in self._positions.items():
             start, stride, count, _ = self._span(number, "positions")
             starts[first : first + count] = start + stride * np.arange(count)
         starts, numbers = np.unique(starts, return_inverse=True)
-        is_position[starts[:, None] + np.arange(12)] = True
         if (np.diff(starts) < 12).any():
             raise ValueError("positions of its primitives overlap in the binary data")
         for number, accessor in enumerate(self._gltf.get("accessors", ())):
-            if number not in self._positions and "bufferView" in accessor:
+            if points and number not in self._positions and "bufferView" in accessor:
                 start, stride, count, size = self._span(number, "the elements")
-                if is_position[start + stride * np.arange(count)[:, None] + np.arange(size)].any():
+                rows = start + stride * np.arange(count)
+                before = np.searchsorted(starts, rows + size) - 1  # the last position that starts before its end
+                if ((before >= 0) & (starts[before] + 12 > rows)).any():
                     raise ValueError(f"accessor {number} has bytes of positions, and would move with them")
         places = starts[:, None] + 4 * np.arange(3)
         return np.stack([places, places + 4], axis=2), numbers.reshape(-1)
