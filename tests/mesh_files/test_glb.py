@@ -125,6 +125,17 @@ def test_positions_and_their_bounds_change_and_nothing_else(tmp_path, indent):
         assert (np.float32(accessor["max"]) == rows.max(axis=0)).all()
 
 
+def test_vertices_are_numbered_in_the_order_of_primitives(tmp_path):
+    """Not in that of the binary data: the second mesh is of accessor 5, whose points come later."""
+    gltf, binary = example()
+    del gltf["meshes"][0]
+    gltf["meshes"].reverse()
+    gltf["nodes"][1:] = [{"mesh": 0}, {"mesh": 1}, {}]
+    mesh = read(tmp_path, glb(gltf, binary))
+    assert mesh.x.tobytes() == X[[5, 6, 7, 8, 0, 1, 2, 3, 4]].tobytes()
+    assert mesh.faces.tolist() == [[1, 2, 0], [2, 3, 0], [4, 5, 6], [5, 7, 6], [6, 7, 8]]
+
+
 def test_a_file_of_another_writer_has_the_same_bits_for_it(tmp_path):
     scene = trimesh.Scene([SPHERE, SPHERE.copy().apply_translation([3.0, 0, 0])])
     mesh = read(tmp_path, scene.export(file_type="glb"))

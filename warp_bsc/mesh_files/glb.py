@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .text_formats import KEPT_NORMALS, Contents
+from .text_formats import KEPT_NORMALS, Contents, first_of_each
 
 _BLANKS = re.compile(r"[ \t\r\n]*")
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -119,7 +119,9 @@ class _Glb:
         for number, first in self._positions.items():
             start, stride, count, _ = self._span(number, "positions")
             starts[first : first + count] = start + stride * np.arange(count)
-        starts, numbers = np.unique(starts, return_inverse=True)
+        order, numbers = first_of_each(starts)
+        places = starts[order, None] + 4 * np.arange(3)
+        starts = np.unique(starts)
         if (np.diff(starts) < 12).any():
             raise ValueError("positions of its primitives overlap in the binary data")
         for number, accessor in enumerate(self._gltf.get("accessors", ())):
@@ -129,8 +131,7 @@ class _Glb:
                 before = np.searchsorted(starts, rows + size) - 1  # the last position that starts before its end
                 if ((before >= 0) & (starts[before] + 12 > rows)).any():
                     raise ValueError(f"accessor {number} has bytes of positions, and would move with them")
-        places = starts[:, None] + 4 * np.arange(3)
-        return np.stack([places, places + 4], axis=2), numbers.reshape(-1)
+        return np.stack([places, places + 4], axis=2), numbers
 
     def _notes_on_transforms(self) -> list[str]:
         """Returns what is to be said of the transforms of nodes; raises a ValueError if they differ."""

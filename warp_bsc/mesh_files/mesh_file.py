@@ -9,7 +9,7 @@ import numpy as np
 from .._atomic_file import naming
 from .glb import read_glb
 from .ply import read_ply
-from .text_formats import read_obj, read_off, read_stl
+from .text_formats import first_of_each, read_obj, read_off, read_stl
 
 READERS = {".glb": read_glb, ".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl}
 """The function that reads the files whose names end so."""
@@ -51,9 +51,8 @@ class MeshFile:
         self.notes = notes + ["polygons are checked as fans from the first corner"] * bool((counts > 3).any())
         self.x, self._vertices = points, np.arange(len(points))
         if suffix == ".stl":
-            _, first, vertices = np.unique(points, axis=0, return_index=True, return_inverse=True)
-            order = np.sort(first)  # as in the file, so that frames of one soup have the same faces
-            self.x, self._vertices = points[order], np.searchsorted(order, first[vertices.reshape(-1)])
+            order, self._vertices = first_of_each(points)  # so that frames of one soup have the same faces
+            self.x = points[order]
         in_face = counts - 2
         self.polygons = np.repeat(np.arange(len(counts)), in_face)
         first = (np.cumsum(counts) - counts)[self.polygons]

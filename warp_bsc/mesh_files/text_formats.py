@@ -90,6 +90,13 @@ def read_stl(data: bytes) -> Contents:
     return Contents(places, _DOUBLE, True, counts, range(sum(counts)), [KEPT_NORMALS])
 
 
+def first_of_each(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the rows that are the first with their value, ascending, and for each row the number of its value."""
+    _, first, numbers = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    order = np.sort(first)
+    return order, np.searchsorted(order, first[numbers.reshape(-1)])  # NumPy 2.0 shapes it otherwise
+
+
 def lines_of(text: bytes, at: int) -> Iterator[tuple[int, int]]:
     """Yields the places of the lines that are not empty, from a byte on; an error in place of the end."""
     for line in _LINE.finditer(text, at):
