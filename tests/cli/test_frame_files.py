@@ -122,6 +122,20 @@ def test_an_interrupted_repair_leaves_whole_frames_from_which_it_is_resumed(fold
     assert len(os.listdir("free")) == 50 and not os.path.exists("free.part")
 
 
+def test_a_repair_that_is_interrupted_before_anything_is_repaired_writes_nothing(folder, monkeypatch):
+    module = __import__("warp_bsc.cli.repair_run", fromlist=["replay"])
+    whole = module.replay
+
+    def stopped(*arguments, **options):
+        for result in whole(*arguments, **options):
+            yield result
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(module, "replay", stopped)
+    assert run("repair", "--output", "f_#.ply") == 130
+    assert not [name for name in os.listdir() if name.startswith(("f_", "."))]
+
+
 def test_an_error_while_a_frame_is_written_leaves_the_frames_before(folder, monkeypatch, capsys):
     file = __import__("warp_bsc._atomic_file", fromlist=["OutputFile"]).OutputFile
     write = file.write

@@ -28,8 +28,9 @@ from .tables import Console, print_table, say
 _DESCRIPTION = """\
 Find what crosses, touches or lies inside in mesh files (.glb, .obj, .off, .ply,
 .stl), exactly, and the faces and edges that are not sound. Several files are one
-scene. Files with numbers are frames of a motion: find the collisions between
-each two, and what crosses in each. So are two files of the same faces.
+scene. A name such as coat_####.ply, or 'coat_*.ply' in quotes, stands for the
+frames of a motion: find the collisions between each two, and what crosses in
+each. Two files of the same faces are a motion, too.
 Vertices of borders in one place are one, as at seams of textures. Elements are
 named by their numbers in their files, which count from 0; --json has all."""
 
@@ -71,7 +72,7 @@ Findings = list[list[dict[str, Any]]]
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
     command = add_command(commands, "check", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    files = several("FILE", "a mesh file, or a pattern: # for a digit of the number of a frame, * in quotes", nargs="+")
+    files = several("FILE", "a mesh file; # stands for a digit of the number of a frame", nargs="+")
     page = file_option("a page with a timeline, every frame in 3D, and a table of what crosses or collides, .html")
     add_options(command, {"files": files, "--report": page, **JSON, **DEVICE})
     add_fail_on(command, _KINDS)

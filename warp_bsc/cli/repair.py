@@ -56,8 +56,8 @@ ends at the last repaired frame, and is marked partial. If it is killed too, a
 file beside the layer remains from which --resume continues.
 Mesh files (.glb, .obj, .off, .ply, .stl) are written again with coordinates at
 which no edge meets a face, all else as it was, and what was written is read and
-checked exactly. Several files are one scene. Files with numbers, such as
-'coat_####.ply', are frames of a shot, which is repaired as one of USD."""
+checked exactly. Several files are one scene. A name such as coat_####.ply, or
+'coat_*.ply' in quotes, stands for the frames of a shot, repaired as one of USD."""
 
 _EPILOG = f"""\
 examples:

@@ -104,7 +104,8 @@ class RepairRun:
             except Exception as error:
                 self.interrupt = INTERRUPTS.came  # a library may have turned it into another error
                 self.problems += [] if self.interrupt else [describe(error)]
-            if isinstance(self._layer, PointsLayer) and not any(stretch.moved for stretch in self.stretches):
+            is_layer = isinstance(self._layer, PointsLayer)
+            if not done or (is_layer and not any(stretch.moved for stretch in self.stretches)):
                 return  # an earlier file is better than an empty one
             if done < len(self.scene):
                 self._layer.end = self.scene.times[done]
