@@ -16,13 +16,13 @@ from ..mesh_files.frames import Frames, find_frames
 from ..mesh_files.mesh_file import MeshScene
 from ..repairing.surface import weld_borders, welded
 from ..scene_replay.html_report import ReportPage
-from ..scene_replay.intervals import replay
 from ..scene_replay.summary import Summary
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import DEVICE, JSON, Commands, add_command, add_fail_on, add_options, file_option, several
 from .progress import RunProgress
 from .repair_files import check_page, in_words, read_frames
+from .repair_run import tracked
 from .tables import Console, print_table, say
 
 _DESCRIPTION = """\
@@ -134,11 +134,10 @@ def _report(path: str, frames: Frames, device: str) -> None:
     scene = read_frames(frames)
     page, intervals = ReportPage(path, scene=scene), []
     try:
-        with RunProgress("Replaying") as progress, naming(path):
-            for result in replay(scene, device=device):
+        with naming(path):
+            for result in tracked(scene, "Replaying", device):
                 page.add(result)
                 intervals.append(result.summary)
-                progress.show(len(intervals), len(scene))
             page.finish(Summary(scene, intervals=intervals, method="exact", device=device, clearance=None))
     finally:
         page.discard()

@@ -29,6 +29,7 @@ class FileScene(Scene):
 
     Attributes:
         frames: The files.
+        meshes: The files of each name.
     """
 
     def __init__(self, frames: Frames, progress: Callable[[int, int], None] | None = None):
@@ -51,8 +52,8 @@ class FileScene(Scene):
         self._segment = self._span = None
         self.files = _Files(frames)
         columns = zip(frames.names, frames.are_several, zip(*frames.paths, strict=True), strict=True)
-        self._usd_meshes = meshes = [
-            _FrameMesh(name, dict(zip(map(float, frames.numbers), paths, strict=True)), moves)
+        self._usd_meshes = self.meshes = meshes = [
+            FrameMesh(name, dict(zip(map(float, frames.numbers), paths, strict=True)), moves)
             for name, moves, paths in columns
         ]
         self._by_name = {mesh.name: mesh for mesh in meshes}
@@ -82,10 +83,6 @@ class FileScene(Scene):
         self.has_strands, self.turning = False, 0
         segment = self.segment(0)
         self.vertex_count, self.face_count = segment.vertex_count, len(segment.faces)
-
-    def read(self, number: int, time: float) -> MeshFile:
-        """Returns the file of the mesh of a number at a frame."""
-        return self._usd_meshes[number].read(time)
 
 
 class FrameFiles:
@@ -148,7 +145,7 @@ class FrameFiles:
         for number, output in enumerate(self._outputs[self._scene.frames.numbers.index(int(time))]):
             if output is None:
                 continue
-            mesh = self._scene.read(number, time)
+            mesh = self._scene.meshes[number].read(time)
             x = mesh.x.copy()
             if number in moved:
                 vertices, positions = moved[number]
@@ -174,7 +171,7 @@ class _Files(SceneFiles):
         """Does nothing: all files are known."""
 
 
-class _FrameMesh:
+class FrameMesh:
     """The files of one name, as a segment reads a mesh."""
 
     display_name, instanced_prim = "", ""
