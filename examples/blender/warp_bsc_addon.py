@@ -249,6 +249,8 @@ class WARP_BSC_OT_repair(_Operator):
     )
 
     def _run(self, context):
+        if context.mode not in ("OBJECT", "EDIT_MESH"):
+            raise ValueError("repair works in object mode and in edit mode")
         bsc = _library()
         surface = Surface(_chosen(context))
         if context.mode == "EDIT_MESH":

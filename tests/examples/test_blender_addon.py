@@ -231,6 +231,9 @@ twin.location.x = 1.0
 twin.select_set(True)
 bpy.context.view_layer.update()
 fails("shares its mesh", repair)
+bpy.ops.object.mode_set(mode="SCULPT")
+fails("object mode and in edit mode", repair)
+bpy.ops.object.mode_set(mode="OBJECT")
 obj.data.vertices[0].co.x = float("nan")
 fails("finite", check)
 obj.data.vertices[0].co.x = 0.0
