@@ -11,7 +11,7 @@ import trimesh
 
 import warp_bsc as bsc
 from warp_bsc.mesh_files.file_scene import FileScene
-from warp_bsc.mesh_files.frames import Frames, find_frames
+from warp_bsc.mesh_files.frames import Frames, find_frames, make_folder
 
 BALL = trimesh.creation.icosphere(1)
 PLATE = trimesh.Trimesh([[-9, -9, 0], [9, -9, 0], [0, 9, 0]], [[0, 1, 2]])
@@ -65,9 +65,12 @@ def test_outputs(folder):
     touch("body.obj", "a_09.obj", "a_10.obj", "b_9.ply", "b_10.ply")
     frames = find_frames(["body.obj", "a_##.obj", "b_#.ply"])
     assert frames.outputs(["b_*"], "free_####.obj") == [[None, "free_0009.obj", None], [None, "free_0010.obj", None]]
-    assert not os.path.exists("out")
     assert frames.outputs([], "out/") == [[None, "out/a_09.obj", "out/b_9.ply"], [None, "out/a_10.obj", "out/b_10.ply"]]
-    assert os.path.isdir("out")
+    assert not os.path.exists("out")
+    make_folder("out")
+    assert not os.path.exists("out")
+    make_folder("out/x/")
+    assert os.path.isdir("out/x")
     assert find_frames(["body.obj"]).outputs([], "x#.obj") == [["x#.obj"]]
     for names, keep, output, error in (
         (["a_##.obj"], [], "free.obj", "free.obj: must be a folder, or have #"),

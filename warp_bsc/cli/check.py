@@ -83,6 +83,8 @@ def _run(arguments: argparse.Namespace) -> int:
     frames = _with_motion(find_frames(arguments.files))
     is_motion = len(frames.numbers) > 1
     device = find_device(arguments.device)
+    if arguments.report:
+        _report(arguments.report, frames, str(device))
     findings: dict[str, Findings] = {kind: [] for kind in _KINDS if is_motion or kind != "collisions"}
     notes: dict[str, None] = {}
     last = None
@@ -100,8 +102,6 @@ def _run(arguments: argparse.Namespace) -> int:
                 if not has_motion or kind in _OF_POSITIONS:
                     findings[kind] += found
             last = scene
-    if arguments.report:
-        _report(arguments.report, frames, str(device))
     if arguments.json:
         facts = {"device": str(device), "is_motion": is_motion, "frames": frames.numbers}
         print(json.dumps(facts | {"findings": findings, "notes": list(notes)}, indent=1))

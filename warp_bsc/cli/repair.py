@@ -8,7 +8,7 @@ from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
 from ..mesh_files.file_scene import FileScene, FrameFiles
-from ..mesh_files.frames import find_frames
+from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
@@ -154,8 +154,9 @@ def _run(arguments: argparse.Namespace) -> int:
     device = find_device(arguments.device)
     chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
     if frames:
-        scene, outputs = read_frames(frames), frames.outputs(arguments.keep, arguments.output)
-        arguments.include_initial = True  # frames have no scene in which parts of a body are meant to cross
+        outputs = frames.outputs(arguments.keep, arguments.output)
+        scene = read_frames(frames)
+        arguments.include_initial = True  # all that crosses is repaired, as in files of one frame
     else:
         scene, outputs = _open_usd(arguments, chosen), []
     kept = kept_meshes(scene, arguments.keep)
@@ -170,6 +171,7 @@ def _run(arguments: argparse.Namespace) -> int:
             page = RepairPage(arguments.report)
             stack.callback(page.discard)
         if isinstance(scene, FileScene):
+            make_folder(arguments.output)
             layer = FrameFiles(scene, outputs)
         else:
             layer = PointsLayer(arguments.output, scene=scene)

@@ -14,7 +14,7 @@ from ..bench.tables import LONGEST, Column, count
 from ..detection.mesh import CollisionMesh
 from ..mesh_files.check import find_meeting
 from ..mesh_files.file_scene import FileScene
-from ..mesh_files.frames import Frames
+from ..mesh_files.frames import Frames, make_folder
 from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
 from ..repairing.repair import repair
 from ..repairing.results import RepairResult
@@ -59,6 +59,7 @@ def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
         raise ValueError("--previous: the files must have the faces of the scene")
     kept = np.array([output is None for output in outputs])
     mesh = _mesh_of(scene, kept, device)
+    make_folder(arguments.output)
     with contextlib.ExitStack() as stack:
         files, page = [], None
         if arguments.report:

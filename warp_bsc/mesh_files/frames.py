@@ -30,15 +30,15 @@ class Frames(NamedTuple):
         return [len(self.numbers) > 1 and len(set(paths)) > 1 for paths in zip(*self.paths, strict=True)]
 
     def outputs(self, keep: Iterable[str], output: str, read: Iterable[str] = ()) -> list[list[str | None]]:
-        """Returns where each file is written to, None for those that are not; makes a folder that ends as one does.
+        """Returns where each file is written to, None for those that are not.
 
         Args:
             keep: Patterns of names that are not written. One file for several frames is not written either.
-            output: A folder, a file, or a name with # in place of the digits of the frame.
+            output: A folder, which need not exist if it ends in a slash, a file, or a name with # for the digits of the
+                frame.
             read: Other files that are read.
 
         Raises:
-            OSError: If the folder cannot be made.
             ValueError: If a pattern matches no name, or files would be written to one place, over one that is read, or
                 in another format.
         """
@@ -48,8 +48,7 @@ class Frames(NamedTuple):
             if not any(matching):
                 raise ValueError(f"--keep: no file matches {pattern}")
             kept = [a or b for a, b in zip(kept, matching, strict=True)]
-        is_new = output.endswith(("/", os.sep))
-        into = is_new or os.path.isdir(output)
+        into = _is_folder(output) or os.path.isdir(output)
         if kept.count(False) != 1 and not into:
             raise ValueError(f"{output}: must be a folder, as not one file may move; --keep names obstacles")
         if len(self.numbers) > 1 and not into and "#" not in os.path.basename(output):
@@ -74,9 +73,17 @@ class Frames(NamedTuple):
                 taken.add(os.path.realpath(to))
                 if os.path.splitext(to)[1].lower() != os.path.splitext(path)[1].lower():
                     raise ValueError(f"{to}: must end as {path} does, of which only coordinates are replaced")
-        if is_new:
-            os.makedirs(output, exist_ok=True)
         return found
+
+
+def make_folder(output: str) -> None:
+    """Makes the folder that an output is if it ends in a slash.
+
+    Raises:
+        OSError: If that fails.
+    """
+    if _is_folder(output):
+        os.makedirs(output, exist_ok=True)
 
 
 def find_frames(names: Sequence[str]) -> Frames:
@@ -95,6 +102,10 @@ def find_frames(names: Sequence[str]) -> Frames:
             raise ValueError(f"{name}: there is no file for frame {missing[0]}")
     pairs = list(zip(names, found, strict=True))
     return Frames(list(names), numbers, [[files.get(number, name) for name, files in pairs] for number in numbers])
+
+
+def _is_folder(output: str) -> bool:
+    return output.endswith(("/", os.sep))
 
 
 def _is_pattern(name: str) -> bool:
