@@ -203,9 +203,11 @@ class ReportPage(RecordFile):
 
     def _cameras(self, summary: Summary, center: list[float]) -> tuple[str, list[dict], int]:
         """Returns the blocks of the scene's cameras, their facts, and the number of cameras left out."""
+        scene = summary.scene
+        if scene.stage is None:  # of mesh files
+            return "", [], 0
         from ..usd.cameras import find_cameras, read_camera  # noqa: PLC0415 (imports pxr)
 
-        scene = summary.scene
         found = find_cameras(scene.stage)
         times = list(scene.times[: len(summary.intervals) + 1])
         most = min(_MOST_CAMERAS, max(1, _MOST_CAMERA_TIMES // len(times)))
