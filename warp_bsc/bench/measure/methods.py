@@ -22,6 +22,7 @@ The phase that decides a query and its clock cycles come from a kernel of its ow
 """
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +58,8 @@ _AXIS_BOXES, _BERNSTEIN_SIGNS, _SEPARATING_DIRECTION, _CLASSIFICATION, _SUBDIVIS
 )
 
 _WARP_SIZE = 32
+_SMALLEST_LAUNCH = {False: 2**18, True: 2**22}
+"""Queries of a launch on a CPU and on a GPU: fewer are repeated."""
 
 
 @wp.func_native("""
@@ -364,6 +367,21 @@ def measure_nanoseconds(run: MethodRun, *, repeat: int) -> float:
         repeat: Number of repetitions; their median counts.
     """
     return 1e6 * median_milliseconds(run.launch, run.queries.device, repeat) / run.queries.count
+
+
+def time_in_turns(
+    methods: Sequence[str], queries: Queries, device: wp.Device, turns: int, measure: Callable[[MethodRun], float]
+) -> dict[str, float]:
+    """Returns what is measured of each method in turns, of which the fastest counts: other work can only slow one down.
+
+    The first launch of each method, which loads its kernels, is not measured. Few queries are repeated.
+    """
+    repeated = QuerySet(queries, device, repeated=-(-_SMALLEST_LAUNCH[device.is_cuda] // len(queries)))
+    runs = {method: MethodRun(method, repeated) for method in methods}
+    for run in runs.values():
+        run.launch()
+    measured = [{method: measure(run) for method, run in runs.items()} for _ in range(turns)]
+    return {method: min(turn[method] for turn in measured) for method in methods}
 
 
 def trace(queries: QuerySet, method: str) -> tuple[np.ndarray, np.ndarray]:
