@@ -12,7 +12,7 @@ import numpy as np
 from .._atomic_file import OutputFile
 from ..usd.segment import Segment
 from .limit import not_listed
-from .outputs import without_last_eighth
+from .outputs import ReplayOutput, without_last_eighth
 from .results import IntervalResult
 from .scene_contacts import PHASES, SceneContacts
 from .scene_intersections import SceneIntersections
@@ -43,8 +43,8 @@ _ROW = np.dtype(
 _ROWS_AT_ONCE = 2**16
 
 
-class HitsNpz:
-    """A ``.npz`` file, a :class:`~warp_bsc.scene_replay.outputs.ReplayOutput`: columns with a row for each pair.
+class HitsNpz(ReplayOutput):
+    """A ``.npz`` file: columns with a row for each pair.
 
     A pair takes less than 30 bytes, a fifteenth of its text in JSON. Its columns, and what their numbers stand for::
 
@@ -59,9 +59,6 @@ class HitsNpz:
     Times of impact, positions and distances are in single precision. Pairs at rest, intersections and proximities, are
     at ``toi`` 0, in the last interval some at 1. The whole is on disk until the file is finished, so that memory does
     not grow with it.
-
-    Attributes:
-        file: The file.
     """
 
     def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], interval_count: int):
@@ -75,7 +72,7 @@ class HitsNpz:
         Raises:
             OSError: If it cannot be written.
         """
-        self.file = OutputFile(path)
+        super().__init__(path)
         self._rows = tempfile.TemporaryFile(dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
         self._facts, self._last = facts, interval_count - 1
         self._meshes: dict[tuple[str, str], int] = {}  # numbers of names and prims
@@ -137,7 +134,7 @@ class HitsNpz:
     def discard(self) -> None:
         """Removes the temporary files."""
         self._rows.close()
-        self.file.discard()
+        super().discard()
 
     def _write_column(self, member, name: str, rows: int) -> None:
         """Writes a column to the archive, some rows after the other."""

@@ -77,24 +77,22 @@ def find_contacts(
 ) -> SceneContacts:
     """Names the detected pairs that are checked by prims and elements.
 
-    Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, and pairs of a mesh with
-    itself if only its transform moves it. Elements that are apart in such a mesh stay apart; elements that touch, at
+    Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, pairs of a mesh with
+    itself if only its transform moves it, and edges of one curve that are near along it, as thick curves always touch
+    themselves there. Elements that are apart in a mesh that its transform moves stay apart; elements that touch, at
     T-junctions or in coplanar faces, would collide by rounding alone. (If a transform that has no turn at a constant
     rate turns by half a circle from one sample to the next, or scales by zero, the straight paths of the vertices meet
     although the mesh does not.)
 
     Args:
         interval: The interval.
-        mesh: The detector's mesh, made of the interval's segment.
+        mesh: The detector's mesh, made of the interval's segment: of its meshes, or of its curves and points as well.
         collisions: Collisions of that mesh in the interval.
         selection: The pairs of meshes that are checked.
         arcs: The motion of the vertices on arcs; None if all move straight.
     """
     segment = interval.segment
-    vertices, faces = collisions.vertex_face.T.astype(np.int64)
-    ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
-    n_vertex_face = len(vertices)
-    if not n_vertex_face + len(ends):
+    if not len(collisions):
         none = np.zeros(0, dtype=np.int64)
         return SceneContacts(
             segment,
@@ -108,39 +106,12 @@ def find_contacts(
             ignored={},
         )
 
-    named = name_elements(segment, vertices, faces, ends)
-    toi = np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi])
-    normal = np.concatenate([collisions.vertex_face_normal, collisions.edge_edge_normal])
-
-    corners = positions_at(interval, arcs, mesh.faces[faces], toi[:n_vertex_face])
-    on_faces = np.einsum("ni,nij->nj", collisions.vertex_face_coordinates, corners)
-    s = collisions.edge_edge_coordinates[:, :1]
-    first = positions_at(interval, arcs, ends[:, 0], toi[n_vertex_face:])
-    position = np.concatenate([on_faces, (1.0 - s) * first[:, 0] + s * first[:, 1]])
-
-    stiff = are_stiff_pairs(segment, vertices, named["meshes"][:n_vertex_face, 1], ends)
-    return _select(interval, named | {"toi": toi, "position": position, "normal": normal}, stiff, selection)
-
-
-def find_strand_contacts(
-    interval: Interval,
-    mesh: CollisionMesh,
-    collisions: Collisions,
-    selection: Selection,
-    arcs: RigidMotion | None = None,
-) -> SceneContacts:
-    """Names the detected pairs with curves or points that are checked by prims and elements.
-
-    Excluded are the pairs that :func:`find_contacts` excludes, and edges of one curve that are near along it, as thick
-    curves always touch themselves there. Arguments: as of that, with the mesh of the detection, made of the interval's
-    segment with its curves and points, in which pairs of two elements of faces are excluded.
-    """
-    segment = interval.segment
-    ends = mesh.edges[collisions.edge_edge].astype(np.int64)
-    of_curves = np.isin(collisions.edge_edge, mesh.free_edges)
-    apart = ~(of_curves.all(axis=1) & segment.are_neighbours(ends[:, 0], ends[:, 1]))
-    vertices, faces = collisions.vertex_face.T.astype(np.int64)
+    ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
+    apart = ~np.isin(collisions.edge_edge, mesh.free_edges).all(axis=1)
+    if not apart.all():
+        apart |= ~segment.are_neighbours(ends[:, 0], ends[:, 1])
     ends = ends[apart]
+    vertices, faces = collisions.vertex_face.T.astype(np.int64)
     points, point_ends = collisions.vertex_edge[:, 0].astype(np.int64), mesh.edges[collisions.vertex_edge[:, 1]]
     both = collisions.vertex_vertex.astype(np.int64)
     named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
@@ -167,11 +138,14 @@ def find_strand_contacts(
         collisions.vertex_edge_normal,
         collisions.vertex_vertex_normal,
     ]
-    first, second = named["meshes"].T
-    is_stiff = np.array([part.moves and not part.deforms for part in segment.meshes])
     arrays = {"toi": tois, "position": position, "normal": normal}
     arrays = named | {name: np.concatenate(parts) for name, parts in arrays.items()}
-    return _select(interval, arrays, (first == second) & is_stiff[first], selection)
+    if len(mesh.free_edges) + len(mesh.points):
+        first, second = named["meshes"].T
+        stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
+    else:
+        stiff = are_stiff_pairs(segment, vertices, named["meshes"][: len(vertices), 1], ends)
+    return _select(interval, arrays, stiff, selection)
 
 
 def _select(
