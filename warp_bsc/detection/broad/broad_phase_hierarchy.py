@@ -38,9 +38,10 @@ def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
 
 
 class BroadPhaseHierarchy:
-    """The broad phase by a hierarchy over the faces, see :class:`warp_bsc.detection.broad.broad_phase.BroadPhase`.
+    """The broad phase by a hierarchy over the faces, see :data:`warp_bsc.detection.broad.broad_phase.BroadPhase`.
 
     Attributes:
+        lock: Held by each user of the broad phase from a run until its queues have been read.
         hierarchy: The hierarchy on the device; a run fits its boxes.
         face_pairs: The queue of the pairs of faces that a run finds, by place, array of vec2i.
     """
@@ -90,7 +91,7 @@ class BroadPhaseHierarchy:
 
     @property
     def buffers(self) -> list[wp.array]:
-        """The queue for pairs of faces."""
+        """All arrays that a run writes to and that may be replaced."""
         return [self.face_pairs]
 
     @property
@@ -104,24 +105,46 @@ class BroadPhaseHierarchy:
             self.face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
 
     def count_filtered_by_world(self, counts: wp.array) -> None:
-        """Makes runs count the pairs that groups and masks leave out by world as well."""
+        """Makes runs add the pairs of elements that groups and masks leave out to counts by world, array of int64."""
         self.hierarchy.filtered_of_worlds = counts
 
     def pair_elements(
         self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
-        """Enqueues the candidates."""
+        """Enqueues the candidates.
+
+        Args:
+            x0: Positions at the start, array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            out: Counts by :class:`Count`, array of int64, and queue for (vertex, face), array of vec2i; then those for
+                (edge, edge), the smaller first.
+            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. More than 1, by body,
+                for those of rigid bodies, within which none are. What is not sought may be found as well.
+            keep_separated: Whether to enqueue the pairs that an axis separates, too.
+        """
         self.pair_faces(x0, x1, changed, keep_separated)
         self._launch_over_pairs(pair_elements_kernel, *out)
 
     def pair_points(
         self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
-        """Enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
+        """Enqueues the candidates of points with the edges that no face has, and with points.
+
+        Call it after :meth:`pair_elements`, whose pairs of cells it reads, with the same arguments but queues for
+        (point, edge) and (point, point), the smaller first. A mesh without points has none.
+        """
         self._launch_over_pairs(pair_points_kernel, *out)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
-        """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
+
+        Args:
+            x: Positions, array of vec3 or vec3d.
+            counts: By :class:`Count`, array of int64.
+            pairs: Queue for (edge, face), array of vec2i.
+            is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
+                boxes are reused on a CPU.
+        """
         self.pair_faces(x, x)
         self._launch_over_pairs(pair_edges_with_faces_kernel, counts, pairs)
 

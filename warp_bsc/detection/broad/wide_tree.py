@@ -301,7 +301,7 @@ class WideTree:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            changed: As of :meth:`.BroadPhase.pair_elements`.
+            changed: As of :meth:`.BroadPhaseHierarchy.pair_elements`.
         """
         _, fit_packets = _kernels(x0.dtype)
         inputs = [x0, x1, self._corners.shape[1], len(self._corners), changed, self._padding]
