@@ -16,12 +16,6 @@ from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
 
-PHASES = ("passes", "enters", "leaves", "stays")
-"""The phases of a contact, by 1 if the surfaces at its elements cross at the interval's end, plus 2 if at its start.
-
-Surfaces that cross at neither time touch within the interval, or pass through each other and out again.
-"""
-
 
 @dataclass(frozen=True)
 class SceneContacts(ScenePairs):
@@ -29,7 +23,6 @@ class SceneContacts(ScenePairs):
 
     Attributes:
         interval: The interval.
-        kind: Index in :data:`~warp_bsc.scene_replay.scene_pairs.KINDS`, shape [n].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
@@ -38,13 +31,12 @@ class SceneContacts(ScenePairs):
         separate: Whether the two meshes neither intersected nor touched at the start of the interval, shape [n]; for a
             mesh with itself, whether no two parts of it did. False where ``phase`` is -1. None if intersections were
             not checked.
-        phase: Index in :data:`PHASES`, shape [n]. The surface at an element consists of all faces with a vertex of it;
-            for a curve, of all its edges with one. -1 for two curves, and for pairs with a point, which cannot cross at
-            rest. None if intersections were not checked.
+        phase: Index in :data:`~warp_bsc.scene_replay.scene_pairs.PHASES`, shape [n]. The surface at an element consists
+            of all faces with a vertex of it; for a curve, of all its edges with one. -1 for two curves, and for pairs
+            with a point, which cannot cross at rest. None if intersections were not checked.
     """
 
     interval: Interval = field(repr=False)
-    kind: np.ndarray
     toi: np.ndarray
     time: np.ndarray
     normal: np.ndarray
@@ -53,7 +45,7 @@ class SceneContacts(ScenePairs):
     separate: np.ndarray | None = None
     phase: np.ndarray | None = None
 
-    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "kind", "toi", "time", "normal", "separate", "phase")
+    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "toi", "time", "normal", "separate", "phase")
 
     @cached_property
     def colliding_faces(self) -> np.ndarray:
@@ -93,16 +85,14 @@ def find_contacts(
     """
     segment = interval.segment
     if not len(collisions):
-        none = np.zeros(0, dtype=np.int64)
         return SceneContacts(
             segment,
             **NO_PAIRS,
             interval=interval,
-            kind=none,
             toi=np.zeros(0),
             time=np.zeros(0),
             normal=np.zeros((0, 3)),
-            counted=none.astype(bool),
+            counted=np.zeros(0, dtype=bool),
             ignored={},
         )
 
@@ -169,7 +159,7 @@ def _select(
 
 def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContacts:
     """Returns the contacts of one interval followed by others of it; ``counted`` is that of the first ones."""
-    names = ("kind", "elements", "meshes", "indices", "vertices", "faces", "position", "toi", "time", "normal")
+    names = *ScenePairs.BY_PAIR, "toi", "time", "normal"
     joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
     ignored = {
         meshes: contacts.ignored.get(meshes, 0) + others.ignored.get(meshes, 0)
