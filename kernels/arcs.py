@@ -42,7 +42,7 @@ import warp as wp
 from .ccd import impact_at_distance
 from .closest import contact_at, contact_weights
 from .distance import closest_points
-from .motion import all_finite, double, doubles, relative_motion
+from .motion import Query, double, relative_motion
 from .pairs import distance_of_corners, firsts_of, form_of
 from .polynomials import EDGE_EDGE
 from .signs import FREE, HIT, ROUNDOFF, UNSURE
@@ -286,45 +286,26 @@ def _first_contact(
 
 
 @wp.func
-def impact_on_arcs(
-    kind: int,
-    v: wp.vec4i,
-    # points at the start
-    a0: Any,
-    b0: Any,
-    c0: Any,
-    d0: Any,
-    # points at the end
-    a1: Any,
-    b1: Any,
-    c1: Any,
-    d1: Any,
-    arcs: Arcs,
-    min_distance: wp.float64,
-) -> Impact:
+def impact_on_arcs(kind: int, v: wp.vec4i, query: Query, arcs: Arcs, min_distance: wp.float64) -> Impact:
     """Returns the first contact of a pair on its arcs; FREE is certain, and HIT within the tolerance of the arcs.
 
     Args:
-        kind: VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX, with points as of :func:`.ccd.impact_at_distance`.
+        kind: VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX.
         v: The vertices of the pair.
-        a0: Points at the start, vec3 or vec3d, and so on.
-        b0: See ``a0``.
-        c0: See ``a0``.
-        d0: See ``a0``.
-        a1: Points at the end of the step.
-        b1: See ``a1``.
-        c1: See ``a1``.
-        d1: See ``a1``.
+        query: Their positions.
         arcs: The arcs.
         min_distance: Distance that the pair keeps, 0 if it must only not touch.
     """
     result = Impact()
     result.status = UNSURE
-    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+    if not wp.isfinite(query):
         return result
-    p, q, r, s = doubles(a0, b0, c0, d0)
-    a, b, c, d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    a, b, c, d = query[0], query[1], query[2], query[3]
+    to_a, to_b, to_c, to_d = query[4], query[5], query[6], query[7]
+    p = query[0]
+    q = query[1]
+    r = query[2]
+    s = query[3]
     bounds = _PairBounds()
     start = wp.float64(0.0)
     length = wp.float64(1.0)

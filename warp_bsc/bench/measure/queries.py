@@ -16,7 +16,7 @@ from ...kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, imp
 from ...kernels.classification import classify
 from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ...kernels.exact.first_contact import NONE, decide_in
-from ...kernels.motion import doubles, edge_edge_motion, vertex_face_motion
+from ...kernels.motion import edge_edge_motion, query_of, vertex_face_motion
 from ...kernels.pipeline.queues import take_slot
 from ...kernels.polynomials import coplanarity
 from ...kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
@@ -172,9 +172,7 @@ def _kernels(kind: PairKind):
     ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
-        a0d, b0d, c0d, d0d = doubles(a0, b0, c0, d0)
-        a1d, b1d, c1d, d1d = doubles(a1, b1, c1, d1)
-        time = decide(number, a0d, b0d, c0d, d0d, a1d, b1d, c1d, d1d, False, 0)
+        time = decide(number, query_of(a0, b0, c0, d0, a1, b1, c1, d1), False, 0)
         status[i] = wp.int8(wp.where(time < NONE, HIT, FREE))
 
     return find_status, find_impact, cull, classify_survivors, find_exact_status

@@ -6,7 +6,7 @@ import warp as wp
 
 from ...kernels.distance_gradients import with_distance_gradients
 from ...kernels.gradients import with_gradients
-from ...kernels.motion import doubles
+from ...kernels.motion import query_at
 from ...kernels.pairs import distance_of_corners, form_of, points_of_pair
 from ...kernels.signs import HIT, UNSURE
 from ...kernels.time_of_impact import Impact
@@ -54,18 +54,17 @@ def _kernel(dtype: type, with_distance: bool) -> wp.Kernel:
         found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
         found.within_tolerance = wp.where(contacts.within_tolerance[i], 1, 0)
         found.toi = contacts.toi[i]
-        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
-        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        query = query_at(x0, x1, v)
         if wp.static(with_distance):
             distance = distance_of_corners(kind, v, radius)
             form = form_of(kind)
-            reached = with_distance_gradients(form, a0, b0, c0, d0, a1, b1, c1, d1, distance, found, tolerance)
+            reached = with_distance_gradients(form, query, distance, found, tolerance)
             toi[i] = reached.toi
             grazing[i] = reached.grazing == 1
         else:
             found.coordinates = contacts.coordinates[i]
             found.normal = contacts.normal[i]
-            contact = with_gradients(kind, a0, b0, c0, d0, a1, b1, c1, d1, found, tolerance)
+            contact = with_gradients(kind, query, found, tolerance)
             toi[i] = contact.toi
             grazing[i] = contact.grazing == 1
             coordinates[i] = contact.coordinates

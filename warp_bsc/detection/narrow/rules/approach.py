@@ -14,7 +14,7 @@ import warp as wp
 from ....kernels.arcs import Arcs, distance_at, impact_on_arcs, move_as_one
 from ....kernels.ccd import impact_at_distance
 from ....kernels.min_distance import clears_at_once, closest_at
-from ....kernels.motion import doubles, motion_and_distance
+from ....kernels.motion import doubles, motion_and_distance, query_at
 from ....kernels.pairs import ABOVE_SUM, distance_of_corners, ends_of, firsts_of
 from ....kernels.signs import FREE, ROUNDOFF
 from ....kernels.time_of_impact import Impact
@@ -103,11 +103,10 @@ def impact_on_arcs_at_distance(
     It keeps its minimum distance ``kept`` at the end of the step, and :data:`SHARE_ON_ARCS` of it on the way. A pair
     that rests at its distance would otherwise have to be followed in ever shorter parts.
     """
-    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
-    a, b, c, d = doubles(a1, b1, c1, d1)
-    found, error = distance_at(kind, a, b, c, d)
+    query = query_at(x0, x1, v)
+    found, error = distance_at(kind, query[4], query[5], query[6], query[7])
     least = wp.where(found - error >= kept, SHARE_ON_ARCS * kept, kept)
-    return impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, least)
+    return impact_on_arcs(kind, v, query, arcs, least)
 
 
 @wp.struct
