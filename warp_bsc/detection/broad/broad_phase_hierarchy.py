@@ -10,7 +10,7 @@ from ...kernels.pipeline.queues import take_slots, write
 from ..mesh import CollisionMesh
 from ..run.launch import THREADS_OF_MULTIPROCESSOR, launch
 from ..run.settings import capacity_for
-from .element_pairs import pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
+from .element_pairs import Pairs, pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
 from .face_hierarchy import box_bundles, bundle_count, fit_kernel, make_hierarchy, traversal_kernel
 
 _WARPS_OF_MULTIPROCESSOR = 128
@@ -20,17 +20,9 @@ _TRAVERSAL_BLOCK = 128
 """Threads of a block of a traversal."""
 
 
-@wp.struct
-class _FacePairs:
-    """The queue of pairs of faces, by place, and its count."""
-
-    pairs: wp.array[wp.vec2i]
-    count: wp.array[wp.int64]
-
-
 @wp.func
-def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
-    slot = take_slots(queue.count, 0, count_set_bits(found))
+def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: Pairs):
+    slot = take_slots(queue.counts, 0, count_set_bits(found))
     while found != wp.uint32(0):
         write(wp.vec2i(place, first + lowest_set_bit(found)), queue.pairs, slot)
         found = found & (found - wp.uint32(1))
@@ -175,11 +167,16 @@ class BroadPhaseHierarchy:
     def pair_faces(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, keep_separated=False) -> None:
         """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once."""
         self.fit(x0, x1, changed, keep_separated=keep_separated)
-        queue = _FacePairs()
-        queue.pairs, queue.count = self.face_pairs, self._count
-        self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
+        self.traverse(traversal_kernel(_enqueue_faces, Pairs), _queue_of(self._count, self.face_pairs))
 
-    def _launch_over_pairs(self, make_kernel, *arguments):
+    def _launch_over_pairs(self, make_kernel, *out):
         threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
-        inputs = [self.hierarchy, self.face_pairs, self._count, *arguments, threads]
+        queues = [_queue_of(counts, pairs) for counts, pairs in zip(out[::2], out[1::2], strict=True)]
+        inputs = [self.hierarchy, _queue_of(self._count, self.face_pairs), *queues, threads]
         launch(make_kernel(self.is_padded, self._swept), threads, inputs=inputs, device=self._device, record_tape=False)
+
+
+def _queue_of(counts, pairs):
+    queue = Pairs()
+    queue.counts, queue.pairs = counts, pairs
+    return queue
