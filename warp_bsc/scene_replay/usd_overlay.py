@@ -12,7 +12,7 @@ from .._version import __version__
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.write.layer import just_before, layer_metadata, unused_path
-from ..usd.write.layer_writer import LayerContent, LayerPrim, LayerScope, PrimKind, write_binary_layer, write_text_layer
+from ..usd.write.layer_writer import LayerContent, LayerPrim, LayerScope, PrimKind, write_layer
 from .limit import not_listed
 from .outputs import ReplayOutput
 from .results import IntervalResult
@@ -147,7 +147,7 @@ class Overlay(ReplayOutput):
         suffix = Path(path).suffix
         if suffix not in (".usda", ".usdc", ".usd"):
             raise ValueError(f"{path}: the name of an overlay, a USD layer, must end in .usda, .usdc or .usd")
-        self._is_text = suffix == ".usda"
+        self._format = "usda" if suffix == ".usda" else "usdc"
         self._scene, self._command = scene, command
         self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
@@ -182,13 +182,9 @@ class Overlay(ReplayOutput):
         if last and last.summary.end == end > last.summary.start:
             self._spool.add_last(end, self._find_at_rest(last, 1))
         content = self._content(summary, end)
-        if self._is_text:
-            self.file.truncate(0)
-            write_text_layer(content, self.file.write)
-        else:
-            temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
-            write_binary_layer(content, temporary)
-            self.file.adopt(temporary)
+        temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
+        write_layer(content, temporary, self._format)
+        self.file.adopt(temporary)
         self.file.commit()
 
     def shrink(self) -> bool:
