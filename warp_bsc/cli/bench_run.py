@@ -182,7 +182,7 @@ def run_paper(arguments: argparse.Namespace) -> None:
         if importlib.util.find_spec("matplotlib") is None:
             raise ValueError("--figure needs matplotlib: pip install 'warp-bsc[bench]'")
     _check_json(arguments.json, scenes_of_detector.is_scene_name, "a scene", "scenes")
-    effort = paper.Effort.quick() if arguments.quick else paper.Effort.full()
+    effort = paper.QUICK if arguments.quick else paper.FULL
     needs_assets = not arguments.scenes or any(name in scenes_of_detector.PAPER_SCENES for name in arguments.scenes)
     known = (
         dict(zip(scenes_of_detector.PAPER_SCENES, scenes_of_detector.paper_scenes(), strict=True))
@@ -277,12 +277,12 @@ def run_queries(arguments: argparse.Namespace) -> None:
 def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
     """Measures random queries in each mode."""
 
-    def measure() -> Generator[queries.QueryBenchmark, None, None]:
+    def measure() -> Generator[dict[str, Any], None, None]:
         with loading_kernels(device):
             for kind in PairKind:
                 queries.benchmark_queries(kind, count=1, device=device, repeat=1)
         for kind in PairKind:
-            yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)
+            yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)[0]
 
     copy_rate = queries.benchmark_copy(device=device, repeat=arguments.repeat)
     settings = {"threads": count_threads(), "repeat": arguments.repeat, "seed": SEED}

@@ -10,7 +10,7 @@ from newton.solvers import SolverBase
 from .._one_thread import one_at_a_time
 from ..detection.run.host_function import run_on_host
 from .contacts.detect import inspect
-from .drive.inner_steps import WholeSteps
+from .drive.inner_steps import InnerSteps
 from .options import checked_report, default_separation, friction_of
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter, checked_filter
@@ -74,7 +74,7 @@ class CollisionMonitor(CollisionStage):
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
         if counts_worlds:
             self._count_worlds()
-        self._inner = WholeSteps(self)
+        self._inner = InnerSteps(self)
         self._prepare_entry()
 
     def _resolve(self, step):

@@ -12,7 +12,7 @@ from .._arguments import checked_choice, checked_integer
 from .._one_thread import one_at_a_time
 from .._private_names.of_newton import body_q_prev
 from ..detection.run.host_function import run_on_host
-from .drive.inner_steps import InnerSteps, WholeSteps
+from .drive.inner_steps import InnerSteps
 from .drive.style3d_springs import SpringSteps
 from .drive.substeps import Substeps
 from .options import (
@@ -214,7 +214,7 @@ class SolverCCD(CollisionStage):
 
     def _choose_steps(self, integrator):
         """Returns how the inner solver takes steps."""
-        steps: InnerSteps = WholeSteps(self)
+        steps = InnerSteps(self)
         if isinstance(self.solver, SolverStyle3D):
             steps = SpringSteps(self, self.work)
         elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
@@ -240,7 +240,7 @@ class SolverCCD(CollisionStage):
                 f"substeps={self.substeps} of SolverCCD in a coupled solver: give them to its SolverCoupled.Entry"
             )
         super().coupling_notify_iteration_restarts(enabled)
-        self._inner = WholeSteps(self)  # springs would push proxies without a feedback
+        self._inner = InnerSteps(self)  # springs would push proxies without a feedback
 
     def _resolve(self, step):
         has_some = step.contacts is not None and step.contacts.soft_contact_max > 0

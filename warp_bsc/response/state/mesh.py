@@ -49,11 +49,7 @@ class Placement:
 
     particle_q: wp.array[wp.vec3]
     body_q: wp.array[wp.transform]
-    shape_vertex_position: wp.array[wp.vec3]
-    shape_vertex_body: wp.array[int]
-    plane_point: wp.array[wp.vec3]
-    plane_normal: wp.array[wp.vec3]
-    plane_body: wp.array[int]
+    shapes: PlacedShapes
 
 
 class ModelMesh(CollisionMesh):
@@ -240,10 +236,7 @@ class ModelMesh(CollisionMesh):
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
-        place.particle_q, place.body_q = particle_q, body_q
-        vertices, planes = self.device_shape_vertices, self.device_planes
-        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
-        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
+        place.particle_q, place.body_q, place.shapes = particle_q, body_q, self.placed_shapes
         return place
 
     def refresh_inverse_masses(self) -> None:
@@ -286,10 +279,10 @@ def vertex_position(place: Placement, vertex: int) -> wp.vec3:
     i = vertex - place.particle_q.shape[0]
     if i < 0:
         return place.particle_q[vertex]
-    body = place.shape_vertex_body[i]
+    body = place.shapes.body[i]
     if body < 0:
-        return place.shape_vertex_position[i]
-    return wp.transform_point(place.body_q[body], place.shape_vertex_position[i])
+        return place.shapes.position[i]
+    return wp.transform_point(place.body_q[body], place.shapes.position[i])
 
 
 @wp.kernel(enable_backward=False, module="unique")
