@@ -33,7 +33,8 @@ def test_a_tape_changes_nothing_of_a_step(device):
         states = program.states
         if not on_tape:
             program.model.requires_grad = requires_grad
-            solver = bsc.SolverImplicit(program.model, max_iterations=60, friction=0.3)
+            radii = program.arrays["particle_radius"]
+            solver = bsc.SolverImplicit(program.model, max_iterations=60, friction=0.3, particle_radius=radii)
             assert (solver.gradients is None) != requires_grad
             states = program.begin(program.inputs)
             solver.reset(states[0])
