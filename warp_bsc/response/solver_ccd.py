@@ -154,7 +154,7 @@ class SolverCCD(CollisionStage):
                 some that could meet something. ``"model"``: pairs keep the thickness that the model has, the radii of
                 particles, or ``particle_radius`` where that is given, and the margins of shapes
                 (``model.shape_margin``). Or a Warp array of float32 of length 1, which each step reads again, as it
-                does radii and margins of a model that requires gradients; what is negative or not finite counts as 0.
+                does radii and margins of a model that requires gradients; what is negative or NaN counts as 0.
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all: pairs keep the sum of
                 their radii beside ``min_distance``. That of an edge or a face is the largest one of its vertices, that
                 of a shape 0, or its margin with ``min_distance="model"``. A Warp array must be of float32, and each

@@ -88,14 +88,6 @@ def _of_model(model, name):
     return array if model.requires_grad else array.numpy()
 
 
-@wp.func
-def _valid(distance: float) -> wp.float64:
-    """Returns a distance that a program has written; one that is negative or not finite counts as 0."""
-    if distance > 0.0 and wp.isfinite(distance):
-        return wp.float64(distance)
-    return wp.float64(0.0)
-
-
 @wp.kernel
 def _read_distances(
     # in
@@ -109,17 +101,17 @@ def _read_distances(
     radius: wp.array[wp.float64],
     of_planes: wp.array[wp.float64],
 ):
-    """Adds distances that arrays have to those that are numbers, of vertices and then of planes."""
+    """Adds distances of arrays to those that are numbers, of vertices and then of planes; negative ones count as 0."""
     i = wp.tid()
-    found, k = wp.float64(numbers[i]), index[i]
+    k, half, own = index[i], float(0.0), float(0.0)
     if minimum:
-        found = found + wp.float64(0.5) * _valid(minimum[0])
-    if i < particle_count:
-        if of_particles:
-            if k >= 0:
-                found = found + _valid(of_particles[k])
-    elif of_shapes:
-        found = found + _valid(of_shapes[k])
+        half = 0.5 * minimum[0]
+    if i >= particle_count:
+        if of_shapes:
+            own = of_shapes[k]
+    elif of_particles and k >= 0:
+        own = of_particles[k]
+    found = numbers[i] + wp.float64(wp.where(half >= 0.0, half, 0.0)) + wp.float64(wp.where(own >= 0.0, own, 0.0))
     if i < radius.shape[0]:
         radius[i] = found
     else:
