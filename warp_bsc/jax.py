@@ -65,7 +65,7 @@ def rollout(
             if array.dtype != np.float32:
                 raise TypeError(f"{argument}[{name!r}] must be of float32, not {array.dtype}")
     shapes = [{name: tuple(array.shape) for name, array in arrays.items()} for arrays in given]
-    options = RolloutOptions(solver, dt, steps, states, *shapes, every)
+    options = RolloutOptions(solver, dt, steps, states, *shapes, every=every)
     of_shapes = (tuple(x.items()) for x in shapes)
     return _differentiable(solver, options.dt, options.steps, states, options.every, *of_shapes)(*given)
 
@@ -76,7 +76,7 @@ def _differentiable(solver: SolverBase, dt: float, steps: int, states: str, ever
 
     JAX compiles each function that it calls, and keeps what it compiled.
     """
-    options = RolloutOptions(solver, dt, steps, states, *map(dict, shapes), every)
+    options = RolloutOptions(solver, dt, steps, states, *map(dict, shapes), every=every)
     rows = (options.steps,) if options.all_states else ()
     results = {
         name: jax.ShapeDtypeStruct((*rows, *options.shape_of(name)), np.float32) for name in options.result_names()

@@ -70,7 +70,7 @@ def rollout(
         for name, tensor in tensors.items():
             _check_tensor(f"{argument}[{name!r}]", tensor, solver.model.device)
     shapes = [{name: tuple(tensor.shape) for name, tensor in tensors.items()} for tensors in given.values()]
-    options = RolloutOptions(solver, dt, steps, states, *shapes, every)
+    options = RolloutOptions(solver, dt, steps, states, *shapes, every=every)
     names = [list(tensors) for tensors in given.values()]
     tensors = [tensor for tensors in given.values() for tensor in tensors.values()]
     recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)

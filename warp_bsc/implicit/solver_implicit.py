@@ -297,7 +297,7 @@ class SolverImplicit(SolverCCD):
         changed = [array for array in arrays if array is not None and array.requires_grad]
         tape.record_func(lambda: run_on_host(backward, device), changed + self._read_arrays())
 
-    def take_checkpointed(self, step, state_in, state_out, *options):
+    def _take_checkpointed(self, step, state_in, state_out, *options):
         """Takes the steps of :func:`checkpointed`, and records them on the active tape, if any."""
         gradients, report = self.gradients, self.report
         assert gradients is not None
@@ -437,4 +437,4 @@ def checkpointed(
     check_instance(outputs, "outputs", (list, tuple), "a list of arrays")
     for array in outputs:
         check_instance(array, "outputs", wp.array, "a list of arrays")
-    solver.take_checkpointed(step, state_in, state_out, count, every, outputs)
+    solver._take_checkpointed(step, state_in, state_out, count, every, outputs)

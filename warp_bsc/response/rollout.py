@@ -79,7 +79,7 @@ class RolloutOptions:
         self.solver, self.dt = solver, checked_number(dt, "dt", 0.0, above=True)
         self.all_states = checked_choice(states, "states", ("last", "all")) == "all"
         self.every = None if every is None else checked_integer(every, "every", 1)
-        if every is not None and not hasattr(solver, "take_checkpointed"):
+        if every is not None and not hasattr(solver, "_take_checkpointed"):
             raise TypeError(f"solver must be a SolverImplicit with every={every}, not a {type(solver).__name__}")
         self._control = model.control()
         for name, shape in state_shapes.items():
@@ -172,7 +172,7 @@ class Rollout:
         if options.every is not None and self._recorded:
             solver: Any = options.solver
             of_steps = options.steps, options.every, list(self.results.values())
-            solver.take_checkpointed(self._take, start, self._new_state(), *of_steps)
+            solver._take_checkpointed(self._take, start, self._new_state(), *of_steps)
             return
         for step in range(options.steps):
             end = self._new_state()

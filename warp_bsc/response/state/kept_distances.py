@@ -46,19 +46,19 @@ class KeptDistances:
         """
         minimum, radii, margins, count = min_distance, particle_radius, None, model.particle_count
         has_radius, name = np.ones(count, dtype=bool), "particle_radius"
+        of_strands = of_strands and minimum is None and radii is None
         if isinstance(min_distance, str):
             if min_distance != _OF_MODEL:
                 raise ValueError(f"min_distance must be a number or {_OF_MODEL!r}, not {min_distance!r}")
             minimum, margins = None, _of_model(model, "shape_margin")
-            if radii is None:
-                radii, name = _of_model(model, "particle_radius"), "model.particle_radius"
-        elif of_strands and minimum is None and radii is None and count:
-            for elements in (model.tri_indices, model.tet_indices):
-                if elements is not None:
-                    has_radius[elements.numpy().ravel()] = False
-            if (has_radius & (model.particle_radius.numpy() != 0.0)).any():
-                radii, name = _of_model(model, "particle_radius"), "model.particle_radius"
+        for elements in (model.tri_indices, model.tet_indices):
+            if of_strands and elements is not None:
+                has_radius[elements.numpy().ravel()] = False
+        if of_strands or (isinstance(min_distance, str) and radii is None):
+            radii, name = _of_model(model, "particle_radius"), "model.particle_radius"
         values = has_radius * checked_distances(0.0 if radii is None else radii, name, count)
+        if of_strands and not values.any():
+            radii = None
         of_shapes = checked_distances(0.0 if margins is None else margins, "model.shape_margin", model.shape_count)
         of_shapes = np.broadcast_to(of_shapes, model.shape_count)
         of_all = 0.0
@@ -133,8 +133,8 @@ class DistanceArrays:
         numbers = np.concatenate([(of_particles is None) * kept.radii, (of_shapes is None) * kept.margins[shapes]])
         numbers += (minimum is None) * 0.5 * kept.minimum
         index = np.concatenate([np.where(kept.has_radius, np.arange(len(kept.radii)), -1), shapes])
-        self._places = [wp.array(numbers, dtype=wp.float64, device=device), wp.array(index, dtype=int, device=device)]
-        self._places.append(len(kept.radii))
+        numbers, index = wp.array(numbers, dtype=wp.float64, device=device), wp.array(index, dtype=int, device=device)
+        self._places = numbers, index, len(kept.radii)
 
     @property
     def requires_grad(self) -> bool:
