@@ -332,12 +332,8 @@ class StepGradients:
         if distances is not None and distances.requires_grad:
             distances.backward(of_motion.distances.radius, of_motion.distances.of_planes)
         self._carried_to = before
-        for gradient in (
-            of.end_particle_q,
-            of.end_particle_qd,
-            of.end_body_q,
-            of.end_body_qd,
-        ):  # the step overwrote what they are of
+        # the step overwrote what they are of
+        for gradient in (of.end_particle_q, of.end_particle_qd, of.end_body_q, of.end_body_qd):
             if gradient is not None:
                 gradient.zero_()
 

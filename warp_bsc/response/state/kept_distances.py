@@ -45,21 +45,21 @@ class KeptDistances:
         With ``of_strands``, particles without triangles and tetrahedra have their radii if there are no arguments.
         """
         minimum, radii, margins, count = min_distance, particle_radius, None, model.particle_count
-        has_radius, name = np.ones(count, dtype=bool), "particle_radius"
+        has_radius, name, prefix = np.ones(count, dtype=bool), "particle_radius", "model."
         of_strands = of_strands and minimum is None and radii is None
         if isinstance(min_distance, str):
             if min_distance != _OF_MODEL:
                 raise ValueError(f"min_distance must be a number or {_OF_MODEL!r}, not {min_distance!r}")
-            minimum, margins = None, _of_model(model, "shape_margin")
+            minimum, margins, prefix = None, _of_model(model, "shape_margin"), f"min_distance={_OF_MODEL!r}: model."
         for elements in (model.tri_indices, model.tet_indices):
             if of_strands and elements is not None:
                 has_radius[elements.numpy().ravel()] = False
         if of_strands or (isinstance(min_distance, str) and radii is None):
-            radii, name = _of_model(model, "particle_radius"), "model.particle_radius"
+            radii, name = _of_model(model, "particle_radius"), f"{prefix}particle_radius"
         values = has_radius * checked_distances(0.0 if radii is None else radii, name, count)
         if of_strands and not values.any():
             radii = None
-        of_shapes = checked_distances(0.0 if margins is None else margins, "model.shape_margin", model.shape_count)
+        of_shapes = checked_distances(0.0 if margins is None else margins, f"{prefix}shape_margin", model.shape_count)
         of_shapes = np.broadcast_to(of_shapes, model.shape_count)
         of_all = 0.0
         if isinstance(minimum, wp.array):
