@@ -68,8 +68,9 @@ class KeptDistances:
             of_all = checked_distance(minimum, "min_distance")
         arrays = (*(x if isinstance(x, wp.array) else None for x in (minimum, radii, margins)),)
         for array, name in zip(arrays, ("min_distance", "particle_radius"), strict=False):
-            if array is not None and array.dtype is not wp.float32:
-                raise TypeError(f"{name} must be a number, or an array of float32, not of {array.dtype.__name__}")
+            if array is not None and (array.dtype is not wp.float32 or array.device != model.device):
+                kind = f"{array.dtype.__name__} on {array.device}"
+                raise TypeError(f"{name} must be numbers, or an array of float32 on {model.device}, not of {kind}")
         is_fixed = margins is not None and arrays[2] is None
         return cls(of_all, values, of_shapes, minimum is not None, is_fixed, arrays, has_radius)
 
