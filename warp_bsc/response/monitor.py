@@ -39,7 +39,7 @@ class CollisionMonitor(CollisionStage):
         self,
         solver: SolverBase,
         *,
-        min_distance: float | Literal["model"] | None = None,
+        min_distance: float | Literal["model"] | wp.array[float] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         report: Collection[Literal["worlds"]] = (),
@@ -63,11 +63,11 @@ class CollisionMonitor(CollisionStage):
         _, counts_worlds = checked_report(report, self.model, choices=["worlds"])
         distances = KeptDistances.of(self.model, min_distance, particle_radius)
         collision_filter = checked_filter(collision_filter, self.model)
-        of_mesh = {"collision_filter": collision_filter, "uses_margins": isinstance(min_distance, str)}
+        of_mesh = {"collision_filter": collision_filter, "uses_margins": distances.has_fixed_margins}
         mesh = ModelMesh(self.model, strands=distances.any, **of_mesh)
         self._warn_of_unseen(mesh, distances)
         if distances.any:
-            mesh.distances = mesh.min_distances(distances, reach=0.0)
+            mesh.keep_distances(distances, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
         motion = ModelMotion(mesh, friction, watches_turns=True)

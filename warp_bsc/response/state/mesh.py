@@ -12,7 +12,7 @@ from ...detection.narrow.rules.approach import MinDistances, make_min_distances
 from ...kernels.pairs import PairFilter
 from ..tuning import SEGMENTS
 from .collision_filter import CollisionFilter, bits_of_model
-from .kept_distances import KeptDistances
+from .kept_distances import DistanceArrays, KeptDistances
 from .shapes import PlacedShapes, place_shapes, shapes_of, take_shapes
 from .structs import Connectivity, Incidence
 from .tessellation import tessellate, tessellation_key
@@ -81,6 +81,7 @@ class ModelMesh(CollisionMesh):
         placed_shapes: Both for kernels, ``state.shapes.PlacedShapes``.
         connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
+        distance_arrays: What each step reads them from, None if they stay as they are.
         shape_filter: Groups and masks of the shapes on the device, for infinite planes; empty without a filter.
     """
 
@@ -188,9 +189,10 @@ class ModelMesh(CollisionMesh):
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
+        self.distance_arrays: DistanceArrays | None = None
 
-    def min_distances(self, kept: KeptDistances, *, reach: float) -> MinDistances:
-        """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.narrow.rules.approach`.
+    def keep_distances(self, kept: KeptDistances, *, reach: float) -> None:
+        """Makes pairs keep distances, see :mod:`warp_bsc.detection.narrow.rules.approach`.
 
         Args:
             kept: The distances that pairs keep.
@@ -200,9 +202,12 @@ class ModelMesh(CollisionMesh):
         half = 0.5 * kept.minimum
         every = half + np.concatenate([kept.radii, kept.margins[self.shape_vertices.shape]])
         rigid_id[count:] = self.shape_vertices.body + 1
-        return make_min_distances(
+        self.distances = make_min_distances(
             self, every, of_planes=half + kept.margins[self.planes.shape], reach=reach, rigid_id=rigid_id
         )
+        if any(array is not None for array in kept.arrays):
+            shapes = np.concatenate([self.shape_vertices.shape, self.planes.shape])
+            self.distance_arrays = DistanceArrays(kept, shapes, self.distances)
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
