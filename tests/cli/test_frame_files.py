@@ -65,6 +65,18 @@ def test_check_finds_what_each_frame_and_each_motion_has(folder, capsys):
     assert "body.obj, coat_####.ply: 50 frames from 1 to 50, and their motion" in capsys.readouterr().out
 
 
+def test_what_is_not_sound_is_told_of_the_frame_in_which_it_begins(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for number in (1, 2, 3):
+        x = SHEET.vertices.copy()
+        if number > 1:
+            x[7] = x[70]  # far from each other, of no common face
+        trimesh.Trimesh(x, SHEET.faces, process=False).export(f"f_{number}.ply", vertex_normal=False)
+    assert main(["check", "f_#.ply", "--json", "--device", "cpu"]) == 0
+    ((first, second),) = json.loads(capsys.readouterr().out)["findings"]["doubled"]
+    assert {first["vertex"], second["vertex"]} == {7, 70} and first["of"] == "f_2.ply"
+
+
 def test_other_faces_are_said_and_a_broken_frame_is_an_error(folder, capsys):
     trimesh.creation.icosphere(1).export("coat_0009.ply")
     facts = facts_of(capsys, "check")

@@ -58,7 +58,7 @@ _KINDS = {
 }
 
 _OF_POSITIONS = ("intersections", "touching", "inside", "degenerate")
-"""The kinds that are found in each frame; the others once for frames of the same faces."""
+"""The kinds that are told of each frame; the others, such as seams, only of the frame from which on they are there."""
 
 _COLUMNS = (
     Column("number", len),
@@ -87,7 +87,7 @@ def _run(arguments: argparse.Namespace) -> int:
         _report(arguments.report, frames, str(device))
     findings: dict[str, Findings] = {kind: [] for kind in _KINDS if is_motion or kind != "collisions"}
     notes: dict[str, None] = {}
-    last = None
+    last, known = None, set()
     with RunProgress("Checking") as progress, loading_kernels(device, progress.console):
         for done, paths in enumerate(frames.paths):
             progress.show(done, len(frames.paths), f"frame {frames.numbers[done]}")
@@ -98,9 +98,14 @@ def _run(arguments: argparse.Namespace) -> int:
                 findings["collisions"] += _find_in_motion(last, scene, device)
             elif last is not None:
                 notes[f"{', '.join(paths)}: other faces than in the frame before, so no motion is checked"] = None
+            names = dict(zip(paths, frames.names, strict=True))
+            before, known = known if has_motion else set(), set()
             for kind, found in _find(scene, device).items():
-                if not has_motion or kind in _OF_POSITIONS:
-                    findings[kind] += found
+                for elements in found:
+                    key = kind, *((names[element["of"]], str(next(iter(element.values())))) for element in elements)
+                    known.add(key)
+                    if kind in _OF_POSITIONS or key not in before:
+                        findings[kind].append(elements)
             last = scene
     if arguments.json:
         facts = {"device": str(device), "is_motion": is_motion, "frames": frames.numbers}

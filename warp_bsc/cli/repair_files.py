@@ -38,9 +38,8 @@ _FILES = (
 def check_page(path: str | None) -> None:
     """Raises a ValueError if a page would be written to standard output, or over a mesh."""
     if path == STDOUT or (path and is_mesh_file(path)):
-        raise ValueError(
-            f"--report must be a file of its own, .html, not {'standard output' if path == STDOUT else path}"
-        )
+        what = "standard output" if path == STDOUT else path
+        raise ValueError(f"--report must be a file of its own, .html, not {what}")
 
 
 def read_frames(frames: Frames) -> FileScene:
