@@ -21,7 +21,6 @@ def publish_contacts(
     contacts: Contacts,
     settings: BarrierSettings,
     trial: Trial,
-    goal: wp.array[wp.vec3],
     step: Step,
     sides: Sides,
     centres: wp.array[wp.vec3d],
@@ -43,7 +42,7 @@ def publish_contacts(
             weights[j] = wp.float64(contacts.weights[i][j])
             x0 = to_double(step.motion.x0[corners[j]])
             slid += weights[j] * (trial.exact[corners[j]] - x0)
-            predicted += weights[j] * (to_double(goal[corners[j]]) - x0)
+            predicted += weights[j] * (to_double(trial.goal[corners[j]]) - x0)
         slid -= wp.dot(slid, normal) * normal
         limit = wp.float64(contacts.limit[i])
         impulse = load * normal - limit * barrier.friction_slope(wp.length(slid), settings.smoothing) * slid
