@@ -166,22 +166,11 @@ def _share_of_pair(i: int, scale: float, candidates: Candidates, trial: Trial) -
     limit = trial.limit
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
     of_bends = wp.vec2d(wp.float64(bends[0]), wp.float64(bends[1]))
-    share = float(
-        barrier.safe_share(
-            kind,
-            e,
-            f,
-            g,
-            h,
-            to_double(_end_of(trial, scale, corners[0])) - e,
-            to_double(_end_of(trial, scale, corners[1])) - f,
-            to_double(_end_of(trial, scale, corners[2])) - g,
-            to_double(_end_of(trial, scale, corners[3])) - h,
-            kept + least,
-            most,
-            of_bends,
-        )
-    )
+    displaced = barrier.Corners()
+    for j in range(4):
+        displaced[j] = to_double(_end_of(trial, scale, corners[j])) - to_double(trial.x[corners[j]])
+    x = wp.matrix_from_rows(e, f, g, h)
+    share = float(barrier.safe_share(kind, x, displaced, kept + least, most, of_bends))
     candidates.share[i] = share
     return share
 

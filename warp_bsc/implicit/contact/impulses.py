@@ -3,7 +3,6 @@
 import warp as wp
 
 from ...kernels.polynomials import EDGE_EDGE
-from ...response.report.forces.accumulate import torque_on
 from ...response.report.forces.emit import publish_contact
 from ...response.report.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.state.structs import ContactKind, Step
@@ -57,6 +56,7 @@ def publish_contacts(
         publish_contact(
             step,
             sides,
+            centres,
             kind,
             corners,
             weights,
@@ -64,8 +64,6 @@ def publish_contacts(
             impulse,
             settings.dt * load,
             normal,
-            torque_on(step, sides, centres, corners, weights, plane, 0, impulse),
-            torque_on(step, sides, centres, corners, weights, plane, 1, impulse),
             to_single(predicted / settings.dt),
             ZERO,
             sums,
