@@ -95,10 +95,8 @@ def _add_contact(
         else:
             across = slope * across
         hessian += across
-    n, of_load, limit_of_slot = to_single(normal), float(load), friction * float(load)
-    write_contact(
-        contacts, unknowns, slot, corners, weights, n, of_load, limit_of_slot, to_single(gradient), hessian, key
-    )
+    n, push, hold = to_single(normal), float(load), friction * float(load)
+    write_contact(contacts, unknowns, slot, corners, weights, n, push, hold, to_single(gradient), hessian, key)
     link_contact(contacts, world, slot, corners, weights)
 
 
