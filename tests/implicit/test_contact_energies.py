@@ -17,16 +17,15 @@ from warp_bsc.implicit.contact.barrier import (
     friction_energy,
     friction_slope,
 )
-from warp_bsc.implicit.contact.bodies import SolvedBodies
-from warp_bsc.implicit.contact.matrix import Matrix, make_matrix
-from warp_bsc.implicit.contact.pairs import Trial
+from warp_bsc.implicit.contact.flow import Place, Problem
+from warp_bsc.implicit.contact.matrix import make_matrix
 from warp_bsc.implicit.contact.rows import Rows, make_rows, sum_of_corners
 from warp_bsc.implicit.contact.system import Contacts, Unknowns
 from warp_bsc.implicit.elasticity.derivatives import Derivatives, element_energy, find_derivatives, make_derivatives
 from warp_bsc.implicit.elasticity.elements import SIZES, ElementKind, Elements, elements_of_model, kind_of
 from warp_bsc.implicit.gradients.elastic import Elastic
 from warp_bsc.implicit.gradients.elements import with_gradient
-from warp_bsc.response.state.structs import Motion, allocate
+from warp_bsc.response.state.structs import allocate
 
 
 @wp.kernel(enable_backward=False)
@@ -45,19 +44,12 @@ def _differentiate(
 
 
 @wp.kernel(enable_backward=False)
-def _add_blocks(
-    derivatives: Derivatives,
-    contacts: Contacts,
-    unknowns: Unknowns,
-    row_of_block: wp.array[int],
-    x: wp.array[wp.vec3],
-    rows: Rows,
-    parts: int,
-    matrix: Matrix,
-):
+def _add_blocks(problem: Problem, threads: int):
     """Without inertia: no unknown is free."""
-    i, trial, motion, bodies, dt = wp.tid(), Trial(), Motion(), SolvedBodies(), wp.float64(DT)
-    add_blocks(i, 0, derivatives, contacts, unknowns, row_of_block, trial, x, motion, bodies, dt, rows, parts, matrix)
+    at = Place()
+    at.thread = wp.tid()
+    at.threads = threads
+    add_blocks(at, problem)
 
 
 @wp.kernel(enable_backward=False)
@@ -232,16 +224,16 @@ def test_rows_are_the_sums_of_elements(scene):
     unknown = np.random.default_rng(2).permutation(count)
     rows = make_rows(scene.vertices, unknown, count, device)
     first, column = rows.first.numpy(), rows.column.numpy()
-    row = np.repeat(np.arange(count), np.diff(first))
-    unknowns, contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
-    unknowns.of_worlds = scene.array([0, count], int)
-    blocks_of = make_matrix(rows, np.array([0, count]), parts=2, device=device)
-    inputs = [derivatives, contacts, unknowns, scene.array(row, int), scene.array(scene.x), rows]
-    numbers = -(-count // 32) * 32 + len(row)  # see block_count
-    wp.launch(_add_blocks, numbers, inputs=[*inputs, 1], outputs=[blocks_of], device=device)
+    row, problem = np.repeat(np.arange(count), np.diff(first)), Problem()
+    problem.derivatives, problem.rows, problem.parts = derivatives, rows, 4
+    problem.unknowns, problem.contacts = allocate(Unknowns, count, device), allocate(Contacts, count, device)
+    problem.unknowns.of_worlds = scene.array([0, count], int)
+    problem.matrix = blocks_of = make_matrix(rows, np.array([0, count]), parts=2, device=device)
+    numbers = -(-count // 32) * 32 + len(row)  # blocks of the diagonal are in warps of their own
+    wp.launch(_add_blocks, numbers, inputs=[problem, numbers], device=device)
     if wp.get_device(device).is_cuda:  # the same sums by four threads for each block
         values = blocks_of.value.numpy()
-        wp.launch(_add_blocks, 4 * numbers, inputs=[*inputs, 4], outputs=[blocks_of], device=device)
+        wp.launch(_add_blocks, 4 * numbers, inputs=[problem, 4 * numbers], device=device)
         np.testing.assert_array_equal(blocks_of.value.numpy(), values)
     gradient = wp.zeros(count, dtype=wp.vec3, device=device)
     wp.launch(_sum_corners, count, inputs=[rows, derivatives], outputs=[gradient], device=device)

@@ -227,12 +227,12 @@ def test_boxes_of_candidates_take_a_part_of_a_displacement_of_metres(device):
     solver = bsc.SolverImplicit(sheets(device, 0.04, 0.006, 1.0))
     problem = solver.newton_method.problem
     step(solver, solver.model.state(), solver.model.state())
-    displaced = np.full((len(problem.lower), 3), [0.005, 0.0, 0.0])
+    displaced = np.full((len(problem.trial.lower), 3), [0.005, 0.0, 0.0])
     displaced[7] = 0.0, 20.0, 0.0
     problem.trial.displaced.assign(displaced)
-    problem.leaves.fill_(1)
+    problem.progress.leaves.fill_(1)
     solver.newton_method.renew_candidates()
-    size = problem.upper.numpy() - problem.lower.numpy()
+    size = problem.trial.upper.numpy() - problem.trial.lower.numpy()
     assert 0.02 < size[7, 1] < 0.15
     assert (np.delete(size[:, 0], 7) > 0.005).all()
 

@@ -1,17 +1,17 @@
-"""Newton steps as one kernel: all that lies between two solves, phase after phase, see :mod:`.phases`.
+"""Newton steps as one kernel: all that lies between two solves, phase after phase.
 
 Each world has a team of threads, which take a share of each phase, and wait for each other behind it. What a phase
 finds decides which comes next: without a launch, a host, or a condition of a CUDA graph in between. A world waits for
 others only where it needs a search for candidates, until they end or need one as well.
+
+The function of a phase takes the share of a thread, and returns which phase comes next. What decides about that is not
+written in the phase, as some threads may still be reading it.
 """
 
 import warp as wp
 
-from ...response.state.planes import MovingPlanes
-from ...response.state.structs import Motion
-from . import decisions, phases
+from . import assembly, bounds, contact_lists, decisions, held, merit, near, steps
 from .flow import Flow, Phase, Place, Problem, count_block, wait_for_team
-from .pairs import BarrierSettings
 from .system import end_of_contacts
 
 wp.set_module_options({"enable_backward": False})
@@ -20,36 +20,36 @@ _PREDICTIONS = wp.constant(2)
 """Solves of a Newton step after its first one, each of which holds what met in the one before."""
 
 _FUNCTIONS = {
-    Phase.BEGIN: phases.begin,
-    Phase.DIFFERENTIATE: phases.differentiate,
-    Phase.LOADS: phases.find_loads,
-    Phase.BEGIN_LIST: phases.begin_list,
-    Phase.LIST_NEAR: phases.list_near,
-    Phase.FIND_NEAR: phases.find_near,
-    Phase.COUNT: phases.count_contacts,
-    Phase.PLACE: phases.place_contacts,
-    Phase.LIST_CONTACTS: phases.list_contacts,
-    Phase.SORT: phases.sort_contacts,
-    Phase.BLOCKS: phases.add_blocks,
-    Phase.ASSEMBLE: phases.assemble,
-    Phase.DISPLACE: phases.displace,
-    Phase.LIST_WAYS: phases.list_ways,
-    Phase.BOUND: phases.bound,
-    Phase.HOLD: phases.hold,
-    Phase.RELEASE_HELD: phases.release_held,
-    Phase.HOLD_PAIRS: phases.hold_pairs,
-    Phase.TAKE_BOUND: phases.take_bound,
-    Phase.MOVE: phases.move,
-    Phase.ENERGY: phases.find_energy,
-    Phase.BEGIN_RELEASE: phases.begin_release,
-    Phase.BEGIN_CUTS: phases.begin_cuts,
-    Phase.CUT: phases.cut,
-    Phase.TAKE_CUT: phases.take_cut,
-    Phase.CHOOSE_CUTS: phases.choose_cuts,
-    Phase.UNDO_CUTS: phases.undo_cuts,
-    Phase.TAKE: phases.take,
-    Phase.DECIDE: phases.decide,
-    Phase.PUBLISH: phases.publish,
+    Phase.BEGIN: decisions.begin,
+    Phase.DIFFERENTIATE: assembly.differentiate,
+    Phase.LOADS: assembly.find_loads,
+    Phase.BEGIN_LIST: near.begin_list,
+    Phase.LIST_NEAR: near.list_near,
+    Phase.FIND_NEAR: near.find_near,
+    Phase.COUNT: contact_lists.count_contacts,
+    Phase.PLACE: contact_lists.place_contacts,
+    Phase.LIST_CONTACTS: contact_lists.list_contacts,
+    Phase.SORT: contact_lists.sort_contacts,
+    Phase.BLOCKS: assembly.add_blocks,
+    Phase.ASSEMBLE: assembly.assemble,
+    Phase.DISPLACE: steps.displace,
+    Phase.LIST_WAYS: bounds.list_ways,
+    Phase.BOUND: bounds.bound,
+    Phase.HOLD: held.hold,
+    Phase.RELEASE_HELD: held.release_held,
+    Phase.HOLD_PAIRS: held.hold_pairs,
+    Phase.TAKE_BOUND: decisions.take_bound,
+    Phase.MOVE: steps.move,
+    Phase.ENERGY: merit.find_energy,
+    Phase.BEGIN_RELEASE: held.begin_release,
+    Phase.BEGIN_CUTS: steps.begin_cuts,
+    Phase.CUT: steps.cut,
+    Phase.TAKE_CUT: decisions.take_cut,
+    Phase.CHOOSE_CUTS: decisions.choose_cuts,
+    Phase.UNDO_CUTS: steps.undo_cuts,
+    Phase.TAKE: steps.take,
+    Phase.DECIDE: decisions.decide,
+    Phase.PUBLISH: near.publish,
 }
 _ALSO = {Phase.FIND_NEAR: Phase.LIST_AND_FIND_NEAR, Phase.BOUND: Phase.LIST_AND_BOUND}
 """Phases that have the function of the one before them, whose code the kernel then has once."""
@@ -96,7 +96,7 @@ def _decide(before: int, found: wp.vec4i, w: int, p: Problem) -> wp.vec4i:
             then, phase = int(Phase.TAKE), int(Phase.MOVE)
         elif progress.active[w] == 0:
             phase = int(Phase.END)
-        elif p.leaves[w] != 0:
+        elif p.progress.leaves[w] != 0:
             phase = int(Phase.SEARCH_CANDIDATES)
     return wp.vec4i(phase, then, found[2], solves)
 
@@ -114,7 +114,7 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
             following = 1 - p.flow.turn[0]
             p.flow.listed[following * p.flow.phase.shape[0] + wp.atomic_add(p.flow.count, following, 1)] = w
     elif phase == Phase.END:
-        p.leaves[w] = 0
+        p.progress.leaves[w] = 0
     else:
         p.flow.goes_on[0] = 1
         p.progress.energy[w] = wp.int64(0)  # the Newton step begins anew
@@ -122,7 +122,7 @@ def _leave(w: int, state: wp.vec4i, p: Problem):
         p.progress.product[w] = wp.int64(0)
         p.progress.held[w] = 0
         if phase == Phase.SEARCH_CANDIDATES:
-            p.any_leaves[0] = 1
+            p.flow.any_leaves[0] = 1
     p.flow.phase[w] = phase
 
 
@@ -143,15 +143,12 @@ def _end_launch(flow: Flow, lane: int, n: int, blocks: int):
 
 def _advance(
     # in
-    motion: Motion,
-    planes: MovingPlanes,
-    settings: BarrierSettings,
     resumes: int,
     of_all: int,
-    # in and out
-    p: Problem,
     n: int,
     blocks: int,
+    # in and out
+    p: Problem,
 ):
     """Goes on with the Newton steps of worlds until a solve, a search for candidates, or their end comes next.
 
@@ -188,7 +185,7 @@ def _advance(
                         at.then = state[1]
                         at.passes = state[2]
                         at.solves = state[3]
-                        state = wp.static(_OF_PHASES[k])(at, p, motion, planes, settings)
+                        state = wp.static(_OF_PHASES[k])(at, p)
                         wait_for_team(p.flow.arrived, w, together)
                         if wp.static(_FIRST[k] in _DECIDED_AFTER):
                             state = _decide(at.phase, state, w, p)

@@ -38,6 +38,8 @@ MOST_LEFT = 0.3
 """Share of the reach that a pair keeps at most."""
 _PLANES = wp.constant(24)
 """Most planes that it takes."""
+Corners = wp.types.matrix(shape=(4, 3), dtype=wp.float64)
+"""Rows for the corners of a pair: their places, or their displacements."""
 
 
 @wp.func
@@ -120,20 +122,7 @@ def _closing_time(first: wp.float64, second: wp.float64, rate: wp.float64, other
 
 @wp.func
 def safe_share(
-    kind: int,
-    # points
-    a: wp.vec3d,
-    b: wp.vec3d,
-    c: wp.vec3d,
-    d: wp.vec3d,
-    # their displacements
-    p: wp.vec3d,
-    q: wp.vec3d,
-    r: wp.vec3d,
-    s: wp.vec3d,
-    least: wp.float64,
-    most: float,
-    bends: wp.vec2d,
+    kind: int, x: Corners, displaced: Corners, least: wp.float64, most: float, bends: wp.vec2d
 ) -> wp.float64:
     """Returns a share of the displacements up to which two elements stay as far apart as ``least``, 1 for all of them.
 
@@ -144,19 +133,18 @@ def safe_share(
     """
     time = ZERO
     for _k in range(_PLANES):
-        e, f, g, h = a + time * p, b + time * q, c + time * r, d + time * s
-        weights, distance = closest_weights_and_gap(kind, e, f, g, h)
-        n = (weights[0] * e + weights[1] * f + weights[2] * g + weights[3] * h) / distance
-        ea, fa, ga, ha = wp.dot(n, e), wp.dot(n, f), wp.dot(n, g), wp.dot(n, h)
+        now = x + time * displaced
+        weights, distance = closest_weights_and_gap(kind, now[0], now[1], now[2], now[3])
+        n = (weights * now) / distance
+        at, way = now * n, displaced * n
         near = least + time * (bends[0] - time * bends[1])
         more = wp.max(bends[0] - _TWO * time * bends[1], ZERO)
-        pa, qa, ra, sa = wp.dot(n, p), wp.dot(n, q), wp.dot(n, r), wp.dot(n, s)
-        ahead = wp.min(_closing_time(ea, ga, pa, ra + more, near), _closing_time(ea, ha, pa, sa + more, near))
-        if kind == EDGE_EDGE:
-            ahead = wp.min(ahead, _closing_time(fa, ga, qa, ra + more, near))
-            ahead = wp.min(ahead, _closing_time(fa, ha, qa, sa + more, near))
-        else:
-            ahead = wp.min(ahead, _closing_time(ea, fa, pa, qa + more, near))
+        ahead = _TWO
+        for j in range(1, 4):
+            if j >= 2 or kind != EDGE_EDGE:
+                ahead = wp.min(ahead, _closing_time(at[0], at[j], way[0], way[j] + more, near))
+            if j >= 2 and kind == EDGE_EDGE:
+                ahead = wp.min(ahead, _closing_time(at[1], at[j], way[1], way[j] + more, near))
         time += _NEXT * wp.max(ahead, ZERO)
         if time >= ONE or float(time) > most:
             return ONE

@@ -13,8 +13,7 @@ from ...response.state.motion import StateArrays
 from ...response.state.poses import centre_of, in_world, point_of, turn_between, turned_pose
 from ...response.state.structs import Bodies, Motion
 from ...response.state.vectors import HALF, ONE, to_double, to_single
-from .decisions import takes
-from .system import Progress, Unknowns
+from .system import Unknowns
 
 wp.set_module_options({"enable_backward": False})
 
@@ -218,20 +217,19 @@ def inertial_energy(bodies: SolvedBodies, motion: Motion, body: int, dt: wp.floa
 @wp.func
 def move_body(
     u: int,
-    world: int,
+    scale: float,
     motion: Motion,
     unknowns: Unknowns,
-    progress: Progress,
     share: wp.array[float],
     solution: wp.array[wp.vec3],
     is_taken: bool,
     bodies: SolvedBodies,
 ):
-    """Moves the body of an unknown by what it and its world take of its displacement, for good if that ``is_taken``."""
+    """Moves the body of an unknown by what it takes of a share of its displacement, for good if ``is_taken``."""
     body = unknowns.body[u]
     if unknowns.is_free[u] == 0:
         return
-    taken = progress.scale[world] * share[bodies.first_vertex[body]]
+    taken = scale * share[bodies.first_vertex[body]]
     pose, low = bodies.pose[body], bodies.low[body] + wp.vec3d()
     bodies.moved[body] = pose
     if taken > 0.0:
@@ -239,24 +237,9 @@ def move_body(
         bodies.moved[body] = turned_pose(motion.bodies, body, pose, shift, to_double(taken * solution[u + 1]))
         low = centre + shift - centre_of(motion.bodies, body, bodies.moved[body])
     bodies.low_moved[body] = low
-    if is_taken and takes(world, progress):
+    if is_taken:
         bodies.pose[body] = bodies.moved[body]
         bodies.low[body] = low
-
-
-@wp.func
-def displace_body(
-    u: int,
-    motion: Motion,
-    unknowns: Unknowns,
-    solution: wp.array[wp.vec3],
-    bodies: SolvedBodies,
-):
-    """Moves the body of an unknown by all of its displacement."""
-    body = unknowns.body[u]
-    if unknowns.is_free[u] != 0:
-        shift, turn = bodies.low[body] + to_double(solution[u]), to_double(solution[u + 1])
-        bodies.moved[body] = turned_pose(motion.bodies, body, bodies.pose[body], shift, turn)
 
 
 @wp.kernel

@@ -3,8 +3,7 @@
 import warp as wp
 
 from ...response.contacts.rules import inverse_mass_of
-from ...response.state.planes import MovingPlanes, signed_distance
-from ...response.state.structs import Motion
+from ...response.state.planes import signed_distance
 from ...response.state.vectors import ZERO, corners_of, to_double, to_single
 from ..vector_access import integers_at
 from . import barrier
@@ -18,16 +17,18 @@ from .distance_bounds import (
     seen_from_last,
     way_together,
 )
+from .flow import Phase, Place, Problem, end_at_planes, go_on, pair_count
 from .pairs import (
     FAR,
     FAR_TOGETHER,
-    BarrierSettings,
     Candidates,
     Trial,
     add_to_list,
+    candidate,
     distance_bound,
     gap_at_plane,
     kept_distance,
+    listed,
     moved,
     plane_at,
     stays_far,
@@ -64,17 +65,17 @@ def _end_of(trial: Trial, scale: float, vertex: int) -> wp.vec3:
 
 
 @wp.func
-def last_of_pair(i: int, candidates: Candidates) -> wp.vec4:
-    """Returns what tells most candidates apart, for :func:`list_pair`: read ahead, as most of the time is waiting."""
+def _last_of_pair(i: int, candidates: Candidates) -> wp.vec4:
+    """Returns what tells most candidates apart, for :func:`_list_pair`: read ahead, as most of the time is waiting."""
     within = ROUNDED_UP * (float(kept_distance(candidates, i)) + candidates.reach[i])
     return wp.vec4(candidates.share[i], candidates.now[i], candidates.apart[i], within)
 
 
 @wp.func
-def list_pair(
+def _list_pair(
     i: int, last: wp.vec4, world: int, candidates: Candidates, trial: Trial, progress: Progress, is_shorter: bool
 ) -> bool:
-    """Lists a candidate that displacements may bring within its reach; returns whether :func:`bound_by_pair` follows.
+    """Lists a candidate that displacements may bring within its reach; returns whether :func:`bound` goes on with it.
 
     Displacements that are parts of those of the last time are shorter: what was far from each other is so still, and
     what did not meet, or was far from each other as all its vertices do the same, does so where none is cut since.
@@ -135,23 +136,12 @@ def list_pair(
 
 
 @wp.func
-def bound_by_pair(
-    i: int,
-    world: int,
-    candidates: Candidates,
-    trial: Trial,
-    progress: Progress,
-    limit: wp.array[float],
-):
-    """Finds the share of displacements up to which a candidate does not meet: for its vertices, and for its world."""
-    corners, kind, kept = (
-        integers_at(candidates.corners, i),
-        kind_of_key(candidates.key[i]),
-        kept_distance(candidates, i),
-    )
+def _share_of_pair(i: int, scale: float, candidates: Candidates, trial: Trial) -> float:
+    """Returns the share of displacements up to which a candidate does not meet."""
+    corners, kind = integers_at(candidates.corners, i), kind_of_key(candidates.key[i])
+    kept = kept_distance(candidates, i)
     reach, floor = candidates.reach[i] + float(0.0), candidates.floor[i] + float(0.0)
     now = candidates.now[i] + float(0.0)
-    scale = progress.scale[world]
     a, b, c = seen_from_last(trial.x, corners)
     p = _end_of(trial, scale, corners[0]) - trial.x[corners[0]]
     q = _end_of(trial, scale, corners[1]) - trial.x[corners[1]]
@@ -163,77 +153,95 @@ def bound_by_pair(
     gap = ROUNDED_DOWN * now - ROUNDED_UP * float(kept)
     # the closest points are found for what comes near
     if way <= ROUNDED_DOWN * (gap - barrier.least_gap(gap, reach, floor)):
-        return
+        return 1.0
     apart = distance_of_ways(kind, a, b, c, p - s, q - s, r - s, wp.vec3()) - rounding_of(a, b, c) - rounding
     if apart >= ROUNDED_UP * (float(kept) + bends[0] + barrier.MOST_LEFT * reach):
-        return
+        return 1.0
     e, f, g, h = corners_of(trial.x, corners)
     _weights, distance = barrier.closest_weights_and_gap(kind, e, f, g, h)
     least = barrier.least_gap(distance - kept, wp.float64(reach), wp.float64(floor))
     if wp.float64(ROUNDED_UP * way) <= distance - kept - least:
-        return
+        return 1.0
     # what other pairs allow: more than that changes nothing
+    limit = trial.limit
     most = wp.max(wp.max(limit[corners[0]], limit[corners[1]]), wp.max(limit[corners[2]], limit[corners[3]]))
     of_bends = wp.vec2d(wp.float64(bends[0]), wp.float64(bends[1]))
-    share = float(
-        barrier.safe_share(
-            kind,
-            e,
-            f,
-            g,
-            h,
-            to_double(_end_of(trial, scale, corners[0])) - e,
-            to_double(_end_of(trial, scale, corners[1])) - f,
-            to_double(_end_of(trial, scale, corners[2])) - g,
-            to_double(_end_of(trial, scale, corners[3])) - h,
-            kept + least,
-            most,
-            of_bends,
-        )
-    )
+    displaced = barrier.Corners()
+    for j in range(4):
+        displaced[j] = to_double(_end_of(trial, scale, corners[j])) - to_double(trial.x[corners[j]])
+    x = wp.matrix_from_rows(e, f, g, h)
+    share = float(barrier.safe_share(kind, x, displaced, kept + least, most, of_bends))
     candidates.share[i] = share
-    if share < 1.0:
-        lower_to(progress.bound, world, share)
-        for j in range(4):
-            lower_to(limit, corners[j], share)
-            if trial.holder[corners[j]] != corners[j]:
-                lower_to(limit, trial.holder[corners[j]], share)
+    return share
 
 
 @wp.func
-def bound_by_planes(
-    vertex: int,
-    world: int,
-    motion: Motion,
-    planes: MovingPlanes,
-    plane_share: wp.array[float],
-    settings: BarrierSettings,
-    trial: Trial,
-    progress: Progress,
-    limit: wp.array[float],
-):
-    """Finds the share of displacements up to which a vertex meets no infinite plane, as :func:`bound_by_pair`."""
-    if inverse_mass_of(motion, vertex) == 0.0:
-        return
-    scale, now = progress.scale[world], plane_share[world]
-    for place in range(planes.of_worlds.shape[1]):
-        i = planes.of_worlds[world, place]
-        if i < 0:
-            return
-        kept, _level, reach, floor = gap_at_plane(motion, planes, settings, i, vertex, to_double(motion.x0[vertex]))
-        if reach == ZERO:
+def list_ways(at: Place, p: Problem) -> wp.vec4i:
+    """Lists candidates that displacements may bring together."""
+    w, count = at.world, pair_count(p.candidates, p.progress, at.world, True)
+    following, of_following = int(0), wp.vec4()
+    for k in range(at.thread - at.threads, count, at.threads):
+        i, last = int(following), wp.vec4(of_following)
+        if k + at.threads < count:
+            following = candidate(p.candidates, w, k + at.threads)
+            of_following = _last_of_pair(following, p.candidates)
+        if k >= 0:
+            _list_pair(i, last, w, p.candidates, p.trial, p.progress, at.passes > 0)
+    return go_on(at, Phase.BOUND)
+
+
+@wp.func
+def bound(at: Place, p: Problem) -> wp.vec4i:
+    """Finds the share of displacements before something meets, by listed candidates or by all, and by planes.
+
+    That of vertices, and of their world.
+    """
+    w, at_once, limit = at.world, at.phase == Phase.LIST_AND_BOUND, p.trial.limit
+    scale = p.progress.scale[w] + float(0.0)
+    for k in range(at.thread, pair_count(p.candidates, p.progress, w, at_once), at.threads):
+        i, is_new = int(0), bool(False)
+        if at_once:
+            i = candidate(p.candidates, w, k)
+            last = _last_of_pair(i, p.candidates)
+            is_new = _list_pair(i, last, w, p.candidates, p.trial, p.progress, at.passes > 0)
+        else:
+            entry = listed(p.candidates, w, k)
+            i, is_new = entry >> 1, (entry & 1) != 0
+        if not is_new:
             continue
-        before, _error = signed_distance(plane_at(planes, i, now), trial.x[vertex])
-        then = now + (1.0 - now) * scale
-        after, _error_after = signed_distance(plane_at(planes, i, then), to_single(moved(trial, scale, vertex)))
-        gap, left = before - kept, after - kept
-        least = barrier.least_gap(gap, reach, floor)
-        taken = scale * trial.share[trial.holder[vertex]]
-        bend = wp.float64(taken * trial.bend[vertex])
-        flat = wp.float64(taken) * bend
-        rate, low = gap - left + bend, gap - least
-        square = rate * rate - wp.float64(4.0) * flat * low
-        if low - rate + flat < ZERO or (square > ZERO and rate > ZERO and rate < wp.float64(2.0) * flat):
-            share = float(wp.float64(2.0) * low / (rate + wp.sqrt(wp.max(square, ZERO))))
-            lower_to(progress.bound, world, share)
-            lower_to(limit, trial.holder[vertex], share)
+        corners, share = integers_at(p.candidates.corners, i), _share_of_pair(i, scale, p.candidates, p.trial)
+        if share < 1.0:
+            lower_to(p.progress.bound, w, share)
+            for j in range(4):
+                lower_to(limit, corners[j], share)
+                if p.trial.holder[corners[j]] != corners[j]:
+                    lower_to(limit, p.trial.holder[corners[j]], share)
+    now = p.progress.plane_share[w] + float(0.0)
+    then = now + (1.0 - now) * scale
+    for k in range(p.worlds.first_vertex[w] + at.thread, end_at_planes(p.worlds, p.vertices_at_planes, w), at.threads):
+        v = p.worlds.vertices[k] + int(0)
+        if v >= p.vertices_at_planes or inverse_mass_of(p.motion, v) == 0.0:
+            continue
+        for place in range(p.planes.of_worlds.shape[1]):
+            plane = p.planes.of_worlds[w, place]
+            if plane < 0:
+                break
+            kept, _level, reach, floor = gap_at_plane(
+                p.motion, p.planes, p.settings, plane, v, to_double(p.motion.x0[v])
+            )
+            if reach == ZERO:
+                continue
+            before, _error = signed_distance(plane_at(p.planes, plane, now), p.trial.x[v])
+            after, _error_after = signed_distance(plane_at(p.planes, plane, then), _end_of(p.trial, scale, v))
+            gap, left = before - kept, after - kept
+            least = barrier.least_gap(gap, reach, floor)
+            taken = scale * p.trial.share[p.trial.holder[v]]
+            bend = wp.float64(taken * p.trial.bend[v])
+            flat = wp.float64(taken) * bend
+            rate, low = gap - left + bend, gap - least
+            square = rate * rate - wp.float64(4.0) * flat * low
+            if low - rate + flat < ZERO or (square > ZERO and rate > ZERO and rate < wp.float64(2.0) * flat):
+                until = float(wp.float64(2.0) * low / (rate + wp.sqrt(wp.max(square, ZERO))))
+                lower_to(p.progress.bound, w, until)
+                lower_to(limit, p.trial.holder[v], until)
+    return go_on(at, at.then)

@@ -83,6 +83,8 @@ class Vectors:
         residual, preconditioned: Of the iteration; the second is the first by ``inverse``.
         product: Of the Hessian and ``preconditioned``.
         direction, along: In which the solution changes, and the product with it.
+        first: Solution of the Newton step before pairs are held.
+        last: The same of the Newton step before.
     """
 
     elastic: wp.array[wp.vec3]
@@ -94,6 +96,8 @@ class Vectors:
     product: wp.array[wp.vec3]
     direction: wp.array[wp.vec3]
     along: wp.array[wp.vec3]
+    first: wp.array[wp.vec3]
+    last: wp.array[wp.vec3]
 
 
 @functools.cache

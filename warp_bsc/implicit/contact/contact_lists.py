@@ -3,7 +3,10 @@
 import warp as wp
 
 from ..vector_access import integers_at, numbers_at
-from .system import NOT_UNKNOWN, Contacts, Unknowns, first_unknown
+from .flow import Phase, Place, Problem, go_on
+from .merge import merge_contact
+from .merit import add_friction_energy
+from .system import NOT_UNKNOWN, Contacts, end_of_contacts, first_unknown
 
 wp.set_module_options({"enable_backward": False})
 
@@ -11,22 +14,6 @@ _COUPLES = wp.constant(wp.int64(1 << 61))
 """What is added to the number of a contact that couples, so that it comes last."""
 _ALONE = wp.constant(wp.int64(-(1 << 62)))
 """The same where it has no other unknown, so that it comes first, and is no part of blocks beside the diagonal."""
-
-
-@wp.func
-def count_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
-    """Counts a contact in ``end`` of the unknowns that are solved for, and of its world if it couples."""
-    weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
-    for j in range(4):
-        if weights[j] != 0.0:
-            u = first_unknown(of_corners[j])
-            if u >= 0:
-                if unknowns.is_free[u] != 0:
-                    wp.atomic_add(contacts.end, u, 1)
-                    if of_corners[j] < 0:
-                        wp.atomic_add(contacts.end, u + 1, 1)
-    if contacts.couples[i] != 0:
-        wp.atomic_add(contacts.coupled_end, world, 1)
 
 
 @wp.func
@@ -38,25 +25,51 @@ def clear_lists(world: int, contacts: Contacts):
 
 
 @wp.func
-def place_coupled(world: int, contacts: Contacts, lacks: wp.array[int]):
-    """Lets the list of contacts of a world that couple begin."""
-    if contacts.count[world] > contacts.start[world + 1] - contacts.start[world]:
-        lacks[0] = 1
-    contacts.coupled_end[world] = contacts.coupled_first[world]
+def count_contacts(at: Place, p: Problem) -> wp.vec4i:
+    """Merges contacts, and counts in ``end`` those of each unknown that is solved for, and those that couple."""
+    w, contacts, parts = at.world, p.contacts, p.contacts.parts
+    first = contacts.start[w] + int(0)
+    for k in range(at.thread, parts * (end_of_contacts(contacts, w) - first), at.threads):
+        i, part = first + k // parts, k % parts
+        if at.solves == 0:
+            merge_contact(i, part, w, contacts)
+        if part != 0:
+            continue
+        weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
+        for j in range(4):
+            if weights[j] != 0.0:
+                u = first_unknown(of_corners[j])
+                if u >= 0:
+                    if p.unknowns.is_free[u] != 0:
+                        wp.atomic_add(contacts.end, u, 1)
+                        if of_corners[j] < 0:
+                            wp.atomic_add(contacts.end, u + 1, 1)
+        if contacts.couples[i] != 0:
+            wp.atomic_add(contacts.coupled_end, w, 1)
+        if at.solves == 0:
+            add_friction_energy(i, w, p.motion, contacts, p.settings, p.trial, p.progress.energy)
+    return go_on(at, Phase.PLACE)
 
 
 @wp.func
-def place_entries(u: int, world: int, contacts: Contacts):
-    """Gives an unknown room for its contacts, anywhere in that of its world; ``end`` becomes the first of them."""
-    count = contacts.end[u]
-    if count > 0:
-        first = contacts.entries_of_each * contacts.start[world] + wp.atomic_add(contacts.listed, world, count)
-        contacts.first[u] = first
-        contacts.end[u] = first
-    else:
-        contacts.first[u] = 0
-        contacts.several[u] = 0
-        contacts.middle[u] = 0
+def place_contacts(at: Place, p: Problem) -> wp.vec4i:
+    """Gives each unknown room for its contacts, anywhere in that of its world; ``end`` becomes the first of them."""
+    w, contacts = at.world, p.contacts
+    if at.thread == 0:
+        if contacts.count[w] > contacts.start[w + 1] - contacts.start[w]:
+            p.flow.lacks[0] = 1
+        contacts.coupled_end[w] = contacts.coupled_first[w]
+    for u in range(p.unknowns.of_worlds[w] + at.thread, p.unknowns.of_worlds[w + 1], at.threads):
+        count = contacts.end[u] + int(0)
+        if count > 0:
+            first = contacts.entries_of_each * contacts.start[w] + wp.atomic_add(contacts.listed, w, count)
+            contacts.first[u] = first
+            contacts.end[u] = first
+        else:
+            contacts.first[u] = 0
+            contacts.several[u] = 0
+            contacts.middle[u] = 0
+    return go_on(at, wp.where(contacts.count[w] > 0, int(Phase.LIST_CONTACTS), int(Phase.BLOCKS)))
 
 
 @wp.func
@@ -82,27 +95,30 @@ def _list_coupled(contacts: Contacts, world: int, i: int):
 
 
 @wp.func
-def list_entries(i: int, world: int, contacts: Contacts, unknowns: Unknowns):
-    """Lists a contact for its unknowns, behind their ``end``, which moves on, and for its world if it couples."""
-    if contacts.couples[i] != 0:
-        _list_coupled(contacts, world, i)
-    weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
-    count = int(0)
-    for j in range(4):
-        if weights[j] == 0.0:
-            of_corners[j] = NOT_UNKNOWN
-        u = first_unknown(of_corners[j])
-        if u >= 0:
-            if unknowns.is_free[u] == 0:
+def list_contacts(at: Place, p: Problem) -> wp.vec4i:
+    """Lists contacts for their unknowns, behind their ``end``, which moves on, and for the world if they couple."""
+    w, contacts = at.world, p.contacts
+    for i in range(contacts.start[w] + at.thread, end_of_contacts(contacts, w), at.threads):
+        if contacts.couples[i] != 0:
+            _list_coupled(contacts, w, i)
+        weights, of_corners = numbers_at(contacts.weights, i), integers_at(contacts.unknowns, i)
+        count = int(0)
+        for j in range(4):
+            if weights[j] == 0.0:
                 of_corners[j] = NOT_UNKNOWN
-            else:
-                count += wp.where(of_corners[j] < 0, 2, 1)
-    for j in range(4):
-        u = first_unknown(of_corners[j])
-        if u >= 0:
-            _list_entry(contacts, u, 4 * i + j, count)
-            if of_corners[j] < 0:
-                _list_entry(contacts, u + 1, 4 * i + j, count)
+            u = first_unknown(of_corners[j])
+            if u >= 0:
+                if p.unknowns.is_free[u] == 0:
+                    of_corners[j] = NOT_UNKNOWN
+                else:
+                    count += wp.where(of_corners[j] < 0, 2, 1)
+        for j in range(4):
+            u = first_unknown(of_corners[j])
+            if u >= 0:
+                _list_entry(contacts, u, 4 * i + j, count)
+                if of_corners[j] < 0:
+                    _list_entry(contacts, u + 1, 4 * i + j, count)
+    return go_on(at, Phase.SORT)
 
 
 @wp.func
@@ -114,7 +130,7 @@ def _put_entry(contacts: Contacts, at: int, order: wp.int64, entry: int):
 
 
 @wp.func
-def sort_entries(n: int, contacts: Contacts):
+def _sort_entries(n: int, contacts: Contacts):
     """Puts an entry of an unknown to its place by its pair, so that sums do not depend on the order of threads.
 
     Those that have no other unknown come first, those that couple last.
@@ -135,8 +151,8 @@ def sort_entries(n: int, contacts: Contacts):
 
 
 @wp.func
-def sort_list(u: int, contacts: Contacts):
-    """Puts all entries of an unknown to their places, as :func:`sort_entries`, by one thread: by shell sort."""
+def _sort_list(u: int, contacts: Contacts):
+    """Puts all entries of an unknown to their places, as :func:`_sort_entries`, by one thread: by shell sort."""
     first, end = contacts.first[u], contacts.end[u]
     step = end - first
     while step > 1:
@@ -164,3 +180,17 @@ def sort_list(u: int, contacts: Contacts):
     if end > first:
         contacts.several[u] = first + alone
         contacts.middle[u] = first + single
+
+
+@wp.func
+def sort_contacts(at: Place, p: Problem) -> wp.vec4i:
+    """Puts the contacts of each unknown into an order that does not depend on threads."""
+    w, contacts = at.world, p.contacts
+    if at.threads == 1:  # long lists in less than a thread for each entry takes
+        for u in range(p.unknowns.of_worlds[w], p.unknowns.of_worlds[w + 1]):
+            _sort_list(u, contacts)
+    else:
+        first = contacts.entries_of_each * contacts.start[w]
+        for i in range(first + at.thread, first + contacts.listed[w], at.threads):
+            _sort_entries(i, contacts)
+    return go_on(at, Phase.BLOCKS)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from ...response.state.vectors import ZERO
+from .flow import Phase, Place, Problem, go_on, go_on_with_pairs
 from .system import Progress, Unknowns, is_near_end
 
 wp.set_module_options({"enable_backward": False})
@@ -19,22 +20,17 @@ _LEAST_SCALE = wp.constant(float(2.0**-12))
 
 
 @wp.func
-def take_bound(w: int, progress: Progress):
-    """Takes the share of a world down to its bound."""
-    progress.scale[w] = progress.scale[w] * progress.bound[w]
+def take_bound(at: Place, p: Problem) -> wp.vec4i:
+    """Takes the share of the world down to its bound."""
+    if at.thread == 0:
+        p.progress.scale[at.world] = p.progress.scale[at.world] * p.progress.bound[at.world]
+    return go_on(at, Phase.MOVE)
 
 
 @wp.func
 def may_cut(progress: Progress, w: int) -> bool:
     """Returns whether cuts of vertices may let a world go further: not while something that a program moves comes."""
     return progress.scale[w] < progress.damping[w] and progress.remaining[w] == 0.0
-
-
-@wp.func
-def begin_hold(w: int, progress: Progress):
-    """Lets a world in which something would meet solve once more, and clears its bound."""
-    progress.bound[w] = 1.0
-    progress.held[w] = 1
 
 
 @wp.func
@@ -51,36 +47,27 @@ def rises(w: int, progress: Progress) -> bool:
 
 
 @wp.func
-def begin_release(w: int, progress: Progress):
-    """Lets a world go along its solution without pairs held."""
-    progress.scale[w] = progress.damping[w]
-    progress.trial[w] = wp.int64(0)
-
-
-@wp.func
-def begin_cuts(w: int, whole: wp.array[float], progress: Progress):
-    """Lets a world that takes less than all of its displacements cut those of single vertices instead."""
-    whole[w] = progress.scale[w]
-    progress.scale[w] = progress.damping[w]
-    progress.bound[w] = 1.0
-
-
-@wp.func
-def take_cut(w: int, progress: Progress):
+def take_cut(at: Place, p: Problem) -> wp.vec4i:
     """Keeps the energy of a world before single vertices were cut, and takes its bound after that."""
-    progress.uncut[w] = progress.trial[w]
-    progress.trial[w] = wp.int64(0)
-    take_bound(w, progress)
+    w, progress = at.world, p.progress
+    if at.thread == 0:
+        progress.uncut[w] = progress.trial[w]
+        progress.trial[w] = wp.int64(0)
+        progress.scale[w] = progress.scale[w] * progress.bound[w]
+    return go_on_with_pairs(at, Phase.MOVE, Phase.CHOOSE_CUTS)
 
 
 @wp.func
-def choose_truncation(w: int, whole: wp.array[float], progress: Progress):
+def choose_cuts(at: Place, p: Problem) -> wp.vec4i:
     """Keeps the cuts of single vertices in a world whose energy is lower with them."""
-    cuts = progress.trial[w] < progress.uncut[w]
-    if not cuts:
-        progress.trial[w] = progress.uncut[w]
-        progress.scale[w] = whole[w]
-    progress.cuts[w] = int(cuts)
+    w, progress = at.world, p.progress
+    if at.thread == 0:
+        cuts = progress.trial[w] < progress.uncut[w]
+        if not cuts:
+            progress.trial[w] = progress.uncut[w]
+            progress.scale[w] = progress.whole[w]
+        progress.cuts[w] = int(cuts)
+    return go_on(at, Phase.UNDO_CUTS)
 
 
 @wp.func
@@ -95,7 +82,15 @@ def is_far(w: int, far_change: float, progress: Progress) -> bool:
 
 
 @wp.func
-def begin_newton_step(w: int, progress: Progress):
+def begin(at: Place, p: Problem) -> wp.vec4i:
+    """Begins the first Newton step."""
+    if at.thread == 0:
+        _begin_newton_step(at.world, p.progress)
+    return go_on(at, Phase.DIFFERENTIATE)
+
+
+@wp.func
+def _begin_newton_step(w: int, progress: Progress):
     """Clears what a Newton step measures of a world."""
     progress.before[w] = wp.where(progress.scale[w] > 0.0, progress.scale[w] * progress.change[w], -1.0)
     progress.change[w] = 0.0
@@ -144,20 +139,15 @@ def takes(w: int, progress: Progress) -> bool:
 
 
 @wp.func
-def decide(
-    w: int,
-    least_change: float,
-    far_change: float,
-    max_steps: int,
-    max_late_steps: int,
-    progress: Progress,
-    plane_share: wp.array[float],
-):
+def decide(at: Place, p: Problem) -> wp.vec4i:
     """Halves the share of a world that has not taken it, or ends its Newton step.
 
     A world ends whose unknowns hardly change, or that has taken all its Newton steps; others begin the next one. They
     are counted from when what a program moves arrives, if it does.
     """
+    w, progress, following = at.world, p.progress, go_on(at, Phase.NEXT)
+    if at.thread != 0:
+        return following
     takes_share, reaches = takes(w, progress), progress.trial[w] + wp.int64(0)
     progress.trial[w] = wp.int64(0)
     progress.searches[w] = int(not takes_share)
@@ -165,25 +155,27 @@ def decide(
         progress.scale[w] = 0.5 * progress.scale[w]
         if progress.scale[w] < _LEAST_SCALE:
             progress.scale[w] = 0.0
-        return
-    scale, was_far = progress.scale[w], is_far(w, far_change, progress)
-    plane_share[w] = wp.where(scale == 1.0, 1.0, plane_share[w] + (1.0 - plane_share[w]) * scale)
-    progress.steps[w] = progress.steps[w] + 1
+        return following
+    scale, was_far = progress.scale[w] + float(0.0), is_far(w, p.far_change, progress)
+    planes = progress.plane_share[w] + float(0.0)
+    progress.plane_share[w] = wp.where(scale == 1.0, 1.0, planes + (1.0 - planes) * scale)
+    steps = progress.steps[w] + 1
+    progress.steps[w] = steps
     arrived = scale == 1.0 or progress.remaining[w] == 0.0
-    steps = progress.steps[w]
     if progress.remaining[w] > 0.0:
         progress.late[w] = steps - 1
     progress.driven[w] = wp.max(progress.driven[w], progress.remaining[w])
-    ends = arrived and (is_near_end(progress, w, least_change) or steps - progress.late[w] >= max_steps)
+    ends = arrived and (is_near_end(progress, w, p.least_change) or steps - progress.late[w] >= p.max_steps)
     if scale == 0.0 and arrived:
         ends = ends or was_far
-    if ends or (steps >= max_late_steps and not arrived):
+    if ends or (steps >= p.max_late_steps and not arrived):
         progress.active[w] = 0
-        return
+        return following
     if arrived and progress.held[w] == 0 and progress.cuts[w] == 0:
         _damp(w, progress)
     progress.reached[w] = reaches
-    begin_newton_step(w, progress)
+    _begin_newton_step(w, progress)
+    return following
 
 
 @wp.func
@@ -200,15 +192,13 @@ def _moves_bodies(unknowns: Unknowns, w: int) -> bool:
 @wp.kernel
 def go_back(
     # in
-    progress: Progress,
     unknowns: Unknowns,
     contact_iteration: wp.array[int],
     begins: bool,
     # in and out
-    place: wp.array[int],
+    progress: Progress,
     # out
     converged: wp.array[wp.bool],
-    goes_back: wp.array[int],
     any_goes_back: wp.array[int],
 ):
     """Lets worlds whose straight way has contacts end a Newton step earlier, down to the first.
@@ -217,12 +207,12 @@ def go_back(
     give vertices much energy. Worlds in which bodies are solved for stay, as the ways of bodies are not kept.
     """
     w = wp.tid()
-    goes_back[w] = 0
+    progress.goes_back[w] = 0
     if begins:
-        place[w] = wp.where(_moves_bodies(unknowns, w), -1, wp.min(progress.steps[w], PATH) - 1)
-    if contact_iteration[w] >= 0 and place[w] >= 0:
+        progress.place[w] = wp.where(_moves_bodies(unknowns, w), -1, wp.min(progress.steps[w], PATH) - 1)
+    if contact_iteration[w] >= 0 and progress.place[w] >= 0:
         converged[w] = False
-        if place[w] > 0:
-            place[w] = place[w] - 1
-            goes_back[w] = 1
+        if progress.place[w] > 0:
+            progress.place[w] = progress.place[w] - 1
+            progress.goes_back[w] = 1
             any_goes_back[0] = 1

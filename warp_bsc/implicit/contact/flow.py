@@ -4,12 +4,14 @@ from enum import IntEnum
 
 import warp as wp
 
+from ...response.state.planes import MovingPlanes
+from ...response.state.structs import Motion
 from ..elasticity.derivatives import Derivatives
 from ..elasticity.elements import Elements
 from .bodies import SolvedBodies
 from .conjugate_gradients import Vectors
 from .matrix import Matrix
-from .pairs import Candidates, Trial
+from .pairs import BarrierSettings, Candidates, Trial, far_ones_stay, listed_count
 from .rows import Rows
 from .system import Contacts, Progress, Unknowns, Worlds
 
@@ -78,6 +80,8 @@ class Flow:
         count: Length of both lists, shape [2].
         taken: Worlds that blocks have taken after their first ones, shape [1].
         ended: Blocks that have ended, shape [1].
+        any_leaves: 1 if a vertex leaves its box, shape [1].
+        lacks: See :func:`.results.write_results`, shape [2].
     """
 
     phase: wp.array[int]
@@ -90,6 +94,8 @@ class Flow:
     count: wp.array[int]
     taken: wp.array[int]
     ended: wp.array[int]
+    any_leaves: wp.array[int]
+    lacks: wp.array[int]
 
 
 @wp.struct
@@ -124,17 +130,6 @@ class Problem:
     """What Newton steps read and write.
 
     Attributes:
-        row_of_block: Row of each block of ``rows``.
-        goal: Where inertia leads each vertex [m].
-        lower, upper: Boxes of vertices within which the candidates are all that may come near each other [m].
-        limit: Share of its displacement before each vertex meets something.
-        plane_share: Share of their ways that infinite planes have gone, by world.
-        whole: Share that each world takes without cuts of single vertices.
-        first: Solution of the Newton step before pairs are held.
-        last: The same of the Newton step before.
-        leaves: 1 for each world of which a vertex leaves its box.
-        any_leaves: 1 if there is one, shape [1].
-        lacks: See :func:`.results.write_results`.
         vertices_at_planes: Vertices that infinite planes may stop, 0 if there are none.
         parts: Threads that share rows and blocks.
         turns: Rows that they share, one after the other, no more than they are.
@@ -144,10 +139,12 @@ class Problem:
         max_steps, max_late_steps: Newton steps of a step at most, and while something that a program moves comes.
     """
 
+    motion: Motion
+    planes: MovingPlanes
+    settings: BarrierSettings
     elements: Elements
     derivatives: Derivatives
     rows: Rows
-    row_of_block: wp.array[int]
     matrix: Matrix
     vectors: Vectors
     unknowns: Unknowns
@@ -157,17 +154,6 @@ class Problem:
     trial: Trial
     progress: Progress
     flow: Flow
-    goal: wp.array[wp.vec3]
-    lower: wp.array[wp.vec3]
-    upper: wp.array[wp.vec3]
-    limit: wp.array[float]
-    plane_share: wp.array[float]
-    whole: wp.array[float]
-    first: wp.array[wp.vec3]
-    last: wp.array[wp.vec3]
-    leaves: wp.array[int]
-    any_leaves: wp.array[int]
-    lacks: wp.array[int]
     worlds: Worlds
     vertices_at_planes: int
     parts: int
@@ -223,3 +209,47 @@ def wait_for_team(arrived: wp.array[int], world: int, blocks: int):
 def count_block(values: wp.array[int]) -> int:
     """Adds 1 to a number for the block of a thread, where all of its threads are here, and returns what it was."""
     ...
+
+
+@wp.func
+def go_on(at: Place, phase: int) -> wp.vec4i:
+    """Goes on with a phase."""
+    return wp.vec4i(phase, at.then, at.passes, at.solves)
+
+
+@wp.func
+def go_on_with_pairs(at: Place, phase: int, then: int) -> wp.vec4i:
+    """Goes on with phases over pairs, ``then`` with another one."""
+    return wp.vec4i(phase, then, at.passes, at.solves)
+
+
+# These take parts of a Problem, as a compiler copies one that is passed on.
+
+
+@wp.func
+def end_of_vertices(worlds: Worlds, progress: Progress, w: int) -> int:
+    """Returns the end of the vertices that may move in a step."""
+    return wp.where(progress.given_moves[w] != 0, worlds.first_vertex[w + 1], worlds.first_given[w])
+
+
+@wp.func
+def end_at_planes(worlds: Worlds, vertices_at_planes: int, w: int) -> int:
+    """Returns the end of the vertices of a world of which some may be at planes."""
+    return wp.where(vertices_at_planes > 0, worlds.first_given[w], 0)
+
+
+@wp.func
+def has_few(candidates: Candidates, at: Place) -> bool:
+    """Returns whether threads have one candidate each at most: they list and do what comes then at once."""
+    return candidates.near[at.world] + candidates.far[at.world] <= at.threads
+
+
+@wp.func
+def pair_count(candidates: Candidates, progress: Progress, w: int, of_all: bool) -> int:
+    """Returns the number of listed candidates of a world, or of all but those that are far in any case."""
+    count = listed_count(candidates, w)
+    if of_all:
+        count = candidates.near[w] + int(0)
+        if not far_ones_stay(progress, w):
+            count += candidates.far[w]
+    return count

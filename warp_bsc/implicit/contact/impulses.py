@@ -3,7 +3,6 @@
 import warp as wp
 
 from ...kernels.polynomials import EDGE_EDGE
-from ...response.report.forces.accumulate import torque_on
 from ...response.report.forces.emit import publish_contact
 from ...response.report.forces.structs import ContactRows, ImpulseSums, Sides
 from ...response.state.structs import ContactKind, Step
@@ -21,7 +20,6 @@ def publish_contacts(
     contacts: Contacts,
     settings: BarrierSettings,
     trial: Trial,
-    goal: wp.array[wp.vec3],
     step: Step,
     sides: Sides,
     centres: wp.array[wp.vec3d],
@@ -43,7 +41,7 @@ def publish_contacts(
             weights[j] = wp.float64(contacts.weights[i][j])
             x0 = to_double(step.motion.x0[corners[j]])
             slid += weights[j] * (trial.exact[corners[j]] - x0)
-            predicted += weights[j] * (to_double(goal[corners[j]]) - x0)
+            predicted += weights[j] * (to_double(trial.goal[corners[j]]) - x0)
         slid -= wp.dot(slid, normal) * normal
         limit = wp.float64(contacts.limit[i])
         impulse = load * normal - limit * barrier.friction_slope(wp.length(slid), settings.smoothing) * slid
@@ -58,6 +56,7 @@ def publish_contacts(
         publish_contact(
             step,
             sides,
+            centres,
             kind,
             corners,
             weights,
@@ -65,8 +64,6 @@ def publish_contacts(
             impulse,
             settings.dt * load,
             normal,
-            torque_on(step, sides, centres, corners, weights, plane, 0, impulse),
-            torque_on(step, sides, centres, corners, weights, plane, 1, impulse),
             to_single(predicted / settings.dt),
             ZERO,
             sums,

@@ -72,9 +72,9 @@ def make_matrix(rows: Rows, of_worlds: np.ndarray, parts: int, device: wp.Device
 
 
 @wp.func
-def block_at(matrix: Matrix, place: int) -> wp.mat33:
-    """Returns the block whose first component is at a place."""
-    v, n = matrix.value, matrix.width
+def block_of(matrix: Matrix, k: int) -> wp.mat33:
+    """Returns a block of the rows."""
+    v, n, place = matrix.value, matrix.width, matrix.place[k]
     return wp.mat33(
         v[place],
         v[place + n],
@@ -86,12 +86,6 @@ def block_at(matrix: Matrix, place: int) -> wp.mat33:
         v[place + 7 * n],
         v[place + 8 * n],
     )
-
-
-@wp.func
-def block_of(matrix: Matrix, k: int) -> wp.mat33:
-    """Returns a block of the rows."""
-    return block_at(matrix, matrix.place[k])
 
 
 @wp.func

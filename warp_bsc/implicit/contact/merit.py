@@ -3,23 +3,27 @@
 import warp as wp
 
 from ...response.contacts.rules import inverse_mass_of
-from ...response.state.planes import MovingPlanes, signed_distance
+from ...response.state.planes import signed_distance
 from ...response.state.structs import Motion
-from ...response.state.vectors import ZERO, corners_of, to_double
+from ...response.state.vectors import HALF, ZERO, corners_of, to_double
+from ..elasticity.derivatives import element_energy
+from ..elasticity.elements import kind_of
 from ..vector_access import integers_at, numbers_at
 from . import barrier
+from .bodies import SolvedBodies, inertial_energy
 from .distance_bounds import seen_from_last
+from .flow import Place, Problem, end_at_planes, go_on, pair_count
 from .pairs import (
     BarrierSettings,
-    Candidates,
     Trial,
     distance_bound,
     gap_at_plane,
+    listed,
     plane_at,
     stiffness_at_plane,
     stiffness_of_pair,
 )
-from .system import Contacts, Progress, kind_of_key
+from .system import Contacts, Unknowns, end_of_contacts, kind_of_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,29 +70,27 @@ def add_energy(energy: wp.array[wp.int64], world: int, value: wp.float64, units:
 
 
 @wp.func
-def add_pair_energy(
-    i: int,
+def add_inertia(
+    u: int,
     world: int,
-    candidates: Candidates,
+    motion: Motion,
     settings: BarrierSettings,
     trial: Trial,
-    progress: Progress,
+    unknowns: Unknowns,
+    bodies: SolvedBodies,
+    energy: wp.array[wp.int64],
 ):
-    """Adds the energy of the barrier of a candidate at the displaced positions."""
-    corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
-    kind = kind_of_key(candidates.key[i])
-    u, v, w = seen_from_last(trial.moved, corners)
-    if wp.float64(distance_bound(candidates, i, kind, u, v, w)) >= candidates.level[i] + reach:
+    """Adds the energy of inertia of an unknown at ``trial.moved`` to that of its world."""
+    if unknowns.is_free[u] == 0:
         return
-    a, b, c, d = corners_of(trial.moved, corners)
-    _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
-    gap = distance - candidates.level[i]
-    if gap < reach:
-        value = MEETS
-        if gap > ZERO:
-            stiffness = stiffness_of_pair(candidates.stiffness[i], settings, trial, corners, reach)
-            value = stiffness * barrier.barrier_energy(gap, reach)
-        add_energy(progress.trial, world, value, settings.units)
+    p = unknowns.particle[u]
+    if p < 0:
+        body = unknowns.body[u]
+        if u == bodies.unknown[body]:
+            add_energy(energy, world, inertial_energy(bodies, motion, body, settings.dt), settings.units)
+        return
+    off = trial.moved[p] - to_double(trial.goal[p])
+    add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
 
 
 @wp.func
@@ -115,31 +117,55 @@ def add_friction_energy(
 
 
 @wp.func
-def add_plane_energies(
-    vertex: int,
-    world: int,
-    motion: Motion,
-    planes: MovingPlanes,
-    plane_share: wp.array[float],
-    settings: BarrierSettings,
-    trial: Trial,
-    progress: Progress,
-):
-    """Adds the energies of a vertex at infinite planes at the displaced positions."""
-    if inverse_mass_of(motion, vertex) == 0.0:
-        return
-    scale, now = progress.scale[world], plane_share[world]
-    for place in range(planes.of_worlds.shape[1]):
-        i = planes.of_worlds[world, place]
+def find_energy(at: Place, p: Problem) -> wp.vec4i:
+    """Finds the energy where vertices are moved to."""
+    w, t, n, energy, units = at.world, at.thread, at.threads, p.progress.trial, p.settings.units
+    from_middle = (t + n // 2) % n
+    for k in range(p.worlds.first_element[w] + n - 1 - t, p.worlds.first_element[w + 1], n):
+        i = p.worlds.elements[k] + int(0)
         if i < 0:
-            return
-        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex, to_double(motion.x0[vertex]))
-        plane = plane_at(planes, i, now + (1.0 - now) * scale)
-        distance, _error = signed_distance(plane, trial.moved[vertex])
+            continue
+        of_element = element_energy(p.elements, i, kind_of(p.elements, i), p.trial.moved, p.motion.x0, p.settings.dt)
+        add_energy(energy, w, of_element, units)
+    for u in range(p.unknowns.of_worlds[w] + from_middle, p.unknowns.of_worlds[w + 1], n):
+        add_inertia(u, w, p.motion, p.settings, p.trial, p.unknowns, p.bodies, energy)
+    for i in range(p.contacts.start[w] + from_middle, end_of_contacts(p.contacts, w), n):
+        add_friction_energy(i, w, p.motion, p.contacts, p.settings, p.trial, energy)
+    for k in range(t, pair_count(p.candidates, p.progress, w, False), n):
+        i = listed(p.candidates, w, k) >> 1
+        corners, reach = integers_at(p.candidates.corners, i), wp.float64(p.candidates.reach[i])
+        kind, level = kind_of_key(p.candidates.key[i]), p.candidates.level[i] + ZERO
+        q, r, s = seen_from_last(p.trial.moved, corners)
+        if wp.float64(distance_bound(p.candidates, i, kind, q, r, s)) >= level + reach:
+            continue
+        a, b, c, d = corners_of(p.trial.moved, corners)
+        _weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
         gap = distance - level
         if gap < reach:
             value = MEETS
             if gap > ZERO:
-                value = stiffness_at_plane(motion, settings, progress.fall[world], vertex, reach)
-                value *= barrier.barrier_energy(gap, reach)
-            add_energy(progress.trial, world, value, settings.units)
+                stiffness = stiffness_of_pair(p.candidates.stiffness[i], p.settings, p.trial, corners, reach)
+                value = stiffness * barrier.barrier_energy(gap, reach)
+            add_energy(energy, w, value, units)
+    now = p.progress.plane_share[w] + float(0.0)
+    then = now + (1.0 - now) * p.progress.scale[w]
+    for k in range(p.worlds.first_vertex[w] + t, end_at_planes(p.worlds, p.vertices_at_planes, w), n):
+        v = p.worlds.vertices[k] + int(0)
+        if v >= p.vertices_at_planes or inverse_mass_of(p.motion, v) == 0.0:
+            continue
+        for place in range(p.planes.of_worlds.shape[1]):
+            plane = p.planes.of_worlds[w, place]
+            if plane < 0:
+                break
+            _kept, level, reach, _floor = gap_at_plane(
+                p.motion, p.planes, p.settings, plane, v, to_double(p.motion.x0[v])
+            )
+            distance, _error = signed_distance(plane_at(p.planes, plane, then), p.trial.moved[v])
+            gap = distance - level
+            if gap < reach:
+                value = MEETS
+                if gap > ZERO:
+                    value = stiffness_at_plane(p.motion, p.settings, p.progress.fall[w], v, reach)
+                    value *= barrier.barrier_energy(gap, reach)
+                add_energy(energy, w, value, units)
+    return go_on(at, at.then)

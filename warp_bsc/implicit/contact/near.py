@@ -4,13 +4,14 @@ import warp as wp
 
 from ...response.contacts.constraints import friction_on_plane, pair_friction
 from ...response.contacts.rules import inverse_mass_of
-from ...response.state.planes import MovingPlanes, signed_distance
+from ...response.state.planes import signed_distance
 from ...response.state.structs import Motion
 from ...response.state.vectors import ONE, ZERO, corners_of, to_double, to_single
-from ..vector_access import integers_at, store_block
+from ..vector_access import integers_at
 from . import barrier
 from .distance_bounds import ROUNDED_DOWN, direction_in_bits, seen_from_last
-from .merge import link_contact
+from .flow import Phase, Place, Problem, end_at_planes, go_on, go_on_with_pairs, has_few, pair_count
+from .merge import clear_buckets, link_contact
 from .merit import MEETS, add_energy
 from .pairs import (
     FAR,
@@ -18,23 +19,17 @@ from .pairs import (
     Candidates,
     Trial,
     add_to_list,
+    candidate,
+    clear_list,
     distance_bound,
     gap_at_plane,
+    listed,
+    listed_count,
     plane_at,
     stiffness_at_plane,
     stiffness_of_pair,
 )
-from .system import (
-    Contacts,
-    Progress,
-    Unknowns,
-    couples,
-    is_solved,
-    key_of_pair,
-    kind_of_key,
-    take_contact,
-    unknowns_of,
-)
+from .system import Contacts, Unknowns, is_solved, key_of_pair, kind_of_key, take_contact, write_contact
 
 wp.set_module_options({"enable_backward": False})
 
@@ -100,22 +95,31 @@ def _add_contact(
         else:
             across = slope * across
         hessian += across
-    of_corners = unknowns_of(unknowns, corners)
-    contacts.corners[slot] = corners
-    contacts.unknowns[slot] = of_corners
-    contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
-    contacts.normal[slot] = to_single(normal)
-    contacts.load[slot] = float(load)
-    contacts.limit[slot] = friction * float(load)
-    contacts.gradient[slot] = to_single(gradient)
-    store_block(contacts.hessian, slot, hessian)
-    contacts.key[slot] = key
-    contacts.couples[slot] = couples(of_corners, weights)
+    n, push, hold = to_single(normal), float(load), friction * float(load)
+    write_contact(contacts, unknowns, slot, corners, weights, n, push, hold, to_single(gradient), hessian, key)
     link_contact(contacts, world, slot, corners, weights)
 
 
 @wp.func
-def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
+def publish(at: Place, p: Problem) -> wp.vec4i:
+    """Finds what is near at the end of a step."""
+    clear_buckets(at.world, at.thread, at.threads, p.contacts)
+    if at.thread == 0:
+        p.contacts.count[at.world] = 0
+    phase = wp.where(listed_count(p.candidates, at.world) >= 0, int(Phase.FIND_NEAR), int(Phase.BEGIN_LIST))
+    return go_on_with_pairs(at, wp.where(p.progress.steps[at.world] == 0, int(Phase.END), phase), Phase.END)
+
+
+@wp.func
+def begin_list(at: Place, p: Problem) -> wp.vec4i:
+    """Empties the list of candidates."""
+    if at.thread == 0:
+        clear_list(p.candidates, at.world)
+    return go_on(at, wp.where(has_few(p.candidates, at), int(Phase.LIST_AND_FIND_NEAR), int(Phase.LIST_NEAR)))
+
+
+@wp.func
+def _list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
     """Lists a candidate if it may be near each other, for :func:`find_near`, where no displacements told."""
     if candidates.share[i] >= FAR:
         return False
@@ -130,110 +134,106 @@ def list_near(i: int, world: int, candidates: Candidates, trial: Trial) -> bool:
 
 
 @wp.func
-def find_near(
-    i: int,
-    world: int,
-    motion: Motion,
-    candidates: Candidates,
-    settings: BarrierSettings,
-    trial: Trial,
-    unknowns: Unknowns,
-    progress: Progress,
-    contacts: Contacts,
-):
-    """Adds a contact if a candidate is near each other, and its energy."""
-    corners, reach = integers_at(candidates.corners, i), wp.float64(candidates.reach[i])
-    key = candidates.key[i] + wp.int64(0)
-    kind = kind_of_key(key)
-    u, v, w = seen_from_last(trial.exact, corners)
-    apart = distance_bound(candidates, i, kind, u, v, w)
-    candidates.now[i] = apart
-    if wp.float64(apart) >= candidates.level[i] + reach:
-        return
-    a, b, c, d = corners_of(trial.exact, corners)
-    weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
-    candidates.now[i] = float(distance * wp.float64(ROUNDED_DOWN))
-    gap = distance - candidates.level[i]
-    if not gap > ZERO:
-        add_energy(progress.energy, world, MEETS, settings.units)
-        return
-    normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
-    candidates.normal[i] = direction_in_bits(normal)
-    if gap >= reach:
-        return
-    stiffness = stiffness_of_pair(candidates.stiffness[i], settings, trial, corners, reach)
-    add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
-    friction = pair_friction(motion, corners)
-    _add_contact(
-        motion,
-        contacts,
-        settings,
-        trial,
-        unknowns,
-        world,
-        corners,
-        _merged(corners, weights),
-        normal,
-        wp.vec3d(),
-        ZERO,
-        gap,
-        reach,
-        stiffness,
-        friction,
-        key,
-    )
+def list_near(at: Place, p: Problem) -> wp.vec4i:
+    """Lists candidates that may be near each other: little for each of all, so that what follows has few."""
+    for k in range(at.thread, pair_count(p.candidates, p.progress, at.world, True), at.threads):
+        _list_near(candidate(p.candidates, at.world, k), at.world, p.candidates, p.trial)
+    return go_on(at, Phase.FIND_NEAR)
 
 
 @wp.func
-def find_near_planes(
-    vertex: int,
-    world: int,
-    motion: Motion,
-    planes: MovingPlanes,
-    plane_share: wp.array[float],
-    settings: BarrierSettings,
-    trial: Trial,
-    unknowns: Unknowns,
-    progress: Progress,
-    contacts: Contacts,
-):
-    """Adds contacts for a vertex that is near infinite planes, and their energies."""
-    if inverse_mass_of(motion, vertex) == 0.0:
-        return
-    for place in range(planes.of_worlds.shape[1]):
-        i = planes.of_worlds[world, place]
-        if i < 0:
-            return
-        plane = plane_at(planes, i, plane_share[world])
-        distance, _error = signed_distance(plane, trial.exact[vertex])
-        _kept, level, reach, _floor = gap_at_plane(motion, planes, settings, i, vertex, to_double(motion.x0[vertex]))
-        gap = distance - level
+def find_near(at: Place, p: Problem) -> wp.vec4i:
+    """Adds contacts of candidates that are near each other, listed ones or all, and of planes, and their energies."""
+    w, at_once, energy = at.world, at.phase == Phase.LIST_AND_FIND_NEAR, p.progress.energy
+    for k in range(at.thread, pair_count(p.candidates, p.progress, w, at_once), at.threads):
+        i, is_near = int(0), bool(True)
+        if at_once:
+            i = candidate(p.candidates, w, k)
+            is_near = _list_near(i, w, p.candidates, p.trial)
+        else:
+            i = listed(p.candidates, w, k) >> 1
+        if not is_near:
+            continue
+        corners, reach = integers_at(p.candidates.corners, i), wp.float64(p.candidates.reach[i])
+        key = p.candidates.key[i] + wp.int64(0)
+        kind = kind_of_key(key)
+        q, r, s = seen_from_last(p.trial.exact, corners)
+        apart = distance_bound(p.candidates, i, kind, q, r, s)
+        p.candidates.now[i] = apart
+        if wp.float64(apart) >= p.candidates.level[i] + reach:
+            continue
+        a, b, c, d = corners_of(p.trial.exact, corners)
+        weights, distance = barrier.closest_weights_and_gap(kind, a, b, c, d)
+        p.candidates.now[i] = float(distance * wp.float64(ROUNDED_DOWN))
+        gap = distance - p.candidates.level[i]
+        if not gap > ZERO:
+            add_energy(energy, w, MEETS, p.settings.units)
+            continue
+        normal = (weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d) / distance
+        p.candidates.normal[i] = direction_in_bits(normal)
         if gap >= reach:
             continue
-        if not gap > ZERO:
-            add_energy(progress.energy, world, MEETS, settings.units)
-            continue
-        normal = wp.vec3d(plane[0], plane[1], plane[2])
-        stiffness = stiffness_at_plane(motion, settings, progress.fall[world], vertex, reach)
-        add_energy(progress.energy, world, stiffness * barrier.barrier_energy(gap, reach), settings.units)
-        key = key_of_pair(1, 0, vertex, i)
-        there, _error_there = signed_distance(planes.end[i], trial.exact[vertex])
-        since, _since_error = signed_distance(planes.start[i], trial.exact[vertex])
+        stiffness = stiffness_of_pair(p.candidates.stiffness[i], p.settings, p.trial, corners, reach)
+        add_energy(energy, w, stiffness * barrier.barrier_energy(gap, reach), p.settings.units)
         _add_contact(
-            motion,
-            contacts,
-            settings,
-            trial,
-            unknowns,
-            world,
-            wp.vec4i(vertex),
-            wp.vec4d(ONE, ZERO, ZERO, ZERO),
+            p.motion,
+            p.contacts,
+            p.settings,
+            p.trial,
+            p.unknowns,
+            w,
+            corners,
+            _merged(corners, weights),
             normal,
-            (since - distance) * normal,
-            distance - there,
+            wp.vec3d(),
+            ZERO,
             gap,
             reach,
             stiffness,
-            friction_on_plane(motion, planes, i, vertex),
+            pair_friction(p.motion, corners),
             key,
         )
+    for k in range(p.worlds.first_vertex[w] + at.thread, end_at_planes(p.worlds, p.vertices_at_planes, w), at.threads):
+        v = p.worlds.vertices[k] + int(0)
+        if v >= p.vertices_at_planes or inverse_mass_of(p.motion, v) == 0.0:
+            continue
+        x = p.trial.exact[v]
+        for place in range(p.planes.of_worlds.shape[1]):
+            plane = p.planes.of_worlds[w, place]
+            if plane < 0:
+                break
+            now = plane_at(p.planes, plane, p.progress.plane_share[w])
+            distance, _error = signed_distance(now, x)
+            _kept, level, reach, _floor = gap_at_plane(
+                p.motion, p.planes, p.settings, plane, v, to_double(p.motion.x0[v])
+            )
+            gap = distance - level
+            if gap >= reach:
+                continue
+            if not gap > ZERO:
+                add_energy(energy, w, MEETS, p.settings.units)
+                continue
+            normal = wp.vec3d(now[0], now[1], now[2])
+            stiffness = stiffness_at_plane(p.motion, p.settings, p.progress.fall[w], v, reach)
+            add_energy(energy, w, stiffness * barrier.barrier_energy(gap, reach), p.settings.units)
+            there, _error_there = signed_distance(p.planes.end[plane], x)
+            since, _since_error = signed_distance(p.planes.start[plane], x)
+            _add_contact(
+                p.motion,
+                p.contacts,
+                p.settings,
+                p.trial,
+                p.unknowns,
+                w,
+                wp.vec4i(v),
+                wp.vec4d(ONE, ZERO, ZERO, ZERO),
+                normal,
+                (since - distance) * normal,
+                distance - there,
+                gap,
+                reach,
+                stiffness,
+                friction_on_plane(p.motion, p.planes, plane, v),
+                key_of_pair(1, 0, v, plane),
+            )
+    return go_on(at, at.then)

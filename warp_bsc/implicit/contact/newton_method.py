@@ -88,8 +88,6 @@ class NewtonMethod:
         keeps_contacts: Whether a solve ends with the contacts at its end, to publish or to record them.
         may_grow: Whether buffers of contacts grow between Newton steps, outside graphs.
         problem: What Newton steps read and write.
-        settings: What barriers and friction depend on.
-        origin: Where vertices started the step, those that touched a shape a little beside it.
     """
 
     keeps_contacts = False
@@ -117,7 +115,7 @@ class NewtonMethod:
         mesh = self.mesh = work.mesh
         model, device = mesh.model, mesh.device
         particles, vertices = model.particle_count, mesh.vertex_count
-        self._elements, of_elements = elements_of_model(model)
+        elements, of_elements = elements_of_model(model)
         bends = of_elements[ElementKind.BENDING]
         bends[(bends < 0).any(axis=1)] = -1  # an edge at a border does not bend
         world = mesh.device_world.numpy()[:particles]
@@ -127,7 +125,8 @@ class NewtonMethod:
         def array(values):
             return wp.array(np.asarray(values, dtype=np.int32), dtype=int, device=device)
 
-        unknowns = self._unknowns = Unknowns()
+        p = self.problem = Problem()
+        unknowns = Unknowns()
         solved, body_of_vertex = self._bodies_in_solve(), mesh.shape_vertices.body
         body_world = np.zeros(0, dtype=int)
         if len(solved):
@@ -152,53 +151,44 @@ class NewtonMethod:
         unknowns.arm = wp.zeros(vertices, dtype=wp.vec3, device=device)
         largest = int(np.bincount(owner_world, minlength=1).max(initial=0))
         self._team, self._threads, self._solve_worlds = make_team(largest, work.worlds, device)
-        self._bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
+        p.bodies = allocate(bodies.SolvedBodies, model.body_count if len(solved) else 0, device)
         holder = np.arange(vertices)
         if len(solved):
             first_vertex = np.full(model.body_count, -1)
             of_body, first_of_body = np.unique(body_of_vertex, return_index=True)
             first_vertex[of_body[of_body >= 0]] = particles + first_of_body[of_body >= 0]
-            self._bodies.unknown, self._bodies.first_vertex = array(of_bodies[:-1]), array(first_vertex)
+            p.bodies.unknown, p.bodies.first_vertex = array(of_bodies[:-1]), array(first_vertex)
             held = np.flatnonzero(first >= 0)
             holder[particles + held] = first_vertex[body_of_vertex[held]]
-        self._rows = make_rows(of_elements, unknown, self._count, device)
-        row_of_block = array(np.repeat(np.arange(self._count), np.diff(self._rows.first.numpy())))
-        self._matrix = make_matrix(self._rows, of_worlds, self._team.parts, device)
-        self._vectors = allocate(Vectors, self._count, device)
-        self.progress = allocate(Progress, work.worlds, device)
-        self._trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles))
-        self._trial.holder = array(holder)
-        self.origin, self._goal, self._lower, self._upper = (
-            wp.zeros(vertices, dtype=wp.vec3, device=device) for _ in range(4)
-        )
-        limit = wp.full(vertices, 1.0, dtype=float, device=device)
-        self._plane_share = wp.zeros(work.worlds, dtype=float, device=device)
-        whole = wp.zeros(work.worlds, dtype=float, device=device)
-        self._leaves = wp.zeros(work.worlds, dtype=int, device=device)
-        self._any_leaves = wp.zeros(1, dtype=int, device=device)
+        p.unknowns, p.rows = unknowns, make_rows(of_elements, unknown, self._count, device)
+        p.matrix = make_matrix(p.rows, of_worlds, self._team.parts, device)
+        p.vectors = allocate(Vectors, self._count, device)
+        p.progress = allocate(Progress, work.worlds, device)
+        p.trial = allocate(Trial, vertices, device, path=(int(decisions.PATH), particles), any_touches=1)
+        p.trial.holder = array(holder)
+        p.trial.limit.fill_(1.0)
         self._goes_back = wp.zeros(1, dtype=int, device=device)
-        self._place = wp.zeros(work.worlds, dtype=int, device=device)
         self.iterations = wp.zeros(work.worlds, dtype=int, device=device)
-        self.settings = BarrierSettings()
+        settings = p.settings
         self._metre = metre_of(mesh)
         reach = self._reach(mesh)
-        self.settings.reach = wp.array(reach, dtype=float, device=device)
-        self.settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
+        settings.reach = wp.array(reach, dtype=float, device=device)
+        settings.elasticity = wp.array(self._elasticity(mesh), dtype=float, device=device)
         is_of_face = np.zeros(vertices)
         is_of_face[mesh.faces.ravel()] = 1
-        self.settings.is_of_face = array(is_of_face)
-        self.settings.load = wp.zeros(vertices, dtype=float, device=device)
+        settings.is_of_face = array(is_of_face)
+        settings.load = wp.zeros(vertices, dtype=float, device=device)
         worlds = mesh.device_world.numpy()
         of_bodies = np.full(vertices, np.inf)
         if len(solved):
             least = in_each_world(np.min, reach[:particles], world, work.worlds, np.inf)[worlds]
             of_bodies = np.minimum(bodies.reach_between_bodies(mesh), least)
             of_bodies[:particles] = np.inf
-        self.settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
+        settings.reach_of_bodies = wp.array(of_bodies, dtype=float, device=device)
         reach = np.minimum(reach, of_bodies)
         margin = np.where(np.isfinite(reach), reach, 0.0)
         margin += 0.5 * in_each_world(np.max, margin, worlds, work.worlds, 0.0)[worlds]
-        self._margin = wp.array(margin, dtype=float, device=device)
+        p.trial.margin = wp.array(margin, dtype=float, device=device)
         masses = host_array(model.particle_mass)
         moves = (host_array(model.particle_inv_mass) > 0) & np.isfinite(masses)
         mass = in_each_world(np.mean, masses[moves], world[moves], work.worlds, 1.0)
@@ -210,26 +200,16 @@ class NewtonMethod:
         if len(solved):
             heaviest = in_each_world(np.max, host_array(model.body_mass)[solved], body_world, work.worlds, 0.0)
             units = np.minimum(units, _MOST_UNITS / np.maximum(heaviest * (_FAST * self._metre) ** 2, 1e-9))
-        self.settings.units = wp.array(units, dtype=wp.float64, device=device)
+        settings.units = wp.array(units, dtype=wp.float64, device=device)
         self._attachments = attachments_of_model(model)
-        self._touching = allocate(pairs.Touching, vertices, device, any=1)
-        self._lacks = wp.zeros(2, dtype=int, device=device)  # see write_results
         self._results = [results, unconverged_steps]
-        sizes = {**dict.fromkeys(("solves_next", "goes_on", "turn", "taken", "ended"), 1), "count": 2}
-        self._flow = allocate(Flow, work.worlds, device, **sizes, listed=2 * work.worlds)
+        sizes = {**dict.fromkeys(("solves_next", "goes_on", "turn", "taken", "ended", "any_leaves"), 1), "count": 2}
+        p.flow = allocate(Flow, work.worlds, device, **sizes, lacks=2, listed=2 * work.worlds)
         processors = device.sm_count if device.is_cuda else 1
         self._is_many = device.is_cuda and vertices > _MANY_VERTICES * processors
         self._block, blocks = BLOCKS[self._is_many]
         self._blocks = blocks * processors
-        p = self.problem = Problem()
-        p.elements, p.derivatives = self._elements, make_derivatives(of_elements, device)
-        p.rows, p.row_of_block, p.matrix = self._rows, row_of_block, self._matrix
-        p.vectors, p.unknowns, p.bodies = self._vectors, unknowns, self._bodies
-        p.trial, p.progress, p.flow = self._trial, self.progress, self._flow
-        p.goal, p.lower, p.upper, p.limit = self._goal, self._lower, self._upper, limit
-        p.plane_share, p.whole, p.lacks = self._plane_share, whole, self._lacks
-        p.leaves, p.any_leaves = self._leaves, self._any_leaves
-        p.first, p.last = (wp.zeros(self._count, dtype=wp.vec3, device=device) for _ in range(2))
+        p.elements, p.derivatives = elements, make_derivatives(of_elements, device)
         p.worlds = self._in_worlds(of_elements, unknowns)
         p.vertices_at_planes = work.vertices_at_planes if work.max_penetrations else 0
         p.parts = _PARTS if device.is_cuda else 1
@@ -238,9 +218,13 @@ class NewtonMethod:
         self._captured, self._retired = False, []
         rooms = np.append(0, np.cumsum(np.where(order < particles, 1, _MORE_OF_BODIES)))
         self._rooms = rooms[of_worlds]  # of contacts, summed up by world
-        self._candidates, self._contacts = Candidates(), Contacts()
         self._allocate_candidates(queues_of(work.detector, candidates=True))
         self.allocate_contacts(max(_CONTACTS, -(-MIN_CAPACITY // max(int(rooms[-1]), 1))))
+
+    @property
+    def settings(self) -> BarrierSettings:
+        """What barriers and friction depend on."""
+        return self.problem.settings
 
     def _in_worlds(self, of_elements, unknowns) -> Worlds:
         """Returns what is in each world."""
@@ -318,13 +302,13 @@ class NewtonMethod:
     def _go_back(self, end, detect, begins):
         work = self._work
         self._goes_back.zero_()
-        inputs = [self.progress, self._unknowns, work.status.contact_iteration, begins]
-        outputs = [self._place, self._results[0].converged, self.progress.solving, self._goes_back]
-        self._launch(decisions.go_back, work.worlds, inputs, outputs)
+        inputs = [self.problem.unknowns, work.status.contact_iteration, begins, self.problem.progress]
+        self._launch(decisions.go_back, work.worlds, inputs, [self._results[0].converged, self._goes_back])
         wp.capture_if(self._goes_back, self._move_back, end=end, detect=detect)
 
     def _move_back(self, end, detect):
-        inputs = [self._trial, self._unknowns, self._dt, self.progress.solving, self._place]
+        p = self.problem
+        inputs = [p.trial, p.unknowns, self._dt, p.progress]
         self._launch(steps.retreat, self.mesh.vertex_count, inputs, [self._work.step.motion, end])
         detect()
 
@@ -335,7 +319,7 @@ class NewtonMethod:
             given = getattr(state, name)
             setattr(end, name, None if given is None else wp.clone(given))
         self._begin(end, 1.0)
-        self.progress.active.zero_()
+        self.problem.progress.active.zero_()
         self._find_end(end)
         self._solve()
 
@@ -350,74 +334,70 @@ class NewtonMethod:
 
     @phase("begin solve")
     def _begin(self, end, dt):
-        work, motion = self._work, self._work.step.motion
+        work, motion, p = self._work, self._work.step.motion, self.problem
         self._dt = float(dt)
-        self.settings.dt = dt
-        self.settings.recovery = self._metre * _RECOVERY_SPEED * dt
-        self.settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
-        p = self.problem
+        p.motion, p.planes = motion, work.motion.planes
+        p.settings.dt = dt
+        p.settings.recovery = self._metre * _RECOVERY_SPEED * dt
+        p.settings.smoothing = self._metre * _SMOOTHING_SPEED * dt
         p.least_change, p.far_change = (
             self._precision * self._least_speed * self._dt,
             self._metre * _FAR_SPEED * self._dt,
         )
         p.max_steps, p.max_late_steps = self.max_steps, max(LATE_STEPS, self.max_steps)
-        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [self._unknowns, self._goal])
+        self._launch(steps.begin_unknowns, self._count, [motion, wp.float64(dt)], [p.unknowns, p.trial])
         if self._attachments is not None:
             inputs = [self._attachments, work.motion.last.poses, end.body_q, wp.float64(dt)]
-            outputs = [motion, self._unknowns, self._goal, work.vertices, end.particle_q, end.particle_qd]
+            outputs = [motion, p.unknowns, p.trial.goal, work.vertices, end.particle_q, end.particle_qd]
             self._launch(attach, self.mesh.model.particle_count, inputs, outputs)
-        self.progress.active.zero_()
-        self.progress.given_moves.zero_()
-        self._flow.arrived.zero_()
+        for zeros in (p.progress.active, p.progress.given_moves, p.flow.arrived, p.flow.lacks, self.iterations):
+            zeros.zero_()
         wp.copy(self._sought, self._all_sought)
-        self._launch_over_bodies(bodies.begin_bodies, [motion, self._unknowns, self.progress.active])
-        inputs = [motion, self._margin, self.mesh.model.gravity, self._dt, self._unknowns, self._bodies]
-        outputs = [self._goal, self._lower, self._upper, self._trial, self.progress, self._plane_share]
-        self._lacks.zero_()
-        self._launch(steps.begin_step, max(self.mesh.vertex_count, work.worlds), inputs, outputs)
-        self.iterations.zero_()
-        self._leaves.zero_()
-        wp.copy(self.origin, motion.x0)
-        self._touching.face.fill_(pairs.NO_FACE)
-        self._touching.any.zero_()
+        outputs = [p.unknowns, p.progress.active, p.bodies]
+        self._launch(bodies.begin_bodies, len(p.bodies.unknown), [motion], outputs)
+        inputs = [motion, self.mesh.model.gravity, self._dt, p.unknowns, p.bodies]
+        self._launch(steps.begin_step, max(self.mesh.vertex_count, work.worlds), inputs, [p.trial, p.progress])
+        wp.copy(p.trial.origin, motion.x0)
+        p.trial.touched.fill_(pairs.NO_FACE)
+        p.trial.any_touches.zero_()
 
     def _find_end(self, end):
-        work, motion, vertices = self._work, self._work.step.motion, self.mesh.vertex_count
+        work, motion, p = self._work, self._work.step.motion, self.problem
         self.find_candidates()
-        wp.capture_if(self._touching.any, self._part_touching)
-        self._flow.phase.fill_(int(Phase.BEGIN))
-        self._flow.goes_on.fill_(1)
-        wp.capture_while(self._flow.goes_on, self._take_newton_steps)
+        wp.capture_if(p.trial.any_touches, self._part_touching)
+        p.flow.phase.fill_(int(Phase.BEGIN))
+        p.flow.goes_on.fill_(1)
+        wp.capture_while(p.flow.goes_on, self._take_newton_steps)
         if self.keeps_contacts:
             retry_until_fits(self._find_contacts_at_end, self, work.device)
-        if len(self._bodies.unknown):
-            self._launch(bodies.finish_bodies, work.body_count, [self._bodies, self._unknowns, self._dt], [motion, end])
+        if len(p.bodies.unknown):
+            self._launch(bodies.finish_bodies, work.body_count, [p.bodies, p.unknowns, self._dt], [motion, end])
             work.launch_over_bodies(begin_response_to_bodies)
-        inputs = [self._trial, self._unknowns, self._dt]
-        self._launch(steps.finish, vertices, inputs, [motion, work.vertices, end, self.progress])
-        inputs = [self.progress, self._dt, self._least_speed, self._lacks]
+        inputs, outputs = [p.trial, p.unknowns, self._dt], [motion, work.vertices, end, p.progress]
+        self._launch(steps.finish, self.mesh.vertex_count, inputs, outputs)
+        inputs = [p.progress, self._dt, self._least_speed, p.flow.lacks]
         self._launch(write_results, work.worlds, inputs, self._results)
 
     def renew_candidates(self):
         """Makes boxes anew in worlds in which a vertex leaves its own, and finds the candidates within them."""
-        inputs = [self._work.step.motion, self._unknowns, self._margin, self._trial, self._leaves]
-        inputs += [self.progress.active, int(self.keeps_contacts)]
-        self._launch(steps.renew_boxes, self.mesh.vertex_count, inputs, [self._lower, self._upper, self._sought])
-        self._leaves.zero_()
-        self._any_leaves.zero_()
+        p = self.problem
+        inputs = [self._work.step.motion, p.unknowns, p.progress, int(self.keeps_contacts), p.trial]
+        self._launch(steps.renew_boxes, self.mesh.vertex_count, inputs, [self._sought])
+        p.progress.leaves.zero_()
+        p.flow.any_leaves.zero_()
         self.find_candidates()
 
     @phase("find candidates")
     def find_candidates(self):
         """Finds the pairs that may come near each other within the boxes."""
-        work, detector = self._work, self._work.detector
+        work, detector, trial = self._work, self._work.detector, self.problem.trial
 
         def find():
             # no pairs of shapes alone, or within a body
-            detector.find_candidates(self._lower, self._upper, changed=self._sought, keep_separated=True)
+            detector.find_candidates(trial.lower, trial.upper, changed=self._sought, keep_separated=True)
 
         retry_until_fits(find, detector, work.device)
-        self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self._lacks])
+        self._launch(note_overflow, 1, [detector.counters.array, detector.capacities], [self.problem.flow.lacks])
         queues = queues_of(detector, candidates=True)
         if [len(q.pairs) for q in self._queues] != [len(q.pairs) for q in queues]:
             self._allocate_candidates(queues)
@@ -426,7 +406,7 @@ class NewtonMethod:
 
     def _place_candidates(self):
         """Gives each world its part of the candidates."""
-        work, candidates = self._work, self._candidates
+        work, candidates = self._work, self.problem.candidates
         if work.worlds == 1:
             return
         candidates.room.zero_()
@@ -437,37 +417,37 @@ class NewtonMethod:
         self._launch(pairs.place_candidates, work.worlds, [candidates], [])
 
     def _prepare_candidates(self):
-        self._candidates.near.zero_()
-        self._candidates.far.zero_()
-        self._candidates.listed_edges.fill_(-1)
-        self._candidates.listed_others.zero_()
-        inputs = [self._work.step, self.settings, self.origin, self._work.status.crossings, self.progress]
+        p = self.problem
+        p.candidates.near.zero_()
+        p.candidates.far.zero_()
+        p.candidates.listed_edges.fill_(-1)
+        p.candidates.listed_others.zero_()
+        inputs = [self._work.step, p.settings, self._work.status.crossings, p.progress]
         for k in range(0, len(self._queues), 2):  # pairs of faces and edges, and then those of points, if there are any
             queues = self._queues[k : k + 2]
-            outputs = [self._candidates, self._touching]
-            self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, *outputs])
+            self._work.launch_over_entries(pairs.prepare_candidates, [*inputs, *queues, p.candidates, p.trial])
 
     def _part_touching(self):
-        inputs = [self._work.step, self.settings, self._touching]
-        self._launch(part_touching, self.mesh.model.particle_count, inputs, [self._trial, self.origin])
+        inputs = [self._work.step, self.settings]
+        self._launch(part_touching, self.mesh.model.particle_count, inputs, [self.problem.trial])
         self._prepare_candidates()
 
     def _allocate_candidates(self, queues):
         capacity, self._queues = sum(len(q.pairs) for q in queues), queues
-        self._retire(self._candidates)
+        self._retire(self.problem.candidates)
         sizes: dict = dict.fromkeys(
             ("start", "room", "near", "far", "listed_edges", "listed_others"), self._work.worlds
         )
         sizes["used"] = 1
         sizes["kept"] = capacity if self.mesh.distances is not None else 0
-        self._candidates = self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
-        self._candidates.room.fill_(capacity)
+        self.problem.candidates = allocate(Candidates, capacity, self._work.device, **sizes)
+        self.problem.candidates.room.fill_(capacity)
 
     def allocate_contacts(self, of_room):
         """Allocates contacts, so many for each particle of a world, and more for each body."""
-        self._retire(self._contacts)
+        self._retire(self.problem.contacts)
         start, device = of_room * self._rooms, self._work.device
-        capacity, of_each = int(start[-1]), 8 if len(self._bodies.unknown) else 4  # a body has two unknowns
+        capacity, of_each = int(start[-1]), 8 if len(self.problem.bodies.unknown) else 4  # a body has two unknowns
         sizes: dict = dict.fromkeys(("first", "several", "middle", "end"), self._count)
         parts = 1 if self._is_many else self.problem.parts
         sizes["bucket"] = parts * self.mesh.vertex_count
@@ -477,18 +457,19 @@ class NewtonMethod:
         contacts.parts, contacts.entries_of_each = parts, of_each
         contacts.start = wp.array(start.astype(np.int32), dtype=int, device=device)
         contacts.first_bucket = self.problem.worlds.first_vertex
-        self._contacts = self.problem.contacts = contacts
+        self.problem.contacts = contacts
 
     def _retire(self, buffers):
         if self._captured:
-            self._retired.append(buffers)  # a CUDA graph may still write to them
+            self._retired.append(dict(vars(buffers)))  # a CUDA graph may still write to the arrays
 
     def grow(self) -> bool:
         """Enlarges the buffers of contacts if those that were found last did not fit; returns whether. Synchronizes."""
+        contacts = self.problem.contacts
         if not self.problem.grows:
             return False
-        found, rooms = self._contacts.count.numpy(), np.diff(self._rooms)
-        if (found <= np.diff(self._contacts.start.numpy())).all():
+        found, rooms = contacts.count.numpy(), np.diff(self._rooms)
+        if (found <= np.diff(contacts.start.numpy())).all():
             return False
         needed = int(np.max(-(-found[rooms > 0] // rooms[rooms > 0])))
         capacity = capacity_for(needed * int(self._rooms[-1]), "contacts")
@@ -496,25 +477,26 @@ class NewtonMethod:
         return True
 
     def _take_newton_steps(self):
-        wp.capture_if(self._any_leaves, self.renew_candidates)
-        self._flow.goes_on.zero_()
+        flow = self.problem.flow
+        wp.capture_if(flow.any_leaves, self.renew_candidates)
+        flow.goes_on.zero_()
         self._advance(resumes=True, of_all=True)
-        wp.capture_while(self._flow.solves_next, self._solve)
+        wp.capture_while(flow.solves_next, self._solve)
         if not self._work.device.is_capturing:
             self.grow()
 
     def _find_contacts_at_end(self):
-        self._flow.phase.fill_(int(Phase.PUBLISH))
+        self.problem.flow.phase.fill_(int(Phase.PUBLISH))
         self._advance(of_all=True)
 
     @phase("linear solve")
     def _solve(self):
-        work, team = self._work, self._team
+        work, team, p = self._work, self._team, self.problem
         if team.blocks > 1:
             team.arrived.zero_()
-        inputs = [self._matrix, self._contacts, self._unknowns, self.progress.solving]
-        inputs += [self._tolerance, _MAX_ITERATIONS, self._flow.solves, team]
-        outputs = [self._vectors, self.iterations, self._flow.solves_next]
+        inputs = [p.matrix, p.contacts, p.unknowns, p.progress.solving]
+        inputs += [self._tolerance, _MAX_ITERATIONS, p.flow.solves, team]
+        outputs = [p.vectors, self.iterations, p.flow.solves_next]
         options = {"device": work.device, "block_dim": self._threads}
         threads = work.worlds * team.blocks * self._threads
         wp.launch(self._solve_worlds, threads, inputs=inputs, outputs=outputs, **options)
@@ -524,9 +506,8 @@ class NewtonMethod:
     def _advance(self, resumes=False, of_all=False):
         work = self._work
         self.problem.grows = int(self.may_grow and not work.device.is_capturing)
-        inputs = [work.step.motion, work.motion.planes, self.settings, int(resumes)]
         threads = self._block if work.device.is_cuda else 1
-        inputs += [int(of_all or work.worlds == 1), self.problem, threads, self._blocks]
+        inputs = [int(resumes), int(of_all or work.worlds == 1), threads, self._blocks, self.problem]
         options = {"device": work.device, "block_dim": self._block}
         wp.launch(ADVANCE[self._is_many], self._blocks * threads, inputs=inputs, **options)
 
@@ -534,13 +515,8 @@ class NewtonMethod:
         """Publishes the impulses of the contacts at the end of the last step, if ``keeps_contacts`` is set."""
         work = self._work
         threads = max(1, _PUBLISHING // work.worlds) if work.device.is_cuda else 1
-        inputs = [self._contacts, self.settings, self._trial, self._goal]
-        inputs += [work.step, sides, centres, threads]
+        inputs = [self.problem.contacts, self.settings, self.problem.trial, work.step, sides, centres, threads]
         self._launch(publish_contacts, (threads, work.worlds), inputs, [sums, rows])
 
     def _launch(self, kernel, size, inputs, outputs):
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self._work.device)
-
-    def _launch_over_bodies(self, kernel, inputs):
-        """Launches a kernel over the bodies, with those of the solve as its last argument, if there are any."""
-        self._launch(kernel, len(self._bodies.unknown), inputs, [self._bodies])

@@ -123,6 +123,9 @@ class BarrierSettings:
     units: wp.array[wp.float64]
 
 
+NO_FACE = wp.constant(2**31 - 1)
+
+
 @wp.struct
 class Trial:
     """Positions, and displacements from them, of which each world takes a share.
@@ -138,6 +141,13 @@ class Trial:
         moved: The same after displacements; where a Newton step begins, before them.
         path: Positions after the Newton steps of the step: the straight way to the first is free, shape [8, particles];
             the last are those after the last of more.
+        goal: Where inertia leads [m].
+        lower, upper: Boxes within which the candidates are all pairs that may come near each other [m].
+        margin: By how much these are larger than ways [m].
+        limit: Share of its displacement before each vertex meets something.
+        origin: Where vertices started the step, those that touched a shape a little beside it [m].
+        touched: First face of a shape that each particle touches at the start; :data:`NO_FACE` for none.
+        any_touches: 1 if one does, shape [1].
     """
 
     x: wp.array[wp.vec3]
@@ -149,6 +159,14 @@ class Trial:
     exact: wp.array[wp.vec3d]
     moved: wp.array[wp.vec3d]
     path: wp.array2d[wp.vec3]
+    goal: wp.array[wp.vec3]
+    lower: wp.array[wp.vec3]
+    upper: wp.array[wp.vec3]
+    margin: wp.array[float]
+    limit: wp.array[float]
+    origin: wp.array[wp.vec3]
+    touched: wp.array[int]
+    any_touches: wp.array[int]
 
 
 @wp.func
@@ -339,22 +357,6 @@ def listed(candidates: Candidates, world: int, k: int) -> int:
     return candidates.list[_place_of(candidates, world, k, candidates.listed_edges[world])] + int(0)
 
 
-@wp.struct
-class Touching:
-    """Particles that touch a face of a shape, to part them.
-
-    Attributes:
-        face: The first such face of each vertex; :data:`NO_FACE` for none.
-        any: 1 if there is one, shape [1].
-    """
-
-    face: wp.array[int]
-    any: wp.array[int]
-
-
-NO_FACE = wp.constant(2**31 - 1)
-
-
 @wp.func
 def stays_far(apart: float, progress: Progress, world: int) -> bool:
     """Returns whether a pair is beyond its reach, whichever of the vertices of its world go the longest ways."""
@@ -384,33 +386,32 @@ def _prepare(
     step: Step,
     queue: PairQueue,
     settings: BarrierSettings,
-    origin: wp.array[wp.vec3],
     crossings: wp.array[int],
     progress: Progress,
     candidates: Candidates,
-    touching: Touching,
+    trial: Trial,
     i: int,
 ):
     motion = step.motion
     corners = vertices_of(queue, i)
     if owner_of(motion, corners) != ContactClass.OURS:
         return
-    a, b, c, d = corners_of(origin, corners)
+    a, b, c, d = corners_of(trial.origin, corners)
     if not wp.isfinite(a + b + c + d):
         return
     start, kept, whole = ZERO, ZERO, reach_of(settings, corners)
     if motion.distances.radius:
         start, kept = distances_of_pair(motion.distances, queue.kind, corners, a, b, c, d)
     else:
-        u, v, w = seen_from_last(origin, corners)
+        u, v, w = seen_from_last(trial.origin, corners)
         start = wp.float64(distance_of_boxes(queue.kind, u, v, w) - rounding_of(u, v, w))
         if not start >= wp.float64(whole):  # farther away, all is the same
             start = barrier.least_distance(queue.kind, a, b, c, d)
     if not start > ZERO:
         if start == ZERO and queue.kind == VERTEX_FACE and settings.reach[corners[1]] == wp.inf:
             if motion.inverse_mass[corners[0]] > 0.0:
-                wp.atomic_min(touching.face, corners[0], queue.pairs[i][1])
-                touching.any[0] = 1
+                wp.atomic_min(trial.touched, corners[0], queue.pairs[i][1])
+                trial.any_touches[0] = 1
         return
     if crossings[motion.world[corners[0]]] > 0:
         if crossed_at_start(step, queue.kind, queue.pairs[i]):
@@ -468,15 +469,13 @@ def prepare_candidates(
     # in
     step: Step,
     settings: BarrierSettings,
-    origin: wp.array[wp.vec3],
     crossings: wp.array[int],
     progress: Progress,
     first: PairQueue,
     second: PairQueue,
     # in and out
     candidates: Candidates,
-    # out
-    touching: Touching,
+    trial: Trial,
     threads: int,
 ):
     """Adds the pairs of two queues to the candidates, but for those that touch or cross at the start of the step."""
@@ -487,7 +486,7 @@ def prepare_candidates(
             if number == 1:
                 of = second
             if has_pair(of, i):
-                _prepare(step, of, settings, origin, crossings, progress, candidates, touching, i)
+                _prepare(step, of, settings, crossings, progress, candidates, trial, i)
             number += 1
 
 

@@ -20,6 +20,7 @@ class Rows:
 
     Attributes:
         first: First block of each row, and the end of the last, shape [unknown_count + 1].
+        row: Row of each block.
         column: Unknown of each block; the first of a row is that of the diagonal.
         first_source: First block of elements in each block of a row, and the end of the last.
         source: Blocks of elements; of bending, -1 less 16 times the element plus 4 times one corner plus the other.
@@ -28,6 +29,7 @@ class Rows:
     """
 
     first: wp.array[int]
+    row: wp.array[int]
     column: wp.array[int]
     first_source: wp.array[int]
     source: wp.array[int]
@@ -81,7 +83,7 @@ def make_rows(vertices: list[np.ndarray], unknown: np.ndarray, count: int, devic
 
     rows = Rows()
     rows.first = array(np.searchsorted(row[order], np.arange(count + 1)))
-    rows.column = array(column[order])
+    rows.row, rows.column = array(row[order]), array(column[order])
     rows.first_source, rows.source = array(kept_before[first_source]), array(source[kept])
     rows.first_corner = array(np.searchsorted(corner_row[by_row], np.arange(count + 1)))
     rows.corner = array(corner[by_row])

@@ -3,13 +3,23 @@
 import warp as wp
 
 from ...response.state.motion import StateArrays, predicted_velocity
+from ...response.state.poses import turned_pose
 from ...response.state.structs import Motion, Vertices
-from ...response.state.vectors import HALF, ONE, ZERO, to_double, to_single
-from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, inertial_energy
-from .conjugate_gradients import Vectors
-from .decisions import takes
+from ...response.state.vectors import ONE, ZERO, to_double, to_single
+from .bodies import SolvedBodies, arm_on_body, bend_of, body_vertex, exact_on_body, move_body
+from .decisions import may_cut, takes
+from .flow import (
+    Phase,
+    Place,
+    Problem,
+    end_of_vertices,
+    go_on,
+    go_on_with_pairs,
+    has_few,
+    wait_for_team,
+)
 from .merit import add_energy
-from .pairs import BarrierSettings, Trial, moved
+from .pairs import Trial, clear_list, moved
 from .system import NOT_UNKNOWN, Progress, Unknowns, displacement, is_solved, lower_to, raise_to, unknown_of_corner
 
 wp.set_module_options({"enable_backward": False})
@@ -18,6 +28,8 @@ _FINE = wp.constant(wp.float64(2.0**16))
 """Factor on products of displacements: a unit of energy is too coarse for them."""
 _ROUNDED = wp.constant(2.0**-20)
 """More than what rounding changes, as a share of a length."""
+_TRUNCATIONS = wp.constant(4)
+"""Passes in which the displacements of single vertices are cut, before those of their world are."""
 
 
 @wp.kernel
@@ -56,7 +68,7 @@ def begin_unknowns(
     dt: wp.float64,
     # out
     unknowns: Unknowns,
-    goal: wp.array[wp.vec3],
+    trial: Trial,
 ):
     """Finds which particles are solved for, their inertia, and where inertia alone leads."""
     u = wp.tid()
@@ -65,7 +77,7 @@ def begin_unknowns(
         return
     unknowns.is_free[u] = 0
     unknowns.inertia[u] = ZERO
-    goal[p] = motion.x1[p]
+    trial.goal[p] = motion.x1[p]
     if motion.inverse_mass[p] > 0.0 and motion.is_not_finite[p] == 0 and wp.isfinite(motion.x0[p]):
         unknowns.is_free[u] = 1
         unknowns.inertia[u] = ONE / (wp.float64(motion.inverse_mass[p]) * dt * dt)
@@ -75,18 +87,13 @@ def begin_unknowns(
 def begin_step(
     # in
     motion: Motion,
-    margin: wp.array[float],
     gravity: wp.array[wp.vec3],
     dt: float,
     unknowns: Unknowns,
     bodies: SolvedBodies,
     # out
-    goal: wp.array[wp.vec3],
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
     trial: Trial,
     progress: Progress,
-    plane_share: wp.array[float],
 ):
     """Takes the motion as predicted, and boxes around the way there. Worlds with unknowns become active."""
     v = wp.tid()
@@ -105,7 +112,8 @@ def begin_step(
         progress.late[v] = 0
         progress.driven[v] = 0.0
         progress.fall[v] = dt * dt * wp.length(gravity[v % gravity.shape[0]])
-        plane_share[v] = 0.0
+        progress.plane_share[v] = 0.0
+        progress.leaves[v] = 0
     if v >= trial.x.shape[0]:
         return
     x0, x1 = motion.x0[v], motion.x1[v]
@@ -116,46 +124,27 @@ def begin_step(
     trial.share[v] = 1.0
     trial.bend[v] = 0.0
     if not wp.isfinite(x0):  # without pairs, and without forces on others
-        lower[v] = wp.vec3()
-        upper[v] = wp.vec3()
+        trial.lower[v] = wp.vec3()
+        trial.upper[v] = wp.vec3()
         return
-    pad = margin[v] + float(0.0)
+    pad = trial.margin[v] + float(0.0)
     u = unknowns.of_vertex[v]
     if u == NOT_UNKNOWN and wp.length_sq(x1 - x0) > 0.0:
         progress.given_moves[motion.world[v]] = 1
     if u < 0:
-        goal[v] = x1
+        trial.goal[v] = x1
     elif unknowns.is_free[u] != 0:
         progress.active[motion.world[v]] = 1
     if is_solved(unknowns, v):
         pad += 0.25 * wp.length(x1 - x0)
         if u < 0:
             unknowns.arm[v] = arm_on_body(bodies, motion, v, x0)
-    lower[v] = wp.min(x0, x1) - wp.vec3(pad)
-    upper[v] = wp.max(x0, x1) + wp.vec3(pad)
+    trial.lower[v] = wp.min(x0, x1) - wp.vec3(pad)
+    trial.upper[v] = wp.max(x0, x1) + wp.vec3(pad)
 
 
 @wp.func
-def truncate(
-    v: int,
-    unknowns: Unknowns,
-    limit: wp.array[float],
-    begins: bool,
-    trial: Trial,
-):
-    """Takes the shares of vertices that are solved for down to their bounds, clears these, and notes what it cuts.
-
-    When it ``begins``, vertices that were to stay in their boxes are cut already.
-    """
-    trial.cut[v] = 0
-    if trial.holder[v] == v and is_solved(unknowns, v):
-        trial.cut[v] = int(limit[v] < 1.0 or (begins and trial.share[v] < 1.0))
-        trial.share[v] = trial.share[v] * limit[v]
-    limit[v] = 1.0
-
-
-@wp.func
-def _way(motion: Motion, trial: Trial, v: int) -> float:
+def way_of(motion: Motion, trial: Trial, v: int) -> float:
     """Returns how far a vertex is from where it was at the start of the step, here or on its displacement [m]."""
     off = trial.x[v] - motion.x0[v]
     farthest = wp.max(wp.length(off), wp.length(off + trial.displaced[v])) + trial.bend[v]
@@ -163,79 +152,70 @@ def _way(motion: Motion, trial: Trial, v: int) -> float:
 
 
 @wp.func
-def find_remaining(
-    v: int,
-    world: int,
-    motion: Motion,
-    unknowns: Unknowns,
-    trial: Trial,
-    progress: Progress,
-):
-    """Writes the ways that are left of what a program moves, before a solve."""
-    trial.share[v] = 1.0
-    if not is_solved(unknowns, v) and wp.isfinite(trial.x[v]):
-        d = motion.x1[v] - trial.x[v]
-        trial.displaced[v] = d
-        if wp.length_sq(d) > 0.0:
-            raise_to(progress.remaining, world, wp.length(d))
-            raise_to(progress.given_way, world, _way(motion, trial, v))
+def _share_within_box(trial: Trial, v: int) -> float:
+    """Returns the share of the displacement of a vertex that stays in its box."""
+    x, d, lower, upper = trial.x[v], trial.displaced[v], trial.lower[v], trial.upper[v]
+    share = float(1.0)
+    for axis in range(3):
+        if x[axis] + d[axis] > upper[axis]:
+            share = wp.min(share, (upper[axis] - x[axis]) / d[axis])
+        elif x[axis] + d[axis] < lower[axis]:
+            share = wp.min(share, (lower[axis] - x[axis]) / d[axis])
+    return wp.max(share, 0.0)
 
 
 @wp.func
-def compare_solutions(
-    u: int,
-    world: int,
-    settings: BarrierSettings,
-    unknowns: Unknowns,
-    solution: wp.array[wp.vec3],
-    last: wp.array[wp.vec3],
-    progress: Progress,
-):
-    """Adds the products of the solution of a particle with itself, and with the ``last`` one, which becomes this."""
-    now, before = solution[u] + wp.vec3(), last[u] + wp.vec3()
-    last[u] = now
-    weight = _FINE * unknowns.inertia[u]
-    add_energy(progress.square, world, weight * wp.float64(wp.dot(now, now)), settings.units)
-    add_energy(progress.product, world, weight * wp.float64(wp.dot(now, before)), settings.units)
+def displace(at: Place, p: Problem) -> wp.vec4i:
+    """Displaces vertices by the solution, and begins the list of candidates that this may bring together.
 
-
-@wp.func
-def displace(
-    v: int,
-    world: int,
-    motion: Motion,
-    unknowns: Unknowns,
-    vectors: Vectors,
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
-    bodies: SolvedBodies,
-    trial: Trial,
-    progress: Progress,
-    limit: wp.array[float],
-    leaves: wp.array[int],
-):
-    """Writes the displacements of vertices after a solve, and whether some leave the boxes of the candidates."""
-    limit[v] = 1.0
-    if not is_solved(unknowns, v):
-        return
-    d = displacement(unknowns, v, vectors.solution)
-    gradient = vectors.gradient[unknown_of_corner(unknowns, v)]
-    u = unknowns.of_vertex[v]
-    if u < 0:
-        d = body_vertex(bodies.moved, motion, v) - trial.x[v]
-        trial.bend[v] = bend_of(unknowns.arm[v], vectors.solution[-1 - u])
-    if not (wp.isfinite(d) and wp.isfinite(gradient)):  # as a start is not: its world stands
-        trial.displaced[v] = wp.vec3()
-        progress.bound[world] = 0.0
-        progress.change[world] = wp.inf
-        return
-    trial.displaced[v] = d
-    raise_to(progress.way, world, _way(motion, trial, v))
-    raise_to(progress.longest, world, wp.length(d) + trial.bend[v])
-    share = _share_within(trial.x[v], d, lower[v], upper[v])
-    if share < 1.0:
-        lower_to(progress.bound, world, share)
-        leaves[world] = 1
+    Writes whether some leave the boxes of the candidates. After the first solve of a Newton step, products of solutions
+    of particles are added up: with themselves, and with the last one.
+    """
+    w, t, n, progress, solution = at.world, at.thread, at.threads, p.progress, p.vectors.solution
+    if t == 0 and at.then == Phase.RELEASED:  # along the solution without pairs held
+        progress.scale[w] = progress.damping[w]
+        progress.trial[w] = wp.int64(0)
+    first_body, end = p.unknowns.first_of_bodies[w] + int(0), p.unknowns.of_worlds[w + 1] + int(0)
+    for u in range(first_body + 2 * t, end, 2 * n):
+        body = p.unknowns.body[u]
+        if p.unknowns.is_free[u] != 0:
+            shift, turn = p.bodies.low[body] + to_double(solution[u]), to_double(solution[u + 1])
+            p.bodies.moved[body] = turned_pose(p.motion.bodies, body, p.bodies.pose[body], shift, turn)
+    if first_body < end:
+        wait_for_team(p.flow.arrived, w, at.blocks)
+    if at.solves == 0 and at.then == Phase.BOUNDED:
+        for u in range(p.unknowns.of_worlds[w] + t, first_body, n):
+            now, before = solution[u] + wp.vec3(), p.vectors.last[u] + wp.vec3()
+            p.vectors.last[u] = now
+            weight = _FINE * p.unknowns.inertia[u]
+            add_energy(progress.square, w, weight * wp.float64(wp.dot(now, now)), p.settings.units)
+            add_energy(progress.product, w, weight * wp.float64(wp.dot(now, before)), p.settings.units)
+    for k in range(p.worlds.first_vertex[w] + t, end_of_vertices(p.worlds, progress, w), n):
+        v = p.worlds.vertices[k] + int(0)
+        p.trial.limit[v] = 1.0
+        if not is_solved(p.unknowns, v):
+            continue
+        x, d = p.trial.x[v] + wp.vec3(), displacement(p.unknowns, v, solution)
+        gradient = p.vectors.gradient[unknown_of_corner(p.unknowns, v)] + wp.vec3()
+        of_vertex = p.unknowns.of_vertex[v] + int(0)
+        if of_vertex < 0:
+            d = body_vertex(p.bodies.moved, p.motion, v) - x
+            p.trial.bend[v] = bend_of(p.unknowns.arm[v], solution[-1 - of_vertex])
+        if not (wp.isfinite(d) and wp.isfinite(gradient)):  # as a start is not: its world stands
+            p.trial.displaced[v] = wp.vec3()
+            progress.bound[w] = 0.0
+            progress.change[w] = wp.inf
+            continue
+        p.trial.displaced[v] = d
+        raise_to(progress.way, w, way_of(p.motion, p.trial, v))
+        raise_to(progress.longest, w, wp.length(d) + p.trial.bend[v])
+        share = _share_within_box(p.trial, v)
+        if share < 1.0:
+            lower_to(progress.bound, w, share)
+            progress.leaves[w] = 1
+    if t == 0:
+        clear_list(p.candidates, w)
+    return go_on(at, wp.where(has_few(p.candidates, at), int(Phase.LIST_AND_BOUND), int(Phase.LIST_WAYS)))
 
 
 @wp.kernel
@@ -243,14 +223,10 @@ def renew_boxes(
     # in
     motion: Motion,
     unknowns: Unknowns,
-    margin: wp.array[float],
-    trial: Trial,
-    leaves: wp.array[int],
-    active: wp.array[int],
+    progress: Progress,
     keeps_ended: int,
     # in and out
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
+    trial: Trial,
     # out
     sought: wp.array[int],
 ):
@@ -262,120 +238,124 @@ def renew_boxes(
     """
     v = wp.tid()
     world = motion.world[v]
-    if leaves[world] == 0:
-        if active[world] == 0 and keeps_ended == 0:
+    if progress.leaves[world] == 0:
+        if progress.active[world] == 0 and keeps_ended == 0:
             sought[v] = 0
         return
     x, d = trial.x[v], trial.displaced[v] + wp.vec3()
     if not wp.isfinite(x):
         return
-    pad = margin[v] + float(0.0)
+    pad = trial.margin[v] + float(0.0)
     if unknowns.of_vertex[v] != -1:
         longest = 4.0 * pad + wp.length(motion.x1[v] - motion.x0[v])
         d *= wp.min(longest / wp.max(wp.length(d), 1.0e-30), 1.0)
         pad += 0.5 * wp.length(d)
     else:
         d = motion.x1[v] - x
-    lower[v] = wp.min(x, x + d) - wp.vec3(pad)
-    upper[v] = wp.max(x, x + d) + wp.vec3(pad)
+    trial.lower[v] = wp.min(x, x + d) - wp.vec3(pad)
+    trial.upper[v] = wp.max(x, x + d) + wp.vec3(pad)
 
 
 @wp.func
-def _share_within(x: wp.vec3, d: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> float:
-    """Returns the share of a displacement that stays in a box."""
-    share = float(1.0)
-    for axis in range(3):
-        if x[axis] + d[axis] > upper[axis]:
-            share = wp.min(share, (upper[axis] - x[axis]) / d[axis])
-        elif x[axis] + d[axis] < lower[axis]:
-            share = wp.min(share, (lower[axis] - x[axis]) / d[axis])
-    return wp.max(share, 0.0)
+def move(at: Place, p: Problem) -> wp.vec4i:
+    """Moves vertices by their shares, to find the energy there."""
+    w, t, n, then, scale = at.world, at.thread, at.threads, at.then + int(0), p.progress.scale[at.world] + float(0.0)
+    if t == 0:
+        p.progress.bound[w] = 1.0
+    if then == Phase.JUDGE and at.solves == 0:  # no pairs are held
+        then = wp.where(may_cut(p.progress, w), int(Phase.BEGIN_CUTS), int(Phase.TAKE))
+    first_body, end = p.unknowns.first_of_bodies[w] + int(0), p.unknowns.of_worlds[w + 1] + int(0)
+    for u in range(first_body + 2 * t, end, 2 * n):
+        move_body(u, scale, p.motion, p.unknowns, p.trial.share, p.vectors.solution, False, p.bodies)
+    if first_body < end:
+        wait_for_team(p.flow.arrived, w, at.blocks)
+    for k in range(p.worlds.first_vertex[w] + t, end_of_vertices(p.worlds, p.progress, w), n):
+        v = p.worlds.vertices[k] + int(0)
+        x = moved(p.trial, scale, v)
+        if p.unknowns.of_vertex[v] < 0 and is_solved(p.unknowns, v):
+            x = exact_on_body(p.bodies.moved, p.bodies.low_moved, p.motion, v)
+        p.trial.moved[v] = x
+    return go_on_with_pairs(at, Phase.ENERGY, then)
 
 
 @wp.func
-def begin_truncation(
-    v: int,
-    unknowns: Unknowns,
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
-    trial: Trial,
-):
-    """Takes the share of a vertex down to what stays in its box."""
-    if is_solved(unknowns, v):
-        lower_to(trial.share, trial.holder[v], _share_within(trial.x[v], trial.displaced[v], lower[v], upper[v]))
+def begin_cuts(at: Place, p: Problem) -> wp.vec4i:
+    """Begins to cut single vertices in place of their world, where energies are lower then: to stay in their boxes."""
+    w, trial = at.world, p.trial
+    for k in range(p.worlds.first_vertex[w] + at.thread, end_of_vertices(p.worlds, p.progress, w), at.threads):
+        v = p.worlds.vertices[k] + int(0)
+        if is_solved(p.unknowns, v):
+            lower_to(trial.share, trial.holder[v], _share_within_box(trial, v))
+    return go_on(at, Phase.CUT)  # the first time by the bounds of the displacements, which are known
 
 
 @wp.func
-def add_inertia(
-    u: int,
-    world: int,
-    motion: Motion,
-    settings: BarrierSettings,
-    trial: Trial,
-    goal: wp.array[wp.vec3],
-    unknowns: Unknowns,
-    bodies: SolvedBodies,
-    energy: wp.array[wp.int64],
-):
-    """Adds the energy of inertia of an unknown at ``trial.moved`` to that of its world."""
-    if unknowns.is_free[u] == 0:
-        return
-    p = unknowns.particle[u]
-    if p < 0:
-        body = unknowns.body[u]
-        if u == bodies.unknown[body]:
-            add_energy(energy, world, inertial_energy(bodies, motion, body, settings.dt), settings.units)
-        return
-    off = trial.moved[p] - to_double(goal[p])
-    add_energy(energy, world, HALF * unknowns.inertia[u] * wp.dot(off, off), settings.units)
+def cut(at: Place, p: Problem) -> wp.vec4i:
+    """Takes the shares of vertices that are solved for down to their bounds, clears these, and notes what it cuts.
+
+    At first, vertices that were to stay in their boxes are cut already.
+    """
+    w, trial, progress, begins, passes = at.world, p.trial, p.progress, at.passes == 0, at.passes + 1
+    if at.thread == 0 and begins:
+        progress.whole[w] = progress.scale[w]
+        progress.scale[w] = progress.damping[w]
+    for k in range(p.worlds.first_vertex[w] + at.thread, end_of_vertices(p.worlds, progress, w), at.threads):
+        v = p.worlds.vertices[k] + int(0)
+        trial.cut[v] = 0
+        if trial.holder[v] == v and is_solved(p.unknowns, v):
+            trial.cut[v] = int(trial.limit[v] < 1.0 or (begins and trial.share[v] < 1.0))
+            trial.share[v] = trial.share[v] * trial.limit[v]
+        trial.limit[v] = 1.0
+    ends = passes == _TRUNCATIONS
+    if at.thread == 0:
+        if begins or ends:
+            progress.bound[w] = 1.0
+        clear_list(p.candidates, w)
+    phase = wp.where(has_few(p.candidates, at), int(Phase.LIST_AND_BOUND), int(Phase.LIST_WAYS))
+    return wp.vec4i(phase, wp.where(ends, int(Phase.TAKE_CUT), int(Phase.CUT)), passes, at.solves)
 
 
 @wp.func
-def write_moved(
-    v: int,
-    scale: float,
-    motion: Motion,
-    unknowns: Unknowns,
-    bodies: SolvedBodies,
-    trial: Trial,
-):
-    """Writes where a vertex is after a share of its displacement."""
-    x = moved(trial, scale, v)
-    if unknowns.of_vertex[v] < 0 and is_solved(unknowns, v):
-        x = exact_on_body(bodies.moved, bodies.low_moved, motion, v)
-    trial.moved[v] = x
+def undo_cuts(at: Place, p: Problem) -> wp.vec4i:
+    """Takes back cuts that were not chosen."""
+    w = at.world
+    for k in range(p.worlds.first_vertex[w] + at.thread, end_of_vertices(p.worlds, p.progress, w), at.threads):
+        if p.progress.cuts[w] == 0:
+            p.trial.share[p.worlds.vertices[k]] = 1.0
+    return go_on(at, Phase.TAKE)
 
 
 @wp.func
-def take(
-    v: int,
-    world: int,
-    motion: Motion,
-    unknowns: Unknowns,
-    bodies: SolvedBodies,
-    progress: Progress,
-    trial: Trial,
-):
-    """Moves a vertex by the share of its world, if that takes it; what a program moves arrives exactly."""
-    if not takes(world, progress):
-        return
-    scale = progress.scale[world]
-    given = not is_solved(unknowns, v)
-    if given and scale == 1.0:
-        trial.x[v] = motion.x1[v]
-        trial.exact[v] = to_double(motion.x1[v])
-    elif given or unknowns.of_vertex[v] >= 0:
-        trial.exact[v] = moved(trial, scale, v)
-        trial.x[v] = to_single(trial.exact[v])
-    else:
-        trial.x[v] = body_vertex(bodies.pose, motion, v)
-        trial.exact[v] = exact_on_body(bodies.pose, bodies.low, motion, v)
-        unknowns.arm[v] = arm_on_body(bodies, motion, v, trial.x[v])
-    trial.moved[v] = trial.exact[v]
-    if unknowns.of_vertex[v] >= 0:
-        trial.path[wp.min(progress.steps[world], trial.path.shape[0] - 1), v] = trial.x[v]
-    if not given:
-        raise_to(progress.change, world, wp.length(trial.displaced[v]))
+def take(at: Place, p: Problem) -> wp.vec4i:
+    """Moves vertices for good by the share of the world, if it takes that; what a program moves arrives exactly."""
+    w, t, n, trial, is_taken = at.world, at.thread, at.threads, p.trial, takes(at.world, p.progress)
+    scale = p.progress.scale[w] + float(0.0)
+    first_body, end = p.unknowns.first_of_bodies[w] + int(0), p.unknowns.of_worlds[w + 1] + int(0)
+    for u in range(first_body + 2 * t, end, 2 * n):
+        move_body(u, scale, p.motion, p.unknowns, trial.share, p.vectors.solution, is_taken, p.bodies)
+    if first_body < end:
+        wait_for_team(p.flow.arrived, w, at.blocks)
+    if not is_taken:
+        return go_on(at, Phase.DECIDE)
+    for k in range(p.worlds.first_vertex[w] + t, end_of_vertices(p.worlds, p.progress, w), n):
+        v = p.worlds.vertices[k] + int(0)
+        given = not is_solved(p.unknowns, v)
+        if given and scale == 1.0:
+            trial.x[v] = p.motion.x1[v]
+            trial.exact[v] = to_double(p.motion.x1[v])
+        elif given or p.unknowns.of_vertex[v] >= 0:
+            trial.exact[v] = moved(trial, scale, v)
+            trial.x[v] = to_single(trial.exact[v])
+        else:
+            trial.x[v] = body_vertex(p.bodies.pose, p.motion, v)
+            trial.exact[v] = exact_on_body(p.bodies.pose, p.bodies.low, p.motion, v)
+            p.unknowns.arm[v] = arm_on_body(p.bodies, p.motion, v, trial.x[v])
+        trial.moved[v] = trial.exact[v]
+        if p.unknowns.of_vertex[v] >= 0:
+            trial.path[wp.min(p.progress.steps[w], trial.path.shape[0] - 1), v] = trial.x[v]
+        if not given:
+            raise_to(p.progress.change, w, wp.length(trial.displaced[v]))
+    return go_on(at, Phase.DECIDE)
 
 
 @wp.kernel
@@ -420,8 +400,7 @@ def retreat(
     trial: Trial,
     unknowns: Unknowns,
     dt: float,
-    goes_back: wp.array[int],
-    place: wp.array[int],
+    progress: Progress,
     # in and out
     motion: Motion,
     end: StateArrays,
@@ -429,9 +408,9 @@ def retreat(
     """Ends the step of worlds that go back where an earlier Newton step led."""
     v = wp.tid()
     world = motion.world[v]
-    if goes_back[world] == 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
+    if progress.goes_back[world] == 0 or unknowns.of_vertex[v] < 0 or not is_solved(unknowns, v):
         return
-    x = trial.path[place[world], v]
+    x = trial.path[progress.place[world], v]
     velocity = motion.velocity[v] + (x - motion.x1[v]) / dt
     end.particle_q[v] = x
     end.particle_qd[v] = velocity

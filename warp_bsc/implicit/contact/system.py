@@ -4,7 +4,7 @@ import warp as wp
 
 from ...kernels.pipeline.queues import take_slot_of
 from ...response.state.vectors import ZERO
-from ..vector_access import READ_BLOCK, integers_at, mat34, numbers_at, stored_block
+from ..vector_access import READ_BLOCK, integers_at, mat34, numbers_at, store_block, stored_block
 from .sums import sum_of
 
 wp.set_module_options({"enable_backward": False})
@@ -87,6 +87,10 @@ class Progress:
         fall: How far gravity moves what is at rest in the step [m].
         driven: Largest way of what a program moves in the step [m].
         given_moves: 1 if something moves in the step that is not solved for.
+        leaves: 1 if a vertex leaves its box.
+        plane_share: Share of their ways that infinite planes have gone.
+        whole: Share that is taken without cuts of single vertices.
+        goes_back: 1 if the step ends at an earlier Newton step, :attr:`place`.
     """
 
     active: wp.array[int]
@@ -117,6 +121,11 @@ class Progress:
     fall: wp.array[float]
     driven: wp.array[float]
     given_moves: wp.array[int]
+    leaves: wp.array[int]
+    plane_share: wp.array[float]
+    whole: wp.array[float]
+    goes_back: wp.array[int]
+    place: wp.array[int]
 
 
 @wp.func
@@ -327,6 +336,35 @@ def take_contact(contacts: Contacts, world: int) -> int:
     return wp.where(slot < contacts.start[world + 1], slot, -1)
 
 
+@wp.func
+def write_contact(
+    contacts: Contacts,
+    unknowns: Unknowns,
+    slot: int,
+    corners: wp.vec4i,
+    weights: wp.vec4d,
+    normal: wp.vec3,
+    load: float,
+    limit: float,
+    gradient: wp.vec3,
+    hessian: wp.mat33d,
+    key: wp.int64,
+):
+    """Writes a contact to its place."""
+    of_vertex = unknowns.of_vertex
+    of_corners = wp.vec4i(of_vertex[corners[0]], of_vertex[corners[1]], of_vertex[corners[2]], of_vertex[corners[3]])
+    contacts.corners[slot] = corners
+    contacts.unknowns[slot] = of_corners
+    contacts.weights[slot] = wp.vec4(float(weights[0]), float(weights[1]), float(weights[2]), float(weights[3]))
+    contacts.normal[slot] = normal
+    contacts.load[slot] = load
+    contacts.limit[slot] = limit
+    contacts.gradient[slot] = gradient
+    store_block(contacts.hessian, slot, hessian)
+    contacts.key[slot] = key
+    contacts.couples[slot] = _couples(of_corners, weights)
+
+
 @wp.func_native(
     snippet=sum_of(
         "wp::mat_t<3, 3, float>",
@@ -391,14 +429,7 @@ def key_in_group(group: int, key: wp.int64) -> wp.int64:
 
 
 @wp.func
-def unknowns_of(unknowns: Unknowns, corners: wp.vec4i) -> wp.vec4i:
-    """Returns the ``of_vertex`` of corners."""
-    of_vertex = unknowns.of_vertex
-    return wp.vec4i(of_vertex[corners[0]], of_vertex[corners[1]], of_vertex[corners[2]], of_vertex[corners[3]])
-
-
-@wp.func
-def couples(of_corners: wp.vec4i, weights: wp.vec4d) -> int:
+def _couples(of_corners: wp.vec4i, weights: wp.vec4d) -> int:
     """Returns whether both elements of a contact are solved for, or one is of a body."""
     first, second = int(0), int(0)
     for j in range(4):

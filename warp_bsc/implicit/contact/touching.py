@@ -4,7 +4,7 @@ import warp as wp
 
 from ...response.state.structs import Step
 from ...response.state.vectors import to_double
-from .pairs import NO_FACE, BarrierSettings, Touching, Trial
+from .pairs import NO_FACE, BarrierSettings, Trial
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,14 +19,12 @@ def part_touching(
     # in
     step: Step,
     settings: BarrierSettings,
-    touching: Touching,
     # in and out
     trial: Trial,
-    origin: wp.array[wp.vec3],
 ):
     """Moves particles that touch a face of a shape off it a little, to the side to which it faces."""
     v = wp.tid()
-    face = touching.face[v]
+    face = trial.touched[v]
     if face == NO_FACE:
         return
     x, mesh = trial.x[v] + wp.vec3(), step.mesh
@@ -36,4 +34,4 @@ def part_touching(
     trial.x[v] = parted
     trial.exact[v] = to_double(parted)
     trial.moved[v] = to_double(parted)
-    origin[v] = parted
+    trial.origin[v] = parted

@@ -163,7 +163,7 @@ class StepGradients:
         work, newton, model, device = self.work, self.newton, self._model, self.work.device
         motion, last, particles = work.motion.vertices, work.motion.last, model.particle_count
         x0, velocity = (wp.zeros(n, dtype=wp.vec3d, device=device) for n in (work.mesh.vertex_count, particles))
-        self._launch(kernels.to_double, len(x0), [newton.origin], [x0])
+        self._launch(kernels.to_double, len(x0), [newton.problem.trial.origin], [x0])
         self._launch(kernels.to_double, particles, [start.particle_qd], [velocity])
         is_fixed = wp.zeros(self.equations.count, dtype=int, device=device)
         self._launch(kernels.find_fixed, len(is_fixed), [newton.problem.unknowns.is_free], [is_fixed])

@@ -156,8 +156,8 @@ def _to_segment(w: wp.vec3d, u: wp.vec3d) -> wp.float64:
 
 
 @wp.func
-def _vertex_face_close(r: Relative, t: wp.float64) -> bool:
-    """Returns whether the vertex is close to the triangle at a time."""
+def _close(vertex_face: bool, r: Relative, t: wp.float64) -> bool:
+    """Returns whether the vertex and the triangle, or both edges, are close to each other at a time."""
     u = r.u + t * r.du
     v = r.v + t * r.dv
     w = r.w + t * r.dw
@@ -169,42 +169,19 @@ def _vertex_face_close(r: Relative, t: wp.float64) -> bool:
     vw = wp.dot(v, w)
     determinant = uu * vv - uv * uv
     beta = uw * vv - vw * uv
-    gamma = vw * uu - uw * uv
-    if determinant > _ZERO and beta >= _ZERO and gamma >= _ZERO and beta + gamma <= determinant:
+    gamma = vw * uu - uw * uv  # edges have the other direction of v
+    other = wp.where(vertex_face, gamma, -gamma)
+    most = wp.where(vertex_face, beta + gamma, wp.max(beta, -gamma))
+    if determinant > _ZERO and beta >= _ZERO and other >= _ZERO and most <= determinant:
         return wp.length_sq(w - (beta * u + gamma * v) / determinant) <= limit
-    return _to_segment(w, u) <= limit or _to_segment(w, v) <= limit or _to_segment(w - u, v - u) <= limit
-
-
-@wp.func
-def _edge_edge_close(r: Relative, t: wp.float64) -> bool:
-    """Returns whether the edges are close to each other at a time."""
-    u = r.u + t * r.du
-    v = r.v + t * r.dv
-    w = r.w + t * r.dw
-    limit = DISTANCE * DISTANCE
-    uu = wp.dot(u, u)
-    uv = wp.dot(u, v)
-    vv = wp.dot(v, v)
-    uw = wp.dot(u, w)
-    vw = wp.dot(v, w)
-    determinant = uu * vv - uv * uv
-    s = uw * vv - uv * vw
-    q = uv * uw - uu * vw
-    if determinant > _ZERO and s >= _ZERO and s <= determinant and q >= _ZERO and q <= determinant:
-        return wp.length_sq(w + (q * v - s * u) / determinant) <= limit
+    if vertex_face:
+        return _to_segment(w, u) <= limit or _to_segment(w, v) <= limit or _to_segment(w - u, v - u) <= limit
     return (
         _to_segment(w, u) <= limit
         or _to_segment(w + v, u) <= limit
         or _to_segment(-w, v) <= limit
         or _to_segment(u - w, v) <= limit
     )
-
-
-@wp.func
-def _close(vertex_face: bool, r: Relative, t: wp.float64) -> bool:
-    if vertex_face:
-        return _vertex_face_close(r, t)
-    return _edge_edge_close(r, t)
 
 
 @wp.func

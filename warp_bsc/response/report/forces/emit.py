@@ -12,8 +12,6 @@ from .sums import add_impulse, body_of_vertex, shape_of, take_impulse
 
 wp.set_module_options({"enable_backward": False})
 
-_Torques = wp.types.matrix(shape=(2, 3), dtype=wp.float64)
-
 
 @wp.func
 def _add_to_side(sums: ImpulseSums, shape: int, body: int, impulse: wp.vec3d, torque: wp.vec3d, lost: wp.array[int]):
@@ -38,6 +36,7 @@ def publish_contact(
     # in
     step: Step,
     sides: Sides,
+    centres: wp.array[wp.vec3d],
     kind: int,
     corners: wp.vec4i,
     weights: wp.vec4d,
@@ -45,8 +44,6 @@ def publish_contact(
     impulse: wp.vec3d,
     along: wp.float64,
     normal: wp.vec3d,
-    torque_on_first: wp.vec3d,
-    torque_on_second: wp.vec3d,
     velocity: wp.vec3,
     toi: wp.float64,
     # out
@@ -64,8 +61,10 @@ def publish_contact(
         point += wp.max(weights[j], ZERO) * to_double(step.vertices.x1[corners[j]])
         if corners[j] < sides.particle_count and weights[j] != ZERO:
             add_impulse(sums.of_particles, corners[j], 0, weights[j] * impulse, rows.lost)
-    _add_to_side(sums, shapes[0], bodies[0], impulse, torque_on_first, rows.lost)
-    _add_to_side(sums, shapes[1], bodies[1], -impulse, torque_on_second, rows.lost)
+    for side in range(2):
+        torque = torque_on(step, sides, centres, corners, weights, plane, side, impulse)
+        of_side = wp.where(side == 0, impulse, -impulse)
+        _add_to_side(sums, shapes[side], bodies[side], of_side, torque, rows.lost)
     world = step.motion.world[corners[0]]
     if float(along) > sums.largest[world]:  # rarely: all contacts of a world have this address
         wp.atomic_max(sums.largest, world, float(along))
@@ -109,11 +108,11 @@ def _kind_of(kind: int) -> int:
 def _add_idle(
     step: Step,
     sides: Sides,
+    centres: wp.array[wp.vec3d],
     corners: wp.vec4i,
     weights: wp.vec4d,
     plane: int,
     impulse: wp.vec3d,
-    torques: _Torques,
     unpaired: Unpaired,
     lost: wp.array[int],
 ):
@@ -125,7 +124,8 @@ def _add_idle(
         body = body_of_side(sides, corners, plane, side)
         if can_move(step.motion, body):
             add_impulse(unpaired.idle_of_bodies, body, 0, wp.where(side == 0, impulse, -impulse), lost)
-            add_impulse(unpaired.idle_of_bodies, body, 3, torques[side], lost)
+            torque = torque_on(step, sides, centres, corners, weights, plane, side, impulse)
+            add_impulse(unpaired.idle_of_bodies, body, 3, torque, lost)
 
 
 @wp.kernel
@@ -150,36 +150,30 @@ def publish_contacts(
         if wp.length_sq(impulse) > ZERO:
             corners, weights, normal = constraints.vertices[i], constraints.weights[i], constraints.normal[i]
             plane = wp.where(constraints.kind[i] == ContactKind.PLANE, constraints.plane[i], -1)
-            torques = _Torques()
-            for side in range(2):
-                torques[side] = torque_on(step, sides, centres, corners, weights, plane, side, impulse)
             if responds(step, i):
                 toi = wp.float64(constraints.toi[i])
                 if plane >= 0:
                     toi = time_at_plane(motion, planes, plane, corners[0])
                 toi = (wp.float64(substep) + toi) / wp.float64(substeps)
                 velocity = to_single(relative(weights, corners, motion.velocity))
-                along = wp.dot(impulse, normal)
-                kind = _kind_of(constraints.kind[i])
                 publish_contact(
                     step,
                     sides,
-                    kind,
+                    centres,
+                    _kind_of(constraints.kind[i]),
                     corners,
                     weights,
                     plane,
                     impulse,
-                    along,
+                    wp.dot(impulse, normal),
                     normal,
-                    torques[0],
-                    torques[1],
                     velocity,
                     toi,
                     sums,
                     rows,
                 )
             else:
-                _add_idle(step, sides, corners, weights, plane, impulse, torques, unpaired, rows.lost)
+                _add_idle(step, sides, centres, corners, weights, plane, impulse, unpaired, rows.lost)
 
 
 @wp.func
