@@ -5,6 +5,7 @@
 
 import os
 import tempfile
+from threading import Lock
 
 from pxr import Sdf, Usd
 from usd_validation_nvidia import (
@@ -30,6 +31,9 @@ __all__ = ["MeshCollisionChecker", "MeshOverlapChecker", "Plugin"]
 FIXED = "Collision", "Intersection"
 """Kinds of what fails a check, and a fix mends."""
 
+_ONE_AT_A_TIME = Lock()
+"""Rules run in threads at once, and Warp starts and compiles once for all."""
+
 
 class _Checker(BaseRuleChecker):
     """Reports some kinds of what :func:`.scene_replay.stage_check.check_stage` finds."""
@@ -40,7 +44,9 @@ class _Checker(BaseRuleChecker):
     def CheckStage(self, usdStage: Usd.Stage) -> None:
         """Checks a stage as it is composed, with edits that are not saved."""
         fix = Suggestion(repair_stage, "Move deforming meshes apart, as warp-bsc repair does")
-        for issue in check_stage(usdStage):
+        with _ONE_AT_A_TIME:
+            issues = check_stage(usdStage)
+        for issue in issues:
             prims = tuple(usdStage.GetPrimAtPath(path) for path in issue.prims)
             if issue.kind == "Unreadable":
                 self._AddError(f"Not checked: {issue.text}", requirement=self._requirement)
