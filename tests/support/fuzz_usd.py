@@ -1,77 +1,40 @@
 """Replays files of USD that are broken at random, in their structure or in their bytes, and looks for what must not be.
 
 ``python tests/support/fuzz_usd.py --count 10000 --seed 1`` makes files one after the other from small scenes (a falling
-triangle, a skinned mesh, instances, curves, points, shapes): values, types, names, paths, times, arrays, references and
-nesting of the text change, or bytes of the crate. ``warp-bsc replay`` reads each with ``--report``, ``--overlay`` and
-``--json``, in processes of its own. The program prints what it finds, with the seed that makes the file, and ends with
-status 1 if there is something:
+triangle, a skinned mesh, instances, curves, points, shapes, tetrahedra): values, types, names, paths, times, arrays,
+references and nesting of the text change, or bytes of the crate. ``warp-bsc replay`` reads each with ``--report``,
+``--overlay`` and ``--json``. The program prints what it finds, with the number that makes the file again (``--first
+NUMBER --count 1``), and ends with status 1 if there is something:
 
 - an error that nobody foresaw (it names a line of the package), a traceback, or an exit status that is not documented,
-- a process that dies, or takes more than ``--limit`` seconds for one file; where that is while OpenUSD alone opens the
-  file, it is only counted,
-- a page with a name or text of the file as markup, or a file outside of the output folder.
+- a process that dies, or takes more than ``--limit`` seconds for one file,
+- a page with a name of the file as markup, or a file outside of the output folder.
 
-``--keep FOLDER`` keeps the files of what is found, ``--only NUMBER`` makes one file again.
+OpenUSD itself dies of some crates, or reads them forever: each file is first read by OpenUSD alone, and one at which
+the process ends there is only counted.
 """
 
 import argparse
 import collections
 import contextlib
+import faulthandler
 import io
-import os
 import random
 import re
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 from pathlib import Path
+
+from pxr import Sdf, Usd
+
+from warp_bsc.cli.main import main as replay
 
 MARKUP = "</script><b id=fuzzed>"
 NAMES = (MARKUP, "]]>", "../../outside", "a\\u0007b", "é\\n", '\\"', "x" * 3000, "${HOME}", "%s%n", "")
-NUMBERS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e39",
-    "-1e308",
-    "1e-45",
-    "-1",
-    "0",
-    "2147483648",
-    "1e15",
-    "",
-    "None",
-    '"x"',
-    "(1, 2)",
-)
-TYPES = (
-    "point3f[]",
-    "point3d[]",
-    "float[]",
-    "int[]",
-    "int",
-    "string",
-    "token",
-    "double3",
-    "matrix4d",
-    "rel",
-    "half3[]",
-)
-SCHEMAS = (
-    "Mesh",
-    "Xform",
-    "Cube",
-    "Sphere",
-    "Capsule",
-    "Points",
-    "BasisCurves",
-    "PointInstancer",
-    "Skeleton",
-    "SkelRoot",
-    "TetMesh",
-)
+NUMBERS = 'nan|inf|-inf|1e39|-1e308|1e-45|-1|0|2147483648|1e15||None|"x"|(1, 2)'.split("|")  # noqa: SIM905
+TYPES = "point3f[] point3d[] float[] int[] int3[] int4[] int string token double3 matrix4d rel half3[]".split()  # noqa: SIM905
+SCHEMAS = "Mesh Xform Cube Sphere Capsule Points BasisCurves PointInstancer Skeleton SkelRoot TetMesh".split()  # noqa: SIM905
 ARCS = (
     "references = @{file}@</World>",
     "references = </World>",
@@ -86,13 +49,31 @@ ARCS = (
     'displayName = "{name}"',
     'customData = {{ string a = "{name}" }}',
 )
-HEADER = '#usda 1.0\n(\n    defaultPrim = "World"\n    startTimeCode = 0\n    endTimeCode = 2\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
+LAYERS = (
+    "subLayers = [@{file}@]",
+    "timeCodesPerSecond = 0",
+    "timeCodesPerSecond = nan",
+    "subLayers = [@./no.usd@ (scale = 0)]",
+)
+HEADER = """#usda 1.0
+(
+    defaultPrim = "World"
+    startTimeCode = 0
+    endTimeCode = 2
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+"""
 SCENES = (
     """def Xform "World" {
     def Mesh "A" (
         kind = "component"
     ) {
-        point3f[] points.timeSamples = { 0: [(0, 0, 1), (1, 0, 1), (0, 1, 1)], 1: [(0, 0, -1), (1, 0, -1), (0, 1, -1)], 2: [(0, 0, 1), (1, 0, 1), (0, 1, 1)] }
+        point3f[] points.timeSamples = {
+            0: [(0, 0, 1), (1, 0, 1), (0, 1, 1)],
+            1: [(0, 0, -1), (1, 0, -1), (0, 1, -1)],
+            2: [(0, 0, 1), (1, 0, 1), (0, 1, 1)],
+        }
         int[] faceVertexCounts = [3]
         int[] faceVertexIndices = [0, 1, 2]
         normal3f[] normals = [(0, 0, 1)] (
@@ -139,8 +120,14 @@ SCENES = (
         prepend apiSchemas = ["SkelBindingAPI"]
     ) {
         uniform token[] joints = ["a", "a/b"]
-        uniform matrix4d[] bindTransforms = [((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)), ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 1, 1))]
-        uniform matrix4d[] restTransforms = [((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)), ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 1, 1))]
+        uniform matrix4d[] bindTransforms = [
+            ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+            ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 1, 1)),
+        ]
+        uniform matrix4d[] restTransforms = [
+            ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)),
+            ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 1, 1)),
+        ]
         rel skel:animationSource = </World/A/C>
         def SkelAnimation "C" {
             uniform token[] joints = ["a", "a/b"]
@@ -167,6 +154,22 @@ SCENES = (
     }
 }
 """,
+    """def Xform "World" {
+    def TetMesh "A" {
+        int4[] tetVertexIndices = [(0, 1, 2, 3)]
+        int3[] surfaceFaceVertexIndices = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
+        uniform token orientation = "rightHanded"
+        point3f[] points.timeSamples = {
+            0: [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
+            2: [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, -1)],
+        }
+    }
+    def TetMesh "B" {
+        int4[] tetVertexIndices = [(0, 1, 2, 3), (1, 2, 3, 4)]
+        point3f[] points = [(0, 0, 0.5), (1, 0, 0.5), (0, 1, 0.5), (0, 0, 2), (1, 1, 2)]
+    }
+}
+""",
 )
 
 
@@ -175,11 +178,9 @@ def mutated_text(rng, path):
     lines = (HEADER + rng.choice(SCENES)).splitlines()
     for _ in range(rng.choice((1, 1, 2, 3, 6))):
         number = rng.randrange(1, len(lines))
-        line, kind = lines[number], rng.randrange(11)
-        name = rng.choice(NAMES)
+        line, kind, name = lines[number], rng.randrange(11), rng.choice(NAMES)
         if kind <= 2:  # numbers
-            places = list(re.finditer(r"-?\d+(\.\d+)?", line))
-            if places:
+            if places := list(re.finditer(r"-?\d+(\.\d+)?", line)):
                 at = rng.choice(places)
                 lines[number] = line[: at.start()] + rng.choice(NUMBERS) + line[at.end() :]
         elif kind == 3:  # arrays: an element less, an array many times over, or empty
@@ -188,7 +189,7 @@ def mutated_text(rng, path):
                 inner = rng.choice((once[1].partition(",")[2], ", ".join(copies * [once[1]]), ""))
                 lines[number] = f"{line[: once.start()]}[{inner}]{line[once.end() :]}"
         elif kind == 4:  # lines
-            lines[number : number + 1] = rng.choice(([], 2 * [line], [lines[rng.randrange(1, len(lines))], line]))
+            lines[number : number + 1] = rng.choice(([], 2 * [line], [rng.choice(lines), line]))
         elif kind == 5:  # types
             lines[number] = re.sub(r"\b\w+(\[\])? (?=[\w:.]+ =)", f"{rng.choice(TYPES)} ", line, count=1)
         elif kind == 6:  # schemas and names of prims
@@ -206,68 +207,45 @@ def mutated_text(rng, path):
         elif kind == 9:  # nesting
             depth = rng.choice((3, 60))
             lines[number:number] = ["}" * (number > 9)] + ['def Xform "N" {'] * depth + ["}"] * depth
-        else:  # layers
-            lines[1:2] = [
-                "(",
-                rng.choice(
-                    (
-                        f"subLayers = [@{path.name}@]",
-                        "timeCodesPerSecond = 0",
-                        "timeCodesPerSecond = nan",
-                        "subLayers = [@./no.usd@ (scale = 0)]",
-                    )
-                ),
-            ]
+        else:
+            lines[1:2] = ["(", rng.choice(LAYERS).format(file=path.name)]
     return "\n".join(lines)
 
 
-def write_file(number, seed, folder):
-    """Writes the file of a number, and returns its path."""
-    from pxr import Sdf
+def write_text(rng, path):
+    """Writes a text file, and returns its path."""
+    path.write_text(mutated_text(rng, path), encoding="utf-8")
+    return path
 
-    rng = random.Random(f"{seed} {number}")
-    path = folder / f"f{number}.usda"
-    path.write_text(mutated_text(rng, path), encoding="utf-8", errors="surrogateescape")
-    if rng.random() < 0.35:
-        layer = Sdf.Layer.CreateAnonymous(".usdc")
-        with contextlib.suppress(Exception):
-            if rng.random() < 0.7:
-                layer.ImportFromString(HEADER + rng.choice(SCENES))
-            else:
-                layer.Import(str(path))
-        crate = path.with_suffix(".usdc")
-        layer.Export(str(crate))
-        data = bytearray(crate.read_bytes())
-        for _ in range(rng.choice((1, 2, 5, 20))):
-            at = rng.randrange(len(data))
-            kind = rng.randrange(4)
-            if kind == 0:
-                data[at] ^= 1 << rng.randrange(8)
-            elif kind == 1:
-                data[at : at + 8] = rng.choice((bytes(8), bytes(8 * [255]), rng.randbytes(8)))
-            elif kind == 2 and len(data) > 200:
-                del data[at : at + rng.choice((1, 8, 64))]
-            else:
-                data[at:at] = data[: rng.choice((1, 8, 64))]
-        if rng.random() < 0.1:
-            del data[rng.randrange(len(data)) :]
-        crate.write_bytes(data)
-        path.unlink()
-        return crate
+
+def write_crate(rng, path):
+    """Writes a crate with some bytes that are others, more or fewer, and returns its path."""
+    layer = Sdf.Layer.CreateAnonymous(".usdc")
+    with contextlib.suppress(Exception):
+        layer.ImportFromString(HEADER + rng.choice(SCENES))
+    layer.Export(str(path))
+    data = bytearray(path.read_bytes())
+    for _ in range(rng.choice((1, 2, 5, 20))):
+        at, kind = rng.randrange(len(data)), rng.randrange(4)
+        if kind == 0:
+            data[at] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            data[at : at + 8] = rng.choice((bytes(8), bytes(8 * [255]), rng.randbytes(8)))
+        elif kind == 2 and len(data) > 200:
+            del data[at : at + rng.choice((1, 8, 64))]
+        else:
+            data[at:at] = data[: rng.choice((1, 8, 64))]
+    path.write_bytes(data[: rng.randrange(len(data))] if rng.random() < 0.1 else data)
     return path
 
 
 def check(path, output):
     """Replays a file, and returns the exit status, and what must not be, in words; empty if all is well."""
-    from warp_bsc.cli.main import main
-
     page, overlay = output / "page.html", output / "overlay.usda"
     command = ["replay", str(path), "--report", str(page), "--overlay", str(overlay), "--json", "--device", "cpu"]
-    before = {item for item in path.parents[1].rglob("*") if output not in item.parents}
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
-        status = main(command)
-    printed = err.getvalue()
-    problems = []
+        status = replay(command)
+    printed, problems = err.getvalue(), []
     if status not in (0, 2, 4):
         problems.append(f"exit status {status}")
     if found := re.search(r"\(\w+\.py:\d+\)|Traceback.*", printed + out.getvalue()):
@@ -276,117 +254,74 @@ def check(path, output):
         problems.append("status 2 without a word")
     if page.exists() and MARKUP in page.read_text():
         problems.append("the page has markup of the file")
-    if strange := {item for item in path.parents[1].rglob("*") if output not in item.parents} - before:
-        problems.append(f"files outside of the output folder: {sorted(map(str, strange))}")
+    if strange := {*path.parent.rglob("*")} - {path, output, page, overlay}:
+        problems.append(f"other files: {sorted(map(str, strange))}")
     for file in output.iterdir():
         file.unlink()
     return status, "; ".join(problems)
 
 
-def work(options):
-    """Makes and checks files, and prints a line before and after each."""
-    import warp as wp
-    from pxr import Usd
+def read_alone(path):
+    """Reads all values of a file by OpenUSD alone."""
+    with contextlib.suppress(Exception):
+        for prim in Usd.Stage.Open(str(path)).TraverseAll():
+            for attribute in prim.GetAttributes():
+                attribute.Get(attribute.GetTimeSamples()[-1] if attribute.GetTimeSamples() else Usd.TimeCode.Default())
 
-    wp.config.log_level = wp.LOG_WARNING
-    with tempfile.TemporaryDirectory() as temporary:
-        folder, output = Path(temporary, "in"), Path(temporary, "out")
-        folder.mkdir()
+
+def work(options):
+    """Makes and checks files, with a line in the log for each."""
+    with tempfile.TemporaryDirectory() as folder, open(options.log, "a", buffering=1) as log:
+        output = Path(folder, "out")
         output.mkdir()
         for number in range(options.first, options.first + options.count):
-            print(f"begin {number}", flush=True)
-            path = write_file(number, options.seed, folder)
-            with contextlib.suppress(Exception):
-                Usd.Stage.Open(str(path))
-            print(f"opened {number}", flush=True)
+            rng = random.Random(f"{options.seed} {number}")
+            write, ending = (write_crate, "usdc") if rng.random() < 0.35 else (write_text, "usda")
+            path = write(rng, Path(folder, f"f{number}.{ending}"))
+            # the first file may compile kernels
+            faulthandler.dump_traceback_later(options.limit if number > options.first else 600.0, exit=True)
+            log.write(f"{number} OpenUSD ")
+            read_alone(path)
+            log.write("dies ")
             status, problem = check(path, output)
-            if problem and options.keep:
-                Path(options.keep).mkdir(parents=True, exist_ok=True)
-                Path(options.keep, path.name).write_bytes(path.read_bytes())
-            print(f"end {number} {status} {problem}", flush=True)
+            faulthandler.cancel_dump_traceback_later()
+            log.write(f"{status} {'bad' if problem else 'good'}\n")
+            if problem:
+                print(f"{number}: {problem}", flush=True)
             path.unlink()
 
 
-def watch(first, stop, options, found, statuses):
-    """Runs a process on some numbers, and another one behind each number that ends it."""
-    while first < stop:
-        command = [sys.executable, __file__, "--worker", "--first", str(first), "--count", str(stop - first)]
-        command += ["--seed", str(options.seed), *(["--keep", options.keep] if options.keep else [])]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        assert process.stdout is not None and process.stderr is not None
-        since, stuck = [time.monotonic(), True], []
-
-        def guard(process=process, since=since, stuck=stuck):
-            while process.poll() is None:
-                if time.monotonic() - since[0] > (options.limit if not since[1] else 300.0):
-                    stuck.append(True)
-                    process.kill()
-                time.sleep(0.2)
-
-        threading.Thread(target=guard, daemon=True).start()
-        errors = []
-        reader = threading.Thread(target=lambda p=process, e=errors: e.append(p.stderr.read()), daemon=True)
-        reader.start()
-        running, is_open = None, True
-        for line in process.stdout:
-            word, number, *rest = line.rstrip("\n").split(" ", 3)
-            if word in ("begin", "opened"):
-                running, is_open = int(number), word == "opened"
-                since[0] = time.monotonic()
-            elif word == "end":
-                since[0], since[1], running, first = time.monotonic(), False, None, int(number) + 1
-                statuses[rest[0]] += 1
-                if rest[1]:
-                    found.append((int(number), rest[1]))
-                    print(f"{number}: {rest[1]}", flush=True)
-        process.wait()
-        reader.join()
-        if first < stop:
-            number = first if running is None else running
-            first = number + 1
-            if not is_open:
-                statuses["OpenUSD"] += 1
-                continue
-            text = (
-                f"takes more than {options.limit:g} s"
-                if stuck
-                else f"dies with {process.returncode}: {errors[0][-300:]}"
-            )
-            found.append((number, text))
-            print(f"{number}: {text}", flush=True)
-
-
 def main():
-    """Checks all files."""
+    """Checks all files in a process, and in another one behind each number that ends it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--limit", type=float, default=20.0, help="seconds for a file")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--keep")
-    parser.add_argument("--only", type=int)
-    parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--log", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.only is not None:
-        options.first, options.count, options.jobs = options.only, 1, 1
-    if options.worker:
+    if options.log:
         work(options)
         return 0
-    found: list[tuple[int, str]] = []
-    statuses: collections.Counter[str] = collections.Counter()
-    stop = options.first + options.count
-    bounds = [options.first + options.count * i // options.jobs for i in range(options.jobs)] + [stop]
-    threads = [
-        threading.Thread(target=watch, args=(*pair, options, found, statuses)) for pair in zip(bounds, bounds[1:])
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    first, stop = options.first, options.first + options.count
+    statuses, bad = collections.Counter(), 0
+    while first < stop:
+        with tempfile.NamedTemporaryFile("r") as log:
+            command = [sys.executable, __file__, "--log", log.name, "--seed", str(options.seed)]
+            command += ["--limit", str(options.limit), "--first", str(first), "--count", str(stop - first)]
+            process = subprocess.run(command, check=False, stderr=subprocess.PIPE, text=True)
+            lines = [line.split() for line in log]
+        for number, *words in lines:
+            first = int(number) + 1
+            statuses[" ".join(words[2:3] or words[-1:])] += 1
+            bad += words[-1] == "bad"
+        if process.returncode and (not lines or lines[-1][-1] == "dies"):
+            print(f"{first - 1}: ends with {process.returncode}: {process.stderr[-2000:]}", flush=True)
+            bad += 1
+            first += not lines
     counts = ", ".join(f"{count:,} with {status}" for status, count in sorted(statuses.items()))
-    print(f"{options.count:,} files, by exit status: {counts}; {len(found)} with a problem")
-    return bool(found)
+    print(f"{options.count:,} files, by exit status: {counts}; {bad} with a problem")
+    return bool(bad)
 
 
 if __name__ == "__main__":
