@@ -51,9 +51,8 @@ class _Checker(BaseRuleChecker):
             if issue.kind == "Unreadable":
                 self._AddError(f"Not checked: {issue.text}", requirement=self._requirement)
             elif issue.kind in self._kinds:
-                is_fixable = issue.kind in FIXED
-                add = self._AddFailedCheck if is_fixable else self._AddWarning
-                add(issue.text, prims, fix if is_fixable else None, requirement=self._requirement)
+                add = self._AddWarning if issue.kind in ("Inside", "Duplicates") else self._AddFailedCheck
+                add(issue.text, prims, fix if issue.kind in FIXED else None, requirement=self._requirement)
 
 
 class MeshOverlapChecker(_Checker):
@@ -67,9 +66,9 @@ class MeshOverlapChecker(_Checker):
 
 
 class MeshCollisionChecker(_Checker):
-    """No vertex meets a face, and no two edges meet, between time samples."""
+    """No vertex meets a face, no two edges meet, and no tetrahedron inverts, at time samples or between them."""
 
-    _kinds = ("Collision",)
+    _kinds = "Collision", "Inversion"
 
 
 class Plugin:

@@ -25,7 +25,7 @@ class StageIssue:
         prims: Paths of the prims.
     """
 
-    kind: Literal["Collision", "Intersection", "Inside", "Duplicates", "Unreadable"]
+    kind: Literal["Collision", "Intersection", "Inversion", "Inside", "Duplicates", "Unreadable"]
     text: str
     prims: tuple[str, ...] = ()
 
@@ -64,6 +64,8 @@ def check_stage(stage: "Usd.Stage", *, frames: FrameRange | None = None) -> list
             add("Inside", span, f"{span.meshes[0]} is inside {span.meshes[1]} {when}")
         elif span.crossings:
             add("Intersection", span, f"{_pair(span.meshes)} cross {when}: at most {span.most:,} edges")
+    for span in summary.inversion_spans:
+        add("Inversion", span, span.describe())
     for span in summary.duplicate_spans:
         add("Duplicates", span, span.describe(_MOST_NAMES))
     return issues

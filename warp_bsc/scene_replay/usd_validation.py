@@ -22,8 +22,9 @@ from .stage_check import check_stage
 __all__ = ["NAME", "PLUGIN_FOLDER", "find_errors"]
 
 NAME = f"{__name__}:Collisions"
-"""Name of the rule. Its errors are ``Collision``, ``Intersection``, and ``Unreadable`` for parts that are not checked;
-its warnings are ``Inside``, for a mesh that is wholly inside another, perhaps intentionally, and ``Duplicates``."""
+"""Name of the rule. Its errors are ``Collision``, ``Intersection``, ``Inversion`` (of tetrahedra), ``Unreadable`` for
+parts that are not checked; its warnings are ``Inside``, for a mesh that is wholly inside another, perhaps
+intentionally, and ``Duplicates``."""
 
 PLUGIN_FOLDER = os.path.join(os.path.dirname(__file__), "plugin", "")
 """Folder of the plugin, for ``PXR_PLUGINPATH_NAME``."""

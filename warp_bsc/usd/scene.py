@@ -346,16 +346,16 @@ class Scene:
     def _read(self, index) -> Interval:
         """Returns an interval, with the notes on reading since the last call of :meth:`take_notes`."""
         self.files.check_stage()
-        segment, x0, x1, jumps = self._read_positions(index)
+        segment, x0, x1, tet_positions, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
         with self._collecting(self._record.messages, self.path):
             turns = segment.turns(start, end) if self.turning and end > start else {}
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
-        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), turns)
+        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), tet_positions, turns)
 
     @one_at_a_time
-    def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Returns the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
+    def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple, tuple[str, ...]]:
+        """Returns an interval's segment, positions at start and end, those of tetrahedra, and meshes that jump."""
         start, end = self.times[index : index + 2]
         with self._collecting(self._record.messages, self.path):
             while True:
@@ -363,12 +363,14 @@ class Scene:
                 try:
                     x0 = segment.positions(start, last=self._jumps.end_of(index - 1, segment))
                     x1 = segment.positions(end, before=True) if end > start else x0
+                    tets = segment.tetrahedra
+                    tet_positions = tets.positions(start), tets.positions(end, before=end > start)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
         jumps = self._jumps.find(index, segment, x0, x1)
         self._record.add_jumps(jumps, start)
-        return segment, x0, x1, jumps
+        return segment, x0, x1, tet_positions, jumps
 
     def _checked_index(self, index, name, last) -> int:
         """Returns the number of an interval; raises a TypeError, or an IndexError if it is not in [0, last]."""
