@@ -16,6 +16,7 @@ from .samples import as_time_code, sample_times
 from .shapes import MeshPolygons, Polygons, ShapePolygons, TetPolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
+from .tetrahedra import NOT_REPAIRED
 from .topology import BROKEN, Topologies, is_empty
 from .unreadable import UnreadableError, reading
 
@@ -228,10 +229,8 @@ class UsdMesh:
     @property
     def why_not_repaired(self) -> str | None:
         """Why a repair does not move the mesh, in words; None if it may."""
-        if self.has_tetrahedra:
-            return "its tetrahedra could invert"
         if self.why_not_written or self.deforms:
-            return self.why_not_written
+            return self.why_not_written or (NOT_REPAIRED if self.has_tetrahedra else None)
         return "its points do not move, only its transform" if self.times else "it does not move"
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:

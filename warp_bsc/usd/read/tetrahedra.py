@@ -1,12 +1,12 @@
 """The tetrahedra of several meshes, in the spaces of their prims: transforms, mirrored ones too, invert none there."""
 
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from .meshes import UsdMesh  # which imports pxr
+NOT_REPAIRED = "its tetrahedra could invert"
+"""Why a repair does not move a mesh of tetrahedra that deforms, in words."""
 
 
 class Tetrahedra:
@@ -19,11 +19,11 @@ class Tetrahedra:
         vertex_count: Number of vertices.
     """
 
-    def __init__(self, usd_meshes: "list[UsdMesh]", time: float):
+    def __init__(self, usd_meshes: list[Any], time: float):
         """Reads the tetrahedra.
 
         Args:
-            usd_meshes: The meshes.
+            usd_meshes: The meshes, see :class:`~warp_bsc.usd.read.meshes.UsdMesh`.
             time: Time code.
 
         Raises:
