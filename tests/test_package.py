@@ -141,7 +141,6 @@ LIBRARIES = {
     "pxr": {
         "usd",
         "warp_bsc/nvidia_validation.py",  # rules of NVIDIA's validation
-        "warp_bsc/scene_replay/stage_check.py",  # for type checkers alone
         "warp_bsc/scene_replay/usd_validation.py",  # a rule of its validation framework
         "warp_bsc/scene_replay/usdview_plugin.py",  # a plugin of its viewer
     },

@@ -72,7 +72,7 @@ examples:
   warp-bsc repair body.obj garment.obj --keep body.obj --output free.obj
   warp-bsc repair body.obj 'coat_####.ply' --output 'free/coat_####.ply'
 
-{explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
+{explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
 _OF_ALL = {"command_line", "scene", "output", "report", "keep", "min_distance", "json", "fail_on", "device"}
 _OF_ONE_FRAME = {"max_strain", "order", "previous"}

@@ -71,7 +71,7 @@ examples:
       --output-path twist.usd
   warp-bsc replay twist.usd
 
-{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT)}"""
+{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 """The help text below the options."""
 
 

@@ -1,15 +1,12 @@
 """What a replay of a USD stage finds, in words, for rules of validation frameworks."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 from ..usd.frames import FrameRange
 from ..usd.scene import Scene
 from .intervals import replay
 from .summary import Summary
-
-if TYPE_CHECKING:
-    from pxr import Usd
 
 _MOST_NAMES = 10  # of duplicates, in words
 
@@ -30,14 +27,14 @@ class StageIssue:
     prims: tuple[str, ...] = ()
 
 
-def check_stage(stage: "Usd.Stage", *, frames: FrameRange | None = None) -> list[StageIssue]:
+def check_stage(stage: Any, *, frames: FrameRange | None = None) -> list[StageIssue]:
     """Returns an issue for each span of time in which two meshes collide, cross, coincide or one is inside another.
 
     The stage is replayed as it is composed, with edits that are not saved, by method ``"exact"`` on Warp's default
     device.
 
     Args:
-        stage: The stage.
+        stage: The stage, a ``Usd.Stage``.
         frames: The times to check; default: all.
     """
     paths: dict[str, str] = {}  # by name

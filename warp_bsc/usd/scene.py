@@ -36,7 +36,7 @@ from .interval import Interval, LeftOutMesh, ReadingNotes, ReadingRecord
 from .jumps import JumpFinder, jumps_at
 from .read.files import SceneFiles
 from .read.openusd import check_openusd
-from .scene_options import Revealed, SceneOptions
+from .scene_options import EmptySceneError, Revealed, SceneOptions
 from .scene_times import find_times
 from .segment import Segment
 from .selection import Selection
@@ -385,11 +385,11 @@ class Scene:
         return self.times, [mesh.name for mesh in self._usd_meshes], len(self.left_out)
 
     def _check_meshes(self, is_selection):
-        """Raises a ValueError if there are no meshes, and none is left out."""
+        """Raises an EmptySceneError if there are no meshes, and none is left out."""
         if not self._usd_meshes and not self.left_out:
             none_selected = ", or none is selected" * is_selection
             reason = "".join(f"; {warning}" for warning in self._warnings[:1])
-            raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
+            raise EmptySceneError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _jumps_at_end(self) -> bool:
         """Returns whether a mesh jumps at the last time, or cannot be read at it."""

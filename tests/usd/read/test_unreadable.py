@@ -262,10 +262,10 @@ def test_many_are_counted(stage):
     assert len(named) == 6 and named[-1] == "left out: 25 more, 30 in all"
 
 
-def test_nothing_readable_is_an_error(tmp_path, capsys):
+def test_nothing_readable_is_an_error_with_a_status_of_its_own(tmp_path, capsys):
     stage = new_stage(tmp_path / "scene.usda")
     add_bare_mesh(stage)
-    assert main(["replay", save(stage), "--device", "cpu"]) == 2
+    assert main(["replay", save(stage), "--device", "cpu"]) == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f"no visible mesh in the scene, or none is selected; {EMPTY}")
 
