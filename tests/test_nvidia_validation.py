@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from usd_stages import FALLING, add_mesh, falling_stage, moved, new_stage, save
+from usd_stages import CORNERS, FALLING, add_mesh, add_tets, falling_stage, moved, new_stage, save
 
 nvidia = pytest.importorskip("usd_validation_nvidia")
 
@@ -49,6 +49,13 @@ def test_a_mesh_inside_another_is_a_warning(tmp_path):
         UsdGeom.Cube.Define(stage, f"/World/{name}").CreateSizeAttr(size)
     (issue,) = found(Usd.Stage.Open(save(stage)))
     assert issue.severity == nvidia.IssueSeverity.WARNING and issue.suggestion is None
+
+
+def test_tetrahedra_that_invert_fail_without_a_fix(tmp_path):
+    stage = new_stage(tmp_path / "soft.usda")
+    add_tets(stage, CORNERS, [(1, 0, 2, 3)])
+    (issue,) = found(stage, rules.MeshCollisionChecker)
+    assert issue.severity == nvidia.IssueSeverity.FAILURE and issue.suggestion is None
 
 
 def test_what_is_not_checked_is_an_error():

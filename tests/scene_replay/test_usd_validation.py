@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from pxr import Gf, Usd, UsdGeom
-from usd_stages import FALLING, add_mesh, falling_stage, moved, new_stage, save
+from usd_stages import CORNERS, FALLING, add_mesh, add_tets, falling_stage, moved, new_stage, save
 
 UsdValidation = pytest.importorskip("pxr.UsdValidation")
 if not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"):
@@ -49,6 +49,18 @@ def test_duplicates_are_a_warning(stage):
     name, text, prims = found(stage)[-1]
     assert (name, sorted(prims)) == ("Duplicates", ["/World/Again", "/World/Crossing"])
     assert text.startswith("2 meshes are duplicates of each other, from 0 to 1: ")
+
+
+def test_tetrahedra_that_invert_are_an_error(tmp_path):
+    stage = new_stage(tmp_path / "soft.usda")
+    add_tets(stage, CORNERS, [(1, 0, 2, 3)])
+    assert found(stage) == [
+        (
+            "Inversion",
+            "1 tetrahedron is inverted in /World/Soft, at 0; the first is tetrahedron 0, at 0",
+            ["/World/Soft"],
+        )
+    ]
 
 
 def test_times(stage):

@@ -7,23 +7,12 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom
 from replay_files import Page
-from usd_stages import add_instancer, add_mesh, falling, find, hits, new_stage, save
+from usd_stages import CORNERS, add_instancer, add_mesh, add_tets, falling, find, hits, new_stage, save
 
 import warp_bsc as bsc
 from warp_bsc.cli.main import main
 
-CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
 SURFACE = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
-
-
-def add_tets(stage, points, tets=((0, 1, 2, 3),), surface=None, path="/World/Soft"):
-    mesh = UsdGeom.TetMesh.Define(stage, path)
-    mesh.CreateTetVertexIndicesAttr(list(tets))
-    if surface:
-        mesh.CreateSurfaceFaceVertexIndicesAttr(surface)
-    for time, value in points.items() if isinstance(points, dict) else [(Usd.TimeCode.Default(), points)]:
-        mesh.CreatePointsAttr().Set(value, time)
-    return mesh
 
 
 def inverted(stage, *options, status=0):
