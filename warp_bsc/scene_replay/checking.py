@@ -170,9 +170,10 @@ class _SegmentDetector:
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
         self._finder = self._detector.intersection_finder() if checks.intersections else None
         self._intersections: _At[tuple[Intersections, Intersections]] | None = None  # of meshes, and of all
-        tets = segment.tetrahedra
-        mesh = CollisionMesh(np.empty((0, 3), int), tets.vertex_count, tets=tets.corners, device=checks.device)
-        self._inversions = CollisionDetector(mesh, method=checks.method) if len(tets.corners) else None
+        tets, self._inversions = segment.tetrahedra, None
+        if len(tets.corners):
+            mesh = CollisionMesh(np.empty((0, 3), int), tets.vertex_count, tets=tets.corners, device=checks.device)
+            self._inversions = CollisionDetector(mesh, method=checks.method)
         clearance = checks.clearance
         self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
         self._proximities: _At[Proximities] | None = None
