@@ -71,6 +71,7 @@ PACKAGES = {
         "_warnings",
     },
     "repairing": {"detection", "response", "kernels", "usd", "scene_replay", "_arguments", "_atomic_file"},
+    "nvidia_validation": {"repairing", "scene_replay", "usd"},
     "mesh_files": {"detection", "repairing", "usd", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread", "_sorted_keys", "_warnings"},
     "scene_replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},
@@ -139,6 +140,7 @@ LIBRARIES = {
     },
     "pxr": {
         "usd",
+        "warp_bsc/nvidia_validation.py",  # rules of NVIDIA's validation
         "warp_bsc/scene_replay/usd_validation.py",  # a rule of its validation framework
         "warp_bsc/scene_replay/usdview_plugin.py",  # a plugin of its viewer
     },

@@ -37,6 +37,13 @@ def test_the_recipe_has_the_version_and_the_dependencies_of_the_package(project)
     assert project["description"] in recipe
 
 
+def test_the_extra_dev_has_those_of_docs_and_usd_and_not_the_package_itself(project):
+    """A package that requires itself is a circle for programs that sort packages by their requirements."""
+    extras = project["optional-dependencies"]
+    assert {*extras["docs"], *extras["usd"]} < {*extras["dev"]}
+    assert not any(name.startswith(project["name"]) for names in extras.values() for name in names)
+
+
 def test_the_lowest_versions_of_warp_and_newton_are_tested_ones(project):
     """The jobs named lowest-versions install them."""
     bounds = dict(requirement.split(">=") for requirement in project["dependencies"])

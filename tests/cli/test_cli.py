@@ -283,8 +283,8 @@ def test_query_fails_on_collision(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("command", "statuses"),
     [
-        ("", [0, 1, 2, 3, 4]),
-        ("replay", [0, 1, 2, 3, 4]),
+        ("", [0, 1, 2, 3, 4, 5]),
+        ("replay", [0, 1, 2, 3, 4, 5]),
         ("query", [0, 1, 2]),
         *((f"bench {name}".strip(), [0, 2]) for name in ("", "paper", "detector", "queries", "newton", "repair")),
     ],

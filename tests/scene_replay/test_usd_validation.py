@@ -6,7 +6,7 @@ import sys
 
 import pytest
 from pxr import Gf, Usd, UsdGeom
-from usd_stages import FALLING, add_mesh, falling_stage, moved, new_stage, save
+from usd_stages import CORNERS, FALLING, add_mesh, add_tets, falling_stage, moved, new_stage, save
 
 UsdValidation = pytest.importorskip("pxr.UsdValidation")
 if not hasattr(UsdValidation.ValidationRegistry, "RegisterPluginStageValidator"):
@@ -51,6 +51,18 @@ def test_duplicates_are_a_warning(stage):
     assert text.startswith("2 meshes are duplicates of each other, from 0 to 1: ")
 
 
+def test_tetrahedra_that_invert_are_an_error(tmp_path):
+    stage = new_stage(tmp_path / "soft.usda")
+    add_tets(stage, CORNERS, [(1, 0, 2, 3)])
+    assert found(stage) == [
+        (
+            "Inversion",
+            "1 tetrahedron is inverted in /World/Soft, at 0; the first is tetrahedron 0, at 0",
+            ["/World/Soft"],
+        )
+    ]
+
+
 def test_times(stage):
     until = UsdValidation.ValidationTimeRange(Gf.Interval(0.0, 0.25))
     assert [name for name, _, _ in found(stage, until)] == ["Intersection"]
@@ -58,9 +70,18 @@ def test_times(stage):
     assert found(stage, default) == []
 
 
+def test_stages_in_memory_and_edits_that_are_not_saved(stage):
+    flat = Usd.Stage.CreateInMemory()
+    flat.GetRootLayer().TransferContent(stage.GetRootLayer())
+    assert [name for name, _, _ in found(flat)] == ["Collision", "Intersection", "Intersection"]
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        stage.GetPrimAtPath("/World/Crossing").SetActive(False)
+    assert [name for name, _, _ in found(stage)] == ["Collision", "Intersection"]
+
+
 def test_a_stage_that_is_not_checked():
     (error,) = found(Usd.Stage.CreateInMemory())
-    assert error[0] == "Unreadable" and "no such file" in error[1]
+    assert error[0] == "Unreadable" and error[1].endswith("no visible mesh in the scene")
 
 
 def test_a_program_that_knows_only_the_plugin(stage):
@@ -85,8 +106,17 @@ def test_a_mesh_inside_another_is_a_warning(tmp_path):
     assert error.GetMessage() == "/World/Inside is inside /World/Case from time 0 to 0"
 
 
-def test_the_module_is_imported_before_the_function_of_the_package():
-    statement = "from warp_bsc.scene_replay import usd_validation as rules"
-    program = f"{statement}; import warp_bsc; assert callable(warp_bsc.replay); print(rules.NAME)"
-    printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert printed.stdout.strip() == rules.NAME
+def test_an_import_after_the_registry_has_read_its_plugins():
+    program = """
+from pxr import UsdValidation
+UsdValidation.ValidationRegistry()
+import warp_bsc.scene_replay.usd_validation
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (
+        done.returncode == 1
+        and "ImportError" in done.stderr
+        and f"PXR_PLUGINPATH_NAME={rules.PLUGIN_FOLDER}" in done.stderr
+    )
+    environment = os.environ | {"PXR_PLUGINPATH_NAME": rules.PLUGIN_FOLDER}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)

@@ -9,7 +9,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from usd_stages import FALLING, add_floor, add_instancer, add_mesh, floor_stage, moved, new_stage, save
+from usd_stages import (
+    CORNERS,
+    FALLING,
+    add_floor,
+    add_instancer,
+    add_mesh,
+    add_tets,
+    floor_stage,
+    moved,
+    new_stage,
+    save,
+)
 from usdview import Menu, Registry, UsdviewApi, define_usdview
 
 import warp_bsc as bsc
@@ -80,6 +91,14 @@ def test_the_interval_of_the_current_frame_is_checked(stage, menu, time, said):
     menu(api)["Check This Interval"]()
     assert api.said[-1].startswith(f"warp-bsc: {said}")
     assert api.frame == Usd.TimeCode(time)
+
+
+def test_tetrahedra_that_invert_are_counted(tmp_path, menu):
+    stage = new_stage(tmp_path / "soft.usda")
+    add_tets(stage, CORNERS, [(1, 0, 2, 3)])
+    api = UsdviewApi(stage, 0)
+    menu(api)["Check This Interval"]()
+    assert api.said[-1].endswith("; 1 inverted tetrahedra")
 
 
 def test_from_hit_to_hit(stage, menu):

@@ -15,6 +15,9 @@ FALLING = [(0.5, -0.5, 0.0), (0.9, -0.5, 0.5), (0.5, -0.9, 0.5)]
 HIT = ("/World/Falling", "vertex 0", "/World/Floor", "face 0", 0.5, (0.5, -0.5, 0.0))
 """What FALLING does when it falls from a height of 0.25 to one of -0.25."""
 
+CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+"""Of a tetrahedron that is not inverted."""
+
 
 def new_stage(path, *, up_axis="Z", meters_per_unit=1.0):
     """A stage with the metadata that usdchecker asks for."""
@@ -39,6 +42,17 @@ def add_mesh(stage, path, points, counts=None, indices=None):
         mesh.CreatePointsAttr(points)
     low, high = np.min(first, axis=0), np.max(first, axis=0)
     mesh.CreateExtentAttr([tuple(map(float, low)), tuple(map(float, high))])
+    return mesh
+
+
+def add_tets(stage, points, tets=((0, 1, 2, 3),), surface=None, path="/World/Soft"):
+    """Tetrahedra, one of CORNERS if none are given; points as of :func:`add_mesh`."""
+    mesh = UsdGeom.TetMesh.Define(stage, path)
+    mesh.CreateTetVertexIndicesAttr(list(tets))
+    if surface:
+        mesh.CreateSurfaceFaceVertexIndicesAttr(surface)
+    for time, value in points.items() if isinstance(points, dict) else [(Usd.TimeCode.Default(), points)]:
+        mesh.CreatePointsAttr().Set(value, time)
     return mesh
 
 

@@ -64,7 +64,6 @@ def test_pairs(crowd, options, expected):
         (["--subdivide", "0"], "at least 1"),
         (["--validate", "some"], "--validate"),
         (["--purpose", "fun"], "fun"),
-        (["--purpose", "guide"], "no visible mesh in the scene, or none is selected"),
         (["--json", "--csv"], "only one of them can be printed"),
         (["--overlay", "out.usdz"], "must end in .usda, .usdc or .usd"),
         (["--report", "gone/out.html"], "there is no folder gone"),

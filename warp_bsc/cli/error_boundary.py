@@ -21,8 +21,8 @@ def run_guarded(command: Callable[[], int]) -> int:
         command: Returns the exit status.
 
     Returns:
-        2 after an error, 128 plus its number after a signal, each with a line on standard error; 141 without a line if
-        the reader of standard output or standard error has closed it.
+        2 after an error, 5 if a scene has nothing to check, 128 plus its number after a signal, each with a line on
+        standard error; 141 without a line if the reader of standard output or standard error has closed it.
     """
     with INTERRUPTS.handled(), _encodable_output():
         try:
@@ -38,7 +38,10 @@ def run_guarded(command: Callable[[], int]) -> int:
             _discard(1, 2)
             return ExitStatus.BROKEN_PIPE
         except Exception as error:
-            return _explain(f"error: {describe(error)}", ExitStatus.ERROR)
+            from ..usd.scene_options import EmptySceneError  # noqa: PLC0415 (slow)
+
+            status = ExitStatus.EMPTY if isinstance(error, EmptySceneError) else ExitStatus.ERROR
+            return _explain(f"error: {describe(error)}", status)
 
 
 def describe(error: BaseException) -> str:

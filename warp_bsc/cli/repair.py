@@ -13,6 +13,7 @@ from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
+from ..usd.read.tetrahedra import NOT_REPAIRED
 from ..usd.scene import Scene
 from ..usd.write.points_layer import PointsLayer
 from .device import find_device, load_detector, loading_kernels
@@ -71,7 +72,7 @@ examples:
   warp-bsc repair body.obj garment.obj --keep body.obj --output free.obj
   warp-bsc repair body.obj 'coat_####.ply' --output 'free/coat_####.ply'
 
-{explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
+{explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 
 _OF_ALL = {"command_line", "scene", "output", "report", "keep", "min_distance", "json", "fail_on", "device"}
 _OF_ONE_FRAME = {"max_strain", "order", "previous"}
@@ -199,7 +200,7 @@ def _run(arguments: argparse.Namespace) -> int:
         print_repair(Console(), run, kept, remaining)
     if "remaining" in arguments.fail_on and any(remaining.values()):
         return ExitStatus.FOUND
-    return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
+    return ExitStatus.LEFT_OUT if scene.left_out or NOT_REPAIRED in kept.values() else ExitStatus.DONE
 
 
 def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:

@@ -44,7 +44,7 @@ widths as radii. Rotations are sampled at every whole time code as well.
 At the time samples themselves, find the edges that pass through faces and the
 meshes that are wholly inside closed ones, including obstacles and linear
 curves, and meshes that are duplicates of each other; if nothing moves, at one
-time.
+time. Find the tetrahedra that invert, or are inverted, at any time.
 Parts that cannot be read are named and left out. Files are written atomically.
 If Ctrl-C, SIGTERM, SIGHUP or an error stops the run, it leaves valid files of
 the finished intervals, marked partial. If it is killed, --json leaves a file
@@ -71,7 +71,7 @@ examples:
       --output-path twist.usd
   warp-bsc replay twist.usd
 
-{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT)}"""
+{explain_statuses(ExitStatus.FOUND, ExitStatus.DISAGREES, ExitStatus.LEFT_OUT, ExitStatus.EMPTY)}"""
 """The help text below the options."""
 
 
@@ -92,6 +92,7 @@ def add_replay_options(command: argparse.ArgumentParser) -> None:
             "collisions": "",
             "distance": "proximities, with --clearance",
             "duplicates": "meshes that are there twice",
+            "inversions": "tetrahedra whose volume is not positive",
             "new": "findings that --baseline does not contain",
         },
     )

@@ -210,6 +210,7 @@ class ReplayRun(contextlib.ExitStack):
             "collisions": summary.hits > 0,
             "distance": bool(summary.nearest),
             "duplicates": bool(summary.duplicate_spans),
+            "inversions": bool(summary.inversion_spans),
             "new": self._baseline is not None and bool(self._baseline.new_in(summary)),
         }
         if any(fails[reason] for reason in self._arguments.fail_on):

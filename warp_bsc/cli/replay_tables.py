@@ -76,6 +76,9 @@ def print_replay(console: Console, summary: Summary) -> None:
         say(console, f"{span.describe(LONGEST)}.")
     if (more := len(summary.duplicate_spans) - LONGEST) > 0:
         say(console, f"  and {count(more, 'more set')} of duplicates; --json has all.")
+    if spans := summary.inversion_spans:
+        say(console, f"Inverted tetrahedra in {count(len({span.meshes for span in spans}), 'mesh', 'meshes')}:")
+        say_list(console, [span.describe() for span in spans], "; --json has all.")
     if summary.clearance is not None:
         _print_proximities(console, summary, summary.clearance)
     if summary.ignored:
@@ -152,6 +155,8 @@ def _new_finding(what: str, meshes: tuple[str, ...], start: float, end: float) -
     finding = f"{_pair((meshes[0], meshes[-1]))} {what}"
     if what == "is inside":
         finding = " is inside ".join(meshes)
+    elif what == "inverts":
+        finding = f"tetrahedra of {meshes[0]} are inverted"
     elif what == "are duplicates":
         finding = f"{meshes[0]} and {count(len(meshes) - 1, 'other')} are duplicates"
     return f"{finding} at {start:g}" if start == end else f"{finding} from {start:g} to {end:g}"

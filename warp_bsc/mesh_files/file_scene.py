@@ -175,7 +175,7 @@ class FrameMesh:
     """The files of one name, as a segment reads a mesh."""
 
     display_name, instanced_prim = "", ""
-    is_strands = is_rigid = may_jump = False
+    is_strands = is_rigid = may_jump = has_tetrahedra = False
 
     def __init__(self, name: str, paths: dict[float, str], moves: bool):
         self.name = self.path = name

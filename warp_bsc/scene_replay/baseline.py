@@ -12,7 +12,7 @@ from .earlier import describe_difference
 from .hit_records import is_tail_line, read_head, read_tail
 from .summary import Summary
 
-Event = Literal["collides", "crosses", "is inside", "is near", "are duplicates"]
+Event = Literal["collides", "crosses", "is inside", "is near", "are duplicates", "inverts"]
 """What meshes may do in a replay."""
 
 _WITHOUT_EFFECT = {"intersections", "strict", "allow_missing", "validate", "limit"}
@@ -23,8 +23,8 @@ class NewFinding(NamedTuple):
     """An interval, or a time, in which meshes do something that they did not do then in an earlier replay.
 
     Attributes:
-        what: ``"collides"``, ``"crosses"``, ``"is inside"``, ``"is near"`` or ``"are duplicates"``.
-        meshes: Names of the two, or of all duplicates.
+        what: ``"collides"``, ``"crosses"``, ``"is inside"``, ``"is near"``, ``"are duplicates"`` or ``"inverts"``.
+        meshes: Names of the two, of all duplicates, or of the one whose tetrahedra are inverted.
         start: Start of the interval, or the time, as a time code.
         end: End of the interval, or the time.
     """
@@ -77,6 +77,8 @@ class Baseline:
                 self._add("is near", span)
             for span in found["duplicate_spans"]:
                 self._add("are duplicates", span)
+            for span in found["inversion_spans"]:
+                self._add("inverts", span)
         except (ValueError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path}: not a JSON file of this version's replay") from error
         if not is_complete:
@@ -101,6 +103,7 @@ class Baseline:
             found += [
                 NewFinding("are duplicates", meshes, interval.start, interval.end) for meshes in interval.duplicates
             ]
+            found += [NewFinding("inverts", mesh.meshes, interval.start, interval.end) for mesh in interval.inverted]
         for sample in summary.intersections:
             crossing = [meshes for meshes, (crossings, _) in sample.mesh_pairs.items() if crossings]
             found += [NewFinding("crosses", meshes, sample.time, sample.time) for meshes in crossing]

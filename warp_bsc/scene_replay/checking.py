@@ -16,6 +16,7 @@ from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.at_rest.intersections import Intersections
 from ..detection.at_rest.proximities import Proximities, ProximityFinder
 from ..detection.detector import CollisionDetector
+from ..detection.inversions import Inversions
 from ..detection.mesh import CollisionMesh
 from ..detection.results.collisions import Collisions, add_stats
 from ..detection.run.settings import Method
@@ -25,7 +26,7 @@ from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.selection import Selection
 from .duplicates import Duplicates
-from .results import IntervalResult, Work, summarize, summarize_intersections
+from .results import IntervalResult, Work, summarize, summarize_intersections, summarize_inversions
 from .scene_arcs import arcs_of
 from .scene_contacts import compare_contacts, find_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
@@ -127,6 +128,7 @@ class _Detection:
         of_strands: Collisions of curves and points; None without any.
         intersections: Intersections at the start and at the end; None if they are not checked.
         proximities: Proximities at the start and at the end; None if they are not checked.
+        inversions: The tetrahedra that invert; None without any tetrahedra.
         detector: The detector of the collisions of meshes if they are validated, else None.
     """
 
@@ -136,6 +138,7 @@ class _Detection:
     of_strands: Collisions | None
     intersections: tuple[Intersections, Intersections] | None
     proximities: tuple[Proximities, Proximities] | None
+    inversions: Inversions | None
     detector: CollisionDetector | None
 
 
@@ -167,6 +170,10 @@ class _SegmentDetector:
         self.strands = _StrandChecker(segment, checks) if segment.has_strands else None
         self._finder = self._detector.intersection_finder() if checks.intersections else None
         self._intersections: _At[tuple[Intersections, Intersections]] | None = None  # of meshes, and of all
+        tets, self._inversions = segment.tetrahedra, None
+        if len(tets.corners):
+            mesh = CollisionMesh(np.empty((0, 3), int), tets.vertex_count, tets=tets.corners, device=checks.device)
+            self._inversions = CollisionDetector(mesh, method=checks.method)
         clearance = checks.clearance
         self._proximity_finder = None if clearance is None else ProximityFinder(self.mesh, clearance)
         self._proximities: _At[Proximities] | None = None
@@ -195,9 +202,9 @@ class _SegmentDetector:
         if self._proximity_finder:
             at_start = self._find_proximities(interval.x0, interval.start)
             proximities = at_start, self._find_proximities(interval.x1, interval.end)
-        return _Detection(
-            interval, arcs, collisions, of_strands, intersections, proximities, detector if self._is_validated else None
-        )
+        inversions = self._inversions and self._inversions.inversions(*interval.tet_positions)
+        validated = detector if self._is_validated else None
+        return _Detection(interval, arcs, collisions, of_strands, intersections, proximities, inversions, validated)
 
     def find_intersections(self, x: np.ndarray, time: float, collisions: Collisions | None = None) -> Intersections:
         """Returns the intersections at a time; those found last, if they are of that time.
@@ -287,6 +294,7 @@ class _SegmentNamer:
             stats=stats,
             validation=validation,
             duplicates=self._named_duplicates,
+            inverted=summarize_inversions(detection.inversions, interval) if detection.inversions else (),
         )
         return IntervalResult(summary, contacts, intersections, proximities, None)
 

@@ -139,6 +139,7 @@ class HitsJson(RecordFile):
                 with_numbers(span, numbers) | {"trend": span.trend} for span in summary.intersection_spans
             ],
             "duplicate_spans": [with_numbers(span, numbers) for span in summary.duplicate_spans],
+            "inversion_spans": [with_numbers(span, numbers) for span in summary.inversion_spans],
             "proximity_spans": [with_numbers(span, numbers) for span in summary.proximity_spans],
             "nearest": [with_numbers(nearest, numbers) for nearest in summary.nearest],
             "validation": asdict(summary.validation) if summary.validation else None,
@@ -190,6 +191,7 @@ class HitsCsv(RecordFile):
         """Returns lines on rows that a limit leaves out, missing intervals and parts that are left out, if any are."""
         limited = str(not_listed(summary, with_end=summary.is_complete) or "")
         lines = "".join(f"# left out: {reason}\n" for reason in summary.scene.left_out)
+        lines += "".join(f"# inverted: {span.describe()}\n" for span in summary.inversion_spans)
         lines += f"# limit: {limited}\n" * bool(limited)
         if not summary.is_complete:
             lines += f"# partial: {len(summary.intervals)} of {summary.interval_count} intervals; {summary.stopped}\n"

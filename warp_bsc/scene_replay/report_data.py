@@ -47,6 +47,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         tiles.append((f"{intersecting:,} of {len(summary.intersections):,}", "times with intersections at rest"))
     if spans := summary.duplicate_spans:
         tiles.append((f"{len({name for span in spans for name in span.meshes}):,}", "meshes that are duplicates"))
+    if inversions := summary.inversion_spans:
+        tiles.append((f"{len({span.meshes for span in inversions}):,}", "meshes with inverted tetrahedra"))
     if depths:
         tiles.append((f"{max(depth for depth, _ in depths.values()):.4g}", "largest depth"))
     if summary.clearance is not None:
@@ -95,6 +97,8 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
         "notes": [
             *(f"{span.describe(_MAX_NAMES)}." for span in spans[:_MAX_ROWS]),
             *([f"{len(spans) - _MAX_ROWS:,} more sets of duplicates."] if len(spans) > _MAX_ROWS else ()),
+            *(f"{span.describe()}." for span in inversions[:_MAX_ROWS]),
+            *([f"{len(inversions) - _MAX_ROWS:,} more times of inversions."] if len(inversions) > _MAX_ROWS else ()),
             summary.motion,
             *scene.warnings,
         ],
@@ -119,7 +123,12 @@ def report_data(summary: Summary, depths: Depths, baseline: Baseline | None) -> 
 
 def _nothing_found(summary: Summary) -> str:
     """Returns a sentence on what was checked if nothing was found in a whole replay, else an empty text."""
-    found = summary.hits or summary.duplicate_spans or any(at.pairs for at in summary.proximities)
+    found = (
+        summary.hits
+        or summary.duplicate_spans
+        or summary.inversion_spans
+        or any(at.pairs for at in summary.proximities)
+    )
     if found or not summary.is_complete or not all(at.is_empty for at in summary.intersections):
         return ""
     if summary.scene.is_still and not summary.intersections:

@@ -5,13 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..detection.inversions import Inversions
 from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
+from ..usd.interval import Interval
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
 from .scene_pairs import KINDS, PHASES, count_by_meshes
 from .scene_proximities import SceneProximities
 from .validation import Validation
+
+MOST_TETRAHEDRA = 1000
+"""Largest number of tetrahedra of a mesh that a summary names."""
 
 TOI_BINS = 20
 """Number of equal parts of an interval in which times of impact are counted."""
@@ -99,6 +104,24 @@ class ProximitySummary:
 
 
 @dataclass(frozen=True)
+class InvertedTetrahedra:
+    """The tetrahedra of a mesh whose volume, in the space of its prim, is not positive at some time of an interval.
+
+    Attributes:
+        meshes: Name of the mesh.
+        number: Number of the tetrahedra.
+        tetrahedra: Their indices in ``tetVertexIndices``, those that invert first coming first, at most
+            :data:`MOST_TETRAHEDRA`.
+        times: Time code at which each of these inverts; the start of the interval if it is inverted there.
+    """
+
+    meshes: tuple[str]
+    number: int
+    tetrahedra: tuple[int, ...]
+    times: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class IntervalSummary:
     """The collisions between two consecutive times of a scene, in numbers.
 
@@ -128,6 +151,7 @@ class IntervalSummary:
         proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
         duplicates: Names of duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by
             their names, in the scene's order; empty if intersections were not checked.
+        inverted: The tetrahedra that invert or are inverted, by mesh, in the scene's order.
     """
 
     index: int
@@ -149,6 +173,7 @@ class IntervalSummary:
     phases: tuple[int, ...] | None
     proximities: tuple[ProximitySummary, ProximitySummary] | None
     duplicates: tuple[tuple[str, ...], ...]
+    inverted: tuple[InvertedTetrahedra, ...]
 
     @property
     def hits(self) -> int:
@@ -216,6 +241,7 @@ def summarize(
     stats: DetectionStats,
     validation: Validation | None,
     duplicates: tuple[tuple[str, ...], ...],
+    inverted: tuple[InvertedTetrahedra, ...],
 ) -> IntervalSummary:
     """Returns the numbers of an interval; the arguments are attributes of its result and its summary."""
     interval, earliest = contacts.interval, None
@@ -262,7 +288,22 @@ def summarize(
         phases=phases,
         proximities=proximity_summaries,
         duplicates=duplicates,
+        inverted=inverted,
     )
+
+
+def summarize_inversions(found: Inversions, interval: Interval) -> tuple[InvertedTetrahedra, ...]:
+    """Returns the tetrahedra of each mesh that invert in an interval."""
+    tetrahedra, inverted = interval.segment.tetrahedra, []
+    mesh_of = np.searchsorted(tetrahedra.first, found.tets, side="right") - 1
+    times = interval.start + found.toi * (interval.end - interval.start)
+    for mesh in np.unique(mesh_of).tolist():
+        (rows,) = np.nonzero(mesh_of == mesh)
+        first = rows[np.argsort(times[rows], kind="stable")][:MOST_TETRAHEDRA]
+        numbers = (found.tets[first] - tetrahedra.first[mesh]).tolist()
+        names = (tetrahedra.names[mesh],)
+        inverted.append(InvertedTetrahedra(names, len(rows), tuple(numbers), tuple(times[first].tolist())))
+    return tuple(inverted)
 
 
 def summarize_intersections(found: SceneIntersections) -> IntersectionSummary:

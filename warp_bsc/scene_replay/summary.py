@@ -113,9 +113,36 @@ class DuplicateSpan:
     def describe(self, most: int) -> str:
         """Returns the duplicates in words, with at most some of their names."""
         names, more = ", ".join(self.meshes[:most]), len(self.meshes) - most
-        when = f"at {self.since:g}" if self.since == self.until else f"from {self.since:g} to {self.until:g}"
+        when = _when(self)
         others = f" and {more:,} more" if more > 0 else ""
         return f"{len(self.meshes):,} meshes are duplicates of each other, {when}: {names}{others}"
+
+
+@dataclass(frozen=True)
+class InversionSpan:
+    """Consecutive intervals of a scene in all of which tetrahedra of a mesh invert or are inverted.
+
+    Attributes:
+        meshes: Name of the mesh.
+        since: Start of the first interval, as a time code.
+        until: End of the last interval.
+        most: Largest number of these tetrahedra in an interval.
+        tetrahedron: The first, an index in ``tetVertexIndices``.
+        time: Time code at which it inverts, or is inverted.
+    """
+
+    meshes: tuple[str]
+    since: float
+    until: float
+    most: int
+    tetrahedron: int
+    time: float
+
+    def describe(self) -> str:
+        """Returns the inversions in words."""
+        number = "1 tetrahedron is" if self.most == 1 else f"at most {self.most:,} tetrahedra are"
+        first = f"the first is tetrahedron {self.tetrahedron}, at {self.time:.6g}"
+        return f"{number} inverted in {self.meshes[0]}, {_when(self)}; {first}"
 
 
 @dataclass(frozen=True)
@@ -246,6 +273,21 @@ class Summary:
         return sorted(_joined(begun, lambda a, b: replace(a, until=b.until)), key=lambda span: span.since)
 
     @cached_property
+    def inversion_spans(self) -> list[InversionSpan]:
+        """The times over which tetrahedra of a mesh are inverted, by their start."""
+        begun = (
+            {
+                found.meshes: InversionSpan(
+                    found.meshes, at.start, at.end, found.number, found.tetrahedra[0], found.times[0]
+                )
+                for found in at.inverted
+            }
+            for at in self.intervals
+        )
+        joined = _joined(begun, lambda a, b: replace(a, until=b.until, most=max(a.most, b.most)))
+        return sorted(joined, key=lambda span: span.since)
+
+    @cached_property
     def nearest(self) -> list[Nearest]:
         """The nearest elements of each two meshes over all times (the first time if tied), by ascending distance."""
         smallest: dict[tuple[str, ...], Nearest] = {}
@@ -327,6 +369,11 @@ def _at_all_times(intervals: Iterable[tuple[_AtRest, _AtRest] | None]) -> list[_
     """Returns what is at the starts of intervals, and at the end of the last one."""
     found = [both for both in intervals if both]
     return [start for start, _ in found] + [end for _, end in found[-1:] if end.time != found[-1][0].time]
+
+
+def _when(span: DuplicateSpan | InversionSpan) -> str:
+    """Returns the times of a span in words."""
+    return f"at {span.since:g}" if span.since == span.until else f"from {span.since:g} to {span.until:g}"
 
 
 def _joined(times: Iterable[dict[tuple[str, ...], _Span]], join: Callable[[_Span, _Span], _Span]) -> list[_Span]:

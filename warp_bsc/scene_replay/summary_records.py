@@ -11,7 +11,7 @@ from typing import Any
 from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
-from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
+from .results import Contact, IntersectionSummary, IntervalSummary, InvertedTetrahedra, Nearest, ProximitySummary
 from .scene_pairs import PHASES
 from .validation import Validation
 
@@ -75,6 +75,8 @@ def summary_fields(summary: IntervalSummary, kinds: Sequence[str], numbers: Mapp
         "stages": {kind: asdict(getattr(summary.stats, kind)) for kind in kinds},
         "validation": asdict(summary.validation) if summary.validation else None,
     }
+    if summary.inverted:
+        fields["inverted"] = [with_numbers(found, numbers) for found in summary.inverted]
     if summary.intersections:
         fields["separate_hits"] = summary.separate_hits
         fields["phases"] = dict(zip(PHASES, summary.phases or (), strict=True))
@@ -119,6 +121,7 @@ def read_summary(fields: dict[str, Any], interval: Interval, names: list[str]) -
         phases=tuple(fields["phases"].values()) if intersections else None,
         proximities=_both_times(proximities, _read_proximities, names),
         duplicates=tuple(tuple(names[number] for number in same) for same in fields.get("duplicates", ())),
+        inverted=tuple(InvertedTetrahedra(**_with_names(found, names)) for found in fields.get("inverted", ())),
     )
 
 

@@ -355,6 +355,8 @@ class Overlay(ReplayOutput):
             facts["stopped"] = summary.stopped
         if summary.duplicate_spans:
             facts["duplicates"] = [span.describe(len(span.meshes)) for span in summary.duplicate_spans]
+        if summary.inversion_spans:
+            facts["inversions"] = [span.describe() for span in summary.inversion_spans]
         if self._scene.left_out:
             facts["leftOut"] = self._scene.left_out
         return facts

@@ -189,6 +189,8 @@ def _describe(result: IntervalResult) -> str:
         text += (
             f"; at {start.time:g} {start.crossings:,} edges through faces, {sum(start.inside.values()):,} parts inside"
         )
+    if summary.inverted:
+        text += f"; {sum(found.number for found in summary.inverted):,} inverted tetrahedra"
     return f"warp-bsc: from {summary.start:g} to {summary.end:g} {summary.hits:,} collisions{text}"
 
 

@@ -110,6 +110,7 @@ class Interval:
         is_joined: Whether the next interval surely starts where this one ends, with the same meshes. False for the last
             interval, and where a mesh may jump at the end.
         notes: The left-out meshes, messages and jumps that reading it revealed.
+        tet_positions: Positions of the vertices of ``segment.tetrahedra`` at the start, and at the end.
         turns: The turns of meshes at a constant rate, by their indices in ``segment.meshes``.
     """
 
@@ -121,6 +122,7 @@ class Interval:
     x1: np.ndarray = field(repr=False)
     is_joined: bool
     notes: ReadingNotes
+    tet_positions: tuple[np.ndarray, np.ndarray] = field(repr=False)
     turns: dict[int, Turn] = field(default_factory=dict)
 
     @property

@@ -36,7 +36,7 @@ from .interval import Interval, LeftOutMesh, ReadingNotes, ReadingRecord
 from .jumps import JumpFinder, jumps_at
 from .read.files import SceneFiles
 from .read.openusd import check_openusd
-from .scene_options import Revealed, SceneOptions
+from .scene_options import EmptySceneError, Revealed, SceneOptions
 from .scene_times import find_times
 from .segment import Segment
 from .selection import Selection
@@ -346,16 +346,16 @@ class Scene:
     def _read(self, index) -> Interval:
         """Returns an interval, with the notes on reading since the last call of :meth:`take_notes`."""
         self.files.check_stage()
-        segment, x0, x1, jumps = self._read_positions(index)
+        segment, x0, x1, tet_positions, jumps = self._read_positions(index)
         start, end = self.times[index : index + 2]
         with self._collecting(self._record.messages, self.path):
             turns = segment.turns(start, end) if self.turning and end > start else {}
         is_joined = not segment.may_jump and bool(self._span and index + 1 < self._span[1])
-        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), turns)
+        return Interval(index, start, end, segment, x0, x1, is_joined, self.take_notes(jumps), tet_positions, turns)
 
     @one_at_a_time
-    def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Returns the segment of an interval, the positions at its start and end, and the names of meshes that jump."""
+    def _read_positions(self, index) -> tuple[Segment, np.ndarray, np.ndarray, tuple, tuple[str, ...]]:
+        """Returns an interval's segment, positions at start and end, those of tetrahedra, and meshes that jump."""
         start, end = self.times[index : index + 2]
         with self._collecting(self._record.messages, self.path):
             while True:
@@ -363,12 +363,14 @@ class Scene:
                 try:
                     x0 = segment.positions(start, last=self._jumps.end_of(index - 1, segment))
                     x1 = segment.positions(end, before=True) if end > start else x0
+                    tets = segment.tetrahedra
+                    tet_positions = tets.positions(start), tets.positions(end, before=end > start)
                     break
                 except self._unreadable as error:
                     self._leave_out(error, index)
         jumps = self._jumps.find(index, segment, x0, x1)
         self._record.add_jumps(jumps, start)
-        return segment, x0, x1, jumps
+        return segment, x0, x1, tet_positions, jumps
 
     def _checked_index(self, index, name, last) -> int:
         """Returns the number of an interval; raises a TypeError, or an IndexError if it is not in [0, last]."""
@@ -383,11 +385,11 @@ class Scene:
         return self.times, [mesh.name for mesh in self._usd_meshes], len(self.left_out)
 
     def _check_meshes(self, is_selection):
-        """Raises a ValueError if there are no meshes, and none is left out."""
+        """Raises an EmptySceneError if there are no meshes, and none is left out."""
         if not self._usd_meshes and not self.left_out:
             none_selected = ", or none is selected" * is_selection
             reason = "".join(f"; {warning}" for warning in self._warnings[:1])
-            raise ValueError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
+            raise EmptySceneError(f"{self.path}: no visible mesh in the scene{none_selected}{reason}")
 
     def _jumps_at_end(self) -> bool:
         """Returns whether a mesh jumps at the last time, or cannot be read at it."""

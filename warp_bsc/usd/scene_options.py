@@ -12,6 +12,10 @@ from .selection import Selection
 _MOST_PARTS = 10_000  # of a step between two times
 
 
+class EmptySceneError(ValueError):
+    """A scene can be read, and has no visible mesh, or none that is selected."""
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """The options with which a scene is opened, the arguments of :class:`~warp_bsc.usd.scene.Scene`."""

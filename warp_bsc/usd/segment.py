@@ -8,6 +8,7 @@ import numpy as np
 
 from .._sorted_keys import distinct, expand_ranges, search, search_ranges
 from .read.position_reader import PositionReader
+from .read.tetrahedra import Tetrahedra
 from .scene_mesh import InPrims, SceneMesh
 from .turns import Turn, find_turns
 from .welding import first_by_hash, first_by_position
@@ -26,6 +27,7 @@ class Segment:
         faces: Vertices of each face, shape [face_count, 3], int32.
         free_edges: Vertices of the edges of curves, shape [n, 2], int32.
         points: Vertices of points, int32.
+        tetrahedra: The tetrahedra of the meshes.
         radius: Radius of each vertex, in the scene's unit of length; 0 at faces; shape [vertex_count].
         vertex_count: Number of vertices of all meshes, welded.
         welded: Number of vertices that were welded to another one.
@@ -56,6 +58,7 @@ class Segment:
             UnreadableError: If a mesh is broken.
         """
         self._usd_meshes = usd_meshes
+        self.tetrahedra = Tetrahedra(usd_meshes, times[0])
         self.dtype = dtype
         self.meshes, faces, edges, curves, points_alone, radius = [], [], [], [], [], []
         vertex_count = face_count = 0

@@ -15,7 +15,6 @@ from usd_stages import (
     add_floor,
     add_instancer,
     add_mesh,
-    falling,
     falling_stage,
     find,
     floor_stage,
@@ -263,10 +262,10 @@ def test_many_are_counted(stage):
     assert len(named) == 6 and named[-1] == "left out: 25 more, 30 in all"
 
 
-def test_nothing_readable_is_an_error(tmp_path, capsys):
+def test_nothing_readable_is_an_error_with_a_status_of_its_own(tmp_path, capsys):
     stage = new_stage(tmp_path / "scene.usda")
     add_bare_mesh(stage)
-    assert main(["replay", save(stage), "--device", "cpu"]) == 2
+    assert main(["replay", save(stage), "--device", "cpu"]) == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f"no visible mesh in the scene, or none is selected; {EMPTY}")
 
@@ -439,46 +438,6 @@ def test_a_scene_without_anything_that_can_be_read(tmp_path, capfd):
     found = find(stage, *all_files(tmp_path), status=4)
     assert len(found["intervals"]) == 1 and found["meshes"] == []
     assert "No edge meets a face at rest" in capfd.readouterr().out
-
-
-def add_tetrahedron(stage, path="/World/Odd"):
-    mesh = UsdGeom.TetMesh.Define(stage, path)
-    mesh.CreatePointsAttr([(0, 0, 5), (1, 0, 5), (0, 1, 5), (0, 0, 6)])
-    mesh.CreateTetVertexIndicesAttr([(0, 1, 2, 3)])
-    mesh.CreateSurfaceFaceVertexIndicesAttr([(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)])
-    return mesh
-
-
-@pytest.mark.parametrize("beside", [False, True])
-def test_tetrahedra_are_not_checked(tmp_path, beside):
-    """They are left out until they are read."""
-    stage = new_stage(tmp_path / "scene.usda")
-    add_tetrahedron(stage)
-    if beside:
-        add_mesh(stage, "/World/Falling", falling(3, 2))
-    page = tmp_path / "page.html"
-    found = find(stage, "--report", str(page), status=4)
-    assert found["left_out"] == ["/World/Odd: prims of type TetMesh cannot be read"]
-    data = Page(page.read_text()).data
-    assert data["nothing"].endswith(" Not checked: 1 part that cannot be read, named as left out.")
-    assert not data["is_whole"]  # it has another colour
-
-
-def test_tetrahedra_that_need_not_be_checked(stage):
-    add_tetrahedron(stage)
-    assert find(stage, "--exclude", "/World/Odd", "--strict")["left_out"] == []
-    visibility = UsdGeom.Imageable(add_tetrahedron(stage)).CreateVisibilityAttr()
-    visibility.Set("invisible")
-    assert find(stage, "--strict")["left_out"] == []
-    visibility.Set("invisible", 0)
-    visibility.Set("inherited", 1)
-    assert len(find(stage, status=4)["left_out"]) == 1
-
-
-def test_tetrahedra_of_instances_are_named_once(stage):
-    add_instancer(stage, "/World/Many", {0: [(0, 0, 5), (1, 0, 5)]}, ["/World/Many/Odd"])
-    add_tetrahedron(stage, "/World/Many/Odd")
-    assert find(stage, status=4)["left_out"] == ["/World/Many/Odd: prims of type TetMesh cannot be read"]
 
 
 # --- Where files are ---

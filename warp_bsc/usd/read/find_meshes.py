@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pxr import Usd
 
 from ..selection import Selection
-from .instancers import is_ever_shown
 from .mesh_prims import MeshPrimFinder
 from .meshes import UsdMesh
 from .unreadable import LeftOut, UnreadableError, reading
@@ -30,7 +29,7 @@ def find_meshes(
     """
     finder = MeshPrimFinder(file, left_out)
     finder.walk(iter(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())))
-    selection.check_patterns([*finder.found, *finder.unread])
+    selection.check_patterns(finder.found)
 
     meshes, invisible, empty, unselected, warnings = [], [], [], Counter(), []
     if unmatched := selection.unmatched(finder.found):
@@ -68,15 +67,6 @@ def find_meshes(
             meshes.append(mesh)
         if found.has_unevaluated_binding:
             warnings.append(f"{mesh.path} is bound to a skeleton in a way that USD does not evaluate")
-    unread = {
-        found.path: found.prim.GetTypeName()  # once for all instances
-        for found in finder.unread
-        if selection.includes(found)
-        and found.purpose in selection.purposes
-        and is_ever_shown(found.prim, found.instance.root if found.instance else None)
-    }
-    for path, type_name in unread.items():
-        left_out.add(UnreadableError(f"{file}: {path}: prims of type {type_name} cannot be read"))
     if invisible:
         warnings.append(f"invisible prims are not checked: {len(invisible)}, the first is {invisible[0]}")
     if empty:

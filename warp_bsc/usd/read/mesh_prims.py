@@ -51,7 +51,6 @@ class MeshPrimFinder:
 
     Attributes:
         found: The prims that are read as meshes, in the order of the walk.
-        unread: The prims that would be, but that no code reads yet, likewise.
         other: Number of the other visible prims with a shape, by their type.
     """
 
@@ -68,7 +67,6 @@ class MeshPrimFinder:
         self._clips: dict[Sdf.Path, bool] = {}  # whether the value clips of a prim are left out
         self._with_clips: list[Sdf.Path] = []  # prims with others
         self.found: list[MeshPrim] = []
-        self.unread: list[MeshPrim] = []
         self.other: Counter[str] = Counter()
 
     def walk(self, prims: Any, instance: Instance | None = None) -> None:
@@ -97,10 +95,8 @@ class MeshPrimFinder:
             elif prim.IsA(UsdSkel.Root):
                 if not self._find_bindings(prim):
                     prims.PruneChildren()
-            elif prim.IsA(UsdGeom.Mesh) or is_shape(prim) or is_strands(prim):
+            elif prim.IsA(UsdGeom.Mesh) or prim.IsA(UsdGeom.TetMesh) or is_shape(prim) or is_strands(prim):
                 self.found.append(MeshPrim(prim, instance, self._bindings.get(prim.GetPath())))
-            elif prim.IsA(UsdGeom.TetMesh):
-                self.unread.append(MeshPrim(prim, instance, None))
             elif prim.IsA(UsdGeom.Gprim) and is_ever_shown(prim, instance.root if instance else None):
                 self.other[f"{prim.GetTypeName()}{' that are not linear' * prim.IsA(UsdGeom.BasisCurves)}"] += 1
 

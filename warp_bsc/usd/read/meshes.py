@@ -13,9 +13,10 @@ from .instancers import is_shown, visibility_times
 from .mesh_prims import MeshPrim
 from .mesh_transforms import MeshTransforms
 from .samples import as_time_code, sample_times
-from .shapes import MeshPolygons, Polygons, ShapePolygons, is_shape
+from .shapes import MeshPolygons, Polygons, ShapePolygons, TetPolygons, is_shape
 from .skinning import Skin
 from .strands import Strands, is_strands
+from .tetrahedra import NOT_REPAIRED
 from .topology import BROKEN, Topologies, is_empty
 from .unreadable import UnreadableError, reading
 
@@ -38,12 +39,14 @@ class UsdMesh:
         display_name: Display name in the file, empty if there is none.
         type_name: Type of the prim.
         is_shape: Whether it is a shape, see :class:`~warp_bsc.usd.read.shapes.ShapePolygons`.
+        has_tetrahedra: Whether it is the surface of tetrahedra.
         is_strands: Whether it is curves or points, see :class:`~warp_bsc.usd.read.strands.Strands`.
         times: Time codes at which its points or its transform to the world have a sample; empty if it does not move.
         states: Its states by the time from which on they hold, the first by minus infinity: None where it is invisible,
             absent or empty, else digests of its topology.
         turns: Whether a transform or a skeleton moves it, so that it may move nonlinearly between the samples.
         is_skinned: Whether a skeleton or blend shapes deform it.
+        has_skeleton: Whether a skeleton does, so that its points are in the space of that.
         deforms: Whether anything except its transform moves it.
         may_jump: Whether its positions just before a time may differ from those at that time.
         is_placed: Whether its transform is the identity at all times, so that its points are in world space.
@@ -70,10 +73,12 @@ class UsdMesh:
         self.is_shape = is_shape(prim)
         self._strands = Strands(prim) if is_strands(prim) else None
         self.is_strands = self._strands is not None
-        shaped = ShapePolygons if self.is_shape else MeshPolygons
+        self.has_tetrahedra = prim.IsA(UsdGeom.TetMesh)
+        shaped = ShapePolygons if self.is_shape else TetPolygons if self.has_tetrahedra else MeshPolygons
         self._polygons: Polygons = self._strands or shaped(prim)
         self._skin = skin = Skin(*found.binding, where=f"{file}: {self.path}") if found.binding else None
         self.is_skinned = skin is not None
+        self.has_skeleton = bool(skin and skin.skeleton)
         self.instanced_prim = found.instanced_prim
         self._last_points: dict[tuple, np.ndarray] = {}  # these two are shared by all instances
         self._last_triangles: dict[tuple, tuple[np.ndarray, np.ndarray, int]] = {}
@@ -225,33 +230,8 @@ class UsdMesh:
     def why_not_repaired(self) -> str | None:
         """Why a repair does not move the mesh, in words; None if it may."""
         if self.why_not_written or self.deforms:
-            return self.why_not_written
+            return self.why_not_written or (NOT_REPAIRED if self.has_tetrahedra else None)
         return "its points do not move, only its transform" if self.times else "it does not move"
-
-    def read_own_points(self, time: float, *, before: bool = False) -> np.ndarray:
-        """Returns the points in the space of the prim itself, also if a skeleton deforms them, shape [point_count, 3].
-
-        Those that nothing deforms have the bits of the file. Arguments and errors are those of :meth:`read_points`.
-        """
-        points = self.read_points(time, before=before)
-        if not (self._skin and self._skin.skeleton):
-            return points
-        transform = self._transform(time, before=before)
-        return self.to_own_space(points @ transform[:3, :3] + transform[3, :3], time, before=before)
-
-    def to_own_space(self, positions: np.ndarray, time: float, *, before: bool = False) -> np.ndarray:
-        """Returns positions in world space, shape [n, 3], as points of the prim, float32.
-
-        Args:
-            positions: The positions.
-            time: Time code.
-            before: Whether the moment just before that time is meant.
-        """
-        if self.is_placed:
-            return positions.astype(np.float32)
-        code = self.time_code(time, before)
-        inverse = np.linalg.inv(np.array(UsdGeom.Imageable(self.prim).ComputeLocalToWorldTransform(code)))
-        return (positions @ inverse[:3, :3] + inverse[3, :3]).astype(np.float32)
 
     def read_points(self, time: float, *, before: bool = False) -> np.ndarray:
         """Returns the stored points, or those that a skeleton and blend shapes deform, shape [point_count, 3].
@@ -307,12 +287,15 @@ class UsdMesh:
             if not self.is_placed:
                 transform = self._transform(time, before=before)
                 positions = positions @ transform[:3, :3] + transform[3, :3]
-            if not np.isfinite(positions).all():
-                first = int(np.argmin(np.isfinite(positions).all(axis=1)))
-                raise UnreadableError(
-                    f"{self._where}: vertex {used[first]} is not finite at time {time:g}: {positions[first].tolist()}"
-                )
-            return positions
+        self.check_finite(positions, used, time)
+        return positions
+
+    def check_finite(self, positions: np.ndarray, used: np.ndarray, time: float) -> None:
+        """Raises an UnreadableError if a position of some points at a time is not finite."""
+        if not np.isfinite(positions).all():
+            first = int(np.argmin(np.isfinite(positions).all(axis=1)))
+            text = f"vertex {used[first]} is not finite at time {time:g}: {positions[first].tolist()}"
+            raise UnreadableError(f"{self._where}: {text}", self.name, time)
 
     def read_used_points(
         self, time: float, *, before: bool = False, used: np.ndarray, point_count: int, dtype: np.dtype
@@ -389,6 +372,17 @@ class UsdMesh:
                 self._last_triangles[key] = self._find_triangles(code, points, is_mirrored)
             return self._last_triangles[key]
 
+    def read_tetrahedra(self, time: float, point_count: int) -> np.ndarray:
+        """Returns the points of the tetrahedra, shape [n, 4]; in the prim's space, volumes are positive.
+
+        Raises:
+            UnreadableError: If they refer to points that are not there.
+        """
+        with reading(self._where, self.name, time):
+            topology = self._topologies.read(self.time_code(time, False), self._where)
+            tets = topology.tetrahedra(point_count, self._where)
+            return tets[:, [1, 0, 2, 3]] if self._is_left_handed else tets
+
     def read_strands(self, times: list[float], point_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the edges of curves, and the radii of curves and points; empty and zero for a mesh with faces.
 
@@ -423,10 +417,13 @@ class UsdMesh:
         """Returns the result of :meth:`read_triangles`."""
         topology = self._topologies.read(code, self._where)
         triangles, polygons = topology.triangles(points, self._where)
-        is_left_handed = UsdGeom.Gprim(self.prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        if is_left_handed != is_mirrored:
+        if self._is_left_handed != is_mirrored:
             triangles = triangles[:, ::-1]
         return triangles, polygons, len(topology.counts)
+
+    @property
+    def _is_left_handed(self) -> bool:
+        return UsdGeom.Gprim(self.prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
 
     def time_code(self, time: float, before: bool) -> Usd.TimeCode:
         """Returns the mesh's own time code for a time of the scene, or for the moment just before it."""

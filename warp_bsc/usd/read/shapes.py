@@ -5,7 +5,7 @@ import math
 from typing import Any
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, Vt
 
 from .samples import may_jump
 
@@ -39,7 +39,10 @@ class Polygons:
         return self.point_attributes[0].Get(time)
 
     def read_topology(self, time: Usd.TimeCode) -> list[Any]:
-        """Returns numbers of corners, the points at the corners and the holes, each None if there are none."""
+        """Returns numbers of corners, the points at the corners and the holes, each None if there are none.
+
+        A fourth value may be the points of tetrahedra.
+        """
         return [attribute.Get(time) for attribute in self.topology_attributes]
 
 
@@ -55,6 +58,26 @@ class MeshPolygons(Polygons):
             mesh.GetHoleIndicesAttr(),
         )
         self.point_attributes = (mesh.GetPointsAttr(),)
+
+
+class TetPolygons(Polygons):
+    """The surface of a ``UsdGeom.TetMesh`` prim; if it has none, the faces that only one of its tetrahedra has."""
+
+    def __init__(self, prim: Usd.Prim):
+        """Finds the attributes of a prim."""
+        self._mesh = mesh = UsdGeom.TetMesh(prim)
+        self.topology_attributes = mesh.GetSurfaceFaceVertexIndicesAttr(), mesh.GetTetVertexIndicesAttr()
+        self.point_attributes = (mesh.GetPointsAttr(),)
+
+    def read_topology(self, time: Usd.TimeCode) -> list[Any]:
+        """Returns numbers of corners, the points at the corners, no holes, and the points of the tetrahedra."""
+        faces, tets = (attribute.Get(time) for attribute in self.topology_attributes)
+        if tets and not faces:
+            faces = UsdGeom.TetMesh.ComputeSurfaceFaces(self._mesh, time)
+        if faces is None:
+            return 4 * [None]
+        corners, points = (Vt.IntArray.FromNumpy(np.array(value or Vt.IntArray()).ravel()) for value in (faces, tets))
+        return [Vt.IntArray(len(faces), 3), corners, None, points]
 
 
 class ShapePolygons(Polygons):

@@ -25,16 +25,18 @@ class Topology(NamedTuple):
         counts: ``faceVertexCounts``, number of corners of each polygon, shape [polygon_count].
         indices: ``faceVertexIndices``, the points at the corners of all polygons, shape [sum(counts)].
         holes: ``holeIndices``, the polygons that are holes, shape [n].
+        tets: ``tetVertexIndices`` of a ``UsdGeom.TetMesh``, one tetrahedron after the other.
     """
 
     counts: np.ndarray
     indices: np.ndarray
     holes: np.ndarray
+    tets: np.ndarray = np.empty(0, dtype=np.int64)
 
     def digests(self) -> tuple[bytes, bytes]:
         """Returns a digest of the polygons, which differs where their points differ, and one of the holes."""
         polygons = hashlib.blake2b(len(self.counts).to_bytes(8, "little") + self.counts.tobytes())
-        polygons.update(self.indices.tobytes())
+        polygons.update(self.indices.tobytes() + self.tets.tobytes())
         return polygons.digest(), hashlib.blake2b(self.holes.tobytes()).digest()
 
     def triangles(self, points: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -51,7 +53,7 @@ class Topology(NamedTuple):
         Raises:
             UnreadableError: If the polygons are broken, or all of them are holes.
         """
-        counts, indices, holes = self
+        counts, indices, holes, _ = self
         if not len(counts):
             raise UnreadableError(f"{where}: the mesh has no faces")
         if counts.min() < 3:
@@ -73,6 +75,21 @@ class Topology(NamedTuple):
         if not solid.any():
             raise UnreadableError(f"{where}: all faces of the mesh are holes")
         return triangles[solid], polygons[solid]
+
+    def tetrahedra(self, point_count: int, where: str) -> np.ndarray:
+        """Returns the points of the tetrahedra, shape [tet_count, 4].
+
+        Raises:
+            UnreadableError: If there is no such point.
+        """
+        tets = self.tets.reshape(-1, 4)
+        (bad,) = np.nonzero(((tets < 0) | (tets >= point_count)).any(axis=1))
+        if len(bad):
+            points = ", ".join(map(str, tets[bad[0]].tolist()))
+            raise UnreadableError(
+                f"{where}: tetrahedron {bad[0]} has the vertices {points}, but the mesh has {point_count} points"
+            )
+        return tets
 
 
 class Topologies:
@@ -157,7 +174,7 @@ def as_topology(values: Sequence[Any], where: str) -> Topology:
             raise UnreadableError(f"{where}: {name} is not a list of integers")
         return array.astype(np.int64)
 
-    names = "faceVertexCounts", "faceVertexIndices", "holeIndices"
+    names = "faceVertexCounts", "faceVertexIndices", "holeIndices", "tetVertexIndices"
     return Topology(*map(as_integers, names, values))
 
 

@@ -87,7 +87,7 @@ class PointsLayer:
             own = rows[frame.segment.vertices_of(number)]
             if (own >= 0).any():
                 prim = self._scene.prim_of(mesh.name)
-                x = prim.to_own_space(frame.x[own[own >= 0]], frame.time, before=frame.before)
+                x = _to_own_space(prim, frame.x[own[own >= 0]], frame.time, frame.before)
                 points = mesh.points[own >= 0]
                 at = self._moved.setdefault(mesh.name, {})
                 at[frame.time, frame.before] = self._moves.tell(), len(points)
@@ -185,7 +185,7 @@ class PointsLayer:
 
     def _points(self, mesh, time, before) -> tuple[np.ndarray, np.ndarray]:
         """Returns the points of a mesh in the scene and in the layer, shapes [point_count, 3]."""
-        old = mesh.read_own_points(time, before=before)
+        old = _own_points(mesh, time, before)
         moved = self._moved[mesh.name].get((time, before))
         if moved is None:
             return old, old
@@ -254,6 +254,30 @@ class _Surface:
         once = np.cross(across, normals)
         turned = normals * 1.0 + once + np.cross(across, once) / np.maximum(1.0 + along, 1e-6)
         return np.where(changed[:, None], turned, normals)
+
+
+def _own_points(mesh: "UsdMesh", time: float, before: bool) -> np.ndarray:
+    """Returns the points of a mesh at, or just before, a time in its prim's space, also if a skeleton deforms them.
+
+    Those that nothing deforms have the bits of the file.
+    """
+    points = mesh.read_points(time, before=before)
+    if not mesh.has_skeleton:
+        return points
+    transform = mesh.read_transform(time, before=before)
+    assert transform is not None  # no instancer places it
+    return _to_own_space(mesh, points @ transform[:3, :3] + transform[3, :3], time, before)
+
+
+def _to_own_space(mesh: "UsdMesh", positions: np.ndarray, time: float, before: bool) -> np.ndarray:
+    """Returns positions in world space at, or just before, a time in the space of a mesh's prim, float32."""
+    from pxr import UsdGeom  # noqa: PLC0415 (slow)
+
+    if mesh.is_placed:
+        return positions.astype(np.float32)
+    code = mesh.time_code(time, before)
+    inverse = np.linalg.inv(np.array(UsdGeom.Imageable(mesh.prim).ComputeLocalToWorldTransform(code)))
+    return (positions @ inverse[:3, :3] + inverse[3, :3]).astype(np.float32)
 
 
 def _normals_of(x, counts, corners) -> tuple[np.ndarray, np.ndarray]:
