@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from dipping import FRAMES, HIT, SIZE, dipping_sheet, points_of, quads, repaired, sheet
-from pxr import Gf, Usd, UsdGeom, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 from replay_files import Page
 from usd_stages import add_mesh, find, new_stage, save
 
@@ -73,29 +73,47 @@ def test_extents_normals_and_velocities_are_made_again(dipped):
     assert not np.any(mesh.GetVelocitiesAttr().Get(0))
 
 
-def test_free_shot_is_not_written(tmp_path, capsys):
+def test_layer_of_a_free_shot_shows_it_as_it_is(tmp_path, capsys):
+    """So that the next command of a job finds a file; an earlier one is replaced."""
     stage = new_stage(tmp_path / "shot.usda")
     add_mesh(stage, "/World/Sheet", {0: sheet(0.0).tolist(), 1: sheet(0.5).tolist()}, [4] * SIZE**2, quads())
-    repaired(stage)
-    assert "Nothing was moved" in capsys.readouterr().out
-    assert not (tmp_path / "fixed.usdc").exists()
+    (tmp_path / "fixed.usdc").write_text("earlier")
+    output = repaired(stage, "--fail-on", "distorted")
+    assert "Nothing was moved: what is written shows the scene as it is.\nWrote " in capsys.readouterr().out
+    assert np.array_equal(points_of(output, 1), sheet(0.5))
+    assert not Sdf.Layer.FindOrOpen(output).rootPrims
+
+
+def test_frames_with_wrecked_edges_are_not_good(tmp_path, capsys):
+    """Free and certified is not enough: a status and a line tell, and the page begins with the worst one."""
+    stage, page = dipping_sheet(tmp_path, dip=-1.0), tmp_path / "moves.html"
+    output = repaired(stage, "--fail-on", "distorted", "--report", str(page), status=1)
+    printed = capsys.readouterr().out
+    assert "Not good: 1 frame, with edges shorter than a third of the shot's" in printed and ", 0 remain." in printed
+    assert f"; at {HIT} the worst, 0." in printed
+    ends = np.array(quads()).reshape(-1, 4)[:, :2]
+    lengths = [np.linalg.norm(np.diff(x[ends], axis=1), axis=2) for x in (points_of(output, HIT), sheet(0.116, -1.0))]
+    assert (lengths[0] / lengths[1]).min() < 0.34
+    frames = Page(page.read_text()).data["frames"]
+    assert [frame["distortion"] > 2.9 for frame in frames] == [frame["time"] == HIT for frame in frames]
+    repaired(stage, "--json", "--fail-on", "remaining")
+    found = json.loads(capsys.readouterr().out)
+    assert found["distorted"] == [HIT] and found["stretches"][0]["edge_ratio"][0] < 1.0 / 3.0
 
 
 def test_kept_meshes_do_not_move_and_are_not_left(tmp_path, capsys):
-    """What they do among themselves is counted in a note alone; an earlier layer stays, and a line says so."""
+    """What they do among themselves is counted in a note alone."""
     stage = dipping_sheet(tmp_path)
-    (tmp_path / "fixed.usdc").write_text("earlier")
     output = repaired(stage, "--keep", "/World/Sheet", "--json", "--fail-on", "remaining")
     found = json.loads(capsys.readouterr().out)
     assert found["kept"]["/World/Sheet"] == "it is to be kept"
-    assert found["remaining"] == found["before"] == {"collisions": 0, "intersections": 0} and found["output"] is None
+    assert found["remaining"] == found["before"] == {"collisions": 0, "intersections": 0} and found["output"] == output
     repaired(stage, "--keep", "/World/Sheet")
     printed = capsys.readouterr().out
     hits = sum(len(result.contacts) for result in replay(Scene(save(stage)), device="cpu"))
     assert hits
     assert f"note: collisions of meshes that are not moved with each other: {hits}, not counted" in printed
-    assert f"Nothing was moved: no USD layer was written.\n{output} is that of an earlier run" in printed
-    assert (tmp_path / "fixed.usdc").read_text() == "earlier"
+    assert "Nothing was moved" in printed
 
 
 def overlapping_sheets(folder):

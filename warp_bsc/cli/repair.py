@@ -133,7 +133,9 @@ def add_to(commands: Commands, summary: str) -> None:
         },
     )
     add_options(command, JSON)
-    add_fail_on(out, {"remaining": "collisions or intersections that remain"})
+    reasons = {"remaining": "collisions or intersections that remain"}
+    reasons["distorted"] = "frames in which edges are shorter than a third of the shot's or longer than twice"
+    add_fail_on(out, reasons)
     add_options(command, DEVICE)
 
 
@@ -151,6 +153,8 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.output == STDOUT:
         raise ValueError("--output must be a file, not standard output")
     if frames and kind == "mesh files":
+        if "distorted" in arguments.fail_on:
+            raise ValueError("--fail-on distorted is for shots; --max-strain bounds the strain of one frame")
         return repair_files(frames, arguments)
     device = find_device(arguments.device)
     chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
@@ -179,7 +183,7 @@ def _run(arguments: argparse.Namespace) -> int:
         run = stack.enter_context(contextlib.closing(RepairRun(scene, layer, arguments, str(device), facts)))
         run.run()
         after = run.journal.findings if run.is_whole else None
-        if run.is_whole and run.is_written:
+        if run.is_whole and (frames or run.has_moved):
             if isinstance(layer, FrameFiles):
                 fixed = read_frames(layer.frames)
             else:
@@ -198,7 +202,8 @@ def _run(arguments: argparse.Namespace) -> int:
         print(json.dumps(run.facts(kept, remaining), indent=1))
     else:
         print_repair(Console(), run, kept, remaining)
-    if "remaining" in arguments.fail_on and any(remaining.values()):
+    found = {"remaining": any(remaining.values()), "distorted": bool(run.distorted)}
+    if any(found[reason] for reason in arguments.fail_on):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out or NOT_REPAIRED in kept.values() else ExitStatus.DONE
 

@@ -37,13 +37,13 @@ class RepairRun:
         unrepaired_pairs: Pairs of meshes that stay as they are.
         stretches: The stretches, without their frames.
         frames: Times and numbers of moved vertices of the moved frames, by stretch.
+        distorted: Smallest and largest lengths of edges in frames that are not good, by time, see :class:`RepairedStretch`.
         earlier: Number of stretches of an earlier run.
         seconds: Times to find and to repair [s].
         interrupt: The signal that ended it.
         problems: Messages of errors.
         notes: Messages on what else did not work.
-        output: Path of the USD layer, or of the files.
-        is_written: Whether something is written: there is no layer if nothing is moved.
+        output: Path of the USD layer, or of the files; a layer in which nothing is moved shows the scene as it is.
         page: Path of the report, once it is written.
     """
 
@@ -76,18 +76,24 @@ class RepairRun:
         self.unrepaired_pairs: tuple[MeshPair, ...] = ()
         self.stretches: list[RepairedStretch] = []
         self.frames: list[list[tuple[float, int]]] = []
+        self.distorted: dict[float, tuple[float, float]] = {}
         self.earlier = 0
         self.seconds = {"finding": 0.0, "repairing": 0.0}
         self.interrupt: KeyboardInterrupt | None = None
         self.problems: list[str] = []
         self.notes: list[str] = []
-        self.output, self.is_written = arguments.output, False
+        self.output = arguments.output
         self.page: Path | None = None
 
     @property
     def is_whole(self) -> bool:
         """Whether neither a signal nor an error has stopped it."""
         return not self.interrupt and not self.problems
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether a frame is moved."""
+        return any(stretch.moved for stretch in self.stretches)
 
     def run(self) -> None:
         """Repairs the scene as far as no signal or error stops it, and writes the layer."""
@@ -105,8 +111,8 @@ class RepairRun:
                 self.interrupt = INTERRUPTS.came  # a library may have turned it into another error
                 self.problems += [] if self.interrupt else [describe(error)]
             is_layer = isinstance(self._layer, PointsLayer)
-            if not done or (is_layer and not any(stretch.moved for stretch in self.stretches)):
-                return  # an earlier file is better than an empty one
+            if not done or (is_layer and not self.is_whole and not self.has_moved):
+                return  # an earlier file is better than one of a run that came to nothing
             if done < len(self.scene):
                 self._layer.end = self.scene.times[done]
             self._finish()
@@ -177,6 +183,7 @@ class RepairRun:
             with naming(self._arguments.output):
                 self._layer.add(frame)
         self.frames.append([(frame.time, len(frame.vertices)) for frame in stretch.frames])
+        self.distorted |= stretch.distorted()
         self.stretches.append(replace(stretch, frames=()))
 
     def _finish(self) -> None:
@@ -196,7 +203,6 @@ class RepairRun:
                     continue
                 self.problems.append(f"{self._arguments.output}: not written: {describe(error)}")
                 return
-            self.is_written = True
             if shortage:
                 self.problems.append(f"not all of it is written: {shortage}")
             return
@@ -231,18 +237,21 @@ class RepairRun:
         for stretch, frames in zip(self.stretches, self.frames, strict=True):
             values = asdict(stretch)
             of_frames = [
-                {"time": time, "moved": moved, "largest_move": move}
-                for (time, moved), move in zip(frames, values.pop("largest_moves"), strict=True)
+                {"time": time, "moved": moved, "largest_move": move, "edge_ratio": ends}
+                for (time, moved), move, ends in zip(
+                    frames, values.pop("largest_moves"), values.pop("edge_ratios"), strict=True
+                )
             ]
-            stretches.append(values | {"frames": of_frames})
+            stretches.append(values | {"edge_ratio": stretch.edge_ratio, "frames": of_frames})
         return {
             "scene": self.scene.path,
-            "output": str(self._arguments.output) if self.is_written else None,
+            "output": str(self.output),
             "before": self.found,
             "remaining": remaining,
             "initially_near": self.initially_near,
             "unrepaired_pairs": self.unrepaired_pairs,
             "kept": kept,
+            "distorted": list(self.distorted),
             "stretches": stretches,
             "seconds": self.seconds,
         }

@@ -1,8 +1,7 @@
 """Prints what warp-bsc repair did: a table of the repaired stretches, and what remains."""
 
-from pathlib import Path
-
 from ..bench.tables import LONGEST, Column, count
+from ..repairing.shot.stretch import distortion
 from .option_names import with_option
 from .repair_run import RepairRun
 from .tables import Console, print_table, say
@@ -47,6 +46,14 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], remaini
         say(console, f"note: stretches that an earlier run has repaired: {run.earlier:,}")
     if run.stretches:
         _print_stretches(console, run)
+    if run.distorted:
+        worst, (low, high) = max(run.distorted.items(), key=lambda frame: distortion(frame[1]))
+        say(
+            console,
+            f"Not good: {count(len(run.distorted), 'frame')}, with edges shorter than a third of the shot's or longer "
+            f"than twice; at {worst:g} the worst, {low:.2f} to {high:.2f}.",
+            style="bold red",
+        )
     for stretch in run.stretches[:LONGEST]:
         for reason in stretch.reasons:
             say(console, f"Not repaired from {stretch.start:g} to {stretch.end:g}: {reason}.")
@@ -61,12 +68,9 @@ def print_repair(console: Console, run: RepairRun, kept: dict[str, str], remaini
         f"Finding took {1e3 * seconds['finding'] / len(scene):,.1f} ms an interval, repairing "
         f"{1e3 * seconds['repairing'] / len(scene):,.1f} ms.",
     )
-    if run.is_written:
-        say(console, f"Wrote {run.output}.")
-    else:
-        say(console, "Nothing was moved: no USD layer was written.")
-        if Path(run.output).exists():
-            say(console, f"{run.output} is that of an earlier run, and stays as it is.")
+    if not run.has_moved:
+        say(console, "Nothing was moved: what is written shows the scene as it is.")
+    say(console, f"Wrote {run.output}.")
     if run.page:
         say(console, f"Wrote {run.page}.")
 

@@ -1,11 +1,12 @@
 """Shows the results of a replay on the terminal."""
 
+import shlex
 from collections import defaultdict
 
 from rich.console import Console
 
 from ..bench.tables import LONGEST, Column, count
-from ..repairing.shot.findings import kept_meshes
+from ..repairing.shot.findings import closed_meshes, kept_meshes
 from ..scene_replay.baseline import NewFinding
 from ..scene_replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
 from ..scene_replay.scene_pairs import PHASES
@@ -103,9 +104,14 @@ def print_repair(console: Console, summary: Summary, command: str) -> None:
     say(console, f"To repair: {command}")
     start = summary.intersections[0].mesh_pairs if summary.intersections else {}
     crossing = [pair for pair, (crosses, _) in start.items() if crosses and pair[0] != pair[1]]
-    if crossing and (left := [pair for pair in crossing if not kept_meshes(summary.scene).keys() >= {*pair}]):
+    kept = kept_meshes(summary.scene).keys() if crossing else ()
+    if left := [pair for pair in crossing if not kept >= {*pair}]:
         pairs = count(len(left), "pair")
         say(console, f"  It leaves {pairs} of meshes that cross at the first time; --include-initial repairs them too.")
+        closed = closed_meshes(summary.scene)
+        bodies = sorted((names & closed) - kept)
+        if bodies and any((first in closed) != (second in closed) for first, second in left):
+            say(console, f"  With --keep {shlex.join(bodies)} bodies stay where they are, and cloth alone moves.")
 
 
 def print_work(console: Console, works: list[Work | None], writing: float) -> None:

@@ -56,9 +56,9 @@ def print_table(
     console.print(table)
 
 
-def say(console: rich.console.Console, line: str) -> None:
-    """Prints a line without markup; on a terminal it wraps."""
-    console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+def say(console: rich.console.Console, line: str, style: str | None = None) -> None:
+    """Prints a line without markup, in a style; on a terminal it wraps."""
+    console.print(line, markup=False, highlight=False, soft_wrap=not console.is_terminal, style=style)
 
 
 def say_list(console: rich.console.Console, lines: Sequence[str], more: str) -> None:

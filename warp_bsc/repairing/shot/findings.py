@@ -87,6 +87,16 @@ def kept_meshes(scene: Scene, keep: Iterable[str] = ()) -> dict[str, str]:
     return kept
 
 
+def closed_meshes(scene: Scene) -> set[str]:
+    """Returns the names of the meshes without a border at the first time, which are bodies rather than cloth."""
+    segment = scene.segment(0)
+    sides = np.sort(segment.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+    mesh = np.repeat(segment.locate_faces(np.arange(len(segment.faces)))[0], 3)
+    found, count = np.unique(np.column_stack([mesh, sides]), axis=0, return_counts=True)
+    closed = np.setdiff1d(mesh, found[count == 1, 0])
+    return {segment.meshes[number].name for number in closed}
+
+
 def find_collisions(
     scene: Scene,
     results: Iterable[IntervalResult],

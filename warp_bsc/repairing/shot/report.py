@@ -16,7 +16,7 @@ from ...usd.scene import Scene
 from ...usd.segment import Segment
 from ...usd.write.points_layer import MovedFrame
 from .findings import Finding
-from .stretch import RepairedStretch
+from .stretch import RepairedStretch, distortion
 
 UNREPAIRED_HITS = "collisions of meshes that cross at the first frame"
 """What remains of pairs of meshes that stay as they are."""
@@ -113,9 +113,11 @@ class _Summary:
         self.segments: list[Segment] = []
         self.moved: list[np.ndarray] = []
         for stretch in stretches:
-            for frame, move in zip(stretch.frames, stretch.largest_moves, strict=True):
+            distorted = stretch.distorted()
+            for frame, move, ends in zip(stretch.frames, stretch.largest_moves, stretch.edge_ratios, strict=True):
                 moved = len(frame.vertices)
                 self.frames.append({"time": frame.time, "before": frame.before, "move": move, "moved": moved})
+                self.frames[-1] |= {"edges": ends, "distortion": distortion(ends) if frame.time in distorted else 0.0}
                 if not self.segments or frame.segment is not self.segments[-1]:
                     self.segments.append(frame.segment)
                     self.moved.append(np.zeros(frame.segment.vertex_count, dtype=bool))
@@ -147,6 +149,7 @@ class _Summary:
             (f"{largest / unit:.3g}", "largest move, in edges"),
             (f"{max((high for _, high in ratios), default=1.0):.3g}", "longest edge against the scene"),
             (f"{min((low for low, _ in ratios), default=1.0):.3g}", "shortest edge against the scene"),
+            (f"{sum(frame['distortion'] > 0 for frame in self.frames):,}", "frames that are not good"),
             ("yes" if not uncertified else f"all but {uncertified:,}", "moved frames certified"),
         ]
         return {
@@ -191,7 +194,7 @@ class _Summary:
             ],
             "notes": [
                 "Moves are distances from the scene at the same time; edges are compared with the scene at the same "
-                "time.",
+                "time. A frame is not good if one is shorter than a third, or longer than twice.",
                 *scene.warnings,
                 *([f"{len(stretches) - _MAX_ROWS:,} stretches are not listed."] if len(stretches) > _MAX_ROWS else []),
             ],
@@ -202,7 +205,8 @@ class _Views:
     """The blocks of the moved frames: triangles, positions in the shot, and displacements.
 
     Attributes:
-        numbers: The frames that have a view: all, or some, spread evenly, and the one with the largest move.
+        numbers: The frames that have a view: all, or some, spread evenly, and the worst: the most distorted one, or
+            the one with the largest move.
     """
 
     def __init__(self, scene: Scene, summary: _Summary):
@@ -210,7 +214,8 @@ class _Views:
         count = len(summary.frames)
         self.numbers = set(spread(count, _MOST_VIEWS).tolist()) if count else set()
         if count > _MOST_VIEWS:
-            self.numbers.add(int(np.argmax([frame["move"] for frame in summary.frames])))
+            worst = max(range(count), key=lambda n: (summary.frames[n]["distortion"], summary.frames[n]["move"]))
+            self.numbers.add(worst)
         most = int(np.clip(_ALL_FACES // max(1, len(self.numbers)), _FEWEST_FACES, _MOST_FACES))
         self._faces = [
             _faces_to_show(segment, moved, most) for segment, moved in zip(summary.segments, summary.moved, strict=True)

@@ -6,6 +6,9 @@ import numpy as np
 
 from ...usd.write.points_layer import MovedFrame
 
+_GOOD_EDGES = 1.0 / 3.0, 2.0
+"""Smallest and largest length of an edge in a frame that is good, as shares of its length in the shot."""
+
 
 @dataclass(frozen=True)
 class RepairedStretch:
@@ -20,7 +23,7 @@ class RepairedStretch:
         largest_move: The largest of all these.
         mean_move: Mean of the distances of moved vertices.
         edge_length: Median edge length of the meshes that may move, at the start.
-        edge_ratio: Smallest and largest length of an edge, as shares of its length in the shot at the same time.
+        edge_ratios: Smallest and largest length of an edge in each of the frames, as shares of its length in the shot.
         acceleration: Largest second difference of the displacement of a vertex over three frames, and of its position
             in the shot, in the unit of length.
         uncertified: Times of the frames whose motion from the frame before is not certified.
@@ -35,10 +38,22 @@ class RepairedStretch:
     largest_move: float
     mean_move: float
     edge_length: float
-    edge_ratio: tuple[float, float]
+    edge_ratios: tuple[tuple[float, float], ...] = field(repr=False)
     acceleration: tuple[float, float]
     uncertified: tuple[float, ...]
     reasons: tuple[str, ...]
+
+    @property
+    def edge_ratio(self) -> tuple[float, float]:
+        """Smallest and largest length of an edge in all of its frames, as shares of its length in the shot."""
+        lows, highs = zip((1.0, 1.0), *self.edge_ratios, strict=True)
+        return min(lows), max(highs)
+
+    def distorted(self) -> dict[float, tuple[float, float]]:
+        """Returns smallest and largest lengths of edges in frames that are not good, by their times."""
+        rows = zip(self.frames, self.edge_ratios, strict=True)
+        return {frame.time: ends for frame, ends in rows if ends[0] < _GOOD_EDGES[0] or ends[1] > _GOOD_EDGES[1]}
+
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +108,7 @@ class StretchRecorder:
         self._uncertified: list[float] = []
         self._largest: list[float] = []
         self._moved, self._sum, self._count = 0, 0.0, 0
-        self._ratio = 1.0, 1.0
+        self._ratios: list[tuple[float, float]] = []
         self._last: list[tuple[np.ndarray, np.ndarray]] = []  # displacements and positions of the last two frames
         self._acceleration = 0.0, 0.0
 
@@ -119,7 +134,7 @@ class StretchRecorder:
         edges = self._mesh.edges
         lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (frame.x, frame.given)]
         ratio = lengths[0] / np.maximum(lengths[1], 1e-12 * self._mesh.length)
-        self._ratio = min(self._ratio[0], float(ratio.min())), max(self._ratio[1], float(ratio.max()))
+        self._ratios.append((float(ratio.min(initial=1.0)), float(ratio.max(initial=1.0))))
 
     def finish(self, reasons: list[str]) -> RepairedStretch:
         """Returns the stretch; ``reasons`` say why collisions remain."""
@@ -132,11 +147,16 @@ class StretchRecorder:
             largest_move=max(self._largest, default=0.0),
             mean_move=self._sum / max(1, self._count),
             edge_length=self._mesh.length,
-            edge_ratio=self._ratio,
+            edge_ratios=tuple(self._ratios),
             acceleration=(self._acceleration[0], self._acceleration[1]),
             uncertified=tuple(self._uncertified),
             reasons=tuple(reasons),
         )
+
+
+def distortion(ends: tuple[float, float]) -> float:
+    """Returns the factor by which edges are longer or shorter at most, of the smallest and the largest ratio."""
+    return max(1.0 / max(ends[0], 1e-9), ends[1])
 
 
 def _largest(vectors: np.ndarray) -> float:

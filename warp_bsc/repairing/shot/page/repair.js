@@ -6,15 +6,17 @@ const KEPT_COLOR = [0.62, 0.64, 0.67];
 const SMALL_MOVE = [0.98, 0.8, 0.25], LARGE_MOVE = [0.8, 0.09, 0.11];
 const meshColor = (mesh) => (data.meshes[mesh].kept ? KEPT_COLOR : BASE_COLORS[mesh % BASE_COLORS.length]);
 
-// `amount` is the root of a move as a share of the largest one, so that small moves are seen.
+// `amount` has the root of a move as a share of the largest one, so that small moves are seen, and the stretch around a
+// vertex: the logarithm to base 3 of the factor by which its edges are longer or shorter at most.
 const MOVED_SHADER = `#version 300 es
-in vec3 start; in vec3 end; in vec3 color; in float amount;
-uniform mat4 view; uniform mat4 projection; uniform float time; uniform float painted; uniform vec3 small; uniform vec3 large;
+in vec3 start; in vec3 end; in vec3 color; in vec2 amount;
+uniform mat4 view; uniform mat4 projection; uniform float time; uniform vec2 painted; uniform vec3 small; uniform vec3 large;
 out vec3 place; out vec3 tint;
 void main() {
   vec4 at = view * vec4(mix(start, end, time), 1.0);
   place = at.xyz;
-  tint = mix(color, mix(small, large, amount), painted * min(1.0, 8.0 * amount));
+  float share = dot(painted, amount);
+  tint = mix(color, mix(small, large, share), min(1.0, 8.0 * share));
   gl_Position = projection * at;
 }`;
 
@@ -66,18 +68,28 @@ function fillTimeline() {
 
 // --- The frame in 3D ---
 
-// Returns the arrays of a frame: positions before and after, and the roots of moves as shares of the largest one.
+const LONGEST = 3; // factor of the deepest colour
+const STEPS = 8; // least length of an edge in steps of rounded positions whose stretch is shown
+
+// Returns the arrays of a frame: positions before and after, and the amounts of the shader.
 async function loadFrame({ view }) {
   const block = await unpack(`frame-${view}`);
   const topology = await unpack(`faces-${block.faces}`);
   const start = new Float32Array(block.before.length);
   block.before.forEach((value, i) => { start[i] = block.low[i % 3] + block.step * value; });
-  const end = start.slice(), amount = new Float32Array(start.length / 3), moved = new Float32Array(3 * block.moved.length);
+  const end = start.slice(), amount = new Float32Array((2 * start.length) / 3), moved = new Float32Array(3 * block.moved.length);
   block.moved.forEach((vertex, row) => {
     const added = block.displacement.subarray(3 * row, 3 * row + 3);
     for (let axis = 0; axis < 3; axis += 1) end[3 * vertex + axis] += added[axis];
-    amount[vertex] = Math.sqrt(Math.min(1, Math.hypot(...added) / data.largest));
+    amount[2 * vertex] = Math.sqrt(Math.min(1, Math.hypot(...added) / data.largest));
     moved.set(end.subarray(3 * vertex, 3 * vertex + 3), 3 * row);
+  });
+  const length = (x, a, b) => Math.hypot(x[3 * a] - x[3 * b], x[3 * a + 1] - x[3 * b + 1], x[3 * a + 2] - x[3 * b + 2]);
+  topology.faces.forEach((a, corner) => {
+    const b = topology.faces[corner % 3 === 2 ? corner - 2 : corner + 1], before = length(start, a, b);
+    if (before < STEPS * block.step) return;
+    const stretch = Math.min(1, Math.abs(Math.log(length(end, a, b) / before)) / Math.log(LONGEST));
+    for (const vertex of [a, b]) amount[2 * vertex + 1] = Math.max(amount[2 * vertex + 1], stretch);
   });
   return { start, end, amount, moved, faces: topology.faces, meshes: topology.mesh_of_vertex, of: block.of };
 }
@@ -89,7 +101,7 @@ function makeViewer(markTime) {
   if (!gl) say("This browser has no WebGL 2, which the view in 3D needs.");
   if (!frames.length) say("Nothing is moved.");
   const made = gl && program(gl, MOVED_SHADER, TRIANGLE_COLOR);
-  const state = { index: -1, shown: null, blend: 1, painted: 1, playing: false, last: 0, framed: false };
+  const state = { index: -1, shown: null, blend: 1, painted: frames.some((one) => one.distortion) ? "stretch" : "moves", playing: false, last: 0, framed: false };
 
   async function show(index) {
     if (index < 0 || index >= frames.length || index === state.index) return;
@@ -101,7 +113,8 @@ function makeViewer(markTime) {
       // a page that stands in another one, as in a notebook, may have no address
     }
     byId("viewer-heading").textContent = `Time ${short(chosen.time)}${chosen.before ? ", just before" : ""}`;
-    byId("viewer-title").textContent = `${plural(chosen.moved, "point")} moved, at most by ${edges(chosen.move)}`;
+    byId("viewer-title").textContent = `${plural(chosen.moved, "point")} moved, at most by ${edges(chosen.move)}; edges are ${chosen.edges.map((ratio) => ratio.toFixed(2)).join(" to ")} times as long as in the scene`;
+    byId("viewer-title").classList.toggle("bad", chosen.distortion > 0);
     byId("frame").value = index;
     byId("frame-label").textContent = `${count(index + 1)} of ${count(frames.length)}`;
     markTime(chosen.time);
@@ -111,7 +124,7 @@ function makeViewer(markTime) {
     state.shown?.part.free();
     const colors = new Float32Array(loaded.start.length);
     loaded.meshes.forEach((mesh, vertex) => colors.set(meshColor(mesh), 3 * vertex));
-    const attributes = [["start", loaded.start, 3], ["end", loaded.end, 3], ["color", colors, 3], ["amount", loaded.amount, 1]];
+    const attributes = [["start", loaded.start, 3], ["end", loaded.end, 3], ["color", colors, 3], ["amount", loaded.amount, 2]];
     const part = vertexArray(gl, made, attributes, loaded.faces);
     if (loaded.faces.length / 3 < loaded.of) byId("viewer-title").textContent += `; the ${count(loaded.faces.length / 3)} of ${count(loaded.of)} triangles around them are shown`;
     const whole = boxOf([loaded.start]), near = boxOf([loaded.moved]);
@@ -130,7 +143,7 @@ function makeViewer(markTime) {
       show((state.index + 1) % frames.length);
     }
     begin(shown.whole.radius);
-    set(made, { time: state.blend, painted: state.painted, small: SMALL_MOVE, large: LARGE_MOVE, only: [0, 0, 0, 0] });
+    set(made, { time: state.blend, painted: [Number(state.painted === "moves"), Number(state.painted === "stretch")], small: SMALL_MOVE, large: LARGE_MOVE, only: [0, 0, 0, 0] });
     gl.bindVertexArray(shown.part.array);
     gl.drawElements(gl.TRIANGLES, shown.faces.length, gl.UNSIGNED_INT, 0);
     if (state.playing) ask();
@@ -149,19 +162,27 @@ function makeViewer(markTime) {
     show(best);
   }
 
-  const legend = byId("viewer-legend");
-  [0.25, 0.5, 0.75, 1].forEach((share) => {
-    const color = SMALL_MOVE.map((value, axis) => value + share * (LARGE_MOVE[axis] - value));
-    addKey(legend, { fill: css(color) }, edges(share ** 2 * data.largest));
-  });
-  data.meshes.slice(0, 6).forEach((mesh, index) => addKey(legend, { fill: css(meshColor(index)) }, mesh.name + (mesh.kept ? ", kept" : "")));
-  if (data.meshes.length > 6) add(legend, "span", {}, `and ${count(data.meshes.length - 6)} more`);
+  function fillLegend() {
+    const legend = byId("viewer-legend");
+    legend.replaceChildren();
+    [0.25, 0.5, 0.75, 1].forEach((share) => {
+      const color = SMALL_MOVE.map((value, axis) => value + share * (LARGE_MOVE[axis] - value));
+      const factor = Number((LONGEST ** share).toPrecision(2));
+      const text = state.painted === "moves" ? edges(share ** 2 * data.largest) : `edges ${factor} times as long or short`;
+      if (state.painted !== "none") addKey(legend, { fill: css(color) }, text);
+    });
+    data.meshes.slice(0, 6).forEach((mesh, index) => addKey(legend, { fill: css(meshColor(index)) }, mesh.name + (mesh.kept ? ", kept" : "")));
+    if (data.meshes.length > 6) add(legend, "span", {}, `and ${count(data.meshes.length - 6)} more`);
+  }
+
+  fillLegend();
+  byId("painted").value = state.painted;
   byId("frame").max = Math.max(0, frames.length - 1);
   byId("frame").addEventListener("input", (event) => show(Number(event.target.value)));
   byId("blend").addEventListener("input", (event) => setBlend(event.target.value / 100));
   byId("show-before").addEventListener("click", () => setBlend(0));
   byId("show-after").addEventListener("click", () => setBlend(1));
-  byId("painted").addEventListener("change", (event) => { state.painted = Number(event.target.checked); ask(); });
+  byId("painted").addEventListener("change", (event) => { state.painted = event.target.value; fillLegend(); ask(); });
   byId("frame-moves").addEventListener("click", () => { if (state.shown) frame(state.shown.near); });
   byId("frame-all").addEventListener("click", () => { if (state.shown) frame({ ...state.shown.whole, radius: 1.15 * state.shown.whole.radius }); });
   byId("previous").addEventListener("click", () => show(state.index - 1));
@@ -172,7 +193,7 @@ function makeViewer(markTime) {
     ask();
   });
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=checkbox])")) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input, select")) return;
     const keys = {
       ArrowLeft: () => show(state.index - 1),
       ArrowRight: () => show(state.index + 1),
@@ -198,7 +219,8 @@ async function start() {
   addTable(byId("stretches"), headers, data.stretches, "Nothing is moved.");
   viewer = makeViewer(data.moves.length ? fillTimeline() : () => {});
   const asked = Number(new URLSearchParams(location.hash.slice(1)).get("frame") ?? -1);
-  const most = frames.reduce((best, one, index) => (one.move > frames[best].move ? index : best), 0);
+  const worse = (one, other) => (one.distortion - other.distortion || one.move - other.move) > 0;
+  const most = frames.reduce((best, one, index) => (worse(one, frames[best]) ? index : best), 0);
   await viewer.show(Number.isInteger(asked) && asked >= 0 && asked < frames.length ? asked : most);
   document.body.dataset.state = "ready";
 }
