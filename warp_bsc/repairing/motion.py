@@ -1,4 +1,6 @@
-"""Certified motions of a surface: as far towards a goal as contacts allow, and apart to a minimum distance."""
+"""Certified motions of a surface: as far towards a goal as contacts allow, and apart to a minimum distance; faults."""
+
+import functools
 
 import numpy as np
 
@@ -19,6 +21,40 @@ _LEAST_TIME = 0.05
 """Shares of the way that are less count as 0, so that the search for a motion ends."""
 _PATIENCE = 4
 """Pushes without fewer near pairs after which the search ends."""
+
+
+class Faults:
+    """What is wrong with positions.
+
+    Attributes:
+        x: Positions, in units of the surface, shape [n, 3].
+        crossings: What crosses and counts, (edge, face), shape [m, 2].
+        inside: Vertices inside solids, int.
+    """
+
+    def __init__(self, surface: Surface, x: np.ndarray):
+        """Finds them."""
+        self._surface, self.x = surface, x
+        self.crossings, self.inside = surface.counted(surface.crossings(x)), surface.inside(x)
+
+    @functools.cached_property
+    def near(self) -> np.ndarray:
+        """Pairs that are at most the minimum distance apart, by a number for each."""
+        return near_pairs(self._surface, self.x)
+
+    @property
+    def count(self) -> int:
+        """Number of crossings and of vertices inside solids."""
+        return len(self.crossings) + len(self.inside)
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to repair."""
+        return bool(self.count or len(self.near))
+
+    def are_fewer(self, before: "Faults") -> bool:
+        """Whether less is wrong than before, and no more crosses."""
+        are_less = (self.count, len(self.near)) < (before.count, len(before.near))
+        return are_less and len(self.crossings) <= len(before.crossings)
 
 
 def move_freely(
@@ -76,7 +112,7 @@ def near_pairs(surface: Surface, x: np.ndarray) -> np.ndarray:
 
 def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     """Returns the pairs that are at most the minimum distance apart at positions in units, as contacts."""
-    positions = surface.positions(x)
+    positions = surface.detected(x)
     found = surface.distance_detector.detect(positions, positions)
     return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
 
@@ -90,7 +126,7 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         goal: Positions at the end.
         near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
     """
-    x0, x1 = surface.positions(start), surface.positions(goal)
+    x0, x1 = surface.detected(start), surface.detected(goal)
     contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1), _GAP * surface.edge)
     if surface.min_distance:
         found = surface.distance_detector.detect(x0, x1)
