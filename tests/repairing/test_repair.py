@@ -109,6 +109,14 @@ def test_a_sheet_that_crosses_itself_from_its_border_is_opened():
     assert np.median(np.abs(lengths[1] / lengths[0] - 1.0)) < 0.1
 
 
+def test_a_contour_between_two_loop_vertices_is_opened_with_little_strain():
+    """A sheet that crosses itself in its middle, up to two points at which it does not."""
+    u, w = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 20), np.linspace(-1.3, 1.3, 20), indexing="ij")).reshape(2, -1)
+    x = np.stack([1.2 * u, w**3 - 0.25 * (1.0 - (u / 0.7) ** 2) * w, 0.8 * w * w], axis=1)
+    result = bsc.repair(grid_faces(20, 20), x, device="cpu")
+    assert result.certified and result.crossings_before > 50 and result.max_strain < 0.1
+
+
 def test_a_sheet_that_is_folded_flat_opens_by_a_little():
     n = 10
     u, v = np.stack(np.meshgrid(np.linspace(0.0, 2.0, 2 * n + 1), np.linspace(0.0, 1.0, n + 1), indexing="ij")).reshape(

@@ -8,6 +8,9 @@ from .motion import move_freely
 from .surface import Surface
 
 _ROUNDS = 24
+_MOMENTA = (0.9, 0.95, 0.0)
+"""Momenta of sweeps, of which the later ones are tried where nothing crosses, but strains are above the limit. Without
+one, sweeps reach less far, but also settle where surfaces are far from their shape."""
 _SWEEPS, _MORE_SWEEPS, _MOST_SWEEPS = 40, 160, 640
 """Sweeps of a round in which strains are below the limit at its start, above it, and once such rounds do no more."""
 _RINGS = 10
@@ -37,6 +40,17 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         springs: Springs of the vertices that may move.
         max_strain: Largest strain.
     """
+    found = []
+    for momentum in _MOMENTA:
+        found.append(_approach(surface, x, springs, max_strain, momentum))
+        crosses = not surface.are_fixed(surface.crossings(found[-1])).all()
+        if crosses or surface.is_late or not score_of(surface, found[-1], max_strain)[0]:
+            break
+    return min(found, key=lambda x: score_of(surface, x, max_strain))
+
+
+def _approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, momentum: float) -> np.ndarray:
+    """Returns positions as :func:`approach`, with one momentum of sweeps."""
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
     held, stalled, known, more = np.zeros(len(x), dtype=bool), 0, Contacts.none(), _MORE_SWEEPS
@@ -45,7 +59,8 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         if held.any():
             around = springs.around(held, _RINGS)
             sweeps = more if score[0] else _SWEEPS
-            goal = springs.relax(goal, sweeps, _SOUGHT * max_strain, contacts=known, around=around)
+            slack = _SOUGHT * max_strain
+            goal = springs.relax(goal, sweeps, slack, momentum=momentum, contacts=known, around=around)
             goal = projected(surface.fixed, goal, known, device=surface.device)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):

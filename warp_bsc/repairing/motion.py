@@ -1,6 +1,7 @@
 """Certified motions of a surface: as far towards a goal as contacts allow, and apart to a minimum distance; faults."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +13,7 @@ _PROJECTIONS = 6
 _DETECTIONS = 40
 """Detections after which nothing moves."""
 _GAP = 2.0**-7
-"""Gap that contacts leave, in edges."""
+"""Gap that contacts leave, in edges of the median length, or the shortest ones of their vertices."""
 _MORE_DISTANCE = 1.0 + 2.0**-7
 """Distance at which contacts with a minimum distance are put, as a multiple of it."""
 _KEPT_TIME = 0.8
@@ -128,6 +129,8 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
     """
     x0, x1 = surface.detected(start), surface.detected(goal)
     contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1), _GAP * surface.edge)
+    # short edges would be strained by the gap of longer ones
+    contacts = replace(contacts, gap=_GAP * surface.shortest[contacts.vertices].min(axis=1))
     if surface.min_distance:
         found = surface.distance_detector.detect(x0, x1)
         too_near = as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)

@@ -104,6 +104,7 @@ class Surface:
         unit: The unit, in the unit of the input.
         lengths: Length of each of the edges in the input, in units, float64, shape [m].
         edge: Median length of the edges.
+        shortest: Length of the shortest edge of each vertex, at most the median, in units, float64, shape [n].
         min_distance: Distance that elements keep, in units, 0 for none.
         end: Time at which a search ends with what it has found, as of ``time.monotonic`` [s].
     """
@@ -151,6 +152,8 @@ class Surface:
         self.fixed = (np.bincount(weld, fixed, len(x)) > 0) | ~is_used
         self.lengths = self._lengths_of(self.home, slice(None))
         self.edge = float(np.median(self.lengths)) if len(self.lengths) else 1.0
+        self.shortest = np.full(len(x), self.edge)
+        np.minimum.at(self.shortest, self.ends, np.broadcast_to(self.lengths, self.ends.shape))
         self.detector = CollisionDetector(mesh)
         self._finder = self.detector.intersection_finder()
 
