@@ -42,7 +42,7 @@ import warp as wp
 from .ccd import impact_at_distance
 from .closest import contact_at, contact_weights
 from .distance import closest_points
-from .motion import all_finite, double, doubles, relative_motion
+from .motion import Query, double, query_motion
 from .pairs import distance_of_corners, firsts_of, form_of
 from .polynomials import EDGE_EDGE
 from .signs import FREE, HIT, ROUNDOFF, UNSURE
@@ -240,91 +240,54 @@ def _bounds_of_pair(kind: int, v: wp.vec4i, largest: wp.float64, arcs: Arcs) -> 
 
 
 @wp.func
-def _largest_coordinate(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
-    return wp.max(wp.max(wp.max(wp.abs(a), wp.abs(b)), wp.max(wp.abs(c), wp.abs(d))))
-
-
-@wp.func
 def _sagittas(bounds: _PairBounds, length: wp.float64) -> wp.float64:
     """Returns the bound of the deviation of both elements in a part of a step, without rounding."""
     return sagitta_of_part(bounds.first, length) + sagitta_of_part(bounds.second, length)
 
 
 @wp.func
-def _closing_way(kind: int, part: Impact, p: wp.vec3d, q: wp.vec3d, r: wp.vec3d, s: wp.vec3d) -> wp.float64:
-    """Returns by how much contact points approach each other along the normal, from the ways of a pair's points."""
+def _closing_way(kind: int, part: Impact, chords: Query) -> wp.float64:
+    """Returns by how much contact points approach each other along the normal on the chords of a part."""
     weights = contact_weights(kind, part.coordinates)
+    p = chords[4] - chords[0]
+    q = chords[5] - chords[1]
+    r = chords[6] - chords[2]
+    s = chords[7] - chords[3]
     return -wp.dot(part.normal, weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s)
 
 
 @wp.func
-def _first_contact(
-    kind: int,
-    part: Impact,
-    # points at the start of the part
-    p: wp.vec3d,
-    q: wp.vec3d,
-    r: wp.vec3d,
-    s: wp.vec3d,
-    # points at its end
-    end_p: wp.vec3d,
-    end_q: wp.vec3d,
-    end_r: wp.vec3d,
-    end_s: wp.vec3d,
-    rounding: wp.float64,
-) -> Impact:
+def _first_contact(kind: int, part: Impact, chords: Query, rounding: wp.float64) -> Impact:
     """Returns the contact of a part with coordinates and normal as of contacts on straight paths."""
     result = part
-    motion = relative_motion(kind, p, q, r, s, end_p, end_q, end_r, end_s, _ZERO)
+    motion = query_motion(kind, chords, _ZERO)
     coordinates, normal = contact_at(motion, part.toi)
     result.coordinates = coordinates
     # where paths graze, velocities do not tell the side, but all until the part began is free
     weights = contact_weights(kind, coordinates)
-    between = weights[0] * p + weights[1] * q + weights[2] * r + weights[3] * s
+    between = weights[0] * chords[0] + weights[1] * chords[1] + weights[2] * chords[2] + weights[3] * chords[3]
     result.normal = wp.where(wp.dot(normal, between) < -rounding, -normal, normal)
     return result
 
 
 @wp.func
-def impact_on_arcs(
-    kind: int,
-    v: wp.vec4i,
-    # points at the start
-    a0: Any,
-    b0: Any,
-    c0: Any,
-    d0: Any,
-    # points at the end
-    a1: Any,
-    b1: Any,
-    c1: Any,
-    d1: Any,
-    arcs: Arcs,
-    min_distance: wp.float64,
-) -> Impact:
+def impact_on_arcs(kind: int, v: wp.vec4i, query: Query, arcs: Arcs, min_distance: wp.float64) -> Impact:
     """Returns the first contact of a pair on its arcs; FREE is certain, and HIT within the tolerance of the arcs.
 
     Args:
-        kind: VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX, with points as of :func:`.ccd.impact_at_distance`.
+        kind: VERTEX_FACE, EDGE_EDGE, VERTEX_EDGE or VERTEX_VERTEX.
         v: The vertices of the pair.
-        a0: Points at the start, vec3 or vec3d, and so on.
-        b0: See ``a0``.
-        c0: See ``a0``.
-        d0: See ``a0``.
-        a1: Points at the end of the step.
-        b1: See ``a1``.
-        c1: See ``a1``.
-        d1: See ``a1``.
+        query: Their positions.
         arcs: The arcs.
         min_distance: Distance that the pair keeps, 0 if it must only not touch.
     """
     result = Impact()
     result.status = UNSURE
-    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+    if not wp.isfinite(query):
         return result
-    p, q, r, s = doubles(a0, b0, c0, d0)
-    a, b, c, d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
+    chords = Query()  # of a part
+    for j in range(4):
+        chords[j] = query[j]
     bounds = _PairBounds()
     start = wp.float64(0.0)
     length = wp.float64(1.0)
@@ -332,27 +295,22 @@ def impact_on_arcs(
     parts = int(0)
     while searching:
         end = start + length
-        end_p = to_a
-        end_q = to_b
-        end_r = to_c
-        end_s = to_d
-        if end < _ONE:
-            end_p = on_arc_of(arcs, v[0], a, to_a, end)
-            end_q = on_arc_of(arcs, v[1], b, to_b, end)
-            end_r = on_arc_of(arcs, v[2], c, to_c, end)
-            end_s = on_arc_of(arcs, v[3], d, to_d, end)
+        for j in range(4):
+            chords[4 + j] = query[4 + j]
+            if end < _ONE:
+                chords[4 + j] = on_arc_of(arcs, v[j], query[j], query[4 + j], end)
         deviation = distance_of_corners(kind, v, arcs.deviation)
         if length < _ONE:
             deviation = _sagittas(bounds, length) + bounds.rounding
         within = _UP * (min_distance + deviation)
+        p, q, r, s = chords[0], chords[1], chords[2], chords[3]
+        end_p, end_q, end_r, end_s = chords[4], chords[5], chords[6], chords[7]
         part = impact_at_distance(kind, p, q, r, s, end_p, end_q, end_r, end_s, within, ROUNDOFF, True, _TIME_TOLERANCE)
         parts += 1
         if part.status == FREE:
             start = end
-            p = end_p
-            q = end_q
-            r = end_r
-            s = end_s
+            for j in range(4):
+                chords[j] = chords[4 + j]
             length = wp.min(_TWO * length, _ONE - start)
             if start >= _ONE:
                 result.status = FREE
@@ -360,7 +318,9 @@ def impact_on_arcs(
                 searching = False
         else:
             if parts == 1:  # most pairs need no more than the first part
-                largest = wp.max(_largest_coordinate(a, b, c, d), _largest_coordinate(to_a, to_b, to_c, to_d))
+                largest = _ZERO
+                for j in range(8):
+                    largest = wp.max(largest, wp.max(wp.abs(query[j])))
                 bounds = _bounds_of_pair(kind, v, largest, arcs)
             advance = _SHORTEST * wp.floor(part.toi * length / _SHORTEST)
             found = _ZERO
@@ -371,13 +331,13 @@ def impact_on_arcs(
             if is_within or parts == MAX_PARTS or length <= _SHORTEST:
                 result = part
                 if min_distance == _ZERO and kind <= EDGE_EDGE:
-                    result = _first_contact(kind, part, p, q, r, s, end_p, end_q, end_r, end_s, bounds.rounding)
+                    result = _first_contact(kind, part, chords, bounds.rounding)
                 result.status = wp.where(is_within, HIT, UNSURE)
                 result.within_tolerance = wp.where(is_within, 1, 0)
                 result.toi = start + advance
                 searching = False
             else:
-                speed = _closing_way(kind, part, end_p - p, end_q - q, end_r - r, end_s - s) / length
+                speed = _closing_way(kind, part, chords) / length
                 length = _HALF * length
                 if advance > _ZERO:
                     # arcs are at most two deviations apart then, and about to meet: a part as long as that takes
@@ -386,10 +346,8 @@ def impact_on_arcs(
                         length = wp.min(length, expected)
                     start += advance
                     length = wp.min(length, _ONE - start)
-                    p = on_arc_of(arcs, v[0], a, to_a, start)
-                    q = on_arc_of(arcs, v[1], b, to_b, start)
-                    r = on_arc_of(arcs, v[2], c, to_c, start)
-                    s = on_arc_of(arcs, v[3], d, to_d, start)
+                    for j in range(4):
+                        chords[j] = on_arc_of(arcs, v[j], query[j], query[4 + j], start)
                 else:
                     # the first part that may be free at all
                     needed = _HALF * (found - min_distance) - bounds.rounding

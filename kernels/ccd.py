@@ -10,7 +10,7 @@ from .culling import centroid_direction, direction_separates, edge_edge_boxes_ap
 from .custom_gradients import func_grad
 from .gradients import with_gradients
 from .min_distance import min_distance_impact
-from .motion import all_finite, doubles, motion_and_distance, relative_motion
+from .motion import Query, all_finite, motion_and_distance, query_motion, query_of
 from .polynomials import EDGE_EDGE, VERTEX_EDGE, VERTEX_FACE, VERTEX_VERTEX, Motion, coplanarity
 from .signs import FREE, ROUNDOFF, UNSURE, certified_sign_cubic
 from .time_of_impact import Impact, impact
@@ -37,29 +37,16 @@ def solve(motion: Motion, timed: bool, tolerance: wp.float64) -> Impact:
 
 
 @wp.func
-def _find_impact(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # time of impact
-    timed: bool,
-    tolerance: wp.float64,
-) -> Impact:
+def _find_impact(kind: int, query: Query, timed: bool, tolerance: wp.float64) -> Impact:
     """Returns the status of a query and, if ``timed``, its first contact, both constants for differentiation."""
     result = Impact()
-    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+    if not wp.isfinite(query):
         result.status = UNSURE
         result.coordinates = wp.vec3d(_NAN)
         result.normal = wp.vec3d(_NAN)
         return result
+    a0, b0, c0, d0 = query[0], query[1], query[2], query[3]
+    a1, b1, c1, d1 = query[4], query[5], query[6], query[7]
     apart = bool(False)
     if kind == VERTEX_FACE:
         apart = vertex_face_boxes_apart(a0, b0, c0, d0, a1, b1, c1, d1)
@@ -68,27 +55,11 @@ def _find_impact(
     if apart:
         result.toi = wp.float64(2.0)
         return result
-    return solve(relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF), timed, tolerance)
+    return solve(query_motion(kind, query, ROUNDOFF), timed, tolerance)
 
 
 @func_grad(_find_impact, Impact)
-def _adjoint_of_find_impact(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # time of impact
-    timed: bool,
-    tolerance: wp.float64,
-    adj_ret: Impact,
-):
+def _adjoint_of_find_impact(kind: int, query: Query, timed: bool, tolerance: wp.float64, adj_ret: Impact):
     """Does nothing, and keeps Warp from differentiating the code behind :func:`_find_impact`."""
 
 
@@ -115,10 +86,8 @@ def impact_vertex_face(
         differentiable functions of the points; ``grazing`` is 1 where their gradients are clamped, see
         :mod:`.gradients`. If a point is not finite, the status is UNSURE, the time 0, coordinates and normal are NaN.
     """
-    p, a, b, c = doubles(p0, a0, b0, c0)
-    to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    found = _find_impact(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, True, tolerance)
-    return with_gradients(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, found, tolerance)
+    query = query_of(p0, a0, b0, c0, p1, a1, b1, c1)
+    return with_gradients(VERTEX_FACE, query, _find_impact(VERTEX_FACE, query, True, tolerance), tolerance)
 
 
 @wp.func
@@ -144,10 +113,8 @@ def impact_edge_edge(
         differentiable functions of the points; ``grazing`` is 1 where their gradients are clamped, see
         :mod:`.gradients`. If a point is not finite, the status is UNSURE, the time 0, coordinates and normal are NaN.
     """
-    a, b, c, d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    found = _find_impact(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, True, tolerance)
-    return with_gradients(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, found, tolerance)
+    query = query_of(a0, b0, c0, d0, a1, b1, c1, d1)
+    return with_gradients(EDGE_EDGE, query, _find_impact(EDGE_EDGE, query, True, tolerance), tolerance)
 
 
 @wp.func
@@ -158,9 +125,7 @@ def ccd_vertex_face(p0: Any, a0: Any, b0: Any, c0: Any, p1: Any, a1: Any, b1: An
     Time and triangle are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. If a point is
     not finite, the status is UNSURE.
     """
-    p, a, b, c = doubles(p0, a0, b0, c0)
-    to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    return _find_impact(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, False, _TOLERANCE).status
+    return _find_impact(VERTEX_FACE, query_of(p0, a0, b0, c0, p1, a1, b1, c1), False, _TOLERANCE).status
 
 
 @wp.func
@@ -171,9 +136,7 @@ def ccd_edge_edge(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any,
     Time and edges are closed: touching is contact. FREE and HIT are certain; treat UNSURE as contact. If a point is not
     finite, the status is UNSURE.
     """
-    a, b, c, d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    return _find_impact(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, False, _TOLERANCE).status
+    return _find_impact(EDGE_EDGE, query_of(a0, b0, c0, d0, a1, b1, c1, d1), False, _TOLERANCE).status
 
 
 @wp.func

@@ -24,7 +24,7 @@ from .closest import between
 from .custom_gradients import func_grad
 from .distance import nearest_pair
 from .gradients import MIN_SQUARE_LENGTH, SQUARE_SINE
-from .motion import all_finite, relative_motion
+from .motion import Query, query_motion
 from .polynomials import VERTEX_FACE, Motion
 from .signs import FREE
 from .time_of_impact import Impact, clamped_tolerance, mix_vector
@@ -88,34 +88,13 @@ def _reach(motion: Motion, distance: wp.float64, found: Impact, tolerance: wp.fl
 
 @wp.func
 def with_distance_gradients(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    distance: wp.float64,
-    # first contact
-    found: Impact,
-    tolerance: wp.float64,
+    kind: int, query: Query, distance: wp.float64, found: Impact, tolerance: wp.float64
 ) -> Impact:
     """Returns the first contact of a query with a minimum distance, with a time that is differentiable by the points.
 
     Args:
-        kind: VERTEX_FACE or EDGE_EDGE; points of a vertex and an edge are p a b a, of two vertices p q q q.
-        a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
-        b0: Second point at the start.
-        c0: Third point at the start.
-        d0: Fourth point at the start.
-        a1: First point at the end.
-        b1: Second point at the end.
-        c1: Third point at the end.
-        d1: Fourth point at the end.
+        kind: VERTEX_FACE, also of a vertex and an edge or two vertices, or EDGE_EDGE.
+        query: The points.
         distance: The minimum distance.
         found: First contact of these points.
         tolerance: Tolerance of its time of impact.
@@ -127,8 +106,8 @@ def with_distance_gradients(
     result.grazing = 0
     if found.status != FREE:
         result.grazing = 1
-        if all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
-            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+        if wp.isfinite(query):
+            motion = query_motion(kind, query, _ZERO)
             if motion.scale > _ZERO:
                 result.grazing = _reach(motion, distance * motion.scale, found, tolerance).grazing
     return result
@@ -136,35 +115,17 @@ def with_distance_gradients(
 
 @func_grad(with_distance_gradients, Impact)
 def _adjoint_of_with_distance_gradients(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    distance: wp.float64,
-    # first contact
-    found: Impact,
-    tolerance: wp.float64,
-    adj_ret: Impact,
+    kind: int, query: Query, distance: wp.float64, found: Impact, tolerance: wp.float64, adj_ret: Impact
 ):
-    if found.status != FREE and all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
-        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+    if found.status != FREE and wp.isfinite(query):
+        motion = query_motion(kind, query, _ZERO)
         if motion.scale > _ZERO:
             reach = _reach(motion, distance * motion.scale, found, tolerance)
             slope = adj_ret.toi * motion.scale * reach.slope
             before = _ONE - reach.time
             after = reach.time
-            wp.adjoint[a0] += before * reach.weights[0] * slope
-            wp.adjoint[b0] += before * reach.weights[1] * slope
-            wp.adjoint[c0] += before * reach.weights[2] * slope
-            wp.adjoint[d0] += before * reach.weights[3] * slope
-            wp.adjoint[a1] += after * reach.weights[0] * slope
-            wp.adjoint[b1] += after * reach.weights[1] * slope
-            wp.adjoint[c1] += after * reach.weights[2] * slope
-            wp.adjoint[d1] += after * reach.weights[3] * slope
+            gradient = Query()
+            for i in range(4):
+                gradient[i] = before * reach.weights[i] * slope
+                gradient[4 + i] = after * reach.weights[i] * slope
+            wp.adjoint[query] += gradient

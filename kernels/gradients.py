@@ -45,7 +45,7 @@ import warp as wp
 
 from .bernstein import mix, restrict_cubic
 from .custom_gradients import func_grad
-from .motion import all_finite, relative_motion
+from .motion import Query, query_motion
 from .polynomials import VERTEX_FACE, Motion, coplanarity
 from .signs import FREE
 from .time_of_impact import Impact, approximate_root, clamped_tolerance, mix_vector
@@ -144,34 +144,12 @@ def _touch(motion: Motion, found: Impact, tolerance: wp.float64) -> Touch:
 
 
 @wp.func
-def with_gradients(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # first contact
-    found: Impact,
-    tolerance: wp.float64,
-) -> Impact:
+def with_gradients(kind: int, query: Query, found: Impact, tolerance: wp.float64) -> Impact:
     """Returns the first contact of a query as a differentiable function of the query's points.
 
     Args:
         kind: VERTEX_FACE or EDGE_EDGE.
-        a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
-        b0: Second point at the start.
-        c0: Third point at the start.
-        d0: Fourth point at the start.
-        a1: First point at the end.
-        b1: Second point at the end.
-        c1: Third point at the end.
-        d1: Fourth point at the end.
+        query: The points.
         found: First contact of these points.
         tolerance: Tolerance of its time of impact.
 
@@ -182,33 +160,17 @@ def with_gradients(
     result.grazing = 0
     if found.status != FREE:
         result.grazing = 1
-        if all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
-            motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+        if wp.isfinite(query):
+            motion = query_motion(kind, query, _ZERO)
             if motion.scale > _ZERO:
                 result.grazing = _touch(motion, found, tolerance).grazing
     return result
 
 
 @func_grad(with_gradients, Impact)
-def _adjoint_of_with_gradients(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # first contact
-    found: Impact,
-    tolerance: wp.float64,
-    adj_ret: Impact,
-):
-    if found.status != FREE and all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
-        motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, _ZERO)
+def _adjoint_of_with_gradients(kind: int, query: Query, found: Impact, tolerance: wp.float64, adj_ret: Impact):
+    if found.status != FREE and wp.isfinite(query):
+        motion = query_motion(kind, query, _ZERO)
         at = _touch(motion, found, tolerance)
         # the normal, along u and v, which move with the time
         turn = adj_ret.normal - wp.dot(at.normal, adj_ret.normal) * at.normal
@@ -235,11 +197,7 @@ def _adjoint_of_with_gradients(
             adj_a = -(adj_u + adj_w)
             adj_b = adj_u
             adj_c = adj_w - adj_v
-        wp.adjoint[a0] += (_ONE - at.t) * adj_a
-        wp.adjoint[b0] += (_ONE - at.t) * adj_b
-        wp.adjoint[c0] += (_ONE - at.t) * adj_c
-        wp.adjoint[d0] += (_ONE - at.t) * adj_d
-        wp.adjoint[a1] += at.t * adj_a
-        wp.adjoint[b1] += at.t * adj_b
-        wp.adjoint[c1] += at.t * adj_c
-        wp.adjoint[d1] += at.t * adj_d
+        s = _ONE - at.t
+        wp.adjoint[query] += wp.matrix_from_rows(
+            s * adj_a, s * adj_b, s * adj_c, s * adj_d, at.t * adj_a, at.t * adj_b, at.t * adj_c, at.t * adj_d
+        )

@@ -12,7 +12,7 @@ import warp as wp
 
 from .bernstein import restrict_cubic
 from .custom_gradients import func_grad
-from .motion import all_finite, doubles, relative_motion
+from .motion import Query, query_motion, query_of
 from .polynomials import VERTEX_FACE, coplanarity
 from .signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign, certified_sign_cubic
 from .time_of_impact import FINEST, MAX_VISITS, clamped_tolerance, power_of_two
@@ -41,21 +41,7 @@ class Inversion:
 
 
 @wp.func
-def first_inversion(
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # accuracy
-    roundoff: wp.float64,
-    tolerance: wp.float64,
-) -> Inversion:
+def first_inversion(tetrahedron: Query, roundoff: wp.float64, tolerance: wp.float64) -> Inversion:
     """Returns the first inversion of a tetrahedron, by testing one interval after the other.
 
     In an interval all of whose coefficients are certainly positive, the tetrahedron does not invert; the next one is
@@ -64,22 +50,15 @@ def first_inversion(
     tolerance; then it is not certain whether the tetrahedron inverts there, but whether it does so later may be.
 
     Args:
-        a0: First point at the start.
-        b0: Second point at the start.
-        c0: Third point at the start.
-        d0: Fourth point at the start.
-        a1: First point at the end.
-        b1: Second point at the end.
-        c1: Third point at the end.
-        d1: Fourth point at the end.
+        tetrahedron: The points of vertex d and face a b c.
         roundoff: ROUNDOFF, or 0 for the signs that floating point computes.
         tolerance: Tolerance of the time, as a share of the step, see :func:`.time_of_impact.clamped_tolerance`.
     """
     result = Inversion()
     result.status = UNSURE
-    if not all_finite(a0, b0, c0, d0, a1, b1, c1, d1):
+    if not wp.isfinite(tetrahedron):
         return result
-    y = coplanarity(relative_motion(VERTEX_FACE, d0, a0, b0, c0, d1, a1, b1, c1, roundoff))
+    y = coplanarity(query_motion(VERTEX_FACE, tetrahedron, roundoff))
     if certified_sign_cubic(y.k, y.bound) > 0:
         result.status = FREE
         result.toi = _NEVER
@@ -116,34 +95,13 @@ def first_inversion(
 
 
 @wp.func
-def _find_inversion(
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    tolerance: wp.float64,
-) -> Inversion:
+def _find_inversion(tetrahedron: Query, tolerance: wp.float64) -> Inversion:
     """Returns the first inversion of a tetrahedron, constant for differentiation."""
-    return first_inversion(a0, b0, c0, d0, a1, b1, c1, d1, ROUNDOFF, tolerance)
+    return first_inversion(tetrahedron, ROUNDOFF, tolerance)
 
 
 @func_grad(_find_inversion, Inversion)
-def _adjoint_of_find_inversion(
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    tolerance: wp.float64,
-    adj_ret: Inversion,
-):
+def _adjoint_of_find_inversion(tetrahedron: Query, tolerance: wp.float64, adj_ret: Inversion):
     """Does nothing, and keeps Warp from differentiating the code behind :func:`_find_inversion`."""
 
 
@@ -169,6 +127,4 @@ def inversion_tetrahedron(
         some time; UNSURE, floating point certifies neither, also if a point is not finite. Before the time it is
         certainly positive.
     """
-    a, b, c, d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    return _find_inversion(a, b, c, d, to_a, to_b, to_c, to_d, tolerance)
+    return _find_inversion(query_of(d0, a0, b0, c0, d1, a1, b1, c1), tolerance)

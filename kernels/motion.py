@@ -67,6 +67,27 @@ def doubles(a: Any, b: Any, c: Any, d: Any):
     return double(a), double(b), double(c), double(d)
 
 
+Query = wp.types.matrix(shape=(8, 3), dtype=wp.float64)
+"""The points of a query in double precision: rows a0 b0 c0 d0 at the start, a1 b1 c1 d1 at the end of the step.
+
+They are p a b c of a vertex and a face, a b c d of two edges, p a b a of a vertex and an edge, p q q q of two vertices.
+"""
+
+
+@wp.func
+def query_of(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> Query:
+    """Returns a query, given its points in any precision."""
+    return wp.matrix_from_rows(
+        double(a0), double(b0), double(c0), double(d0), double(a1), double(b1), double(c1), double(d1)
+    )
+
+
+@wp.func
+def query_at(x0: wp.array[Any], x1: wp.array[Any], v: wp.vec4i) -> Query:
+    """Returns a query, given positions at both ends of the step in any precision, and its vertices in order."""
+    return query_of(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]], x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+
+
 @wp.func
 def all_finite(a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any) -> bool:
     """Returns whether all coordinates are finite: then the mean of eight points is finite as well."""
@@ -166,31 +187,19 @@ def _rescaled(x: wp.vec3d, size: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def _rescaled_points(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, size: wp.float64):
-    """Returns four :func:`_rescaled` points."""
-    return _rescaled(a, size), _rescaled(b, size), _rescaled(c, size), _rescaled(d, size)
+def _rescaled_query(query: Query, size: wp.float64) -> Query:
+    """Returns a query of :func:`_rescaled` points."""
+    result = Query()
+    for i in range(8):
+        result[i] = _rescaled(query[i], size)
+    return result
 
 
 @wp.func
-def _motion_of_kind(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # rounding
-    roundoff: wp.float64,
-) -> Motion:
-    """Returns the scaled relative motion of a query of any kind, whose points are in double precision.
-
-    The points of a vertex and an edge, p a b a, and of two vertices, p q q q, are those of a vertex and a face.
-    """
+def _motion_of_kind(kind: int, query: Query, roundoff: wp.float64) -> Motion:
+    """Returns the scaled relative motion of a query of any kind; those without a face and two edges count as a face."""
+    a0, b0, c0, d0 = query[0], query[1], query[2], query[3]
+    a1, b1, c1, d1 = query[4], query[5], query[6], query[7]
     if kind == EDGE_EDGE:
         return _scaled(EDGE_EDGE, roundoff, b0 - a0, b1 - a1, d0 - c0, d1 - c1, c0 - a0, c1 - a1)
     return _scaled(VERTEX_FACE, roundoff, c0 - b0, c1 - b1, d0 - b0, d1 - b1, a0 - b0, a1 - b1)
@@ -205,9 +214,7 @@ def vertex_face_motion(
     The motion is zero, so that culls do not decide it, if its size is out of range. :func:`relative_motion` rescales
     the points then; in culls that would cost registers.
     """
-    p, a, b, c = doubles(p0, a0, b0, c0)
-    to_p, to_a, to_b, to_c = doubles(p1, a1, b1, c1)
-    return _motion_of_kind(VERTEX_FACE, p, a, b, c, to_p, to_a, to_b, to_c, roundoff)
+    return _motion_of_kind(VERTEX_FACE, query_of(p0, a0, b0, c0, p1, a1, b1, c1), roundoff)
 
 
 @wp.func
@@ -215,9 +222,7 @@ def edge_edge_motion(
     a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
     """Returns the relative motion of two edges with finite coordinates, zero as in :func:`vertex_face_motion`."""
-    a, b, c, d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    return _motion_of_kind(EDGE_EDGE, a, b, c, d, to_a, to_b, to_c, to_d, roundoff)
+    return _motion_of_kind(EDGE_EDGE, query_of(a0, b0, c0, d0, a1, b1, c1, d1), roundoff)
 
 
 @wp.func
@@ -225,17 +230,22 @@ def relative_motion(
     kind: int, a0: Any, b0: Any, c0: Any, d0: Any, a1: Any, b1: Any, c1: Any, d1: Any, roundoff: wp.float64
 ) -> Motion:
     """Returns the relative motion of a query with finite coordinates, of any kind and at any scale."""
-    from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)
+    query = query_of(a0, b0, c0, d0, a1, b1, c1, d1)
+    motion = _motion_of_kind(kind, query, roundoff)
     size = motion.size
     if _out_of_range(a0, size):
-        a, b, c, d = _rescaled_points(from_a, from_b, from_c, from_d, size)
-        end_a, end_b, end_c, end_d = _rescaled_points(to_a, to_b, to_c, to_d, size)
-        motion = _motion_of_kind(kind, a, b, c, d, end_a, end_b, end_c, end_d, roundoff)
+        motion = _motion_of_kind(kind, _rescaled_query(query, size), roundoff)
         in_range = size > _SMALLEST_WITH_GRADIENT and size < _ONE
         motion.scale = wp.where(in_range, _LIFT * motion.scale, _ZERO)
     return motion
+
+
+@wp.func
+def query_motion(kind: int, query: Query, roundoff: wp.float64) -> Motion:
+    """Returns the relative motion of a query as of :func:`relative_motion`."""
+    return relative_motion(
+        kind, query[0], query[1], query[2], query[3], query[4], query[5], query[6], query[7], roundoff
+    )
 
 
 @wp.func
@@ -261,15 +271,12 @@ def motion_and_distance(
     A distance out of the range of that scale becomes infinite, where it is more than all distances of the query, or
     changes by up to 2^-1022 of the largest coordinate.
     """
-    from_a, from_b, from_c, from_d = doubles(a0, b0, c0, d0)
-    to_a, to_b, to_c, to_d = doubles(a1, b1, c1, d1)
-    motion = _motion_of_kind(kind, from_a, from_b, from_c, from_d, to_a, to_b, to_c, to_d, roundoff)
+    query = query_of(a0, b0, c0, d0, a1, b1, c1, d1)
+    motion = _motion_of_kind(kind, query, roundoff)
     size = motion.size
     rescaled = distance
     if _out_of_range(a0, size):
-        a, b, c, d = _rescaled_points(from_a, from_b, from_c, from_d, size)
-        end_a, end_b, end_c, end_d = _rescaled_points(to_a, to_b, to_c, to_d, size)
-        motion = _motion_of_kind(kind, a, b, c, d, end_a, end_b, end_c, end_d, roundoff)
+        motion = _motion_of_kind(kind, _rescaled_query(query, size), roundoff)
         rescaled = _rescaled_coordinate(distance, size)
         if size < _ONE and distance >= _TINY_DISTANCE:
             rescaled = wp.float64(wp.inf)

@@ -94,25 +94,18 @@ def plane_clears(part: Motion, distance: wp.float64) -> bool:
     )
 
 
+_Ends = wp.types.matrix(shape=(2, 3), dtype=wp.float64)
+"""A vector at both ends of a part."""
+
+
 @wp.func
 def _side_clears(
-    part: Motion,
-    alone: bool,
-    # corner, side along the line, side away from it; at both ends of the part
-    q0: wp.vec3d,
-    q1: wp.vec3d,
-    e0: wp.vec3d,
-    e1: wp.vec3d,
-    i0: wp.vec3d,
-    i1: wp.vec3d,
-    # sizes of the sides
-    e_size: wp.vec3d,
-    i_size: wp.vec3d,
-    distance: wp.float64,
+    part: Motion, alone: bool, q: _Ends, e: _Ends, i: _Ends, e_size: wp.vec3d, i_size: wp.vec3d, distance: wp.float64
 ) -> bool:
     """Returns whether a side of the polygon stays farther away than a distance, and the polygon beyond it.
 
-    With ``alone`` the polygon is this side, and i is not used.
+    It is the side e from the corner q on, and i is the side away from the line. With ``alone`` the polygon is this
+    side, and i is not used.
 
     Bounds: c = q x e has 6 + 5 roundings of its factors, 1 of the product and 1 or 2 of the sum, 14r C with C the sum
     of the sizes of its products; its product with the direction has 3 more. The norm of e is off by 5r of the sum of
@@ -120,16 +113,16 @@ def _side_clears(
     three coefficients, and 2 of the sixth.
     """
     size = part.u_size + part.v_size + part.w_size
-    c0 = wp.cross(q0, e0)
-    ch = cross_middle(q0, q1, e0, e1)
-    c1 = wp.cross(q1, e1)
+    c0 = wp.cross(q[0], e[0])
+    ch = cross_middle(q[0], q[1], e[0], e[1])
+    c1 = wp.cross(q[1], e[1])
     direction = unit_scale(c0 + _TWO * ch + c1)
     c_size = cross_size(size, e_size)
     slack = part.roundoff * UNDERFLOW
     bound = _CROSS_ERROR * part.roundoff * wp.dot(wp.abs(direction), c_size) + slack
     error = _SIDE_ERROR * part.roundoff * sum_of_size(e_size) + slack
-    start = norm_bound(e0) + error
-    end = norm_bound(e1) + error
+    start = norm_bound(e[0]) + error
+    end = norm_bound(e[1]) + error
     needed = distance * norm_bound(direction) * INFLATED
     if not (
         wp.dot(direction, c0) - bound > needed * start
@@ -139,9 +132,9 @@ def _side_clears(
         return False
     if alone:
         return True
-    k0 = wp.cross(i0, e0)
-    kh = cross_middle(i0, i1, e0, e1)
-    k1 = wp.cross(i1, e1)
+    k0 = wp.cross(i[0], e[0])
+    kh = cross_middle(i[0], i[1], e[0], e[1])
+    k1 = wp.cross(i[1], e[1])
     away = _QUARTIC_ERROR * part.roundoff * wp.dot(c_size, cross_size(i_size, e_size)) + slack
     return (
         wp.dot(c0, k0) >= away
@@ -153,42 +146,33 @@ def _side_clears(
 
 
 @wp.func
-def _points_away(q0: wp.vec3d, q1: wp.vec3d, e0: wp.vec3d, e1: wp.vec3d, bound: wp.float64) -> bool:
+def _points_away(q: _Ends, e: _Ends, bound: wp.float64) -> bool:
     """Returns whether q.e is certainly not negative over a part, in all its coefficients."""
-    return wp.dot(q0, e0) >= bound and _HALF * (wp.dot(q0, e1) + wp.dot(q1, e0)) >= bound and wp.dot(q1, e1) >= bound
+    middle = _HALF * (wp.dot(q[0], e[1]) + wp.dot(q[1], e[0]))
+    return wp.dot(q[0], e[0]) >= bound and middle >= bound and wp.dot(q[1], e[1]) >= bound
 
 
 @wp.func
 def _corner_clears(
-    part: Motion,
-    # corner and both sides at it, at both ends of the part
-    q0: wp.vec3d,
-    q1: wp.vec3d,
-    e0: wp.vec3d,
-    e1: wp.vec3d,
-    i0: wp.vec3d,
-    i1: wp.vec3d,
-    # sizes of the sides
-    e_size: wp.vec3d,
-    i_size: wp.vec3d,
-    distance: wp.float64,
+    part: Motion, q: _Ends, e: _Ends, i: _Ends, e_size: wp.vec3d, i_size: wp.vec3d, distance: wp.float64
 ) -> bool:
-    """Returns whether a corner of the polygon stays farther away than a distance, and the polygon beyond it.
+    """Returns whether a corner q of the polygon stays farther away than a distance, and the polygon beyond it.
+
+    Both sides at it are e and i.
 
     Bounds: a product with the direction has 6 roundings of q, 1 of the product and 2 of the sum. q.e has 6 + 5
     roundings of its factors, 1 of the product, 2 of the sum and 1 of the sum of two.
     """
     size = part.u_size + part.v_size + part.w_size
-    direction = unit_scale(q0 + q1)
+    direction = unit_scale(q[0] + q[1])
     slack = part.roundoff * UNDERFLOW
     bound = POINT_ERROR * part.roundoff * wp.dot(wp.abs(direction), size) + slack
     needed = distance * norm_bound(direction)
-    if not (wp.dot(direction, q0) - bound > needed and wp.dot(direction, q1) - bound > needed):
+    if not (wp.dot(direction, q[0]) - bound > needed and wp.dot(direction, q[1]) - bound > needed):
         return False
     factor = _DOT_ERROR * part.roundoff
-    return _points_away(q0, q1, e0, e1, factor * wp.dot(size, e_size) + slack) and _points_away(
-        q0, q1, i0, i1, factor * wp.dot(size, i_size) + slack
-    )
+    away_from_e = _points_away(q, e, factor * wp.dot(size, e_size) + slack)
+    return away_from_e and _points_away(q, i, factor * wp.dot(size, i_size) + slack)
 
 
 @wp.func
@@ -212,13 +196,12 @@ def polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64) 
     second_high = at[1] >= _ONE
     alone = kind == VERTEX_EDGE
     # the corner, both sides at it, and which of these are tried
-    q0 = part.w0
-    q1 = part.w1
-    e0 = -part.u0
-    e1 = -part.u1
+    u = wp.matrix_from_rows(part.u0, part.u1)
+    v = wp.matrix_from_rows(part.v0, part.v1)
+    q = wp.matrix_from_rows(part.w0, part.w1)
+    e = -u
+    i = -v
     e_size = part.u_size
-    i0 = -part.v0
-    i1 = -part.v1
     i_size = part.v_size
     along_e = bool(False)
     along_i = bool(False)
@@ -228,19 +211,14 @@ def polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64) 
         along_i = first_low or first_high
         along_e = second_low or second_high
         corner = along_e and along_i
-        q0 = -q0
-        q1 = -q1
+        q = -q
         if first_high:
-            q0 += part.u0
-            q1 += part.u1
+            q += u
         else:
-            e0 = part.u0
-            e1 = part.u1
+            e = u
         if second_high:
-            q0 -= part.v0
-            q1 -= part.v1
-            i0 = part.v0
-            i1 = part.v1
+            q -= v
+            i = v
     else:
         # x = w - beta u - gamma v
         third = at[0] + at[1] >= _ONE
@@ -248,47 +226,31 @@ def polygon_clears(kind: int, part: Motion, at: wp.vec2d, distance: wp.float64) 
         along_i = not alone and (corner or (first_low and not third))
         along_e = corner or ((third or second_low) and not along_i)
         if third and not second_high:  # from b on, along b c and b a; otherwise from c on, or from a on
-            q0 -= part.u0
-            q1 -= part.u1
-            e0 = part.u0 - part.v0
-            e1 = part.u1 - part.v1
-            i0 = part.u0
-            i1 = part.u1
+            q -= u
+            e = u - v
+            i = u
             e_size = part.u_size + part.v_size
             i_size = part.u_size
         elif second_high:
-            q0 -= part.v0
-            q1 -= part.v1
-            e0 = part.v0
-            e1 = part.v1
-            i0 = part.v0 - part.u0
-            i1 = part.v1 - part.u1
+            q -= v
+            e = v
+            i = v - u
             e_size = part.v_size
             i_size = part.u_size + part.v_size
         if alone and corner:  # one side, twice
-            i0 = wp.where(first_high, part.u0, -part.u0)
-            i1 = wp.where(first_high, part.u1, -part.u1)
-            e0 = i0
-            e1 = i1
+            i = wp.where(first_high, u, -u)
+            e = i
             e_size = part.u_size
             i_size = part.u_size
-    if corner and _corner_clears(part, q0, q1, e0, e1, i0, i1, e_size, i_size, distance):
+    if corner and _corner_clears(part, q, e, i, e_size, i_size, distance):
         return True
     sides = int(2)  # not a constant, as the body would be repeated
     for side in range(sides):
         is_e = side == 0
-        if wp.where(is_e, along_e, along_i) and _side_clears(
-            part,
-            alone,
-            q0,
-            q1,
-            wp.where(is_e, e0, i0),
-            wp.where(is_e, e1, i1),
-            wp.where(is_e, i0, e0),
-            wp.where(is_e, i1, e1),
-            wp.where(is_e, e_size, i_size),
-            wp.where(is_e, i_size, e_size),
-            distance,
-        ):
-            return True
+        if wp.where(is_e, along_e, along_i):
+            along = wp.where(is_e, e, i)
+            away = wp.where(is_e, i, e)
+            size = wp.where(is_e, e_size, i_size)
+            if _side_clears(part, alone, q, along, away, size, wp.where(is_e, i_size, e_size), distance):
+                return True
     return not alone and plane_clears(part, distance)

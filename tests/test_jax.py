@@ -23,8 +23,8 @@ def test_states_are_those_of_the_solver_bit_for_bit(device):
             np.testing.assert_array_equal(np.asarray(result[name]), values if states == "all" else values[-1])
 
 
-@pytest.mark.parametrize("states", ["last", "all"])
-def test_gradients_under_jit_are_those_of_central_differences(states, device):
+@pytest.mark.parametrize(("states", "every"), [("last", None), ("all", None), ("last", 5)])
+def test_gradients_under_jit_are_those_of_central_differences(states, every, device):
     solver = rollouts.bouncing_patch(device)
     state, controls = rollouts.arguments(solver.model)
     rng = np.random.default_rng(1)
@@ -32,13 +32,15 @@ def test_gradients_under_jit_are_those_of_central_differences(states, device):
     weights = {name: rng.normal(size=shape).astype(np.float32) for name in state}
 
     def results_of(state, controls):
-        return warp_bsc.jax.rollout(solver, state, controls, dt=DT, steps=STEPS, states=states)
+        return warp_bsc.jax.rollout(solver, state, controls, dt=DT, steps=STEPS, states=states, every=every)
 
     def loss(state, controls):
         return sum((weights[name] * array).sum() for name, array in results_of(state, controls).items())
 
     values = as_single(state), as_single(controls)
+    taken = solver.gradients.taken
     gradients = jax.jit(jax.grad(loss, argnums=(0, 1)))(*values)
+    assert solver.gradients.taken - taken == (1 if every is None else 2) * STEPS
     for which, name, h in ((0, "particle_q", 2e-5), (0, "particle_qd", 2e-3), (1, "particle_f", 2e-4)):
         direction = rng.normal(size=values[which][name].shape)
         sides = []

@@ -71,7 +71,7 @@ PACKAGES = {
         "_warnings",
     },
     "repairing": {"detection", "response", "kernels", "usd", "scene_replay", "_arguments", "_atomic_file"},
-    "mesh_files": {"_atomic_file"},
+    "mesh_files": {"detection", "repairing", "usd", "_atomic_file"},
     "usd": {"_arguments", "_atomic_file", "_one_thread", "_sorted_keys", "_warnings"},
     "scene_replay": {"usd", "detection", "checker", "_arguments", "_atomic_file", "_sorted_keys", "_version"},
     "bench": {
@@ -106,6 +106,7 @@ PACKAGES = {
         "checker",
         "detection",
         "implicit",
+        "mesh_files",
         "repairing",
         "scene_replay",
         "response",
@@ -152,14 +153,16 @@ LIBRARIES = {
         "response",
         "usd",
         "warp_bsc/repairing/repair.py",
-        "warp_bsc/repairing/check.py",
-    },  # for type checkers alone
+        "warp_bsc/mesh_files/check.py",
+        "warp_bsc/mesh_files/glb.py",  # matrices of nodes; the others for type checkers alone
+    },
     "warp": {
         "kernels",
         "detection",
         "implicit",
         "response",
         "repairing",
+        "warp_bsc/mesh_files/check.py",
         "bench",
         "cli",
         "_private_names",

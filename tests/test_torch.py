@@ -2,6 +2,7 @@
 
 import itertools
 
+import newton
 import numpy as np
 import pytest
 import rollouts
@@ -36,14 +37,14 @@ def test_states_are_those_of_the_solver_bit_for_bit(device):
     np.testing.assert_array_equal(result["particle_q"].cpu().numpy(), expected[0][-1])
 
 
-@pytest.mark.parametrize("states", ["last", "all"])
-def test_gradients_are_those_of_central_differences(states, device):
+@pytest.mark.parametrize(("states", "every"), [("last", None), ("all", None), ("all", 5)])
+def test_gradients_are_those_of_central_differences(states, every, device):
     """Of a random function of the states, in random directions of all arguments."""
     solver = rollouts.bouncing_patch(device)
     values = dict(zip(("state", "controls"), rollouts.arguments(solver.model), strict=True))
     given = {argument: tensors(arrays, device) for argument, arrays in values.items()}
     rng = np.random.default_rng(1)
-    result = warp_bsc.torch.rollout(solver, **given, dt=DT, steps=STEPS, states=states)
+    result = warp_bsc.torch.rollout(solver, **given, dt=DT, steps=STEPS, states=states, every=every)
     weights = {name: rng.normal(size=tuple(array.shape)) for name, array in result.items()}
     loss = sum((tensors(weights, device, False)[name] * array).sum() for name, array in result.items())
     loss.backward(retain_graph=True)
@@ -85,6 +86,22 @@ def test_gradients_are_those_of_a_tape_around_the_solver(device):
     tape.backward()
     for name, tensor in state.items():
         np.testing.assert_array_equal(tensor.grad.cpu().numpy(), getattr(states[0], name).grad.numpy())
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_states_may_be_kept_now_and_then(every, device):
+    """Gradients are those of a tape that keeps all, up to rounding, as contacts may come in another order."""
+    solver, found = rollouts.bouncing_patch(device), []
+    values = rollouts.arguments(solver.model)
+    for kept in (None, every):
+        given = [tensors(arrays, device) for arrays in values]
+        taken = solver.gradients.taken
+        result = warp_bsc.torch.rollout(solver, *given, dt=DT, steps=STEPS, every=kept)
+        (result["particle_q"] ** 2).sum().backward()
+        assert solver.gradients.taken - taken == (STEPS if kept is None else 2 * STEPS)
+        found.append([result["particle_q"].detach(), *(x.grad for arrays in given for x in arrays.values())])
+    for all_kept, some_kept in zip(*found, strict=True):
+        torch.testing.assert_close(some_kept, all_kept, rtol=1e-4, atol=1e-6)
 
 
 def test_rollouts_one_after_another_are_one(device):
@@ -130,6 +147,10 @@ def test_wrong_use(device):
         rollout(solver, state, {"particle_f": force}, dt=0.0)
     with pytest.raises(ValueError, match="states must be"):
         rollout(solver, state, {"particle_f": force}, dt=DT, states="first")
+    with pytest.raises(ValueError, match="every must be"):
+        rollout(solver, state, {"particle_f": force}, dt=DT, every=0)
+    with pytest.raises(TypeError, match="solver must be a SolverImplicit with every=2, not a SolverSemiImplicit"):
+        rollout(newton.solvers.SolverSemiImplicit(solver.model), state, None, dt=DT, steps=4, every=2)
     plain = rollouts.bouncing_patch(device, requires_grad=False)
     with pytest.raises(ValueError, match="solver: its model has no gradients"):
         rollout(plain, state, {"particle_f": force}, dt=DT)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:  # type checkers and editors do not look into __getattr__
     from .detection.results.collisions import CapturedCollisions, Collisions, DetectionStats
     from .detection.results.differentiable import DifferentiableContacts
     from .implicit.solver_implicit import SolverImplicit, checkpointed
-    from .repairing.check import MeshCheck, check
+    from .mesh_files.check import MeshCheck, check
     from .repairing.repair import repair
     from .repairing.results import RepairResult, UnresolvedContour
     from .repairing.state import StateRepairResult, repair_state
@@ -81,7 +81,7 @@ _MODULES = {
     "FrictionTable": "response.state.friction_table",
     "IntervalResult": "scene_replay.results",
     "IntervalSummary": "scene_replay.results",
-    "MeshCheck": "repairing.check",
+    "MeshCheck": "mesh_files.check",
     "DeviceQueryResult": "detection.queries.query_arrays",
     "QueryResult": "detection.queries.query",
     "RepairResult": "repairing.results",
@@ -97,7 +97,7 @@ _MODULES = {
     "StateRepairResult": "repairing.state",
     "UnresolvedContour": "repairing.results",
     "chamfer_distance": "detection.at_rest.chamfer_distance",
-    "check": "repairing.check",
+    "check": "mesh_files.check",
     "checkpointed": "implicit.solver_implicit",
     "distances": "detection.at_rest.proximities",
     "leave_out": "detection.mesh",

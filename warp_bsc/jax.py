@@ -33,6 +33,7 @@ def rollout(
     dt: float,
     steps: int | None = None,
     states: Literal["last", "all"] = "last",
+    every: int | None = None,
 ) -> dict[str, jax.Array]:
     """Returns the states after steps of a solver, as differentiable functions of the first state and of controls.
 
@@ -47,6 +48,7 @@ def rollout(
         dt: Length of a step [s].
         steps: Steps, a multiple of the rows of controls; default: one a row.
         states: Whether the result is the ``"last"`` state or ``"all"``, each array then with a row a step.
+        every: As of :func:`warp_bsc.torch.rollout`; the backward pass takes the steps twice then.
 
     Returns:
         The arrays of the last state by name, those that the model has; or of all states, shape [steps, ...].
@@ -63,18 +65,19 @@ def rollout(
             if array.dtype != np.float32:
                 raise TypeError(f"{argument}[{name!r}] must be of float32, not {array.dtype}")
     shapes = [{name: tuple(array.shape) for name, array in arrays.items()} for arrays in given]
-    options = RolloutOptions(solver, dt, steps, states, *shapes)
-    return _differentiable(solver, options.dt, options.steps, states, *(tuple(x.items()) for x in shapes))(*given)
+    options = RolloutOptions(solver, dt, steps, states, *shapes, every=every)
+    of_shapes = (tuple(x.items()) for x in shapes)
+    return _differentiable(solver, options.dt, options.steps, states, options.every, *of_shapes)(*given)
 
 
 @functools.lru_cache(maxsize=16)
-def _differentiable(solver: SolverBase, dt: float, steps: int, states: str, *shapes: tuple):
+def _differentiable(solver: SolverBase, dt: float, steps: int, states: str, every: int | None, *shapes: tuple):
     """Returns a rollout as a function of the state and the controls, always the same for the same arguments.
 
     JAX compiles each function that it calls, and keeps what it compiled.
     """
-    options = RolloutOptions(solver, dt, steps, states, *map(dict, shapes))
-    rows = (options.steps,) if options.every else ()
+    options = RolloutOptions(solver, dt, steps, states, *map(dict, shapes), every=every)
+    rows = (options.steps,) if options.all_states else ()
     results = {
         name: jax.ShapeDtypeStruct((*rows, *options.shape_of(name)), np.float32) for name in options.result_names()
     }
@@ -88,11 +91,13 @@ def _differentiable(solver: SolverBase, dt: float, steps: int, states: str, *sha
 
     def step(state, controls):
         taken = Rollout(options, as_arrays(state), as_arrays(controls), recorded=False)
-        return {name: array.numpy() if options.every else array.numpy()[0] for name, array in taken.results.items()}
+        return {
+            name: array.numpy() if options.all_states else array.numpy()[0] for name, array in taken.results.items()
+        }
 
     def step_and_go_back(state, controls, of_results):
         taken = Rollout(options, as_arrays(state), as_arrays(controls))
-        of_results = {name: x if options.every else np.asarray(x)[None] for name, x in of_results.items()}
+        of_results = {name: x if options.all_states else np.asarray(x)[None] for name, x in of_results.items()}
         gradients = taken.backward(as_arrays(of_results))
         return tuple({name: array.numpy() for name, array in arrays.items()} for arrays in gradients)
 

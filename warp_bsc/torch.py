@@ -29,6 +29,7 @@ def rollout(
     dt: float,
     steps: int | None = None,
     states: Literal["last", "all"] = "last",
+    every: int | None = None,
 ) -> dict[str, torch.Tensor]:
     """Returns the states after steps of a solver, as differentiable functions of the first state and of controls.
 
@@ -38,8 +39,8 @@ def rollout(
             forces = policy(state["particle_q"], state["particle_qd"])
             state = warp_bsc.torch.rollout(solver, state, {"particle_f": forces[None]}, dt=1.0 / 600.0, steps=10)
 
-    Each call records a tape of Warp, which holds all of its states until autograd drops its graph. Its backward pass
-    clears the gradients of arrays of the model. Second derivatives raise an error.
+    Each call records a tape of Warp, which holds its states until autograd drops its graph. Its backward pass clears
+    the gradients of arrays of the model. Second derivatives raise an error.
 
     Args:
         solver: A solver that is differentiable, such as a :class:`.SolverImplicit`; its model must be finalized with
@@ -53,6 +54,8 @@ def rollout(
         dt: Length of a step [s].
         steps: Steps, a multiple of the rows of controls; default: one a row.
         states: Whether the result is the ``"last"`` state or ``"all"``, each tensor then with a row a step.
+        every: Steps between two states that are kept, as of :func:`.checkpointed`, of a :class:`.SolverImplicit`: the
+            backward pass takes the steps again, so many at a time. Default: all states are kept.
 
     Returns:
         The tensors of the last state by name, those that the model has; or of all states, shape [steps, ...].
@@ -67,7 +70,7 @@ def rollout(
         for name, tensor in tensors.items():
             _check_tensor(f"{argument}[{name!r}]", tensor, solver.model.device)
     shapes = [{name: tuple(tensor.shape) for name, tensor in tensors.items()} for tensors in given.values()]
-    options = RolloutOptions(solver, dt, steps, states, *shapes)
+    options = RolloutOptions(solver, dt, steps, states, *shapes, every=every)
     names = [list(tensors) for tensors in given.values()]
     tensors = [tensor for tensors in given.values() for tensor in tensors.values()]
     recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
@@ -97,7 +100,7 @@ class _Rollout(torch.autograd.Function):
         ctx.options, ctx.taken = options, taken
         ctx.set_materialize_grads(False)
         results = [wp.to_torch(array, requires_grad=False) for array in taken.results.values()]
-        return tuple(results if options.every else [result[0] for result in results])
+        return tuple(results if options.all_states else [result[0] for result in results])
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -106,7 +109,7 @@ class _Rollout(torch.autograd.Function):
         gradients = {}
         for name, gradient in zip(options.result_names(), of_results, strict=True):
             if gradient is not None:
-                rows = gradient if options.every else gradient[None]
+                rows = gradient if options.all_states else gradient[None]
                 gradients[name] = _as_array(rows, options.dtype_of(name))
         with _stream_of_torch(options.solver.model.device):
             of_state, of_controls = taken.backward(gradients)

@@ -27,10 +27,11 @@ from typing import Any
 
 import warp as wp
 
+from ..motion import Query
 from ..not_inlined import NOT_INLINED
 from ..polynomials import EDGE_EDGE
 from ..signs import FREE, HIT, UNSURE
-from .polygon import coordinate, lowest_bits, make_polygon, widest
+from .polygon import coordinate, lowest_exponents, make_polygon, widest
 from .wide_integers import (
     add,
     integer,
@@ -215,35 +216,13 @@ def decide_distance_in(limbs: int) -> wp.Function:
 
     @wp.func
     def decide_distance(
-        kind: int,
-        # points at the start
-        a0: wp.vec3d,
-        b0: wp.vec3d,
-        c0: wp.vec3d,
-        d0: wp.vec3d,
-        # points at the end
-        a1: wp.vec3d,
-        b1: wp.vec3d,
-        c1: wp.vec3d,
-        d1: wp.vec3d,
-        # minimum distance
-        distance: wp.float64,
-        toi: wp.float64,
-        digits: int,
-        timed: bool,
+        kind: int, query: Query, distance: wp.float64, toi: wp.float64, digits: int, timed: bool
     ) -> int:
         """Returns whether a query comes within a distance, if that is so at the times that are looked at.
 
         Args:
             kind: VERTEX_FACE or EDGE_EDGE; faces may be degenerate, as those that stand for edges or vertices.
-            a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
-            b0: Second point at the start.
-            c0: Third point at the start.
-            d0: Fourth point at the start.
-            a1: First point at the end.
-            b1: Second point at the end.
-            c1: Third point at the end.
-            d1: Fourth point at the end.
+            query: The points.
             distance: The distance, at least 0.
             toi: Time in [0, 1] before which the distance is not reached.
             digits: Binary digits of the tolerance of the time of impact, and one more.
@@ -252,16 +231,12 @@ def decide_distance_in(limbs: int) -> wp.Function:
         Returns:
             FREE, HIT, TOO_WIDE, or UNSURE where neither is proven.
         """
-        lowest = wp.min(
-            wp.min(wp.min(lowest_bits(a0, b0), lowest_bits(c0, d0)), wp.min(lowest_bits(a1, b1), lowest_bits(c1, d1)))
-        )
-        lowest = wp.min(lowest, lowest_bit(distance))
-        top = wp.max(wp.max(widest(kind, a0, b0, c0, d0), widest(kind, a1, b1, c1, d1)))
-        top = wp.max(top, top_bit_of_difference(distance, wp.float64(0.0)))
+        lowest = wp.min(wp.min(lowest_exponents(query)), lowest_bit(distance))
+        top = wp.max(wp.max(widest(kind, query)), top_bit_of_difference(distance, wp.float64(0.0)))
         if wp.max(top - lowest, 0) + digits > most:
             return TOO_WIDE
         polygon = wp.zeros(shape=(36,), dtype=number)
-        make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, wp.vec3i(lowest, lowest, lowest), polygon)
+        make_polygon(kind == EDGE_EDGE, query, wp.vec3i(lowest, lowest, lowest), polygon)
         scale = wp.float64(wp.uint64(1) << wp.uint64(digits))
         time = wp.uint64(wp.floor(toi * scale)) + wp.uint64(2)
         corners = wp.where(kind == EDGE_EDGE, 4, 3)

@@ -27,7 +27,7 @@ import warp as wp
 
 from ..not_inlined import NOT_INLINED
 from ..signs import FREE, HIT, UNSURE
-from .polygon import lowest_bits, top_bits
+from .polygon import lowest_exponents, top_bits
 from .wide_integers import SCALED, add, integer, minor, product, sign, subtract
 
 BITS = {2: 83, 8: 339}
@@ -36,20 +36,24 @@ BITS = {2: 83, 8: 339}
 TOUCHES = wp.constant(3)
 """Status of an edge that meets a face, but does not pass through it."""
 
-# indices of the points: p and q of the edge, the corners of the face, and the third corners of its neighbours
+EdgeAndFace = wp.types.matrix(shape=(8, 3), dtype=wp.float64)
+"""Points in double precision: rows p q of an edge, a b c of a face, and u v w, the third corners of its neighbours.
+
+These are u of the neighbour at the side a b, v at b c, and w at c a; where there is none, the corner c, a or b.
+"""
+# indices of these points
 _P = wp.constant(0)
 _Q = wp.constant(1)
 _CORNER = wp.constant(2)
 _ACROSS = wp.constant(5)
 
 _FROM_POINTS = f"""{SCALED}
-    const wp::vec_t<3, wp::float64> others[8] = {{p, q, a, b, c, u, v, w}};
     constexpr int L = sizeof(*points.data) / 8;
     for (int axis = 0; axis < 3; ++axis) {{
         wp::uint64 origin[L], x[L];
-        scaled(p[axis], exponents[axis], origin);
+        scaled(given.data[0][axis], exponents[axis], origin);
         for (int i = 0; i < 8; ++i) {{
-            scaled(others[i][axis], exponents[axis], x);
+            scaled(given.data[i][axis], exponents[axis], x);
             difference(x, origin, points.data[3 * i + axis]);
         }}
     }}
@@ -59,23 +63,7 @@ for _limbs in BITS:
     _Integer = integer(_limbs)
 
     @wp.func_native(snippet=_FROM_POINTS)
-    def _subtract_origin(
-        # edge
-        p: wp.vec3d,
-        q: wp.vec3d,
-        # face
-        a: wp.vec3d,
-        b: wp.vec3d,
-        c: wp.vec3d,
-        # third corners of its neighbours
-        u: wp.vec3d,
-        v: wp.vec3d,
-        w: wp.vec3d,
-        # scale
-        exponents: wp.vec3i,
-        # out
-        points: wp.array[_Integer],
-    ):
+    def _subtract_origin(given: EdgeAndFace, exponents: wp.vec3i, points: wp.array[_Integer]):
         """Writes x, y, z of each point minus p, divided by 2^exponents, modulo 2 to their width."""
         ...
 
@@ -211,42 +199,21 @@ def edge_meets_face_in(limbs: int) -> wp.Function:
     most = BITS[limbs]
 
     @wp.func
-    def edge_meets_face(
-        # edge
-        p: wp.vec3d,
-        q: wp.vec3d,
-        # face
-        a: wp.vec3d,
-        b: wp.vec3d,
-        c: wp.vec3d,
-        # third corners of its neighbours
-        u: wp.vec3d,
-        v: wp.vec3d,
-        w: wp.vec3d,
-    ) -> int:
+    def edge_meets_face(given: EdgeAndFace) -> int:
         """Returns whether the closed edge p q meets the closed triangle a b c, and passes through it.
-
-        Args:
-            p: Start of the edge.
-            q: Its end.
-            a: First corner of the face.
-            b: Second corner.
-            c: Third corner.
-            u: Third corner of the neighbour at the side a b; c where there is none.
-            v: Third corner of the neighbour at the side b c; a where there is none.
-            w: Third corner of the neighbour at the side c a; b where there is none.
 
         Returns:
             FREE; TOUCHES; HIT if the edge passes through, as :func:`warp_bsc.checker.edges_pass_faces` defines it; or
             UNSURE if the exponents are too far apart for the width.
         """
-        lowest = wp.min(wp.min(lowest_bits(p, q), lowest_bits(a, b)), wp.min(lowest_bits(c, u), lowest_bits(v, w)))
-        top = wp.max(wp.max(top_bits(q, p), top_bits(a, p)), wp.max(top_bits(b, p), top_bits(c, p)))
-        top = wp.max(top, wp.max(top_bits(u, p), wp.max(top_bits(v, p), top_bits(w, p))))
+        lowest = lowest_exponents(given)
+        top = top_bits(given[1], given[0])
+        for i in range(2, 8):
+            top = wp.max(top, top_bits(given[i], given[0]))
         if wp.max(top - lowest) > most:
             return UNSURE
         points = wp.zeros(shape=(24,), dtype=number)
-        _subtract_origin(p, q, a, b, c, u, v, w, lowest, points)
+        _subtract_origin(given, lowest, points)
         return _decide(points)
 
     return edge_meets_face

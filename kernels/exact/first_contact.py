@@ -39,6 +39,7 @@ from typing import Any
 
 import warp as wp
 
+from ..motion import Query
 from ..not_inlined import NOT_INLINED
 from ..polynomials import EDGE_EDGE, VERTEX_FACE
 from .algebraic import count_cubic_roots, count_quadratic_roots, root_time, signs_at_cubic_roots, signs_at_roots
@@ -319,46 +320,24 @@ def decide_in(limbs: int) -> wp.Function:
     largest = BITS[limbs]
 
     @wp.func
-    def decide(
-        kind: int,
-        # points at the start
-        a0: wp.vec3d,
-        b0: wp.vec3d,
-        c0: wp.vec3d,
-        d0: wp.vec3d,
-        # points at the end
-        a1: wp.vec3d,
-        b1: wp.vec3d,
-        c1: wp.vec3d,
-        d1: wp.vec3d,
-        # time of impact
-        timed: bool,
-        digits: int,
-    ) -> wp.float64:
+    def decide(kind: int, query: Query, timed: bool, digits: int) -> wp.float64:
         """Returns :func:`first_contact_exactly` of a query, or TOO_WIDE.
 
         Args:
             kind: VERTEX_FACE or EDGE_EDGE.
-            a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
-            b0: Second point at the start.
-            c0: Third point at the start.
-            d0: Fourth point at the start.
-            a1: First point at the end.
-            b1: Second point at the end.
-            c1: Third point at the end.
-            d1: Fourth point at the end.
+            query: The points.
             timed: Whether the time is needed, see :func:`first_contact_exactly`.
             digits: Binary digits of the time, at most 38.
         """
         polygon = wp.zeros(shape=(24,), dtype=number)
         fits = int(-1)
         if wp.static(limbs == 1):
-            fits = make_narrow_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, polygon)
+            fits = make_narrow_polygon(kind == EDGE_EDGE, query, polygon)
         if fits < 0:
-            exponents, bits = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+            exponents, bits = spread(kind, query)
             if bits > largest:
                 return TOO_WIDE
-            make_polygon(kind == EDGE_EDGE, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+            make_polygon(kind == EDGE_EDGE, query, exponents, polygon)
         elif fits == 0:
             return TOO_WIDE
         return _decide(kind, polygon, timed, digits)

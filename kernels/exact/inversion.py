@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from ..motion import Query
 from ..polynomials import VERTEX_FACE
 from ..signs import FREE, HIT, UNSURE
 from .algebraic import count_cubic_roots
@@ -36,35 +37,17 @@ def tetrahedron_inverts_in(limbs: int) -> wp.Function:
     largest = BITS[limbs]
 
     @wp.func
-    def tetrahedron_inverts(
-        # points at the start
-        a0: wp.vec3d,
-        b0: wp.vec3d,
-        c0: wp.vec3d,
-        d0: wp.vec3d,
-        # points at the end
-        a1: wp.vec3d,
-        b1: wp.vec3d,
-        c1: wp.vec3d,
-        d1: wp.vec3d,
-    ) -> int:
+    def tetrahedron_inverts(tetrahedron: Query) -> int:
         """Returns whether the volume of a tetrahedron is not positive at some time: FREE or HIT; UNSURE if too wide.
 
         Args:
-            a0: First point at the start.
-            b0: Second point at the start.
-            c0: Third point at the start.
-            d0: Fourth point at the start.
-            a1: First point at the end.
-            b1: Second point at the end.
-            c1: Third point at the end.
-            d1: Fourth point at the end.
+            tetrahedron: The points of vertex d and face a b c.
         """
-        exponents, bits = spread(VERTEX_FACE, d0, a0, b0, c0, d1, a1, b1, c1)
+        exponents, bits = spread(VERTEX_FACE, tetrahedron)
         if bits > largest:
             return UNSURE
         polygon = wp.zeros(shape=(24,), dtype=number)
-        make_polygon(False, d0, a0, b0, c0, d1, a1, b1, c1, exponents, polygon)
+        make_polygon(False, tetrahedron, exponents, polygon)
         return wp.where(_inverts(polygon), HIT, FREE)
 
     return tetrahedron_inverts

@@ -27,6 +27,7 @@ from typing import Any
 
 import warp as wp
 
+from ..motion import Query
 from ..native_text import definitions, header
 from ..not_inlined import NOT_INLINED
 from ..polynomials import VERTEX_FACE
@@ -38,13 +39,12 @@ BITS = {1: 35, 2: 71, 4: 144, 8: 291}
 _FROM_POINTS = f"""{SCALED}
     // both points of the difference that each corner is; 0 to 3: the points of the query in order
     const int first[2][4] = {{{{0, 0, 0, 0}}, {{2, 2, 3, 3}}}}, second[2][4] = {{{{1, 2, 3, 3}}, {{0, 1, 1, 0}}}};
-    const wp::vec_t<3, wp::float64> points[2][4] = {{{{a0, b0, c0, d0}}, {{a1, b1, c1, d1}}}};
     constexpr int L = sizeof(*polygon.data) / 8;
     for (int axis = 0; axis < 3; ++axis) {{
         for (int end = 0; end < 2; ++end) {{
             wp::uint64 x[4][L];
             for (int point = 0; point < 4; ++point)
-                scaled(points[end][point][axis], exponents[axis], x[point]);
+                scaled(query.data[4 * end + point][axis], exponents[axis], x[point]);
             for (int corner = 0; corner < 4; ++corner)
                 difference(
                     x[first[edges][corner]], x[second[edges][corner]], polygon.data[(end * 4 + corner) * 3 + axis]
@@ -55,21 +55,7 @@ _FROM_POINTS = f"""{SCALED}
 
 
 @wp.func_native(snippet=definitions({}, largest_bits=BITS[1]) + header(__file__, "narrow_polygon.h"))
-def make_narrow_polygon(
-    edges: bool,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-    # out
-    polygon: wp.array[integer(1)],
-) -> int:
+def make_narrow_polygon(edges: bool, query: Query, polygon: wp.array[integer(1)]) -> int:
     """Does what :func:`spread` and :func:`make_polygon` do for one limb a coordinate, in SIMD instructions of a CPU.
 
     Returns:
@@ -83,35 +69,12 @@ for _limbs in LIMBS[:4]:
     _Integer = integer(_limbs)
 
     @wp.func_native(snippet=_FROM_POINTS)
-    def make_polygon(
-        edges: bool,
-        # points at the start
-        a0: wp.vec3d,
-        b0: wp.vec3d,
-        c0: wp.vec3d,
-        d0: wp.vec3d,
-        # points at the end
-        a1: wp.vec3d,
-        b1: wp.vec3d,
-        c1: wp.vec3d,
-        d1: wp.vec3d,
-        # scale
-        exponents: wp.vec3i,
-        # out
-        polygon: wp.array[_Integer],
-    ):
+    def make_polygon(edges: bool, query: Query, exponents: wp.vec3i, polygon: wp.array[_Integer]):
         """Writes the polygon of a query: x, y, z of each corner at the start, then at the end, modulo 2 to their width.
 
         Args:
             edges: Whether it is an edge-edge query; the polygon of a vertex-face query has its last corner twice.
-            a0: First point at the start: p of p a b c (a vertex and a face), or a of a b c d (two edges).
-            b0: Second point at the start.
-            c0: Third point at the start.
-            d0: Fourth point at the start.
-            a1: First point at the end.
-            b1: Second point at the end.
-            c1: Third point at the end.
-            d1: Fourth point at the end.
+            query: The points.
             exponents: Exponent for each axis of a power of two that divides all coordinates.
             polygon: Array of 24 integers to write to.
         """
@@ -125,12 +88,8 @@ def coordinate(polygon: wp.array[Any], corner: int, end: int, axis: int):
 
 
 @wp.func
-def lowest_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
-    """Returns the exponents of the lowest bits of two points, for each axis."""
-    return wp.min(
-        wp.vec3i(lowest_bit(x[0]), lowest_bit(x[1]), lowest_bit(x[2])),
-        wp.vec3i(lowest_bit(y[0]), lowest_bit(y[1]), lowest_bit(y[2])),
-    )
+def _lowest_bits(x: wp.vec3d) -> wp.vec3i:
+    return wp.vec3i(lowest_bit(x[0]), lowest_bit(x[1]), lowest_bit(x[2]))
 
 
 @wp.func
@@ -142,7 +101,16 @@ def top_bits(x: wp.vec3d, y: wp.vec3d) -> wp.vec3i:
 
 
 @wp.func
-def widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
+def lowest_exponents(query: Query) -> wp.vec3i:
+    """Returns the exponents of the lowest bits of all points, for each axis."""
+    lowest = _lowest_bits(query[0])
+    for i in range(1, 8):
+        lowest = wp.min(lowest, _lowest_bits(query[i]))
+    return lowest
+
+
+@wp.func
+def _widest_at(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.vec3i:
     """Returns an exponent e for each axis, so that the corners of the polygon at one time are below 2^e."""
     if kind == VERTEX_FACE:
         return wp.max(top_bits(a, b), wp.max(top_bits(a, c), top_bits(a, d)))
@@ -150,23 +118,17 @@ def widest(kind: int, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.
 
 
 @wp.func
-def spread(
-    kind: int,
-    # points at the start
-    a0: wp.vec3d,
-    b0: wp.vec3d,
-    c0: wp.vec3d,
-    d0: wp.vec3d,
-    # points at the end
-    a1: wp.vec3d,
-    b1: wp.vec3d,
-    c1: wp.vec3d,
-    d1: wp.vec3d,
-):
+def widest(kind: int, query: Query) -> wp.vec3i:
+    """Returns an exponent e for each axis, so that the corners of the polygon at both times are below 2^e."""
+    at_start = _widest_at(kind, query[0], query[1], query[2], query[3])
+    return wp.max(at_start, _widest_at(kind, query[4], query[5], query[6], query[7]))
+
+
+@wp.func
+def spread(kind: int, query: Query):
     """Returns the exponent of the power of two to divide each axis by, and the bits B of the corners after that."""
-    lowest = wp.min(wp.min(lowest_bits(a0, b0), lowest_bits(c0, d0)), wp.min(lowest_bits(a1, b1), lowest_bits(c1, d1)))
-    bits = wp.max(widest(kind, a0, b0, c0, d0), widest(kind, a1, b1, c1, d1)) - lowest
-    return lowest, wp.max(wp.max(bits), 0)
+    lowest = lowest_exponents(query)
+    return lowest, wp.max(wp.max(widest(kind, query) - lowest), 0)
 
 
 @wp.func(**NOT_INLINED)

@@ -9,6 +9,7 @@ import warp as wp
 from bench_commands import fail
 
 from warp_bsc import CollisionDetector, CollisionMesh, checker
+from warp_bsc.bench.measure import methods
 from warp_bsc.bench.measure import paper as bench_paper
 from warp_bsc.bench.measure.methods import METHODS, PHASES
 from warp_bsc.bench.measure.paper import Effort, benchmark_scene, find_places
@@ -25,8 +26,8 @@ TINY = Effort(intervals=2, queries=3000, sample=100, ipc_queries=20, adversaries
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    monkeypatch.setattr(Effort, "quick", classmethod(lambda cls: TINY))
-    monkeypatch.setattr(bench_paper, "_CPU_QUERIES", 1)
+    monkeypatch.setattr(bench_paper, "QUICK", TINY)
+    monkeypatch.setattr(methods, "_SMALLEST_LAUNCH", {False: 1, True: 1})
     monkeypatch.setattr("warp_bsc.bench.measure.worst_case._SUSPECTS", 2)
     monkeypatch.setattr("warp_bsc.bench.measure.worst_case._CPU_NANOSECONDS", 1e4)
 

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import trimesh
+from replay_files import Page
 
 import warp_bsc as bsc
 from warp_bsc._atomic_file import OutputFile
@@ -25,7 +26,7 @@ CROSSING = 72
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, mesh in {"first": FIRST, "second": SECOND, "balls": BALLS}.items():
-        for suffix in ("obj", "off", "ply", "stl"):
+        for suffix in ("glb", "obj", "off", "ply", "stl"):
             mesh.export(f"{name}.{suffix}")
     return tmp_path
 
@@ -58,7 +59,7 @@ def crossings(*paths):
     return len(bsc.CollisionDetector(mesh).find_intersections(x))
 
 
-@pytest.mark.parametrize("suffix", ["obj", "off", "ply", "stl"])
+@pytest.mark.parametrize("suffix", ["glb", "obj", "off", "ply", "stl"])
 def test_what_is_written_is_free_for_another_reader(folder, capsys, suffix):
     assert crossings(f"balls.{suffix}") == CROSSING
     assert repair(f"balls.{suffix}", "--output", f"free.{suffix}") == 0
@@ -168,7 +169,9 @@ def test_what_is_not_freed_is_named(folder, capsys):
         trimesh.Trimesh(np.column_stack([x, 0.0 * x[:, 0]]), faces, process=False).export(f"{name}.obj", digits=17)
     os.mkdir("free")
     scene = ["low.obj", "high.obj", "--output", "free"]
-    facts = facts_of(capsys, *scene, "--fail-on", "remaining", status=1)
+    facts = facts_of(capsys, *scene, "--fail-on", "remaining", "--report", "page.html", status=1)
+    page = Page((folder / "page.html").read_text()).data
+    assert page["tiles"][-1] == ["all but 1", "moved frames certified"]
     (contour,) = facts["unresolved"]
     assert "--order or --previous may tell" in contour["reason"] and facts["certified"] is False
     assert {element["of"] for pair in contour["elements"] for element in pair} == {"low.obj", "high.obj"}
@@ -209,8 +212,8 @@ def test_seams_stay_closed(folder, capsys):
     ("arguments", "error"),
     [
         (["none.obj", "--output", "free.obj"], "none.obj: No such file or directory"),
-        (["balls.glb", "--output", "free.glb"], "balls.glb: "),
-        (["balls.obj", "balls.usd", "--output", "free.obj"], "balls.usd: the name of a mesh file must end in .obj,"),
+        (["balls.gltf", "--output", "free.gltf"], "balls.gltf: "),
+        (["balls.obj", "balls.usd", "--output", "free.obj"], "balls.usd: the name of a mesh file must end in .glb,"),
         (["a.usda", "b.usda", "--output", "free.usda"], "only mesh files can be several"),
         (["balls.obj", "--output", "free.ply"], "free.ply: must end as balls.obj does"),
         (["balls.obj", "--output", "./balls.obj"], "./balls.obj: named twice, or read"),
@@ -219,10 +222,9 @@ def test_seams_stay_closed(folder, capsys):
         (["balls.obj", "--output", "free.obj", "--keep", "x*"], "--keep: no file matches x*"),
         (["balls.obj", "--output", "free.obj", "--keep", "*"], "free.obj: must be a folder, as not one file may move"),
         (["first.obj", "second.obj", "--output", "free.obj"], "free.obj: must be a folder, as not one file may move"),
-        (["balls.obj", "--output", "free.obj", "--frames", "1:2"], "--frames is for USD scenes only"),
-        (["balls.obj", "--output", "free.obj", "--report", "a.html"], "--report is for USD scenes only"),
-        (["demo", "--output", "free.usda", "--order"], "--order is for mesh files only"),
-        (["demo", "--output", "free.usda", "--max-strain", "0.5"], "--max-strain is for mesh files only"),
+        (["balls.obj", "--output", "free.obj", "--frames", "1:2"], "--frames is not for mesh files"),
+        (["demo", "--output", "free.usda", "--order"], "--order is not for USD scenes"),
+        (["demo", "--output", "free.usda", "--max-strain", "0.5"], "--max-strain is not for USD scenes"),
         (["balls.obj", "--output", "free.obj", "--previous", "first.obj"], "--previous: the files must have the faces"),
         (["balls.obj", "--output", "free.obj", "--previous", "balls.off"], "--previous must not cross"),
         (["first.obj", "--output", "free.obj", "--previous", "first.ply"], "--previous must have the type"),

@@ -162,17 +162,26 @@ def test_commands_of_mesh_files(tmp_path, capsys, monkeypatch):
         ("garment.obj", 1.02, dent),
         ("shirt.ply", 1.02, dent),
         ("coat.stl", 1.04, dent),
+        ("hero.glb", 1.0, 0.0),
+        *((f"body_{number}.obj", 1.0, 0.0) for number in (1, 2)),
+        *((f"coat_{number}.obj", 1.02, number * dent) for number in (1, 2)),
+        *((f"coat_000{number}.ply", 1.02, number * dent) for number in (1, 2)),
     ):
         trimesh.Trimesh(radius * ball.vertices + moves, ball.faces).export(name)
     section = (DOCS / "usd" / "repair.md").read_text().partition("## Positions")[0]
-    commands, checks = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", section, re.DOTALL))
-    assert len(commands) == len(checks) == 4
+    commands, frames, checks = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", section, re.DOTALL))
+    assert len(commands) == len(checks) == 5 and len(frames) == 2
     for number, command in enumerate(commands):
         assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
         said = capsys.readouterr().out
         assert " 0 remain." in said and "read again: certified." in said
-        assert ("Intersections: 0 before" in said) == (number in (0, 3))  # the garment alone
+        assert ("Intersections: 0 before" in said) == (number in (0, 3, 4))  # the garment alone, and the hero
     assert sorted(path.name for path in tmp_path.glob("free/*")) == ["coat.stl", "shirt.ply"]
+    for command in frames:
+        assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
+        said = capsys.readouterr().out
+        assert "Intersections: 0 before" not in said and said.count(" 0 remain.") == 2
+    assert len(list(tmp_path.glob("free/coat_*"))) == 4
     for command in checks:
         assert main([*shlex.split(command)[1:], "--device", "cpu"]) == 0
         capsys.readouterr()

@@ -258,8 +258,10 @@ def test_errors_name_the_file_and_the_place(tmp_path, name, data, error):
 
 
 def test_errors_of_the_name(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.glb: the name of a mesh file must end in \.obj, \.off, \.ply, \.stl"):
-        MeshFile(str(tmp_path / "a.glb"))
+    with pytest.raises(
+        ValueError, match=r"a\.gltf: the name of a mesh file must end in \.glb, \.obj, \.off, \.ply, \.stl"
+    ):
+        MeshFile(str(tmp_path / "a.gltf"))
     with pytest.raises(FileNotFoundError, match=r"a\.obj: No such file"):
         MeshFile(str(tmp_path / "a.obj"))
 

@@ -210,15 +210,14 @@ def test_full_disk_has_room_for_all_files(tmp_path, size):
 def test_no_room_at_the_end_is_an_error(tmp_path, monkeypatch, capsys, suffix):
     stage = many_hits(tmp_path / "scene.usda", samples=9)
     path = tmp_path / f"overlay.{suffix}"
-    name = {"usda": "write_text_layer", "usdc": "write_binary_layer"}[suffix]
-    write, calls = getattr(usd_overlay, name), []
+    write, calls = usd_overlay.write_layer, []
 
     def without_room(*arguments):
         calls.append(arguments)
         with largest_file(10_000) if len(calls) == 1 else contextlib.nullcontext():
             write(*arguments)
 
-    monkeypatch.setattr(usd_overlay, name, without_room)
+    monkeypatch.setattr(usd_overlay, "write_layer", without_room)
     command = ["replay", save(stage), "--device", "cpu", "--no-intersections", "--overlay", str(path)]
     assert main(command) == 2
     assert f"overlay.{suffix}: not all of it is written: [Errno 27] File too large" in capsys.readouterr().err

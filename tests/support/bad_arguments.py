@@ -491,7 +491,14 @@ def calls_of_solvers() -> dict[str, Call]:
         "doubles": wp.zeros(1, dtype=wp.float64, device="cpu"),
         "shape": wp.zeros(count + 1, dtype=wp.float32, device="cpu"),
     }
+    double = wp.zeros(count, dtype=wp.float64, device="cpu", requires_grad=True)
+    distances = without(DISTANCES, "None") | {
+        "doubles with gradients": double[:1],
+        "Warp array of two": wp.zeros(2, dtype=float, device="cpu"),
+        "negative in a Warp array": wp.full(1, -1.0, dtype=float, device="cpu"),
+    }
     radii = without(MANY_DISTANCES, "None") | {
+        "doubles with gradients": double,
         "one bad": [1.0] * (count - 1) + [-1.0],
         "masked": masked(np.ones(count)),
     }
@@ -553,7 +560,7 @@ def calls_of_solvers() -> dict[str, Call]:
                 "inversions": {"unknown": "counted", "flag": True, "None": None},
                 "max_iterations": NOT_COUNT | {"too many": 41},
                 "report": reported,
-                "min_distance": without(DISTANCES, "None"),
+                "min_distance": distances,
                 "particle_radius": radii,
                 "collision_filter": filters,
             },
@@ -564,7 +571,7 @@ def calls_of_solvers() -> dict[str, Call]:
             {"solver": inner},
             {
                 "solver": solvers,
-                "min_distance": without(DISTANCES, "None"),
+                "min_distance": distances,
                 "particle_radius": radii,
                 "collision_filter": filters,
                 "report": reported,
@@ -577,7 +584,7 @@ def calls_of_solvers() -> dict[str, Call]:
             {
                 "model": OBJECTS,
                 "friction": coefficient | {"huge": 1e39} | tables,
-                "min_distance": without(DISTANCES, "None"),
+                "min_distance": distances,
                 "particle_radius": radii,
                 "collision_filter": filters,
                 "bodies": {"unknown": "moved", "flag": True, "None": None},

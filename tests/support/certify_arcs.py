@@ -22,6 +22,7 @@ from warp_bsc.detection.arcs.rigid_motion import points_on_arcs
 from warp_bsc.detection.narrow.rules.arc import allocate_arcs, bound_arc
 from warp_bsc.kernels.arcs import Arcs, impact_on_arcs
 from warp_bsc.kernels.ccd import impact_at_distance
+from warp_bsc.kernels.motion import query_of
 from warp_bsc.kernels.pairs import distance_of_corners
 from warp_bsc.kernels.signs import ROUNDOFF
 
@@ -144,7 +145,8 @@ def _search(
     v = wp.vec4i(4 * i, 4 * i + 1, 4 * i + 2, 4 * i + 3)
     a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
     a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-    found = impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, wp.float64(0.0))
+    query = query_of(a0, b0, c0, d0, a1, b1, c1, d1)
+    found = impact_on_arcs(kind, v, query, arcs, wp.float64(0.0))
     within = distance_of_corners(kind, v, arcs.deviation)
     whole = impact_at_distance(kind, a0, b0, c0, d0, a1, b1, c1, d1, within, ROUNDOFF, False, TIME_TOLERANCE)
     status[i] = found.status

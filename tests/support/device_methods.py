@@ -12,7 +12,7 @@ from compilation import QUICK
 from warp_bsc.kernels import ccd_edge_edge, ccd_vertex_face
 from warp_bsc.kernels.ccd import impact_at_distance, solve
 from warp_bsc.kernels.exact.distance import decide_distance_in
-from warp_bsc.kernels.motion import relative_motion
+from warp_bsc.kernels.motion import query_of, relative_motion
 from warp_bsc.kernels.pairs import form_of
 from warp_bsc.kernels.polynomials import VERTEX_FACE
 from warp_bsc.kernels.signs import FREE, HIT, UNSURE
@@ -104,7 +104,8 @@ def exact_distance_kernel(limbs):
             return
         x = points[i]
         form = form_of(kind)
-        status = decide(form, x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], distance[i], toi[i], _DIGITS, False)
+        query = query_of(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7])
+        status = decide(form, query, distance[i], toi[i], _DIGITS, False)
         if status == FREE:
             time[i] = _2
         elif status == HIT:

@@ -8,6 +8,7 @@ from compilation import QUICK
 
 from warp_bsc.kernels.exact.first_contact import decide_in
 from warp_bsc.kernels.exact.polygon import spread
+from warp_bsc.kernels.motion import query_of
 
 _0 = wp.constant(wp.float64(0.0))
 
@@ -29,17 +30,11 @@ def exact_kernel(limbs):
         i = wp.tid()
         if time[i] >= _0:
             return
-        a0 = points[i, 0]
-        b0 = points[i, 1]
-        c0 = points[i, 2]
-        d0 = points[i, 3]
-        a1 = points[i, 4]
-        b1 = points[i, 5]
-        c1 = points[i, 6]
-        d1 = points[i, 7]
-        _, width = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+        x = points[i]
+        query = query_of(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7])
+        _, width = spread(kind, query)
         bits[i] = width
-        time[i] = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
+        time[i] = decide(kind, query, timed, digits)
 
     return decide_queries
 

@@ -31,7 +31,6 @@ from gradient_reference import ReferenceSteps
 
 import warp_bsc as bsc
 
-DT = 1.0 / 60.0
 WEIGHT = np.array([1.0, 0.3, 0.7])
 EXACT, COMPUTED = 1e-4, 3e-3  # m/s
 CLOTH = {"dim_x": 6, "dim_y": 6, "cell_x": 0.05, "cell_y": 0.05, "mass": 0.001, "vel": wp.vec3()}
@@ -125,10 +124,12 @@ class Scene:
         model: The model.
         throws: Velocities of the worlds, float64, shape [worlds, 3].
         solver: The solver.
+        dt: Length of a step [s].
     """
 
-    def __init__(self, name, worlds, device, seed=0):
+    def __init__(self, name, worlds, device, seed=0, dt=1.0 / 60.0):
         """Builds the worlds."""
+        self.dt = dt
         world, builder = newton.ModelBuilder(), newton.ModelBuilder()
         throw, options = SCENES[name](world)
         builder.replicate(world, worlds)
@@ -197,7 +198,7 @@ def run_exactly(scene, steps):
         reference.begin(held, x0, scene.velocities(throws), *bodies)
         with wp.Tape() as tape:  # what records steps solves them in float64
             for start, end in itertools.pairwise(states):
-                solver.step(start, end, None, None, DT)
+                solver.step(start, end, None, None, scene.dt)
         unsolved[:] |= reference.unsolved
         return tape, scene.losses(reference.x)
 
@@ -225,7 +226,7 @@ def run_as_computed(scene, steps):
 
     def take_steps():
         for start, end in itertools.pairwise(states):
-            solver.step(start, end, None, None, DT)
+            solver.step(start, end, None, None, scene.dt)
 
     def run(throws):
         begin(throws)
@@ -248,9 +249,9 @@ def deviations(gradients, found):
     return (off / size).max(axis=1), of_each.max(axis=1)
 
 
-def judge(name, worlds, steps, device):
+def judge(name, worlds, steps, dt, device):
     """Returns what a row shows of a scene, and all deviations."""
-    scene, start = Scene(name, worlds, device), time.perf_counter()
+    scene, start = Scene(name, worlds, device, dt=dt), time.perf_counter()
     row = {"scene": name, "worlds": worlds, "steps": steps}
     gradients, found, unsolved = run_exactly(scene, steps)
     off, of_each = deviations(gradients, found)
@@ -273,6 +274,7 @@ def main():
     parser.add_argument("scenes", nargs="*", help=f"of {', '.join(SCENES)} (default: all)")
     parser.add_argument("--worlds", type=int, default=8)
     parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--dt", type=float, default=1.0 / 60.0, help="length of a step [s]")
     parser.add_argument("--device", help="Warp device, such as cpu or cuda:0 (default: the first GPU, else cpu)")
     parser.add_argument("--json", metavar="FILE", help="file to which all deviations are written")
     options = parser.parse_args()
@@ -281,7 +283,7 @@ def main():
     print("scene         exact   median unsolved as computed   median  NaN      s")
     for name in options.scenes or SCENES:
         with wp.ScopedDevice(device):
-            row = judge(name, options.worlds, options.steps, device)
+            row = judge(name, options.worlds, options.steps, options.dt, device)
         rows.append(row)
         exact = f"{row['exact']:6.0%} {row['median']:8.1e} {row['unsolved']:8}"
         computed = f"{row['as computed']:11.0%} {row['of it']:8.1e} {row['NaN']:4} {row['seconds']:6.0f}"

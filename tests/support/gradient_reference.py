@@ -189,6 +189,8 @@ class ReferenceSteps:
 
     def _count(self, step):
         """Returns how many contacts of a step push, by kind."""
+        if not len(step.vertices):
+            return {}
         pushes = self._gradients.equations._in_contact.forces.numpy()[: len(step.vertices), 0].any(axis=(1, 2))
         kind, is_pair = step.contacts.kind.numpy(), (step.vertices.numpy() >= len(self.x)).all(axis=1)
         found = {name: int((pushes & (kind == k)).sum()) for name, k in KINDS.items()}

@@ -20,7 +20,9 @@ OF_MODEL = (
 )
 """Arrays of a model that steps have gradients of."""
 OF_STATE = "particle_q", "particle_qd", "particle_f", "body_q", "body_qd", "body_f"
-INPUTS = *OF_STATE[:3], "places", "friction", "friction_table", *OF_MODEL, *OF_STATE[3:], "poses"
+DISTANCES = "min_distance", "particle_radius", "shape_margin"
+"""Arrays of distances that pairs keep, where a program has any."""
+INPUTS = *OF_STATE[:3], "places", "friction", "friction_table", *DISTANCES, *OF_MODEL, *OF_STATE[3:], "poses"
 """All inputs of programs."""
 SIZES = {"particle_qd": 1.0, "edge_rest_angle": 1.0, "body_qd": 1.0, "body_f": np.repeat([0.1, 1e-3], 3)}
 SIZES |= dict.fromkeys(("particle_q", "particle_f", "body_q", "poses", "places"), 0.1)
@@ -43,16 +45,20 @@ class Program:
         kinds: The kinds of contacts that push in it.
         reference: What solves the steps in float64, after :meth:`refine`.
         inputs: Values of all inputs by name: of arrays of the model; of ``friction`` of particles, or of its table; of
-            the state at the start; of external forces, which all steps have; of ``poses`` of kinematic bodies and of
-            ``places`` of particles without mass, in each step, which the program writes before it.
+            distances that pairs keep; of the state at the start; of external forces, which all steps have; of ``poses``
+            of kinematic bodies and of ``places`` of particles without mass, in each step, which the program writes
+            before it.
         free: Which particles have a mass.
         weights: Those of positions and of velocities at the end, by the name of the array of the state.
         forces: Names of external forces.
         states, tape: Of the last run.
     """
 
-    def __init__(self, builder, device, kinds, *, friction, steps=3, poses=None, places=None, **options):
-        """Finalizes a builder; ``poses`` and ``places`` are those of each step."""
+    def __init__(self, builder, device, kinds, *, friction, steps=3, poses=None, places=None, distances=(), **options):
+        """Finalizes a builder; ``poses`` and ``places`` are those of each step.
+
+        ``distances`` names the arrays of :data:`DISTANCES` that act; those without an option are of the model.
+        """
         builder.color()
         model = self.model = builder.finalize(device=device, requires_grad=True)
         self.kinds, self.steps, self.reference, n = kinds, steps, None, model.particle_count
@@ -66,6 +72,7 @@ class Program:
             self.arrays["friction_table"] = friction.coefficients
         else:
             friction = self.arrays["friction"] = wp.array(np.full(n, friction), dtype=float, device=device)
+        self.arrays |= {name: options.get(name, getattr(model, name, None)) for name in distances}
         for array in self.arrays.values():
             array.requires_grad = True
         self.solver = bsc.SolverImplicit(model, max_iterations=60, friction=friction, **options)
@@ -183,6 +190,11 @@ def _normalized(poses):
 TILT = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 0.7, 0.2)), 0.2)
 
 
+def radii(builder, least, most, device):
+    """Returns different radii of particles: the larger one of two that are equal is not smooth."""
+    return wp.array(np.linspace(most, least, builder.particle_count), dtype=float, device=device)
+
+
 def add_cloth(builder, at, velocity=(0.0, 0.0, 0.0), *, rot=TILT, cell=0.05, **options):
     """Adds a cloth of two by two cells."""
     dims = {"dim_x": 2, "dim_y": 2, "cell_x": cell, "cell_y": cell, "mass": 0.002}
@@ -212,37 +224,40 @@ def block_on_plane(device):
     """A soft block that falls on an infinite plane, which a program shifts and tilts, and from which it keeps 1 mm."""
     builder = newton.ModelBuilder()
     body = builder.add_body(is_kinematic=True)
-    builder.add_shape_plane(body=body, width=0.0, length=0.0, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5))
+    builder.add_shape_plane(body=body, width=0.0, length=0.0, cfg=newton.ModelBuilder.ShapeConfig(mu=0.5, margin=5e-4))
     cells = dict.fromkeys(("dim_x", "dim_y", "dim_z"), 1) | dict.fromkeys(("cell_x", "cell_y", "cell_z"), 0.05)
     material = {"density": 300.0, "k_mu": 3000.0, "k_lambda": 4000.0, "k_damp": 2.0, "particle_radius": 0.0}
     at, velocity = wp.vec3(0.0, 0.0, 0.012), wp.vec3(0.3, 0.1, -0.4)
     builder.add_soft_grid(pos=at, rot=TILT, vel=velocity, **cells, **material)
     poses = [[[0.002 * k, 0.001 * k, 0.0, 0.003 * k, -0.003 * k, 0.002 * k, 1.0]] for k in range(3)]
-    return Program(builder, device, ["plane"], friction=0.4, poses=poses, min_distance=0.001)
+    options = {"min_distance": "model", "particle_radius": radii(builder, 4e-4, 6e-4, device)}
+    return Program(builder, device, ["plane"], friction=0.4, poses=poses, distances=DISTANCES[1:], **options)
 
 
 def cloth_on_sheet(device):
-    """A cloth that falls on a sheet, two sides of which a program moves."""
+    """A cloth that falls on a sheet, two sides of which a program moves; particles have radii."""
     builder = newton.ModelBuilder()
     add_cloth(builder, (-0.03, -0.02, 0.012), (0.3, 0.1, -0.6))
     held = dict.fromkeys(["fix_left", "fix_right"], True)
     add_cloth(builder, (-0.08, -0.08, 0.0), rot=wp.quat_identity(), cell=0.08, **held)
     x, is_held = np.array(builder.particle_q), np.array(builder.particle_mass) == 0.0
     places = [x[is_held] + k * np.array([0.001, 0.0005, 0.002]) for k in range(3)]
-    return Program(builder, device, ON_FACES, friction=0.3, places=places)
+    options = {"particle_radius": radii(builder, 5e-4, 1e-3, device), "distances": ["particle_radius"]}
+    return Program(builder, device, ON_FACES, friction=0.3, places=places, **options)
 
 
 def rope_over_bar(device):
-    """A rope of springs that falls over a bar, and keeps its radius from it."""
+    """A rope of springs that falls over a bar, and keeps its radii, those of the model, from it."""
     builder = newton.ModelBuilder()
     turned = wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), np.pi / 2.0)
     bar = wp.transform(wp.vec3(0.0, 0.0, -0.05), turned)
     builder.add_shape_capsule(-1, xform=bar, radius=0.05, half_height=0.2)
     for i in range(5):
-        builder.add_particle(wp.vec3(0.04 * (i - 2), 0.01 * i, 0.012), wp.vec3(0.1, 0.2, -0.6), 0.01, radius=0.005)
+        at, velocity = wp.vec3(0.04 * (i - 2), 0.01 * i, 0.012), wp.vec3(0.1, 0.2, -0.6)
+        builder.add_particle(at, velocity, 0.01, radius=0.0045 + 2e-4 * i)
         if i:
             builder.add_spring(i - 1, i, 60.0, 0.5, 0.0)
-    return Program(builder, device, ["edge-edge"], friction=0.3, particle_radius=0.005)
+    return Program(builder, device, ["edge-edge"], friction=0.3, distances=["particle_radius"])
 
 
 def cloth_on_body(device):
@@ -264,14 +279,15 @@ def pushed_cloth(device):
     """A cloth that a box pushes, which a program moves and turns, and that keeps 2 mm from it."""
     builder = newton.ModelBuilder()
     body = builder.add_body(is_kinematic=True)
-    builder.add_shape_box(body, hx=0.15, hy=0.15, hz=0.02)
+    builder.add_shape_box(body, hx=0.15, hy=0.15, hz=0.02, cfg=newton.ModelBuilder.ShapeConfig(margin=1e-3))
     add_cloth(builder, (-0.05, -0.04, 0.035), (0.1, 0.0, -0.2))
     poses = [[[0.002 * k, 0.001 * k, 0.006 * k, 0.02 * k, 0.01 * k, 0.02 * k, 1.0]] for k in range(3)]
-    return Program(builder, device, ON_FACES, friction=0.4, poses=poses, min_distance=0.002)
+    options = {"min_distance": "model", "particle_radius": radii(builder, 8e-4, 1e-3, device)}
+    return Program(builder, device, ON_FACES, friction=0.4, poses=poses, distances=DISTANCES[1:], **options)
 
 
 def boxes_on_plane(device):
-    """A box on an infinite plane, one that falls on it, and a cloth that falls on that one."""
+    """A box on an infinite plane, one that falls on it, and a cloth that falls on that one, which keep a distance."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane(cfg=newton.ModelBuilder.ShapeConfig(mu=0.4))
     cfg = newton.ModelBuilder.ShapeConfig(density=100.0, mu=0.5)
@@ -282,7 +298,8 @@ def boxes_on_plane(device):
         builder.add_shape_box(body, hx=0.04, hy=0.03, hz=0.03, cfg=cfg)
         builder.body_qd[body] = wp.spatial_vector(0.1, -0.05, -0.2, 0.5, -0.3, 0.2)
     add_cloth(builder, (-0.05, -0.05, 0.165), (0.3, 0.1, -0.6))
-    return Program(builder, device, ["edge-edge", "plane", BETWEEN_BODIES], steps=2, friction=0.3)
+    options = {"min_distance": wp.array([2e-5], dtype=float, device=device), "distances": ["min_distance"]}
+    return Program(builder, device, ["edge-edge", "plane", BETWEEN_BODIES], steps=2, friction=0.3, **options)
 
 
 OF_PARTICLES = (

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 import warp as wp
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from .._atomic_file import STDOUT, OutputFile
 from ..bench.figure import draw_paper_benchmarks
@@ -42,6 +41,7 @@ from ..detection.run.settings import PairKind
 from ..mesh_files.mesh_file import is_mesh_file
 from .device import find_device, load_detector, loading_kernels
 from .interrupts import INTERRUPTS
+from .progress import RunProgress
 from .query_file import find_query_files, read_query_file
 from .tables import Console, print_table, say
 
@@ -156,35 +156,22 @@ def _measure_each(
             errors, or none.
     """
     cases = list(cases)
-    with _show_progress(len(cases)) as (console, show), loading_kernels(device, console):
+    with RunProgress("Measuring") as progress, loading_kernels(device, progress.console):
         for done, case in enumerate(cases):
             name = title(*case)
-            show(done, f"{name}: starts")
+            progress.show(done, len(cases), f"{name}: starts")
 
             def show_part(part: int, parts: int, name: str = name, done: int = done) -> None:
                 INTERRUPTS.check()
                 how_much = f"{unit} {part:,} of {parts:,}" if unit else f"{part / parts:.0%}"
-                show(done + part / parts, f"{name}: {how_much}")
+                progress.show(done + part / parts, len(cases), f"{name}: {how_much}")
 
             with INTERRUPTS.held() if holds else contextlib.nullcontext():
                 run = measure(*case, progress=show_part)
-            if (problem := getattr(run, "problem", None)) and console.is_terminal:
-                say(console, f"{name}: {problem}")
+            if (problem := getattr(run, "problem", None)) and progress.console.is_terminal:
+                say(progress.console, f"{name}: {problem}")
             yield run
             INTERRUPTS.check()
-
-
-@contextlib.contextmanager
-def _show_progress(total: int) -> Iterator[tuple[Console, Callable[[float, str], None]]]:
-    """Shows a bar of ``total`` runs on standard error if that is a terminal.
-
-    Yields a console that prints above the bar, and a function to call with how many runs are done, and what is done.
-    """
-    console = Console(stderr=True)
-    columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("Measuring", total=total)
-        yield console, lambda done, description: progress.update(task, completed=done, description=description)
 
 
 def run_paper(arguments: argparse.Namespace) -> None:
@@ -195,7 +182,7 @@ def run_paper(arguments: argparse.Namespace) -> None:
         if importlib.util.find_spec("matplotlib") is None:
             raise ValueError("--figure needs matplotlib: pip install 'warp-bsc[bench]'")
     _check_json(arguments.json, scenes_of_detector.is_scene_name, "a scene", "scenes")
-    effort = paper.Effort.quick() if arguments.quick else paper.Effort.full()
+    effort = paper.QUICK if arguments.quick else paper.FULL
     needs_assets = not arguments.scenes or any(name in scenes_of_detector.PAPER_SCENES for name in arguments.scenes)
     known = (
         dict(zip(scenes_of_detector.PAPER_SCENES, scenes_of_detector.paper_scenes(), strict=True))
@@ -231,12 +218,12 @@ def _measure_scenes(scenes: list, places: list[paper.Place], effort: paper.Effor
     compare = ipc_toolkit.is_installed()
     parts = 4 + len({str(place.device) for place in places}) + len(places) + 2 * compare
     benchmarks = []
-    with _show_progress(parts * len(scenes)) as (_, show):
+    with RunProgress("Measuring") as progress:
         for index, (name, intervals) in enumerate(scenes):
             done = itertools.count(parts * index)
 
             def show_part(part: str, name: str = name, done: Iterator[int] = done) -> None:
-                show(next(done), f"{Path(name).stem}: {part}")
+                progress.show(next(done), parts * len(scenes), f"{Path(name).stem}: {part}")
 
             benchmarks.append(
                 paper.benchmark_scene(name, intervals, places, effort, compare=compare, progress=show_part)
@@ -290,12 +277,12 @@ def run_queries(arguments: argparse.Namespace) -> None:
 def _measure_random(arguments: argparse.Namespace, device: wp.Device) -> None:
     """Measures random queries in each mode."""
 
-    def measure() -> Generator[queries.QueryBenchmark, None, None]:
+    def measure() -> Generator[dict[str, Any], None, None]:
         with loading_kernels(device):
             for kind in PairKind:
                 queries.benchmark_queries(kind, count=1, device=device, repeat=1)
         for kind in PairKind:
-            yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)
+            yield queries.benchmark_queries(kind, count=arguments.count, device=device, repeat=arguments.repeat)[0]
 
     copy_rate = queries.benchmark_copy(device=device, repeat=arguments.repeat)
     settings = {"threads": count_threads(), "repeat": arguments.repeat, "seed": SEED}

@@ -7,23 +7,30 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .._atomic_file import naming
 from ..bench.tables import Column
 from ..detection.detector import CollisionDetector
 from ..detection.mesh import CollisionMesh
+from ..mesh_files.check import check
+from ..mesh_files.frames import Frames, find_frames
 from ..mesh_files.mesh_file import MeshScene
-from ..repairing.check import check
 from ..repairing.surface import weld_borders, welded
+from ..scene_replay.html_report import ReportPage
+from ..scene_replay.summary import Summary
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
-from .options import DEVICE, JSON, Commands, add_command, add_fail_on, add_options, several
-from .repair_files import in_words
+from .options import DEVICE, JSON, Commands, add_command, add_fail_on, add_options, file_option, several
+from .progress import RunProgress
+from .repair_files import check_page, in_words, read_frames
+from .repair_run import tracked
 from .tables import Console, print_table, say
 
 _DESCRIPTION = """\
-Find what crosses, touches or lies inside in mesh files (.obj, .off, .ply, .stl),
-exactly, and the faces and edges that are not sound. Several files are one scene.
-Two files of the same faces are the start and the end of a motion: find the
-collisions in it, and what crosses at either end.
+Find what crosses, touches or lies inside in mesh files (.glb, .obj, .off, .ply,
+.stl), exactly, and the faces and edges that are not sound. Several files are one
+scene. A name such as coat_####.ply, or 'coat_*.ply' in quotes, stands for the
+frames of a motion: find the collisions between each two, and what crosses in
+each. Two files of the same faces are a motion, too.
 Vertices of borders in one place are one, as at seams of textures. Elements are
 named by their numbers in their files, which count from 0; --json has all."""
 
@@ -33,6 +40,7 @@ examples:
   warp-bsc check body.obj garment.ply --json > findings.json
   warp-bsc check part.stl --fail-on intersections,borders,degenerate
   warp-bsc check frame_11.ply frame_12.ply --fail-on collisions
+  warp-bsc check body.obj 'coat_####.ply' --report coat.html
 
 {explain_statuses(ExitStatus.FOUND)}"""
 
@@ -49,6 +57,9 @@ _KINDS = {
     "borders": "edges of one face",
 }
 
+_OF_POSITIONS = ("intersections", "touching", "inside", "degenerate")
+"""The kinds that are told of each frame; the others, such as seams, only of the frame from which on they are there."""
+
 _COLUMNS = (
     Column("number", len),
     Column("the first", lambda found: in_words(found[0]) if found else None, kind="text"),
@@ -61,29 +72,80 @@ Findings = list[list[dict[str, Any]]]
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
     command = add_command(commands, "check", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    add_options(command, {"files": several("FILE", "a mesh file", nargs="+"), **JSON, **DEVICE})
+    files = several("FILE", "a mesh file; # stands for a digit of the number of a frame", nargs="+")
+    page = file_option("a page with a timeline, every frame in 3D, and a table of what crosses or collides, .html")
+    add_options(command, {"files": files, "--report": page, **JSON, **DEVICE})
     add_fail_on(command, _KINDS)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    files = [MeshScene([path]) for path in arguments.files]
+    check_page(arguments.report)
+    frames = _with_motion(find_frames(arguments.files))
+    is_motion = len(frames.numbers) > 1
     device = find_device(arguments.device)
-    is_motion = len(files) == 2 and np.array_equal(files[0].faces, files[1].faces)
-    with loading_kernels(device):
-        scene = MeshScene(arguments.files)
-        findings = _find_in_motion(files[0], files[1], device) if is_motion else _find(scene, device)
-    notes = [f"{file.path}: {note}" for file in scene.files for note in file.notes]
+    if arguments.report:
+        _report(arguments.report, frames, str(device))
+    findings: dict[str, Findings] = {kind: [] for kind in _KINDS if is_motion or kind != "collisions"}
+    notes: dict[str, None] = {}
+    last, known = None, set()
+    with RunProgress("Checking") as progress, loading_kernels(device, progress.console):
+        for done, paths in enumerate(frames.paths):
+            progress.show(done, len(frames.paths), f"frame {frames.numbers[done]}")
+            scene = MeshScene(paths)
+            notes |= dict.fromkeys(f"{file.path}: {note}" for file in scene.files for note in file.notes)
+            has_motion = last is not None and np.array_equal(last.faces, scene.faces)
+            if last is not None and has_motion:
+                findings["collisions"] += _find_in_motion(last, scene, device)
+            elif last is not None:
+                notes[f"{', '.join(paths)}: other faces than in the frame before, so no motion is checked"] = None
+            names = dict(zip(paths, frames.names, strict=True))
+            before, known = known if has_motion else set(), set()
+            for kind, found in _find(scene, device).items():
+                for elements in found:
+                    key = kind, *((names[element["of"]], str(next(iter(element.values())))) for element in elements)
+                    known.add(key)
+                    if kind in _OF_POSITIONS or key not in before:
+                        findings[kind].append(elements)
+            last = scene
     if arguments.json:
-        facts = {"device": str(device), "is_motion": is_motion, "findings": findings, "notes": notes}
-        print(json.dumps(facts, indent=1))
+        facts = {"device": str(device), "is_motion": is_motion, "frames": frames.numbers}
+        print(json.dumps(facts | {"findings": findings, "notes": list(notes)}, indent=1))
     else:
         console = Console()
         for note in notes:
             say(console, f"note: {note}")
-        what = "the same faces, so the start and the end of a motion" if is_motion else "one configuration"
+        what = "one configuration"
+        if is_motion:
+            what = f"{len(frames.numbers):,} frames from {frames.numbers[0]} to {frames.numbers[-1]}, and their motion"
         say(console, f"{', '.join(arguments.files)}: {what}")
         print_table(console, "found", _COLUMNS, [(_KINDS[kind], found) for kind, found in findings.items()])
+        if arguments.report:
+            say(console, f"Wrote {arguments.report}.")
     return ExitStatus.FOUND if any(findings.get(kind) for kind in arguments.fail_on) else ExitStatus.DONE
+
+
+def _with_motion(frames: Frames) -> Frames:
+    """Returns two files of the same faces as two frames of one mesh; other files as they are."""
+    if len(frames.numbers) > 1 or len(frames.names) != 2:
+        return frames
+    start, end = (MeshScene([path]) for path in frames.paths[0])
+    if not np.array_equal(start.faces, end.faces):
+        return frames
+    return Frames([", ".join(frames.names)], [0, 1], [[path] for path in frames.paths[0]])
+
+
+def _report(path: str, frames: Frames, device: str) -> None:
+    """Writes the page of a replay of the files."""
+    scene = read_frames(frames)
+    page, intervals = ReportPage(path, scene=scene), []
+    try:
+        with naming(path):
+            for result in tracked(scene, "Replaying", device):
+                page.add(result)
+                intervals.append(result.summary)
+            page.finish(Summary(scene, intervals=intervals, method="exact", device=device, clearance=None))
+    finally:
+        page.discard()
 
 
 def _find(scene: MeshScene, device: wp.Device) -> dict[str, Findings]:
@@ -113,15 +175,11 @@ def _find(scene: MeshScene, device: wp.Device) -> dict[str, Findings]:
     }
 
 
-def _find_in_motion(start: MeshScene, end: MeshScene, device: wp.Device) -> dict[str, Findings]:
-    """Returns the collisions of a motion, and what crosses or touches at its ends."""
+def _find_in_motion(start: MeshScene, end: MeshScene, device: wp.Device) -> Findings:
+    """Returns the collisions of a motion."""
     x0, x1 = (x.astype(np.result_type(start.x, end.x)) for x in (start.x, end.x))
     mesh = CollisionMesh(start.faces, len(x0), device=device)
     mesh = welded(mesh, weld_borders(mesh, np.hstack([x0, x1])))
     found = CollisionDetector(mesh, method="exact").detect(x0, x1)
     collisions = [[start.element("vertex", v), start.element("face", f)] for v, f in found.vertex_face]
-    collisions += [[start.element("edge", ends) for ends in mesh.edges[pair]] for pair in found.edge_edge]
-    at_ends = [_find(scene, device) for scene in (start, end)]
-    return {"collisions": collisions} | {
-        kind: at_ends[0][kind] + at_ends[1][kind] for kind in ("intersections", "touching")
-    }
+    return collisions + [[start.element("edge", ends) for ends in mesh.edges[pair]] for pair in found.edge_edge]

@@ -31,7 +31,7 @@ class RunProgress:
         self._bar.disable = as_json or not self._bar.console.is_terminal
         self._task = self._bar.add_task("", total=None, note="")
         self._started = self._last_line = time.monotonic()
-        self._first: tuple[int, float] | None = None  # what was done first, and when: before that, things load
+        self._first: tuple[float, float] | None = None  # what was done first, and when: before that, things load
 
     @property
     def console(self) -> rich.console.Console:
@@ -45,7 +45,7 @@ class RunProgress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def show(self, done: int, total: int, note: str = "", **facts: int) -> None:
+    def show(self, done: float, total: int, note: str = "", **facts: int) -> None:
         """Shows how much of the total is done, and a note; programs get the facts by their names instead."""
         now = time.monotonic()
         if self._as_json:
@@ -60,9 +60,9 @@ class RunProgress:
         self._bar.update(self._task, completed=done, total=total, note=note)
         if self._bar.disable and done and now - self._last_line > LOG_SECONDS:
             self._last_line = now
-            say(self._bar.console, f"{self._activity}: {done} of {total}{', ' * bool(note)}{note}{left}")
+            say(self._bar.console, f"{self._activity}: {int(done)} of {total}{', ' * bool(note)}{note}{left}")
 
-    def _seconds_each(self, done: int, now: float) -> float | None:
+    def _seconds_each(self, done: float, now: float) -> float | None:
         """Returns the mean time of what was done after the first, without that of loading; None if there is none."""
         if self._first is None:
             if done:

@@ -4,12 +4,17 @@ import argparse
 import contextlib
 import json
 import os
+from typing import Any
 
 from .._atomic_file import STDOUT, unfinished_path
+from ..mesh_files.file_scene import FileScene, FrameFiles
+from ..mesh_files.frames import find_frames, make_folder
 from ..mesh_files.mesh_file import is_mesh_file
 from ..repairing.shot.findings import kept_meshes
 from ..repairing.shot.report import RepairPage
 from ..scene_replay.hit_files import replay_facts
+from ..usd.scene import Scene
+from ..usd.write.points_layer import PointsLayer
 from .device import find_device, load_detector, loading_kernels
 from .exit_status import ExitStatus, explain_statuses
 from .options import (
@@ -27,7 +32,7 @@ from .options import (
     positive_real,
     scene_path,
 )
-from .repair_files import repair_files
+from .repair_files import check_page, read_frames, repair_files
 from .repair_run import RepairRun, count_found, find
 from .repair_tables import print_repair
 from .replay_options import add_scene_selection, describe_selection, read_scene, read_selection
@@ -49,9 +54,10 @@ of its own. The layer is then replayed, and what remains is named.
 If Ctrl-C, SIGTERM, SIGHUP, an error or a full disk stops the run, the layer
 ends at the last repaired frame, and is marked partial. If it is killed too, a
 file beside the layer remains from which --resume continues.
-Mesh files (.obj, .off, .ply, .stl) are one configuration: they are written again
-with coordinates at which no edge meets a face, all else as it was, and what was
-written is read and checked exactly. Several files are one scene."""
+Mesh files (.glb, .obj, .off, .ply, .stl) are written again with coordinates at
+which no edge meets a face, all else as it was, and what was written is read and
+checked exactly. Several files are one scene. A name such as coat_####.ply, or
+'coat_*.ply' in quotes, stands for the frames of a shot, repaired as one of USD."""
 
 _EPILOG = f"""\
 examples:
@@ -63,18 +69,20 @@ examples:
   warp-bsc repair shot.usd --output fixed.usdc --fail-on remaining --json > done.json
   warp-bsc repair garment.obj --output free.obj
   warp-bsc repair body.obj garment.obj --keep body.obj --output free.obj
+  warp-bsc repair body.obj 'coat_####.ply' --output 'free/coat_####.ply'
 
 {explain_statuses(ExitStatus.FOUND, ExitStatus.LEFT_OUT)}"""
 
-_OF_BOTH = {"command_line", "scene", "output", "keep", "min_distance", "json", "fail_on", "device"}
-_OF_FILES = {"max_strain", "order", "previous"}
-"""The options for USD scenes and mesh files, and for mesh files alone. The others are for USD scenes alone."""
+_OF_ALL = {"command_line", "scene", "output", "report", "keep", "min_distance", "json", "fail_on", "device"}
+_OF_ONE_FRAME = {"max_strain", "order", "previous"}
+_OF_FRAMES = {"max_move", "resume"}
+"""The options for everything, for mesh files of one frame alone, and for several frames. Others are for USD alone."""
 
 
 def add_to(commands: Commands, summary: str) -> None:
     """Adds the command with its options, and a line for the list of commands."""
     command = add_command(commands, "repair", _run, summary=summary, description=_DESCRIPTION, epilog=_EPILOG)
-    command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or one or several mesh files")
+    command.add_argument("scene", metavar="SCENE", nargs="+", help="a USD file, demo, or mesh files, # for digits")
     which = command.add_argument_group("selection")
     add_options(which, {"--keep": patterns("obstacles: prims, and all below, or files that stay; * matches any text")})
     add_scene_selection(which)
@@ -102,7 +110,7 @@ def add_to(commands: Commands, summary: str) -> None:
         },
     )
     previous = "the files of a time before at which nothing crosses, such as the last frame, in the same order"
-    files = command.add_argument_group("repair of mesh files")
+    files = command.add_argument_group("repair of mesh files of one frame")
     add_options(files, {"--max-strain": number(positive_real, "strain to keep to (default: %(default)s)", default=0.1)})
     add_options(files, {"--order": flag("the files are sheets, from inside to outside, whose faces point outside")})
     add_options(files, {"--previous": patterns(previous) | {"metavar": "FILE"}})
@@ -111,7 +119,9 @@ def add_to(commands: Commands, summary: str) -> None:
     add_options(
         out,
         {
-            "--output": file_option("the USD layer, .usda, .usdc or .usd; or a mesh file, or a folder", required=True),
+            "--output": file_option(
+                "the USD layer, .usda, .usdc or .usd; or a mesh file, # for digits, or a folder", required=True
+            ),
             "--report": file_option(
                 "a page with a timeline and the moved frames in 3D, before and after, with the moves as colour, .html"
             ),
@@ -127,30 +137,28 @@ def add_to(commands: Commands, summary: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    is_of_files = any(map(is_mesh_file, arguments.scene))
+    frames = find_frames(arguments.scene) if any(map(is_mesh_file, arguments.scene)) else None
+    kind, options = "USD scenes", vars(arguments).keys() - _OF_ONE_FRAME
+    if frames:
+        of_one = len(frames.numbers) == 1
+        kind = "mesh files" if of_one else "frames of mesh files"
+        options = _OF_ALL | (_OF_ONE_FRAME if of_one else _OF_FRAMES)
     for name, value in vars(arguments).items():
-        if name not in _OF_BOTH and (name in _OF_FILES) != is_of_files and value != arguments.default_of(name):
-            raise ValueError(f"--{name.replace('_', '-')} is for {'USD scenes' if is_of_files else 'mesh files'} only")
-    for name in ("output", "report"):
-        if getattr(arguments, name) == STDOUT:
-            raise ValueError(f"--{name} must be a file, not standard output")
-    if is_of_files:
-        return repair_files(arguments)
-    if len(arguments.scene) > 1:
-        raise ValueError("only mesh files can be several")
-    written = [file for file in (arguments.output, arguments.report) if file]
-    written.append(str(unfinished_path(arguments.output)))
-    arguments.scene = scene_path(arguments.scene[0])
-    paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise ValueError(f"{path}: named twice, as two files of a repair")
+        if name not in options and value != arguments.default_of(name):
+            raise ValueError(f"--{name.replace('_', '-')} is not for {kind}")
+    check_page(arguments.report)
+    if arguments.output == STDOUT:
+        raise ValueError("--output must be a file, not standard output")
+    if frames and kind == "mesh files":
+        return repair_files(frames, arguments)
     device = find_device(arguments.device)
     chosen = {"selection": read_selection(arguments), "frames": arguments.frames}
-    scene = read_scene(arguments.scene, arguments, **chosen)
-    for file in written:
-        if file in scene.files:
-            raise ValueError(f"{file}: the scene is read from this file; write to another one")
+    if frames:
+        outputs = frames.outputs(arguments.keep, arguments.output)
+        scene = read_frames(frames)
+        arguments.include_initial = True  # all that crosses is repaired, as in files of one frame
+    else:
+        scene, outputs = _open_usd(arguments, chosen), []
     kept = kept_meshes(scene, arguments.keep)
     with loading_kernels(device):
         load_detector("exact", scene.dtype, device, intersections=True, strands=scene.has_strands)
@@ -162,11 +170,19 @@ def _run(arguments: argparse.Namespace) -> int:
         if arguments.report:
             page = RepairPage(arguments.report)
             stack.callback(page.discard)
-        run = stack.enter_context(contextlib.closing(RepairRun(scene, arguments, str(device), facts)))
+        if isinstance(scene, FileScene):
+            make_folder(arguments.output)
+            layer = FrameFiles(scene, outputs)
+        else:
+            layer = PointsLayer(arguments.output, scene=scene)
+        run = stack.enter_context(contextlib.closing(RepairRun(scene, layer, arguments, str(device), facts)))
         run.run()
         after = run.journal.findings if run.is_whole else None
         if run.is_whole and run.is_written:
-            fixed = read_scene(arguments.output, arguments, **chosen)
+            if isinstance(layer, FrameFiles):
+                fixed = read_frames(layer.frames)
+            else:
+                fixed = read_scene(arguments.output, arguments, **chosen)
             assert run.journal.findings
             after = find(fixed, "Checking", arguments, str(device), run.journal.findings[0].unrepaired_pairs)
         if page and run.journal.findings is not None:
@@ -184,3 +200,25 @@ def _run(arguments: argparse.Namespace) -> int:
     if "remaining" in arguments.fail_on and any(remaining.values()):
         return ExitStatus.FOUND
     return ExitStatus.LEFT_OUT if scene.left_out else ExitStatus.DONE
+
+
+def _open_usd(arguments: argparse.Namespace, chosen: dict[str, Any]) -> Scene:
+    """Opens a USD scene, given the selection and the frames.
+
+    Raises:
+        ValueError: If the options do not fit together, or the file is broken.
+    """
+    if len(arguments.scene) > 1:
+        raise ValueError("only mesh files can be several")
+    written = [file for file in (arguments.output, arguments.report) if file]
+    written.append(str(unfinished_path(arguments.output)))
+    arguments.scene = scene_path(arguments.scene[0])
+    paths = [os.path.realpath(file) for file in [arguments.scene, *written]]
+    for path in paths:
+        if paths.count(path) > 1:
+            raise ValueError(f"{path}: named twice, as two files of a repair")
+    scene = read_scene(arguments.scene, arguments, **chosen)
+    for file in written:
+        if file in scene.files:
+            raise ValueError(f"{file}: the scene is read from this file; write to another one")
+    return scene

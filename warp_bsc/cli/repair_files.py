@@ -2,23 +2,30 @@
 
 import argparse
 import contextlib
-import fnmatch
 import itertools
 import json
-import os
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from .._atomic_file import OutputFile
+from .._atomic_file import STDOUT, OutputFile, naming
 from ..bench.tables import LONGEST, Column, count
 from ..detection.mesh import CollisionMesh
-from ..mesh_files.mesh_file import MeshFile, MeshScene
-from ..repairing.check import find_meeting
+from ..mesh_files.check import find_meeting
+from ..mesh_files.file_scene import FileScene
+from ..mesh_files.frames import Frames, make_folder
+from ..mesh_files.mesh_file import MeshFile, MeshScene, is_mesh_file
 from ..repairing.repair import repair
+from ..repairing.results import RepairResult
+from ..repairing.shot.findings import kept_meshes
+from ..repairing.shot.report import RepairPage
+from ..repairing.shot.stretch import FollowedMesh, ShotFrame, StretchRecorder
+from ..usd.write.points_layer import MovedFrame
 from .device import find_device, loading_kernels
 from .exit_status import ExitStatus
+from .progress import RunProgress
+from .repair_run import find
 from .tables import Console, print_table, say, say_list
 
 _FILES = (
@@ -28,18 +35,35 @@ _FILES = (
 )
 
 
-def repair_files(arguments: argparse.Namespace) -> int:
-    """Runs the command for mesh files, and returns the exit status."""
-    scene = MeshScene(arguments.scene)
-    outputs = _outputs(scene, arguments)
+def check_page(path: str | None) -> None:
+    """Raises a ValueError if a page would be written to standard output, or over a mesh."""
+    if path == STDOUT or (path and is_mesh_file(path)):
+        what = "standard output" if path == STDOUT else path
+        raise ValueError(f"--report must be a file of its own, .html, not {what}")
+
+
+def read_frames(frames: Frames) -> FileScene:
+    """Returns mesh files by frame as a scene, and shows how many have been read."""
+    with RunProgress("Reading") as progress:
+        return FileScene(frames, progress.show)
+
+
+def repair_files(frames: Frames, arguments: argparse.Namespace) -> int:
+    """Runs the command for mesh files of one frame, and returns the exit status."""
+    scene = MeshScene(frames.paths[0])
+    (outputs,) = frames.outputs(arguments.keep, arguments.output, arguments.previous)
     device = find_device(arguments.device)
     previous = MeshScene(arguments.previous) if arguments.previous else None
     if previous and not np.array_equal(previous.faces, scene.faces):
         raise ValueError("--previous: the files must have the faces of the scene")
     kept = np.array([output is None for output in outputs])
     mesh = _mesh_of(scene, kept, device)
+    make_folder(arguments.output)
     with contextlib.ExitStack() as stack:
-        files = []
+        files, page = [], None
+        if arguments.report:
+            page = RepairPage(arguments.report)
+            stack.callback(page.discard)
         for output in filter(None, outputs):
             files.append(OutputFile(output))  # fails before anything is repaired
             stack.callback(files[-1].discard)
@@ -53,12 +77,16 @@ def repair_files(arguments: argparse.Namespace) -> int:
                 min_distance=arguments.min_distance,
                 max_strain=arguments.max_strain,
             )
-        contents = map(MeshFile.with_positions, scene.files, scene.of_files(np.asarray(result.x)))
+        xs = scene.of_files(np.asarray(result.x))
+        contents = map(MeshFile.with_positions, scene.files, xs)
         for file, data in zip(files, itertools.compress(contents, ~kept), strict=True):
             file.write(data)
         for file in files:
             file.commit()
-    written = MeshScene([output or file.path for file, output in zip(scene.files, outputs, strict=True)])
+        paths = [output or file.path for file, output in zip(scene.files, outputs, strict=True)]
+        if page:
+            _write_page(page, read_frames(frames), read_frames(frames._replace(paths=[paths])), xs, result, arguments)
+    written = MeshScene(paths)
     with np.errstate(over="ignore"):
         rounded = written.x.astype(np.float32)
     positions = [written.x, rounded] if np.isfinite(rounded).all() else [written.x]
@@ -106,7 +134,43 @@ def repair_files(arguments: argparse.Namespace) -> int:
             say(console, f"Not repaired: {count(len(lines), 'edge')} through faces: {contour['reason']}.")
             say_list(console, lines, "")
         say(console, f"What was written has been read again: {'' if certified else 'not '}certified.")
+        if page:
+            say(console, f"Wrote {page.file.path}.")
     return ExitStatus.FOUND if arguments.fail_on and any(remaining.values()) else ExitStatus.DONE
+
+
+def _write_page(
+    page: RepairPage,
+    before: FileScene,
+    after: FileScene,
+    xs: list[np.ndarray],
+    result: RepairResult,
+    arguments: argparse.Namespace,
+) -> None:
+    """Writes the page of a repair of one frame, given the files before and after, and the positions of each file."""
+    device, kept = str(find_device(arguments.device)), kept_meshes(before, arguments.keep)
+    segment, time = before.segment(0), before.times[0]
+    given = segment.start_positions
+    x, is_movable = given.copy(), np.zeros(len(given), bool)
+    for number, mesh in enumerate(segment.meshes):
+        x[segment.vertices_of(number)] = xs[number][mesh.points]
+        is_movable[segment.vertices_of(number)] = mesh.name not in kept
+    edges = CollisionMesh(segment.faces, len(given), device=device).edges
+    length = float(np.median(np.linalg.norm(given[edges[:, 0]] - given[edges[:, 1]], axis=1)))
+    recorder = StretchRecorder(FollowedMesh(is_movable, edges, length))
+    (vertices,) = np.nonzero((x != given).any(axis=1))
+    moved = MovedFrame(time, False, segment, vertices, x[vertices].astype(np.float64))
+    recorder.add(ShotFrame(given, x, x - given, result.certified), moved)
+    stretches = [recorder.finish([contour.reason for contour in result.unresolved])]
+    with naming(page.file.name):
+        page.write(
+            before,
+            stretches=lambda: stretches,
+            before=find(before, "Finding", arguments, device, ()),
+            after=find(after, "Checking", arguments, device, ()),
+            kept=kept,
+            min_distance=arguments.min_distance,
+        )
 
 
 def in_words(elements: list[dict[str, Any]]) -> str:
@@ -120,27 +184,3 @@ def _mesh_of(scene: MeshScene, kept: np.ndarray, device: wp.Device) -> Collision
     """Returns the mesh of a scene, in which files that are kept do not meet each other or themselves."""
     is_kept = kept[scene.file_of].astype(int)
     return CollisionMesh(scene.faces, len(scene.x), group=1 + is_kept, mask=3 - 2 * is_kept, device=device)
-
-
-def _outputs(scene: MeshScene, arguments: argparse.Namespace) -> list[str | None]:
-    """Returns where each file is written to, None for those that are kept."""
-    paths = [file.path for file in scene.files]
-    moving = paths
-    for pattern in arguments.keep:
-        matching = {path for path in paths if path == pattern or fnmatch.fnmatchcase(path, pattern)}
-        if not matching:
-            raise ValueError(f"--keep: no file matches {pattern}")
-        moving = [path for path in moving if path not in matching]
-    if len(moving) != 1 and not os.path.isdir(arguments.output):
-        raise ValueError(f"{arguments.output}: must be a folder, as not one file may move; --keep names obstacles")
-    into = os.path.isdir(arguments.output)
-    outputs = {
-        path: os.path.join(arguments.output, os.path.basename(path)) if into else arguments.output for path in moving
-    }
-    read = [os.path.realpath(path) for path in (*paths, *arguments.previous)]
-    for path, output in outputs.items():
-        if [*read, *map(os.path.realpath, outputs.values())].count(os.path.realpath(output)) > 1:
-            raise ValueError(f"{output}: named twice, or read; write to another file")
-        if os.path.splitext(output)[1].lower() != os.path.splitext(path)[1].lower():
-            raise ValueError(f"{output}: must end as {path} does, of which only coordinates are replaced")
-    return [outputs.get(path) for path in paths]

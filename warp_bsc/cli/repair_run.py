@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from .._atomic_file import naming, unfinished_path
+from ..mesh_files.file_scene import FrameFiles
 from ..repairing.shot.findings import Finding, MeshPair, find_collisions
 from ..repairing.shot.journal import Journal
 from ..repairing.shot.repair_shot import repair_shot
@@ -26,7 +27,7 @@ from .progress import RunProgress
 
 
 class RepairRun:
-    """Finds collisions, repairs, and writes the USD layer of the stretches that are done.
+    """Finds collisions, repairs, and writes the USD layer of the stretches that are done, or the files of the frames.
 
     Attributes:
         scene: The scene.
@@ -41,22 +42,30 @@ class RepairRun:
         interrupt: The signal that ended it.
         problems: Messages of errors.
         notes: Messages on what else did not work.
-        output: Path of the USD layer.
-        is_written: Whether there is a layer: there is none if nothing is moved.
+        output: Path of the USD layer, or of the files.
+        is_written: Whether something is written: there is no layer if nothing is moved.
         page: Path of the report, once it is written.
     """
 
-    def __init__(self, scene: Scene, arguments: argparse.Namespace, device: str, facts: dict[str, Any]):
+    def __init__(
+        self,
+        scene: Scene,
+        layer: PointsLayer | FrameFiles,
+        arguments: argparse.Namespace,
+        device: str,
+        facts: dict[str, Any],
+    ):
         """Opens the files.
 
         Args:
             scene: The scene.
+            layer: What is written.
             arguments: The options.
             device: Name of the Warp device.
             facts: Scene and options, which must be the same in a run that resumes this one.
         """
         self.scene, self._arguments, self._device = scene, arguments, device
-        self._layer = PointsLayer(arguments.output, scene=scene)
+        self._layer = layer
         try:
             self.journal = Journal(unfinished_path(arguments.output), facts, resume=arguments.resume)
         except BaseException:
@@ -95,7 +104,8 @@ class RepairRun:
             except Exception as error:
                 self.interrupt = INTERRUPTS.came  # a library may have turned it into another error
                 self.problems += [] if self.interrupt else [describe(error)]
-            if not any(stretch.moved for stretch in self.stretches):
+            is_layer = isinstance(self._layer, PointsLayer)
+            if not done or (is_layer and not any(stretch.moved for stretch in self.stretches)):
                 return  # an earlier file is better than an empty one
             if done < len(self.scene):
                 self._layer.end = self.scene.times[done]
@@ -247,7 +257,7 @@ def find(
 ) -> list[Finding]:
     """Returns what an exact replay of a scene finds, and shows its progress; pairs as of :func:`.find_collisions`."""
     options = {"keep": arguments.keep, "unrepaired_pairs": unrepaired_pairs, "min_distance": arguments.min_distance}
-    return list(find_collisions(scene, _tracked(scene, activity, device), **options, device=device))
+    return list(find_collisions(scene, tracked(scene, activity, device), **options, device=device))
 
 
 def count_found(findings: list[Finding], min_distance: float) -> dict[str, int]:
@@ -266,7 +276,7 @@ def _interval_after(scene: Scene, stretch: RepairedStretch) -> int:
     return len(scene) if stretch.start == stretch.end else scene.times.index(stretch.end)
 
 
-def _tracked(scene: Scene, activity: str, device: str) -> Iterator[IntervalResult]:
+def tracked(scene: Scene, activity: str, device: str) -> Iterator[IntervalResult]:
     """Yields what an exact replay finds, and shows its progress."""
     with RunProgress(activity) as progress:
         progress.show(0, len(scene))

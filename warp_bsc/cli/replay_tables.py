@@ -8,7 +8,7 @@ from ..bench.tables import LONGEST, Column, count
 from ..repairing.shot.findings import kept_meshes
 from ..scene_replay.baseline import NewFinding
 from ..scene_replay.results import Contact, IntersectionSummary, IntervalSummary, Nearest, Work
-from ..scene_replay.scene_contacts import PHASES
+from ..scene_replay.scene_pairs import PHASES
 from ..scene_replay.summary import CERTIFIED_FOR, IntersectionSpan, Summary
 from ..scene_replay.validation import Validation
 from .option_names import with_option

@@ -26,21 +26,26 @@ _MIN_OWN_CLUSTER = 8
 """Connected components with fewer faces share clusters, so that at most three of four places are empty."""
 
 
+_AXES = wp.constant(wp.types.matrix(shape=(8, 2), dtype=int)(1, 0, 0, 1, 1, 1, 1, -1, 2, 1, 2, -1, 1, 2, 1, -2))
+"""Directions in the plane of both coordinates, from pole to pole, along which parts may be split."""
+
+
+@wp.struct
+class _Faces:
+    """The faces of a mesh while they are ordered."""
+
+    links: wp.array2d[int]  # the faces that each is linked to at its edges, -1 for none
+    order: wp.array[int]
+    place_of: wp.array[int]  # in the order
+    visited: wp.array[int]  # stamp of the last search that came to a face
+    queue: wp.array[int]  # a part in another order, by place, as are the next two
+    keys: wp.array[int]
+    buckets: wp.array[int]
+    distances: wp.array2d[int]  # of each face from four poles
+
+
 @wp.func
-def _visit(
-    links: wp.array2d[int],
-    begin: int,
-    end: int,
-    seed: int,
-    stamp: int,
-    order: wp.array[int],
-    place_of: wp.array[int],
-    # in and out
-    visited: wp.array[int],
-    # out
-    queue: wp.array[int],
-    distance: wp.array[int],
-):
+def _visit(faces: _Faces, begin: int, end: int, seed: int, stamp: int, distance: wp.array[int]):
     """Writes the faces of a part to a queue, breadth first from a seed, and their distances.
 
     The part is ``order[begin:end]``. Faces that the seed does not reach follow, in pieces, as if they were next to the
@@ -52,25 +57,25 @@ def _visit(
     face = int(seed)
     steps = int(0)
     while filled < end:
-        while visited[face] == stamp:
-            face = order[scanned]
+        while faces.visited[face] == stamp:
+            face = faces.order[scanned]
             scanned += 1
-        visited[face] = stamp
+        faces.visited[face] = stamp
         distance[face] = steps
-        queue[filled] = face
+        faces.queue[filled] = face
         filled += 1
         while read < filled:
-            face = queue[read]
+            face = faces.queue[read]
             read += 1
             steps = distance[face] + 1
-            for k in range(links.shape[1]):
-                other = links[face, k]
+            for k in range(faces.links.shape[1]):
+                other = faces.links[face, k]
                 if other >= 0:
-                    place = place_of[other]
-                    if place >= begin and place < end and visited[other] != stamp:
-                        visited[other] = stamp
+                    place = faces.place_of[other]
+                    if place >= begin and place < end and faces.visited[other] != stamp:
+                        faces.visited[other] = stamp
                         distance[other] = steps
-                        queue[filled] = other
+                        faces.queue[filled] = other
                         filled += 1
 
 
@@ -89,36 +94,27 @@ def _split_at(begin: int, end: int):
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _find_components(
-    links: wp.array2d[int],
-    # in and out
-    order: wp.array[int],
-    visited: wp.array[int],
-    # out
-    starts: wp.array[int],
-    component_count: wp.array[int],
-    queue: wp.array[int],
-):
-    """Writes the faces by connected component, and where each component starts."""
+def _find_components(faces: _Faces, starts: wp.array[int], component_count: wp.array[int]):
+    """Writes the faces by connected component to the queue, and where each component starts."""
     count = int(0)
     filled = int(0)
-    for i in range(order.shape[0]):
-        if visited[order[i]] == 0:
+    for i in range(faces.order.shape[0]):
+        if faces.visited[faces.order[i]] == 0:
             starts[count] = filled
             count += 1
-            visited[order[i]] = 1
-            queue[filled] = order[i]
+            faces.visited[faces.order[i]] = 1
+            faces.queue[filled] = faces.order[i]
             read = int(filled)
             filled += 1
             while read < filled:
-                face = queue[read]
+                face = faces.queue[read]
                 read += 1
-                for k in range(links.shape[1]):
-                    other = links[face, k]
+                for k in range(faces.links.shape[1]):
+                    other = faces.links[face, k]
                     if other >= 0:
-                        if visited[other] == 0:
-                            visited[other] = 1
-                            queue[filled] = other
+                        if faces.visited[other] == 0:
+                            faces.visited[other] = 1
+                            faces.queue[filled] = other
                             filled += 1
     component_count[0] = count
 
@@ -141,44 +137,22 @@ def _farthest(begin: int, end: int, order: wp.array[int], distances: wp.array2d[
 
 @wp.func
 def _coordinate(axis: int, face: int, distances: wp.array2d[int]):
-    """Returns the coordinate of a face along one of four axes: from pole to pole, and the two between these."""
+    """Returns the coordinate of a face along an axis."""
     u = distances[0, face] - distances[1, face]
     v = distances[2, face] - distances[3, face]
-    if axis == 0:
-        return u
-    if axis == 1:
-        return v
-    if axis == 2:
-        return u + v
-    if axis == 3:
-        return u - v
-    if axis == 4:
-        return 2 * u + v
-    if axis == 5:
-        return 2 * u - v
-    if axis == 6:
-        return u + 2 * v
-    return u - 2 * v
+    axes = _AXES
+    return axes[axis, 0] * u + axes[axis, 1] * v
 
 
 @wp.func
-def _sort(
-    begin: int,
-    end: int,
-    axis: int,
-    order: wp.array[int],
-    distances: wp.array2d[int],
-    # scratch
-    keys: wp.array[int],
-    buckets: wp.array[int],
-    # out
-    sorted_faces: wp.array[int],
-):
-    """Sorts the faces of a part along an axis, by counting."""
-    lowest = _coordinate(axis, order[begin], distances)
+def _sort(faces: _Faces, begin: int, end: int, axis: int):
+    """Writes the faces of a part to the queue, sorted along an axis, by counting."""
+    keys = faces.keys
+    buckets = faces.buckets
+    lowest = _coordinate(axis, faces.order[begin], faces.distances)
     highest = lowest
     for i in range(begin, end):
-        key = _coordinate(axis, order[i], distances)
+        key = _coordinate(axis, faces.order[i], faces.distances)
         lowest = wp.min(lowest, key)
         highest = wp.max(highest, key)
         keys[i] = key
@@ -195,54 +169,28 @@ def _sort(
         place += size
     for i in range(begin, end):
         bucket = keys[i]
-        sorted_faces[buckets[bucket]] = order[i]
+        faces.queue[buckets[bucket]] = faces.order[i]
         buckets[bucket] = buckets[bucket] + 1
 
 
 @wp.func
-def _count_cut(
-    links: wp.array2d[int],
-    begin: int,
-    split: int,
-    end: int,
-    stamp: int,
-    sorted_faces: wp.array[int],
-    place_of: wp.array[int],
-    # in and out
-    visited: wp.array[int],
-):
-    """Returns how many links the two halves of a part have with one another."""
+def _count_cut(faces: _Faces, begin: int, split: int, end: int, stamp: int):
+    """Returns how many links the two halves of a part in the queue have with one another."""
     for i in range(begin, split):
-        visited[sorted_faces[i]] = stamp
+        faces.visited[faces.queue[i]] = stamp
     cut = int(0)
     for i in range(split, end):
-        for k in range(links.shape[1]):
-            other = links[sorted_faces[i], k]
+        for k in range(faces.links.shape[1]):
+            other = faces.links[faces.queue[i], k]
             if other >= 0:
-                place = place_of[other]
-                if place >= begin and place < end and visited[other] == stamp:
+                place = faces.place_of[other]
+                if place >= begin and place < end and faces.visited[other] == stamp:
                     cut += 1
     return cut
 
 
 @wp.kernel(**NO_GRADIENTS)
-def _halve_parts(
-    first: int,
-    links: wp.array2d[int],
-    parts: wp.array[wp.vec2i],
-    stamp: int,
-    # in and out
-    order: wp.array[int],
-    place_of: wp.array[int],
-    visited: wp.array[int],
-    # scratch
-    queue: wp.array[int],
-    keys: wp.array[int],
-    buckets: wp.array[int],
-    distances: wp.array2d[int],
-    # out
-    splits: wp.array[int],
-):
+def _halve_parts(first: int, faces: _Faces, parts: wp.array[wp.vec2i], stamp: int, splits: wp.array[int]):
     """Orders each part by the half that its faces are in; parts may be halved at once, as no face is in two.
 
     A part has the places from the first to before the second of its numbers. ``stamp`` is :data:`_STAMPS` more than in
@@ -251,27 +199,28 @@ def _halve_parts(
     i = first + wp.tid()
     begin = parts[i][0]
     end = parts[i][1]
-    _visit(links, begin, end, order[begin], stamp, order, place_of, visited, queue, distances[0])
-    pole = queue[end - 1]
+    order = faces.order
+    _visit(faces, begin, end, order[begin], stamp, faces.distances[0])
+    pole = faces.queue[end - 1]
     for k in range(4):
         if k > 0:
-            pole = _farthest(begin, end, order, distances, k)
-        _visit(links, begin, end, pole, stamp + 1 + k, order, place_of, visited, queue, distances[k])
+            pole = _farthest(begin, end, order, faces.distances, k)
+        _visit(faces, begin, end, pole, stamp + 1 + k, faces.distances[k])
     for k in range(begin, end):
-        order[k] = queue[k]
+        order[k] = faces.queue[k]
     split = _split_at(begin, end)
     best = int(0)
     least_cut = int(2147483647)
     for axis in range(wp.where(end - begin > _LARGE, 4, 8)):
-        _sort(begin, end, axis, order, distances, keys, buckets, queue)
-        cut = _count_cut(links, begin, split, end, stamp + 5 + axis, queue, place_of, visited)
+        _sort(faces, begin, end, axis)
+        cut = _count_cut(faces, begin, split, end, stamp + 5 + axis)
         if cut < least_cut:
             least_cut = cut
             best = axis
-    _sort(begin, end, best, order, distances, keys, buckets, queue)
+    _sort(faces, begin, end, best)
     for k in range(begin, end):
-        order[k] = queue[k]
-        place_of[queue[k]] = k
+        order[k] = faces.queue[k]
+        faces.place_of[faces.queue[k]] = k
     splits[i] = split
 
 
@@ -333,14 +282,14 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     def on_host(values: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=int, device="cpu")
 
-    links = _links(faces)
-    order = on_host(np.arange(n) if world is None else np.argsort(world, kind="stable"))
-    starts, count, queue = on_host(np.zeros(n)), on_host(np.zeros(1)), wp.empty_like(order)
-    inputs = [on_host(links), order, on_host(np.zeros(n)), starts, count, queue]
-    launch(_find_components, 1, inputs=inputs, device="cpu", record_tape=False)
+    links, mesh = _links(faces), _Faces()
+    order = np.arange(n) if world is None else np.argsort(world, kind="stable")
+    mesh.links, mesh.order, mesh.visited, mesh.queue = map(on_host, (links, order, np.zeros(n), np.zeros(n)))
+    starts, count = on_host(np.zeros(n)), on_host(np.zeros(1))
+    launch(_find_components, 1, inputs=[mesh, starts, count], device="cpu", record_tape=False)
 
     # neighbours get numbers close to one another, for the sake of processor caches
-    face_of = queue.numpy()
+    face_of = mesh.queue.numpy()
     number_of = np.empty(n + 1, dtype=np.int32)
     number_of[face_of] = np.arange(n)
     number_of[-1] = -1
@@ -353,16 +302,17 @@ def order_faces(faces: np.ndarray, world: np.ndarray | None = None) -> np.ndarra
     numbers[place_of] = np.arange(n)
 
     device = wp.get_device("cpu")
-    result, links_on_host, place_of, visited = on_host(numbers), on_host(links), on_host(place_of), on_host(np.zeros(n))
-    scratch = [*(wp.empty_like(result) for _ in range(3)), wp.empty((4, n), dtype=int, device=device)]
+    mesh.links, mesh.order, mesh.place_of, mesh.visited = map(on_host, (links, numbers, place_of, np.zeros(n)))
+    mesh.queue, mesh.keys, mesh.buckets = (wp.empty_like(mesh.order) for _ in range(3))
+    mesh.distances = wp.empty((4, n), dtype=int, device=device)
     parts = np.stack([places[:-1], places[:-1] + sizes], axis=1)
     stamp = 1
     while len(parts := parts[parts[:, 1] - parts[:, 0] > CLUSTER]):
         splits = wp.empty(len(parts), dtype=int, device=device)
-        inputs = [links_on_host, wp.array(parts.astype(np.int32), dtype=wp.vec2i, device=device), stamp]
-        inputs += [result, place_of, visited, *scratch]
+        inputs = [mesh, wp.array(parts.astype(np.int32), dtype=wp.vec2i, device=device), stamp]
         launch_over(_halve_parts, len(parts), inputs=inputs, outputs=[splits], device=device, chunk=1)
         middle = splits.numpy()
         parts = np.concatenate([np.stack([parts[:, 0], middle], axis=1), np.stack([middle, parts[:, 1]], axis=1)])
         stamp += _STAMPS
-    return np.where(result.numpy() < 0, -1, face_of[result.numpy()])
+    result = mesh.order.numpy()
+    return np.where(result < 0, -1, face_of[result])

@@ -10,7 +10,7 @@ from .._arguments import check_finite
 from ..kernels.exact.inversion import tetrahedron_inverts_in
 from ..kernels.exact.polygon import BITS
 from ..kernels.inversion import first_inversion
-from ..kernels.motion import doubles
+from ..kernels.motion import query_at
 from ..kernels.signs import FREE, HIT, ROUNDOFF, UNSURE
 from .mesh import CollisionMesh
 from .run.launch import launch_over, made_once
@@ -57,10 +57,8 @@ def _classify(dtype: type) -> wp.Kernel:
         within_tolerance: wp.array[bool],
     ):
         i = first + wp.tid()
-        a, b, c, d = tets[i, 0], tets[i, 1], tets[i, 2], tets[i, 3]
-        a0, b0, c0, d0 = doubles(x0[a], x0[b], x0[c], x0[d])
-        a1, b1, c1, d1 = doubles(x1[a], x1[b], x1[c], x1[d])
-        found = first_inversion(a0, b0, c0, d0, a1, b1, c1, d1, roundoff, tolerance)
+        vertices = wp.vec4i(tets[i, 3], tets[i, 0], tets[i, 1], tets[i, 2])
+        found = first_inversion(query_at(x0, x1, vertices), roundoff, tolerance)
         status[i] = wp.int8(found.status)
         toi[i] = found.toi
         within_tolerance[i] = found.within_tolerance == 1
@@ -86,10 +84,8 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
         i = first + wp.tid()
         if int(status[i]) != UNSURE:
             return
-        a, b, c, d = tets[i, 0], tets[i, 1], tets[i, 2], tets[i, 3]
-        a0, b0, c0, d0 = doubles(x0[a], x0[b], x0[c], x0[d])
-        a1, b1, c1, d1 = doubles(x1[a], x1[b], x1[c], x1[d])
-        status[i] = wp.int8(tetrahedron_inverts(a0, b0, c0, d0, a1, b1, c1, d1))
+        vertices = wp.vec4i(tets[i, 3], tets[i, 0], tets[i, 1], tets[i, 2])
+        status[i] = wp.int8(tetrahedron_inverts(query_at(x0, x1, vertices)))
 
     return decide_exactly
 

@@ -282,7 +282,7 @@ class DetectionPipeline:
                 None for all.
             proximities: Whether contacts with minimum distances of a response include pairs that are only near.
             sort: Whether to sort the contacts for :meth:`NarrowPhase.ordered_contacts`.
-            keep_separated: As of :meth:`.BroadPhase.pair_elements`.
+            keep_separated: As of :meth:`.BroadPhaseHierarchy.pair_elements`.
             queued: Whether to take the candidates of the last run, which kept those that an axis separates, in place of
                 seeking them: each position at the end is to be between its own there and that at the start.
             timer: Measures the phases.
@@ -334,7 +334,7 @@ class DetectionPipeline:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d on the mesh's device.
             x1: Positions at the end, of the same type.
-            changed: As of :meth:`.BroadPhase.pair_elements`.
+            changed: As of :meth:`.BroadPhaseHierarchy.pair_elements`.
             keep_separated: The same.
         """
         self._pad_arcs()

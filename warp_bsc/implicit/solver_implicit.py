@@ -91,15 +91,6 @@ class _Inertia(SolverBase):
         wp.launch(steps.predict_positions, model.particle_count, inputs=inputs, outputs=outputs, device=model.device)
 
 
-def _radii_of_strands(model: newton.Model) -> np.ndarray | None:
-    """Returns the radii of particles without triangles and tetrahedra, 0 for others [m]; None if all are 0."""
-    radii = host_array(model.particle_radius).astype(np.float64)
-    for elements in (model.tri_indices, model.tet_indices):
-        if elements is not None:
-            radii[elements.numpy().ravel()] = 0.0
-    return radii if radii.any() else None
-
-
 class SolverImplicit(SolverCCD):
     """Steps cloth and soft bodies by one implicit solve a step, which has contact and friction in it.
 
@@ -130,12 +121,14 @@ class SolverImplicit(SolverCCD):
     ``body_inv_inertia`` and ``gravity``; ``tri_poses``, ``tri_areas``, ``tri_materials``, ``edge_rest_angle``,
     ``edge_rest_length``, ``edge_bending_properties``, ``tet_poses``, ``tet_materials``, ``spring_rest_length``,
     ``spring_stiffness`` and ``spring_damping``; points, stiffness and damping of attachments; coefficients of friction
-    of particles, shapes and pairs; and to kinematic particles and bodies that a program moves. The implicit function
-    theorem makes them of each converged step, with friction and closest points as they move, by one linear solve, see
-    :mod:`.gradients.equations`. They are NaN, and counted, in worlds whose step did not converge. Such a model is
-    solved closer, in some two Newton steps more. Two things count as constant: which pairs are near, and by how much
-    barriers are stiffer where solids and taut elements press. :mod:`.gradients.between_steps` says where gradients of
-    kinematic particles and bodies are that a program moves between steps.
+    of particles, shapes and pairs; distances that pairs keep, as ``min_distance`` and ``particle_radius`` give them, or
+    ``particle_radius`` and ``shape_margin`` of the model; and to kinematic particles and bodies that a program moves.
+    The implicit function theorem makes them of each converged step, with friction and closest points as they move, by
+    one linear solve, see :mod:`.gradients.equations`. They are NaN, and counted, in worlds whose step did not converge.
+    Such a model is solved closer, in some two Newton steps more. Three things count as constant: which pairs are near,
+    by how much barriers are stiffer where solids and taut elements press, and how far they reach, which radii of the
+    model limit at construction. :mod:`.gradients.between_steps` says where gradients of kinematic particles and bodies
+    are that a program moves between steps.
 
     Limitations:
         Restitution does not exist: contacts are without bounce, and implicit steps damp.
@@ -153,7 +146,7 @@ class SolverImplicit(SolverCCD):
     """
 
     _near = 0.0  # no constraints for near pairs: barriers keep them apart
-    _has_few_contacts = True
+    _has_few_contacts = _keeps_strands = True
     report: ImplicitStepReport
     _report_type = ImplicitStepReport
 
@@ -163,7 +156,7 @@ class SolverImplicit(SolverCCD):
         *,
         friction: float | wp.array[float] | FrictionTable | None = None,
         bodies: Literal["solved", "ignored"] = "solved",
-        min_distance: float | Literal["model"] | None = None,
+        min_distance: float | Literal["model"] | wp.array[float] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         inversions: Inversions = "allowed",
@@ -181,8 +174,8 @@ class SolverImplicit(SolverCCD):
             min_distance: Distance that pairs keep [m], or ``"model"``. Barriers push beyond it. Without this and
                 ``particle_radius``, springs and particles without faces, such as ropes and grains, collide by their
                 radii, as they have no other surface; cloth and shapes keep no distance. Where those radii are 0, they
-                take no part, and a warning says so.
-            particle_radius: Radius of each particle [m], or one for all.
+                take no part, and a warning says so. An array, of one element, may require gradients.
+            particle_radius: Radius of each particle [m], or one for all. An array may require gradients.
             collision_filter: Groups and masks of particles and shapes.
             inversions: What happens to tetrahedra that invert: ``"allowed"``, ``"reported"`` or ``"prevented"``.
             max_iterations: Newton steps of a step at most; it ends earlier where they converge, in some 2 if nothing
@@ -221,8 +214,6 @@ class SolverImplicit(SolverCCD):
         if max_iterations is None:
             max_iterations = MAX_PRECISE_STEPS if model.requires_grad else MAX_STEPS
         max_steps = checked_integer(max_iterations, "max_iterations", 1)
-        if model.particle_count and min_distance is None and particle_radius is None:
-            particle_radius = _radii_of_strands(model)
         super().__init__(
             _Inertia(model, moves_bodies=moves),
             bodies="separated" if moves and _dynamic_bodies(model).any() else "ignored",
@@ -336,7 +327,8 @@ class SolverImplicit(SolverCCD):
         names += ["tet_poses", "tet_materials"]
         names += [f"edge_{name}" for name in ("rest_angle", "rest_length", "bending_properties")]
         names += [f"spring_{name}" for name in ("rest_length", "stiffness", "damping")]
-        arrays = [*friction.inputs, *(getattr(model, name) for name in names)]
+        distances = [] if self.mesh.distance_arrays is None else self.mesh.distance_arrays.inputs
+        arrays = [*friction.inputs, *distances, *(getattr(model, name) for name in names)]
         attached = attachment_arrays(model)
         if attached is not None:
             arrays += [attached.body_point, attached.stiffness, attached.damping]

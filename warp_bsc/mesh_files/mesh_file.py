@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from .._atomic_file import naming
+from .glb import read_glb
 from .ply import read_ply
-from .text_formats import read_obj, read_off, read_stl
+from .text_formats import first_of_each, read_obj, read_off, read_stl
 
-READERS = {".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl}
+READERS = {".glb": read_glb, ".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl}
 """The function that reads the files whose names end so."""
 
 
@@ -40,7 +41,7 @@ class MeshFile:
         with naming(path):
             self._data = Path(path).read_bytes()
         try:
-            places, self._dtype, self._is_text, counts, corners, notes = READERS[suffix](self._data)
+            places, self._dtype, self._is_text, counts, corners, notes, self._finish = READERS[suffix](self._data)
             self._places = np.asarray(places, np.int64).reshape(-1, 3, 2)
             counts, corners = np.asarray(counts, np.int64), np.asarray(corners, np.int64)
             self._points = points = self._read_points()
@@ -50,8 +51,8 @@ class MeshFile:
         self.notes = notes + ["polygons are checked as fans from the first corner"] * bool((counts > 3).any())
         self.x, self._vertices = points, np.arange(len(points))
         if suffix == ".stl":
-            self.x, vertices = np.unique(points, axis=0, return_inverse=True)
-            self._vertices = vertices.reshape(-1)  # NumPy 2.0 shapes it otherwise
+            order, self._vertices = first_of_each(points)  # so that frames of one soup have the same faces
+            self.x = points[order]
         in_face = counts - 2
         self.polygons = np.repeat(np.arange(len(counts)), in_face)
         first = (np.cumsum(counts) - counts)[self.polygons]
@@ -66,7 +67,7 @@ class MeshFile:
         if not self._is_text:
             data = np.frombuffer(self._data, np.uint8).copy()
             data[places[:, :1] + np.arange(self._dtype.itemsize)] = values[:, None].view(np.uint8)
-            return data.tobytes()
+            return self._finish(data.tobytes())
         parts, at = [], 0
         for row in np.argsort(places[:, 0]):
             parts += self._data[at : places[row, 0]], repr(values[row].item()).encode()

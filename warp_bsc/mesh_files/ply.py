@@ -53,7 +53,7 @@ def read_ply(data: bytes) -> Contents:
     if order:
         starts = np.concatenate(places)
         places = np.stack([starts, starts + dtype.itemsize], axis=2)
-    return (places, dtype, not order, counts, corners, notes)
+    return Contents(places, dtype, not order, counts, corners, notes)
 
 
 def _read_header(data: bytes, header: re.Match) -> list[tuple[str, int, list[tuple[str, str, str]]]]:

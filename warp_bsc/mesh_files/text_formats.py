@@ -1,7 +1,8 @@
 """Reads OBJ, OFF and STL files, and the lines of text files. Errors are ValueErrors, which name the line."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,10 +15,26 @@ _LINE = re.compile(rb"[^\r\n]*[^\s][^\r\n]*")
 _WORD = re.compile(rb"\S+")
 
 
-Contents = tuple[Sequence | np.ndarray, np.dtype, bool, Sequence | np.ndarray, Sequence | np.ndarray, list[str]]
-"""The first byte of x, y and z of each point and the byte after it, their type, whether they are text; the number of
-corners of each polygon, and the points of all corners; notes on what is not checked, or kept although it may not fit.
-"""
+class Contents(NamedTuple):
+    """The contents of a file.
+
+    Attributes:
+        places: The first byte of x, y and z of each point, and the byte after it.
+        dtype: Type of these numbers.
+        is_text: Whether they are text.
+        counts: Number of corners of each polygon.
+        corners: The points of all corners.
+        notes: What is not checked, or kept although it may not fit other positions.
+        finish: Returns the bytes with what else depends on the positions, given those in which they are replaced.
+    """
+
+    places: Sequence | np.ndarray
+    dtype: np.dtype
+    is_text: bool
+    counts: Sequence | np.ndarray
+    corners: Sequence | np.ndarray
+    notes: list[str]
+    finish: Callable[[bytes], bytes] = bytes
 
 
 def read_obj(data: bytes) -> Contents:
@@ -35,7 +52,7 @@ def read_obj(data: bytes) -> Contents:
     notes = [KEPT_NORMALS] if re.search(rb"^[ \t]*vn[ \t]", data, re.MULTILINE) else []
     if unchecked := len(_OBJ_UNCHECKED.findall(data)):
         notes.append(f"lines, points, curves and surfaces are not checked: {unchecked:,}")
-    return (places, _DOUBLE, True, counts, corners, notes)
+    return Contents(places, _DOUBLE, True, counts, corners, notes)
 
 
 def read_off(data: bytes) -> Contents:
@@ -54,7 +71,7 @@ def read_off(data: bytes) -> Contents:
         words = text[start:end].split()
         counts += integers(text, start, words, 1)
         corners += integers(text, start, words[1:], counts[-1])
-    return (places, _DOUBLE, True, counts, corners, [KEPT_NORMALS] if header[1] else [])
+    return Contents(places, _DOUBLE, True, counts, corners, [KEPT_NORMALS] if header[1] else [])
 
 
 def read_stl(data: bytes) -> Contents:
@@ -63,14 +80,21 @@ def read_stl(data: bytes) -> Contents:
     if len(data) == 84 + 50 * count:
         starts = 96 + 50 * np.arange(count)[:, None] + 4 * np.arange(9)
         places = np.stack([starts, starts + 4], axis=2)
-        return (places, np.dtype("<f4"), False, np.full(count, 3), np.arange(3 * count), [KEPT_NORMALS])
+        return Contents(places, np.dtype("<f4"), False, np.full(count, 3), np.arange(3 * count), [KEPT_NORMALS])
     if not data.lstrip().startswith(b"solid"):
         raise ValueError("it is neither a text STL nor a binary one of the length that its count of facets says")
     places = [place for vertex in _STL_VERTEX.finditer(data) for place in coordinates(data, vertex.span(1))]
     *counts, rest = (len(_STL_VERTEX.findall(loop)) for loop in data.split(b"endloop"))
     if rest:
         raise ValueError("it ends within a facet")
-    return (places, _DOUBLE, True, counts, range(sum(counts)), [KEPT_NORMALS])
+    return Contents(places, _DOUBLE, True, counts, range(sum(counts)), [KEPT_NORMALS])
+
+
+def first_of_each(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the rows that are the first with their value, ascending, and for each row the number of its value."""
+    _, first, numbers = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    order = np.sort(first)
+    return order, np.searchsorted(order, first[numbers.reshape(-1)])  # NumPy 2.0 shapes it otherwise
 
 
 def lines_of(text: bytes, at: int) -> Iterator[tuple[int, int]]:

@@ -12,7 +12,7 @@ from ..detection.mesh import CollisionMesh
 from ..detection.run.launch import launch
 from ..response.report.inside import Inside, InsideFinder
 from ..response.state.mesh import ModelMesh, Placement, elements_of
-from ..response.state.planes import transformed_plane
+from ..response.state.motion import plane_in
 from .contours import connected_components
 from .solids import leave_solid, leave_solid_whole, spread_exits
 from .surface import Surface, differ, weld_borders
@@ -128,8 +128,7 @@ class ModelSurface(Surface):
 @wp.kernel(enable_backward=False, module="unique")
 def _place_planes(place: Placement, planes: wp.array[wp.vec4d]):
     """Writes the infinite planes of a model where its bodies are."""
-    i = wp.tid()
-    planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)
+    planes[wp.tid()] = plane_in(place, wp.tid())
 
 
 def _planes_in(mesh: ModelMesh, state: newton.State) -> np.ndarray:

@@ -10,7 +10,7 @@ from newton.solvers import SolverBase
 from .._one_thread import one_at_a_time
 from ..detection.run.host_function import run_on_host
 from .contacts.detect import inspect
-from .drive.inner_steps import WholeSteps
+from .drive.inner_steps import InnerSteps
 from .options import checked_report, default_separation, friction_of
 from .stage import CollisionStage
 from .state.collision_filter import CollisionFilter, checked_filter
@@ -39,7 +39,7 @@ class CollisionMonitor(CollisionStage):
         self,
         solver: SolverBase,
         *,
-        min_distance: float | Literal["model"] | None = None,
+        min_distance: float | Literal["model"] | wp.array[float] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         report: Collection[Literal["worlds"]] = (),
@@ -63,18 +63,18 @@ class CollisionMonitor(CollisionStage):
         _, counts_worlds = checked_report(report, self.model, choices=["worlds"])
         distances = KeptDistances.of(self.model, min_distance, particle_radius)
         collision_filter = checked_filter(collision_filter, self.model)
-        of_mesh = {"collision_filter": collision_filter, "uses_margins": isinstance(min_distance, str)}
+        of_mesh = {"collision_filter": collision_filter, "uses_margins": distances.has_fixed_margins}
         mesh = ModelMesh(self.model, strands=distances.any, **of_mesh)
         self._warn_of_unseen(mesh, distances)
         if distances.any:
-            mesh.distances = mesh.min_distances(distances, reach=0.0)
+            mesh.keep_distances(distances, reach=0.0)
         nothing = wp.zeros(max(1, self.model.shape_count), dtype=float, device=mesh.device)
         friction = friction_of(mesh, nothing[:1], nothing)
         motion = ModelMotion(mesh, friction, watches_turns=True)
         self._allocate(motion, default_separation(mesh), nothing, responds=False)
         if counts_worlds:
             self._count_worlds()
-        self._inner = WholeSteps(self)
+        self._inner = InnerSteps(self)
         self._prepare_entry()
 
     def _resolve(self, step):

@@ -41,7 +41,8 @@ class RolloutOptions:
     Attributes:
         solver: The solver.
         dt: Length of a step [s].
-        every: Whether all states are results, and not the last alone.
+        all_states: Whether all states are results, and not the last alone.
+        every: Steps between two states that a tape keeps, None to keep all.
         rows: Rows of each control; 0 if there are no controls.
         steps: Steps.
     """
@@ -54,6 +55,7 @@ class RolloutOptions:
         states: str,
         state_shapes: dict[str, tuple[int, ...]],
         control_shapes: dict[str, tuple[int, ...]],
+        every: int | None = None,
     ):
         """Checks the arguments.
 
@@ -64,6 +66,7 @@ class RolloutOptions:
             states: ``"last"`` or ``"all"``.
             state_shapes: Shapes of the arrays of the state by name, as of a library without types of vectors.
             control_shapes: The same of the controls.
+            every: Steps between two states that a tape keeps, None to keep all.
 
         Raises:
             TypeError: If an argument has another type.
@@ -74,7 +77,10 @@ class RolloutOptions:
         if not model.requires_grad:
             raise ValueError("solver: its model has no gradients; finalize it with requires_grad=True")
         self.solver, self.dt = solver, checked_number(dt, "dt", 0.0, above=True)
-        self.every = checked_choice(states, "states", ("last", "all")) == "all"
+        self.all_states = checked_choice(states, "states", ("last", "all")) == "all"
+        self.every = None if every is None else checked_integer(every, "every", 1)
+        if every is not None and not hasattr(solver, "_take_checkpointed"):
+            raise TypeError(f"solver must be a SolverImplicit with every={every}, not a {type(solver).__name__}")
         self._control = model.control()
         for name, shape in state_shapes.items():
             if name not in STATE:
@@ -148,10 +154,10 @@ class Rollout:
             self._controls = {name: wp.clone(array, requires_grad=recorded) for name, array in controls.items()}
             self.results: Arrays = {}
             for name in options.result_names():
-                shape = (options.steps if options.every else 1, len(getattr(model, name)))
+                shape = (options.steps if options.all_states else 1, len(getattr(model, name)))
                 dtype = options.dtype_of(name)
                 self.results[name] = wp.zeros(shape, dtype=dtype, device=model.device, requires_grad=recorded)
-            self._tape = wp.Tape()
+            self._tape, self._control = wp.Tape(), model.control()
             if recorded:
                 with self._tape:
                     self._run()
@@ -159,26 +165,35 @@ class Rollout:
                 self._run()
 
     def _run(self):
-        options, model = self._options, self._options.solver.model
+        options = self._options
         start = self._new_state()
         for name, array in self._inputs.items():
             self._launch(_copy, len(array), [array], [getattr(start, name)])
-        held = options.steps // options.rows if options.rows else options.steps
-        control = model.control()
+        if options.every is not None and self._recorded:
+            solver: Any = options.solver
+            of_steps = options.steps, options.every, list(self.results.values())
+            solver._take_checkpointed(self._take, start, self._new_state(), *of_steps)
+            return
         for step in range(options.steps):
-            end, row = self._new_state(), step // held
-            for name, array in self._controls.items():
-                if name not in ADDED:
-                    if step % held == 0:
-                        control = self._with_row(control, name, array, row)
-                elif name not in STATE or step % held == 0:
-                    self._launch(_add_row, array.shape[1], [array, row], [getattr(start, name)])
-            options.solver.step(start, end, control, None, options.dt)
-            if options.every or step + 1 == options.steps:
-                for name, array in self.results.items():
-                    row = step if options.every else 0
-                    self._launch(_write_row, array.shape[1], [getattr(end, name), row], [array])
+            end = self._new_state()
+            self._take(step, start, end)
             start = end
+
+    def _take(self, step, start, end):
+        """Takes a step between two states, by its number."""
+        options, control = self._options, self._control
+        held = options.steps // options.rows if options.rows else options.steps
+        row = step // held
+        for name, array in self._controls.items():
+            if name not in ADDED:
+                control = self._with_row(control, name, array, row)
+            elif name not in STATE or step % held == 0:
+                self._launch(_add_row, array.shape[1], [array, row], [getattr(start, name)])
+        options.solver.step(start, end, control, None, options.dt)
+        if options.all_states or step + 1 == options.steps:
+            for name, array in self.results.items():
+                row = step if options.all_states else 0
+                self._launch(_write_row, array.shape[1], [getattr(end, name), row], [array])
 
     def _new_state(self):
         with paused_tape():  # which would record that it begins as a copy of the model

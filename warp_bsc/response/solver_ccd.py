@@ -12,7 +12,7 @@ from .._arguments import checked_choice, checked_integer
 from .._one_thread import one_at_a_time
 from .._private_names.of_newton import body_q_prev
 from ..detection.run.host_function import run_on_host
-from .drive.inner_steps import InnerSteps, WholeSteps
+from .drive.inner_steps import InnerSteps
 from .drive.style3d_springs import SpringSteps
 from .drive.substeps import Substeps
 from .options import (
@@ -115,7 +115,7 @@ class SolverCCD(CollisionStage):
         restitution: float | wp.array[float] | None = None,
         substeps: int = 1,
         bodies: Bodies = "pushed",
-        min_distance: float | Literal["model"] | None = None,
+        min_distance: float | Literal["model"] | wp.array[float] | None = None,
         particle_radius: float | np.ndarray | wp.array | None = None,
         collision_filter: CollisionFilter | None = None,
         inversions: Inversions = "allowed",
@@ -153,10 +153,12 @@ class SolverCCD(CollisionStage):
                 pairs do not touch, and springs and particles without faces take no part; None warns where there are
                 some that could meet something. ``"model"``: pairs keep the thickness that the model has, the radii of
                 particles, or ``particle_radius`` where that is given, and the margins of shapes
-                (``model.shape_margin``).
+                (``model.shape_margin``). Or a Warp array of float32 of length 1, which each step reads again, as it
+                does radii and margins of a model that requires gradients; what is negative or NaN counts as 0.
             particle_radius: Radius of each particle [m], shape [particle_count], or one for all: pairs keep the sum of
                 their radii beside ``min_distance``. That of an edge or a face is the largest one of its vertices, that
-                of a shape 0, or its margin with ``min_distance="model"``.
+                of a shape 0, or its margin with ``min_distance="model"``. A Warp array must be of float32, and each
+                step reads it again.
             collision_filter: Groups and masks of particles and shapes: pairs that they leave out are delegated to the
                 inner solver, also if ``contacts`` are passed to :meth:`step`, see
                 :class:`.state.collision_filter.CollisionFilter`. None for none. Shapes that do not collide with
@@ -186,15 +188,15 @@ class SolverCCD(CollisionStage):
         self.substeps = checked_integer(substeps, "substeps", 1, MAX_SUBSTEPS)
         self.max_iterations = checked_integer(max_iterations, "max_iterations", 0, MAX_ITERATIONS)
         inversions = checked_choice(inversions, "inversions", get_args(Inversions))
-        distances = KeptDistances.of(self.model, min_distance, particle_radius)
+        distances = KeptDistances.of(self.model, min_distance, particle_radius, of_strands=self._keeps_strands)
         collision_filter = checked_filter(collision_filter, self.model)
         listed_contacts, counts_worlds = checked_report(report, self.model, self.substeps)
-        of_mesh = {"separates_bodies": bodies == "separated", "uses_margins": isinstance(min_distance, str)}
+        of_mesh = {"separates_bodies": bodies == "separated", "uses_margins": distances.has_fixed_margins}
         mesh = ModelMesh(self.model, strands=distances.any, collision_filter=collision_filter, **of_mesh)
         self._warn_of_unseen(mesh, distances)
         self.separation = default_separation(mesh) if separation is None else separation
         if distances.any:
-            mesh.distances = mesh.min_distances(distances, reach=self._near * self.separation)
+            mesh.keep_distances(distances, reach=self._near * self.separation)
         integrator = innermost(solver)
         moves, responds = moves_bodies(bodies, mesh, integrator), bodies == "separated"
         coefficients = friction_of(mesh, self.friction, table=table)
@@ -214,7 +216,7 @@ class SolverCCD(CollisionStage):
 
     def _choose_steps(self, integrator):
         """Returns how the inner solver takes steps."""
-        steps: InnerSteps = WholeSteps(self)
+        steps = InnerSteps(self)
         if isinstance(self.solver, SolverStyle3D):
             steps = SpringSteps(self, self.work)
         elif isinstance(integrator, SolverVBD) and integrator.particle_enable_self_contact:
@@ -240,7 +242,7 @@ class SolverCCD(CollisionStage):
                 f"substeps={self.substeps} of SolverCCD in a coupled solver: give them to its SolverCoupled.Entry"
             )
         super().coupling_notify_iteration_restarts(enabled)
-        self._inner = WholeSteps(self)  # springs would push proxies without a feedback
+        self._inner = InnerSteps(self)  # springs would push proxies without a feedback
 
     def _resolve(self, step):
         has_some = step.contacts is not None and step.contacts.soft_contact_max > 0

@@ -39,6 +39,7 @@ class CollisionStage(CouplingHooks):
     report: SolverReport
     _report_type: type[SolverReport] = SolverReport
     _has_few_contacts = False  # of a solver that leaves hardly any
+    _keeps_strands = False  # apart by the radii of the model, without arguments
     _counter: WorldCounter | None = None  # of results by world, if the report is asked for them
     _inner: InnerSteps  # how the inner solver takes a step
 
@@ -213,6 +214,8 @@ class CollisionStage(CouplingHooks):
     def _prepared(self, step, end):
         """Prepares the motion to the end that the inner solver predicted, in worlds that take part; counts the step."""
         with self._timed(step.number):
+            if self.mesh.distance_arrays is not None:
+                self.mesh.distance_arrays.read()
             self._motion.set_end(end, step.dt)
             with contextlib.nullcontext() if step.mask is None else self._world_mask.applied(step.mask):
                 yield

@@ -27,7 +27,7 @@ from ..usd.selection import Selection
 from .duplicates import Duplicates
 from .results import IntervalResult, Work, summarize, summarize_intersections
 from .scene_arcs import arcs_of
-from .scene_contacts import compare_contacts, find_contacts, find_strand_contacts, join_contacts
+from .scene_contacts import compare_contacts, find_contacts, join_contacts
 from .scene_intersections import SceneIntersections, name_intersections
 from .scene_proximities import SceneProximities, name_proximities
 from .threads import read_ahead
@@ -262,7 +262,7 @@ class _SegmentNamer:
         certified, stats = collisions.certified, collisions.stats
         if detection.of_strands:
             assert self._strand_mesh
-            more = find_strand_contacts(interval, self._strand_mesh, detection.of_strands, selection, detection.arcs)
+            more = find_contacts(interval, self._strand_mesh, detection.of_strands, selection, detection.arcs)
             contacts, stats = join_contacts(contacts, more), add_stats(stats, detection.of_strands.stats)
             certified &= detection.of_strands.certified
         if intersections:

@@ -12,17 +12,14 @@ import numpy as np
 from .._atomic_file import OutputFile
 from ..usd.segment import Segment
 from .limit import not_listed
-from .outputs import without_last_eighth
+from .outputs import ReplayOutput, without_last_eighth
 from .results import IntervalResult
-from .scene_contacts import PHASES, SceneContacts
-from .scene_intersections import SceneIntersections
-from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
+from .scene_contacts import SceneContacts
+from .scene_pairs import ALL_PHASES, ELEMENT_WORDS, KINDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import Summary
 
-_KINDS = (*KINDS, "edge-face")
-_PHASES = (*PHASES, "crosses", "touches", "inside", "near", "")
-_CROSSES, _TOUCHES, _INSIDE, _NEAR, _NONE = range(len(PHASES), len(_PHASES))
+_PHASES = (*ALL_PHASES, "")  # the last of contacts that are not compared with intersections
 _NORMAL_UNIT = 2**15 - 1
 """Units of a component of a normal: it is within 1.6e-5."""
 _ROW = np.dtype(
@@ -43,8 +40,8 @@ _ROW = np.dtype(
 _ROWS_AT_ONCE = 2**16
 
 
-class HitsNpz:
-    """A ``.npz`` file, a :class:`~warp_bsc.scene_replay.outputs.ReplayOutput`: columns with a row for each pair.
+class HitsNpz(ReplayOutput):
+    """A ``.npz`` file: columns with a row for each pair.
 
     A pair takes less than 30 bytes, a fifteenth of its text in JSON. Its columns, and what their numbers stand for::
 
@@ -59,9 +56,6 @@ class HitsNpz:
     Times of impact, positions and distances are in single precision. Pairs at rest, intersections and proximities, are
     at ``toi`` 0, in the last interval some at 1. The whole is on disk until the file is finished, so that memory does
     not grow with it.
-
-    Attributes:
-        file: The file.
     """
 
     def __init__(self, path: str | os.PathLike, *, facts: dict[str, Any], interval_count: int):
@@ -75,7 +69,7 @@ class HitsNpz:
         Raises:
             OSError: If it cannot be written.
         """
-        self.file = OutputFile(path)
+        super().__init__(path)
         self._rows = tempfile.TemporaryFile(dir=self.file.folder)  # noqa: SIM115 (closed when discarded)
         self._facts, self._last = facts, interval_count - 1
         self._meshes: dict[tuple[str, str], int] = {}  # numbers of names and prims
@@ -88,7 +82,7 @@ class HitsNpz:
         times = 2 if interval.index == self._last and interval.end > interval.start else 1
         parts = [self._rows_of_contacts(result.contacts)]
         for toi, pairs in enumerate((result.intersections or ())[:times]):
-            parts.append(self._rows_of_intersections(pairs, toi))
+            parts.append(self._rows_of(pairs, pairs.phase, toi))
         for toi, pairs in enumerate((result.proximities or ())[:times]):
             parts.append(self._rows_of_proximities(pairs, toi))
         rows = np.concatenate(parts)
@@ -111,7 +105,7 @@ class HitsNpz:
         facts["not_listed"] = asdict(missing) if missing else None
         facts["left_out"] = summary.scene.left_out
         names, prims = ([names[side] for names in self._meshes] for side in range(2))
-        words = {"meshes": names, "prims": prims, "kinds": _KINDS, "phases": _PHASES, "elements": ELEMENT_WORDS}
+        words = {"meshes": names, "prims": prims, "kinds": KINDS, "phases": _PHASES, "elements": ELEMENT_WORDS}
         starts, ends = np.array(self._times[:count], dtype=float).reshape(-1, 2).T
         with zipfile.ZipFile(cast(Any, _Writer(self.file)), "w", zipfile.ZIP_DEFLATED) as archive:
             values = {"facts": json.dumps(facts), "starts": starts, "ends": ends} | words
@@ -137,7 +131,7 @@ class HitsNpz:
     def discard(self) -> None:
         """Removes the temporary files."""
         self._rows.close()
-        self.file.discard()
+        super().discard()
 
     def _write_column(self, member, name: str, rows: int) -> None:
         """Writes a column to the archive, some rows after the other."""
@@ -149,27 +143,21 @@ class HitsNpz:
             size = min(_ROWS_AT_ONCE, rows - first) * _ROW.itemsize
             member.write(np.ascontiguousarray(np.frombuffer(self._rows.read(size), _ROW)[name]).tobytes())
 
-    def _rows_of(self, pairs: ScenePairs, kind, phase, toi) -> np.ndarray:
+    def _rows_of(self, pairs: ScenePairs, phase, toi) -> np.ndarray:
         rows = np.zeros(len(pairs), dtype=_ROW)
-        rows["kind"], rows["phase"], rows["toi"] = kind, phase, toi
+        rows["kind"], rows["phase"], rows["toi"] = pairs.kind, phase, toi
         rows["element"], rows["index"], rows["position"] = pairs.elements, pairs.indices, pairs.position
         rows["mesh"] = self._numbers(pairs.segment, pairs.meshes)
         return rows
 
     def _rows_of_contacts(self, contacts: SceneContacts) -> np.ndarray:
-        phase = np.full(len(contacts), _NONE) if contacts.phase is None else contacts.phase
-        rows = self._rows_of(contacts, contacts.kind, np.where(phase < 0, _NONE, phase), contacts.toi)
+        phase = np.full(len(contacts), -1) if contacts.phase is None else contacts.phase
+        rows = self._rows_of(contacts, np.where(phase < 0, len(ALL_PHASES), phase), contacts.toi)
         rows["normal"] = np.rint(_NORMAL_UNIT * contacts.normal)
         return rows
 
-    def _rows_of_intersections(self, intersections: SceneIntersections, toi: int) -> np.ndarray:
-        is_edge = np.arange(len(intersections)) < intersections.edge_rows.stop
-        kind = np.where(is_edge, _KINDS.index("edge-face"), _KINDS.index("vertex-face"))
-        phase = np.where(is_edge, np.where(intersections.crosses, _CROSSES, _TOUCHES), _INSIDE)
-        return self._rows_of(intersections, kind, phase, toi)
-
     def _rows_of_proximities(self, proximities: SceneProximities, toi: int) -> np.ndarray:
-        rows = self._rows_of(proximities, proximities.kind, _NEAR, toi)
+        rows = self._rows_of(proximities, proximities.phase, toi)
         rows["distance"] = proximities.distance
         return rows
 

@@ -15,19 +15,13 @@ import orjson
 from .._version import __version__
 from ..detection.run.settings import DistanceKind, PairKind
 from ..usd.scene import Scene
-from .hit_records import (
-    head_line,
-    intersection_kinds,
-    intersection_phases,
-    interval_line,
-    tail_line,
-)
+from .hit_records import head_line, interval_line, kind_words, phase_words, tail_line
 from .limit import not_listed
 from .outputs import RecordFile
 from .results import IntervalResult
-from .scene_contacts import PHASES, SceneContacts
+from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import ELEMENT_WORDS, KINDS, ScenePairs
+from .scene_pairs import ELEMENT_WORDS, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import CERTIFIED_FOR, Summary
 from .summary_records import mesh_pairs_to_list, with_numbers
@@ -188,9 +182,9 @@ class HitsCsv(RecordFile):
         times = 2 if interval.index == self._last_index and interval.end > interval.start else 1
         yield from _csv_rows(where, contacts, _contact_columns)
         for intersections in (result.intersections or ())[:times]:
-            yield from _csv_rows(where, intersections, _intersection_columns)
+            yield from _csv_rows(where, intersections, _columns_at_rest)
         for proximities in (result.proximities or ())[:times]:
-            yield from _csv_rows(where, proximities, _proximity_columns)
+            yield from _csv_rows(where, proximities, _columns_at_rest)
 
     def tail(self, summary: Summary) -> str:
         """Returns lines on rows that a limit leaves out, missing intervals and parts that are left out, if any are."""
@@ -236,32 +230,23 @@ def _csv_sides(pairs: ScenePairs, rows: slice, side: int, names: dict[int, str])
 
 def _contact_columns(contacts: SceneContacts, rows: slice) -> tuple[list[str], list[str], list[str]]:
     """Returns texts of some contacts, as :func:`_csv_rows` takes them."""
-    kinds = [KINDS[kind] for kind in contacts.kind[rows].tolist()]
+    kinds = kind_words(contacts, rows)
     measures = _numbers_to_csv(contacts.time[rows], contacts.toi[rows], contacts.position[rows], contacts.normal[rows])
     ends = [",,"] * len(kinds)
     if contacts.phase is not None and contacts.separate is not None:
-        phases = zip(contacts.phase[rows].tolist(), contacts.separate[rows].tolist(), strict=True)
-        ends = [f"{PHASES[phase]},{separate}," if phase >= 0 else ",," for phase, separate in phases]
+        phases = zip(phase_words(contacts, rows), contacts.separate[rows].tolist(), strict=True)
+        ends = [f"{phase},{separate}," if phase else ",," for phase, separate in phases]
     return kinds, measures, ends
 
 
-def _intersection_columns(intersections: SceneIntersections, rows: slice) -> tuple[list[str], list[str], list[str]]:
-    """Returns texts of some intersections, as :func:`_csv_rows` takes them."""
-    kinds, phases = intersection_kinds(intersections, rows), intersection_phases(intersections, rows)
-    measures = _at_rest_to_csv(intersections.time, intersections.position[rows])
-    return kinds, measures, [f"{phase},," for phase in phases]
-
-
-def _proximity_columns(proximities: SceneProximities, rows: slice) -> tuple[list[str], list[str], list[str]]:
-    """Returns texts of some proximities, as :func:`_csv_rows` takes them."""
-    kinds = [KINDS[kind] for kind in proximities.kind[rows].tolist()]
-    measures = _at_rest_to_csv(proximities.time, proximities.position[rows])
-    return kinds, measures, [f"near,,{distance}" for distance in _numbers_to_csv(proximities.distance[rows])]
-
-
-def _at_rest_to_csv(time: float, position: np.ndarray) -> list[str]:
-    """Returns the columns from the time to the normal of pairs without a time of impact and a normal."""
-    return [f"{time},,{point},,," for point in _numbers_to_csv(position)]
+def _columns_at_rest(
+    pairs: SceneIntersections | SceneProximities, rows: slice
+) -> tuple[list[str], list[str], list[str]]:
+    """Returns texts of some pairs without a time of impact and a normal, as :func:`_csv_rows` takes them."""
+    measures = [f"{pairs.time},,{point},,," for point in _numbers_to_csv(pairs.position[rows])]
+    distances = _numbers_to_csv(pairs.distance[rows]) if isinstance(pairs, SceneProximities) else [""] * len(measures)
+    ends = [f"{phase},,{distance}" for phase, distance in zip(phase_words(pairs, rows), distances, strict=True)]
+    return kind_words(pairs, rows), measures, ends
 
 
 def _numbers_to_csv(*columns: np.ndarray) -> list[str]:

@@ -13,9 +13,9 @@ import orjson
 
 from ..usd.interval import Interval
 from .results import IntervalResult
-from .scene_contacts import PHASES, SceneContacts
+from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import DIAGONAL, EDGE, ELEMENT_WORDS, FACE, KINDS, ScenePairs
+from .scene_pairs import ALL_PHASES, DIAGONAL, EDGE, ELEMENT_WORDS, FACE, KINDS, PHASES, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary_records import read_summary, summary_fields
 
@@ -99,25 +99,15 @@ def _numbers(name: str, shape: tuple[int, ...] = (-1,)) -> Column:
     )
 
 
-def intersection_kinds(intersections: SceneIntersections, rows: slice) -> list[str]:
-    """Returns the kinds of some intersections, in words."""
-    edges = intersections.edge_rows.stop
-    return ["edge-face" if row < edges else "vertex-face" for row in range(*rows.indices(len(intersections)))]
+def kind_words(pairs: ScenePairs, rows: slice) -> list[str]:
+    """Returns the kinds of some pairs, in words."""
+    return [KINDS[kind] for kind in pairs.kind[rows].tolist()]
 
 
-def intersection_phases(intersections: SceneIntersections, rows: slice) -> list[str]:
-    """Returns what the elements of some intersections do, in words."""
-    crosses, edges = intersections.crosses[rows].tolist(), intersections.edge_rows.stop
-    numbers = range(*rows.indices(len(intersections)))
-    return [
-        "inside" if row >= edges else "crosses" if passes else "touches"
-        for row, passes in zip(numbers, crosses, strict=True)
-    ]
-
-
-def _contact_phases(contacts: SceneContacts, rows: slice) -> list[str | None]:
-    assert contacts.phase is not None
-    return [PHASES[phase] if phase >= 0 else None for phase in contacts.phase[rows].tolist()]
+def phase_words(pairs: SceneContacts | SceneIntersections | SceneProximities, rows: slice) -> list[str | None]:
+    """Returns the phases of some pairs, in words; None where a pair has none."""
+    assert pairs.phase is not None
+    return [ALL_PHASES[phase] if phase >= 0 else None for phase in pairs.phase[rows].tolist()]
 
 
 def _contact_separate(contacts: SceneContacts, rows: slice) -> list[bool | None]:
@@ -126,17 +116,13 @@ def _contact_separate(contacts: SceneContacts, rows: slice) -> list[bool | None]
     return [one if phase >= 0 else None for phase, one in zip(phases, separate, strict=True)]
 
 
-def _same(value: Callable[[Any], Any]) -> Callable[[Any, slice], list[Any]]:
-    """Returns what writes one value of the pairs in all rows."""
-    return lambda pairs, rows: [value(pairs)] * len(range(*rows.indices(len(pairs))))
-
-
 _KIND = Column(
     "kind",
-    lambda pairs, rows: [KINDS[kind] for kind in pairs.kind[rows].tolist()],
+    kind_words,
     "kind",
     lambda values: np.array([KINDS.index(kind) for kind in values], dtype=np.int64),
 )
+_TIME = Column("time", lambda pairs, rows: [pairs.time] * len(pairs.kind[rows]))
 _POSITION = _numbers("position", (-1, 3))
 _ELEMENTS = (
     Column("elements", lambda pairs, rows: pairs.element_names(rows)),
@@ -149,7 +135,7 @@ _CONTACTS = (_KIND, *_ELEMENTS, _numbers("time"), _numbers("toi"), _POSITION, _n
 _COMPARISON = (
     Column(
         "phase",
-        _contact_phases,
+        phase_words,
         "phase",
         lambda values: np.array([-1 if phase is None else PHASES.index(phase) for phase in values], dtype=np.int64),
     ),
@@ -158,13 +144,13 @@ _COMPARISON = (
 """The fields that contacts have as well if they are compared with the intersections."""
 
 _INTERSECTIONS = (
-    Column("kind", intersection_kinds),
+    _KIND,
     *_ELEMENTS,
-    Column("time", _same(lambda pairs: pairs.time)),
+    _TIME,
     _POSITION,
     Column(
         "phase",
-        intersection_phases,
+        phase_words,
         "crosses",
         lambda values: np.array([phase == "crosses" for phase in values], dtype=bool),
     ),
@@ -172,9 +158,9 @@ _INTERSECTIONS = (
 _PROXIMITIES = (
     _KIND,
     *_ELEMENTS,
-    Column("time", _same(lambda pairs: pairs.time)),
+    _TIME,
     _POSITION,
-    Column("phase", _same(lambda _: "near")),
+    Column("phase", phase_words),
     _numbers("distance"),
 )
 

@@ -18,7 +18,7 @@ from .report_data import MAX_PAIRS, Depths, report_data, report_title
 from .results import IntersectionSummary, IntervalResult
 from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import ScenePairs
+from .scene_pairs import CROSSES, INSIDE, ScenePairs
 from .scene_proximities import SceneProximities
 from .summary import Summary
 from .view_blocks import ViewBlocks, moving_points
@@ -26,7 +26,6 @@ from .view_blocks import ViewBlocks, moving_points
 _ALL_ROWS = 300_000  # in the table; divided by the number of intervals, twice the limit of an interval ...
 _FEWEST_ROWS, _MOST_ROWS = 100, 50_000  # ... within these bounds
 _MOST_CAMERAS, _MOST_CAMERA_TIMES = 100, 100_000
-_CROSSES, _TOUCHES, _INSIDE, _PROXIMITY = range(4, 8)  # kinds of rows, after those of collisions: see rows.js
 _COLUMNS = ("first", "second", "elements", "first_0", "first_1", "second_0", "second_1")
 
 _SCRIPTS = (
@@ -156,31 +155,29 @@ class ReportPage(RecordFile):
         crosses, inside = (self._new(what, found, rows, found.time, found.time) for what in ("crosses", "is inside"))
         if not crosses:
             return {}
-        return {"new": np.select([kind == _CROSSES, kind == _INSIDE], [crosses["new"], inside["new"]], 0)}
+        return {"new": np.select([kind == CROSSES, kind == INSIDE], [crosses["new"], inside["new"]], 0)}
 
     def _at_rest(self, name: str, index: int, found: _AtRest, numbers: np.ndarray) -> tuple[int, str]:
         """Returns the number of rows and the block of intersections or proximities at one time; no block for none."""
         if not len(found):
             return 0, ""
         rows = _choose_rows(found, self._most_rows)
-        arrays = self._pairs(found, rows, numbers)
+        # rows at rest have the phase as their kind, which is after those of collisions: see rows.js
+        arrays = self._pairs(found, rows, numbers) | {"kind": found.phase[rows]}
         facts = {"of": len(found)}
         if isinstance(found, SceneProximities):
-            arrays |= {"kind": np.full(len(rows), _PROXIMITY), "distance": found.distance[rows]}
+            arrays |= {"distance": found.distance[rows]}
             arrays |= self._new("is near", found, rows, found.time, found.time)
         else:
-            kind = np.where(found.crosses[rows], _CROSSES, _TOUCHES)
-            kind = np.where(rows < found.edge_rows.stop, kind, _INSIDE)
             cuts = spread(len(found.cuts.points), self._most_rows)
             step, points = moving_points(*(self._from_center(found.cuts.points[cuts])).transpose(1, 0, 2))
             arrays |= {
-                "kind": kind,
                 "curve_start": points["start"],
                 "curve_end": points["end"],
                 "curve_meshes": numbers[found.cuts.meshes[cuts]] if len(cuts) else cuts,
                 "through": np.flatnonzero(np.isin(rows, found.of_curves)),
             }
-            arrays |= self._new_intersections(found, rows, kind)
+            arrays |= self._new_intersections(found, rows, arrays["kind"])
             facts |= {"curves": len(found.cuts.points), "curve_step": step}
         return len(rows), block(f"{name}-{index}", facts, arrays)
 
@@ -203,9 +200,11 @@ class ReportPage(RecordFile):
 
     def _cameras(self, summary: Summary, center: list[float]) -> tuple[str, list[dict], int]:
         """Returns the blocks of the scene's cameras, their facts, and the number of cameras left out."""
+        scene = summary.scene
+        if scene.stage is None:  # of mesh files
+            return "", [], 0
         from ..usd.cameras import find_cameras, read_camera  # noqa: PLC0415 (imports pxr)
 
-        scene = summary.scene
         found = find_cameras(scene.stage)
         times = list(scene.times[: len(summary.intervals) + 1])
         most = min(_MOST_CAMERAS, max(1, _MOST_CAMERA_TIMES // len(times)))

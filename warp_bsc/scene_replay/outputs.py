@@ -3,7 +3,7 @@
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from .._atomic_file import OutputFile
 from .results import IntervalResult
@@ -12,50 +12,11 @@ from .summary import Summary
 _Item = TypeVar("_Item")
 
 
-class ReplayOutput(Protocol):
+class ReplayOutput(ABC):
     """A file to which the intervals of a replay are written.
 
     Attributes:
         file: The file, which appears at its path when the output is finished.
-    """
-
-    file: OutputFile
-
-    def add(self, result: IntervalResult) -> None:
-        """Adds an interval.
-
-        Raises:
-            OSError: If the disk is full. After that the output can only be shrunk, finished or discarded.
-        """
-        ...
-
-    def finish(self, summary: Summary) -> None:
-        """Completes the file and moves it to its path.
-
-        Args:
-            summary: The whole replay. The last of its intervals may be missing in this file.
-
-        Raises:
-            OSError: If the disk is full. After shrinking, finishing may be tried again.
-        """
-        ...
-
-    def shrink(self) -> bool:
-        """Drops the last eighth of the intervals to save space, and returns whether the file becomes smaller."""
-        ...
-
-    def discard(self) -> None:
-        """Removes all temporary files; a finished file stays."""
-        ...
-
-
-class RecordFile(ABC):
-    """A :class:`ReplayOutput` for text files of a head, one record for each interval, and a tail.
-
-    The finished file contains only whole records.
-
-    Attributes:
-        file: The file.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -65,6 +26,44 @@ class RecordFile(ABC):
             OSError: If it cannot be written.
         """
         self.file = OutputFile(path)
+
+    @abstractmethod
+    def add(self, result: IntervalResult) -> None:
+        """Adds an interval.
+
+        Raises:
+            OSError: If the disk is full. After that the output can only be shrunk, finished or discarded.
+        """
+
+    @abstractmethod
+    def finish(self, summary: Summary) -> None:
+        """Completes the file and moves it to its path.
+
+        Args:
+            summary: The whole replay. The last of its intervals may be missing in this file.
+
+        Raises:
+            OSError: If the disk is full. After shrinking, finishing may be tried again.
+        """
+
+    @abstractmethod
+    def shrink(self) -> bool:
+        """Drops the last eighth of the intervals to save space, and returns whether the file becomes smaller."""
+
+    def discard(self) -> None:
+        """Removes all temporary files; a finished file stays."""
+        self.file.discard()
+
+
+class RecordFile(ReplayOutput):
+    """A text file of a head, one record for each interval, and a tail.
+
+    The finished file contains only whole records.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        """Opens the file, with errors as of :class:`ReplayOutput`."""
+        super().__init__(path)
         self._ends = []  # offsets at which the head and each record end
 
     @abstractmethod
@@ -107,10 +106,6 @@ class RecordFile(ABC):
         self._ends[1:] = without_last_eighth(self._ends[1:])
         self.file.truncate(self._ends[-1])
         return True
-
-    def discard(self) -> None:
-        """Removes the temporary file."""
-        self.file.discard()
 
     def _append(self, texts: Iterable[str | bytes]) -> None:
         for text in texts:

@@ -7,9 +7,9 @@ import numpy as np
 
 from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
-from .scene_contacts import PHASES, SceneContacts
+from .scene_contacts import SceneContacts
 from .scene_intersections import SceneIntersections
-from .scene_pairs import KINDS, count_by_meshes
+from .scene_pairs import KINDS, PHASES, count_by_meshes
 from .scene_proximities import SceneProximities
 from .validation import Validation
 
@@ -123,7 +123,7 @@ class IntervalSummary:
         separate_hits: Number of pairs that collide and whose two meshes did not intersect at the start; None if
             intersections were not checked.
         ignored: Number of pairs that collide and are ignored, by the names of their two meshes, in the scene's order.
-        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.scene_replay.scene_contacts.PHASES`; None if
+        phases: Number of pairs of meshes that collide by :data:`~warp_bsc.scene_replay.scene_pairs.PHASES`; None if
             intersections were not checked.
         proximities: The proximities at the start and at the end, as ``intersections``; None without a clearance.
         duplicates: Names of duplicates, see :class:`~warp_bsc.scene_replay.duplicates.Duplicates`, by

@@ -16,12 +16,6 @@ from .scene_arcs import positions_at
 from .scene_intersections import SceneIntersections
 from .scene_pairs import EDGE, NO_PAIRS, VERTEX, ScenePairs, are_stiff_pairs, count_by_meshes, name_elements, take_rows
 
-PHASES = ("passes", "enters", "leaves", "stays")
-"""The phases of a contact, by 1 if the surfaces at its elements cross at the interval's end, plus 2 if at its start.
-
-Surfaces that cross at neither time touch within the interval, or pass through each other and out again.
-"""
-
 
 @dataclass(frozen=True)
 class SceneContacts(ScenePairs):
@@ -29,7 +23,6 @@ class SceneContacts(ScenePairs):
 
     Attributes:
         interval: The interval.
-        kind: Index in :data:`~warp_bsc.scene_replay.scene_pairs.KINDS`, shape [n].
         toi: Times of impact, 0 at the start of the interval and 1 at its end, shape [n].
         time: The same as time codes, shape [n].
         normal: Unit normals, against the velocity of the first element relative to the second, shape [n, 3].
@@ -38,13 +31,12 @@ class SceneContacts(ScenePairs):
         separate: Whether the two meshes neither intersected nor touched at the start of the interval, shape [n]; for a
             mesh with itself, whether no two parts of it did. False where ``phase`` is -1. None if intersections were
             not checked.
-        phase: Index in :data:`PHASES`, shape [n]. The surface at an element consists of all faces with a vertex of it;
-            for a curve, of all its edges with one. -1 for two curves, and for pairs with a point, which cannot cross at
-            rest. None if intersections were not checked.
+        phase: Index in :data:`~warp_bsc.scene_replay.scene_pairs.PHASES`, shape [n]. The surface at an element consists
+            of all faces with a vertex of it; for a curve, of all its edges with one. -1 for two curves, and for pairs
+            with a point, which cannot cross at rest. None if intersections were not checked.
     """
 
     interval: Interval = field(repr=False)
-    kind: np.ndarray
     toi: np.ndarray
     time: np.ndarray
     normal: np.ndarray
@@ -53,7 +45,7 @@ class SceneContacts(ScenePairs):
     separate: np.ndarray | None = None
     phase: np.ndarray | None = None
 
-    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "kind", "toi", "time", "normal", "separate", "phase")
+    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "toi", "time", "normal", "separate", "phase")
 
     @cached_property
     def colliding_faces(self) -> np.ndarray:
@@ -77,70 +69,39 @@ def find_contacts(
 ) -> SceneContacts:
     """Names the detected pairs that are checked by prims and elements.
 
-    Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, and pairs of a mesh with
-    itself if only its transform moves it. Elements that are apart in such a mesh stay apart; elements that touch, at
+    Excluded are pairs of meshes that never move, pairs that the selection excludes or ignores, pairs of a mesh with
+    itself if only its transform moves it, and edges of one curve that are near along it, as thick curves always touch
+    themselves there. Elements that are apart in a mesh that its transform moves stay apart; elements that touch, at
     T-junctions or in coplanar faces, would collide by rounding alone. (If a transform that has no turn at a constant
     rate turns by half a circle from one sample to the next, or scales by zero, the straight paths of the vertices meet
     although the mesh does not.)
 
     Args:
         interval: The interval.
-        mesh: The detector's mesh, made of the interval's segment.
+        mesh: The detector's mesh, made of the interval's segment: of its meshes, or of its curves and points as well.
         collisions: Collisions of that mesh in the interval.
         selection: The pairs of meshes that are checked.
         arcs: The motion of the vertices on arcs; None if all move straight.
     """
     segment = interval.segment
-    vertices, faces = collisions.vertex_face.T.astype(np.int64)
-    ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
-    n_vertex_face = len(vertices)
-    if not n_vertex_face + len(ends):
-        none = np.zeros(0, dtype=np.int64)
+    if not len(collisions):
         return SceneContacts(
             segment,
             **NO_PAIRS,
             interval=interval,
-            kind=none,
             toi=np.zeros(0),
             time=np.zeros(0),
             normal=np.zeros((0, 3)),
-            counted=none.astype(bool),
+            counted=np.zeros(0, dtype=bool),
             ignored={},
         )
 
-    named = name_elements(segment, vertices, faces, ends)
-    toi = np.concatenate([collisions.vertex_face_toi, collisions.edge_edge_toi])
-    normal = np.concatenate([collisions.vertex_face_normal, collisions.edge_edge_normal])
-
-    corners = positions_at(interval, arcs, mesh.faces[faces], toi[:n_vertex_face])
-    on_faces = np.einsum("ni,nij->nj", collisions.vertex_face_coordinates, corners)
-    s = collisions.edge_edge_coordinates[:, :1]
-    first = positions_at(interval, arcs, ends[:, 0], toi[n_vertex_face:])
-    position = np.concatenate([on_faces, (1.0 - s) * first[:, 0] + s * first[:, 1]])
-
-    stiff = are_stiff_pairs(segment, vertices, named["meshes"][:n_vertex_face, 1], ends)
-    return _select(interval, named | {"toi": toi, "position": position, "normal": normal}, stiff, selection)
-
-
-def find_strand_contacts(
-    interval: Interval,
-    mesh: CollisionMesh,
-    collisions: Collisions,
-    selection: Selection,
-    arcs: RigidMotion | None = None,
-) -> SceneContacts:
-    """Names the detected pairs with curves or points that are checked by prims and elements.
-
-    Excluded are the pairs that :func:`find_contacts` excludes, and edges of one curve that are near along it, as thick
-    curves always touch themselves there. Arguments: as of that, with the mesh of the detection, made of the interval's
-    segment with its curves and points, in which pairs of two elements of faces are excluded.
-    """
-    segment = interval.segment
-    ends = mesh.edges[collisions.edge_edge].astype(np.int64)
-    of_curves = np.isin(collisions.edge_edge, mesh.free_edges)
-    apart = ~(of_curves.all(axis=1) & segment.are_neighbours(ends[:, 0], ends[:, 1]))
-    vertices, faces = collisions.vertex_face.T.astype(np.int64)
+    ends = mesh.edges[collisions.edge_edge].astype(np.int64)  # (n, 2 edges, 2 ends)
+    apart = ~np.isin(collisions.edge_edge, mesh.free_edges).all(axis=1)
+    if not apart.all():
+        apart |= ~segment.are_neighbours(ends[:, 0], ends[:, 1])
     ends = ends[apart]
+    vertices, faces = collisions.vertex_face.T.astype(np.int64)
     points, point_ends = collisions.vertex_edge[:, 0].astype(np.int64), mesh.edges[collisions.vertex_edge[:, 1]]
     both = collisions.vertex_vertex.astype(np.int64)
     named = name_elements(segment, vertices, faces, ends, (points, point_ends.astype(np.int64), both))
@@ -167,11 +128,14 @@ def find_strand_contacts(
         collisions.vertex_edge_normal,
         collisions.vertex_vertex_normal,
     ]
-    first, second = named["meshes"].T
-    is_stiff = np.array([part.moves and not part.deforms for part in segment.meshes])
     arrays = {"toi": tois, "position": position, "normal": normal}
     arrays = named | {name: np.concatenate(parts) for name, parts in arrays.items()}
-    return _select(interval, arrays, (first == second) & is_stiff[first], selection)
+    if len(mesh.free_edges) + len(mesh.points):
+        first, second = named["meshes"].T
+        stiff = (first == second) & np.array([part.moves and not part.deforms for part in segment.meshes])[first]
+    else:
+        stiff = are_stiff_pairs(segment, vertices, named["meshes"][: len(vertices), 1], ends)
+    return _select(interval, arrays, stiff, selection)
 
 
 def _select(
@@ -195,7 +159,7 @@ def _select(
 
 def join_contacts(contacts: SceneContacts, others: SceneContacts) -> SceneContacts:
     """Returns the contacts of one interval followed by others of it; ``counted`` is that of the first ones."""
-    names = ("kind", "elements", "meshes", "indices", "vertices", "faces", "position", "toi", "time", "normal")
+    names = *ScenePairs.BY_PAIR, "toi", "time", "normal"
     joined = {name: np.concatenate([getattr(contacts, name), getattr(others, name)]) for name in names}
     ignored = {
         meshes: contacts.ignored.get(meshes, 0) + others.ignored.get(meshes, 0)

@@ -12,7 +12,21 @@ from ..detection.at_rest.intersections import Intersections
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import DIAGONAL, EDGE, FACE, NO_PAIRS, VERTEX, ScenePairs, take_rows
+from .scene_pairs import (
+    CROSSES,
+    DIAGONAL,
+    EDGE,
+    FACE,
+    INSIDE,
+    KINDS,
+    NO_PAIRS,
+    TOUCHES,
+    VERTEX,
+    ScenePairs,
+    take_rows,
+)
+
+_EDGE_FACE = KINDS.index("edge-face")
 
 
 class Cuts(NamedTuple):
@@ -62,7 +76,12 @@ class SceneIntersections(ScenePairs):
     @cached_property
     def edge_rows(self) -> slice:
         """The rows of the edges that meet faces."""
-        return slice(0, int((self.elements[:, 0] != VERTEX).sum()))
+        return slice(0, int((self.kind == _EDGE_FACE).sum()))
+
+    @property
+    def phase(self) -> np.ndarray:
+        """Index in :data:`~warp_bsc.scene_replay.scene_pairs.ALL_PHASES`, shape [n]."""
+        return np.where(self.kind == _EDGE_FACE, np.where(self.crosses, CROSSES, TOUCHES), INSIDE)
 
     @property
     def inside_rows(self) -> slice:
@@ -157,6 +176,7 @@ def name_intersections(
     counted &= ~segment.are_stiff(ends, face_meshes)
     nowhere = np.full_like(faces, -1)
     arrays = {
+        "kind": np.full(len(faces), _EDGE_FACE),
         "elements": np.stack([np.where(diagonal, DIAGONAL, EDGE), np.full(len(faces), FACE)], axis=1),
         "meshes": meshes,
         "indices": np.stack([points, np.stack([polygons, nowhere], axis=1)], axis=1),
@@ -179,6 +199,7 @@ def _name_inside(segment: Segment, inside: Containment, x: np.ndarray) -> dict[s
     points = segment.find_points(inside.bodies[:, 0], inside.vertices)
     _, polygons = segment.locate_faces(inside.faces)
     return {
+        "kind": np.full(count, KINDS.index("vertex-face")),
         "elements": np.tile([VERTEX, FACE], (count, 1)),
         "meshes": inside.bodies,
         "indices": np.stack([points, nothing, polygons, nothing], axis=1).reshape(-1, 2, 2),

@@ -7,8 +7,18 @@ import numpy as np
 
 from ..usd.segment import Segment
 
-KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex")
-"""Labels of the kinds of pair in collisions and proximities, by their numbers; the last two have points or curves."""
+KINDS = ("vertex-face", "edge-edge", "vertex-edge", "vertex-vertex", "edge-face")
+"""Labels of the kinds of pair, by their numbers; the last is of intersections, the two before of points or curves."""
+
+PHASES = ("passes", "enters", "leaves", "stays")
+"""The phases of a contact, by 1 if the surfaces at its elements cross at the interval's end, plus 2 if at its start.
+
+Surfaces that cross at neither time touch within the interval, or pass through each other and out again.
+"""
+
+ALL_PHASES = (*PHASES, "crosses", "touches", "inside", "near")
+"""These, and what the elements of intersections and proximities do, by their numbers."""
+CROSSES, TOUCHES, INSIDE, NEAR = range(len(PHASES), len(ALL_PHASES))
 
 VERTEX, FACE, EDGE, DIAGONAL = range(4)
 """The kinds of element. A diagonal is an edge between two triangles of one polygon; the prim has no such edge."""
@@ -17,6 +27,7 @@ ELEMENT_WORDS = ("vertex", "face", "edge", "diagonal")
 """The words for the kinds of element, by their numbers."""
 
 NO_PAIRS = {
+    "kind": np.zeros(0, dtype=np.int64),
     "elements": np.zeros((0, 2), dtype=np.int64),
     "meshes": np.zeros((0, 2), dtype=np.int64),
     "indices": np.zeros((0, 2, 2), dtype=np.int64),
@@ -36,6 +47,7 @@ class ScenePairs:
 
     Attributes:
         segment: The segment.
+        kind: Index in :data:`KINDS`, shape [n].
         elements: Kinds of the two elements: :data:`VERTEX`, :data:`FACE`, :data:`EDGE` or :data:`DIAGONAL`, shape
             [n, 2].
         meshes: The two meshes, indices in ``segment.meshes``, shape [n, 2].
@@ -48,6 +60,7 @@ class ScenePairs:
     """
 
     segment: Segment = field(repr=False)
+    kind: np.ndarray
     elements: np.ndarray
     meshes: np.ndarray
     indices: np.ndarray
@@ -55,7 +68,7 @@ class ScenePairs:
     faces: np.ndarray
     position: np.ndarray
 
-    BY_PAIR: ClassVar[tuple[str, ...]] = ("elements", "meshes", "indices", "vertices", "faces", "position")
+    BY_PAIR: ClassVar[tuple[str, ...]] = ("kind", "elements", "meshes", "indices", "vertices", "faces", "position")
     """Names of the arrays with a row for each pair."""
 
     def __len__(self) -> int:
@@ -157,7 +170,7 @@ def name_elements(
     ends: np.ndarray,
     points: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Returns the arrays of :class:`ScenePairs` except the positions, and the kinds, for pairs given kind by kind.
+    """Returns the arrays of :class:`ScenePairs` except the positions, for pairs given kind by kind.
 
     Args:
         segment: The segment.

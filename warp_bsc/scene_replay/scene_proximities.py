@@ -9,7 +9,7 @@ from ..detection.at_rest.proximities import Proximities
 from ..detection.mesh import CollisionMesh
 from ..usd.segment import Segment
 from ..usd.selection import Selection
-from .scene_pairs import NO_PAIRS, ScenePairs, are_stiff_pairs, name_elements
+from .scene_pairs import NEAR, NO_PAIRS, ScenePairs, are_stiff_pairs, name_elements
 
 
 @dataclass(frozen=True)
@@ -18,15 +18,18 @@ class SceneProximities(ScenePairs):
 
     Attributes:
         time: Time code.
-        kind: Index in :data:`~warp_bsc.scene_replay.scene_pairs.KINDS`, shape [n].
         distance: Distances, in the scene's unit of length, shape [n].
     """
 
     time: float
-    kind: np.ndarray
     distance: np.ndarray
 
-    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "kind", "distance")
+    BY_PAIR: ClassVar[tuple[str, ...]] = (*ScenePairs.BY_PAIR, "distance")
+
+    @property
+    def phase(self) -> np.ndarray:
+        """Index in :data:`~warp_bsc.scene_replay.scene_pairs.ALL_PHASES`, shape [n]."""
+        return np.full(len(self), NEAR)
 
 
 def name_proximities(
@@ -45,8 +48,7 @@ def name_proximities(
         selection: The pairs of meshes that are checked.
     """
     if not len(found.distance):
-        none = np.zeros(0, dtype=np.int64)
-        return SceneProximities(segment, **NO_PAIRS, time=time, kind=none, distance=np.zeros(0))
+        return SceneProximities(segment, **NO_PAIRS, time=time, distance=np.zeros(0))
     vertices, faces = found.vertex_face.T.astype(np.int64)
     ends = mesh.edges[found.edge_edge].astype(np.int64)
     named = name_elements(segment, vertices, faces, ends)

@@ -12,7 +12,7 @@ from ..detection.results.collisions import DetectionStats, PhaseCounts
 from ..detection.run.settings import DistanceKind
 from ..usd.interval import Interval
 from .results import Contact, IntersectionSummary, IntervalSummary, Nearest, ProximitySummary
-from .scene_contacts import PHASES
+from .scene_pairs import PHASES
 from .validation import Validation
 
 

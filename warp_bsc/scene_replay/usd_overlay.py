@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from .._atomic_file import OutputFile
 from .._version import __version__
 from ..usd.scene import Scene
 from ..usd.segment import Segment
 from ..usd.write.layer import just_before, layer_metadata, unused_path
-from ..usd.write.layer_writer import LayerContent, LayerPrim, LayerScope, PrimKind, write_binary_layer, write_text_layer
+from ..usd.write.layer_writer import LayerContent, LayerPrim, LayerScope, PrimKind, write_layer
 from .limit import not_listed
+from .outputs import ReplayOutput
 from .results import IntervalResult
 from .sample_spool import Key, Sample, SampleSpool
 from .scene_contacts import SceneContacts
@@ -88,7 +88,7 @@ _PARTS: dict[str, tuple[PrimKind, dict[str, str]]] = {
 _REST = "Rest"
 
 
-class Overlay:
+class Overlay(ReplayOutput):
     """A USD layer whose sublayer is the scene, so that opening it shows both. It does not change the scene's prims.
 
     ``/Collisions`` has a prim for each pair of meshes, such as ``Coat_with_Body`` or ``Coat_with_itself``, so that a
@@ -130,9 +130,6 @@ class Overlay:
     USD's own layers hold their whole content in memory. This one writes its samples to a
     :class:`~warp_bsc.scene_replay.sample_spool.SampleSpool`, and sorts them by attribute at the end, a few megabytes at
     a time. It does not read the scene again, whose file may have become unreadable.
-
-    Attributes:
-        file: The file.
     """
 
     def __init__(self, path: str | os.PathLike, *, scene: Scene, command: str):
@@ -150,7 +147,7 @@ class Overlay:
         suffix = Path(path).suffix
         if suffix not in (".usda", ".usdc", ".usd"):
             raise ValueError(f"{path}: the name of an overlay, a USD layer, must end in .usda, .usdc or .usd")
-        self._is_text = suffix == ".usda"
+        self._format = "usda" if suffix == ".usda" else "usdc"
         self._scene, self._command = scene, command
         self._last: IntervalResult | None = None  # the last complete interval
         self._prims: dict[str, int] = {}  # number of each mesh with a pair, by its name
@@ -159,7 +156,7 @@ class Overlay:
         low, high = _bounds(scene)
         self._size = float(np.linalg.norm(high - low)) or 1.0
         self._metadata = layer_metadata(scene)
-        self.file = OutputFile(path)
+        super().__init__(path)
         self._spool = SampleSpool(self.file.folder, {name: types for name, (_, types) in _PARTS.items()})
 
     def add(self, result: IntervalResult) -> None:
@@ -185,13 +182,9 @@ class Overlay:
         if last and last.summary.end == end > last.summary.start:
             self._spool.add_last(end, self._find_at_rest(last, 1))
         content = self._content(summary, end)
-        if self._is_text:
-            self.file.truncate(0)
-            write_text_layer(content, self.file.write)
-        else:
-            temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
-            write_binary_layer(content, temporary)
-            self.file.adopt(temporary)
+        temporary = Path(self.file.folder, f".warp-bsc-{secrets.token_hex(8)}.tmp")
+        write_layer(content, temporary, self._format)
+        self.file.adopt(temporary)
         self.file.commit()
 
     def shrink(self) -> bool:
@@ -202,7 +195,7 @@ class Overlay:
     def discard(self) -> None:
         """Removes the temporary files."""
         self._spool.discard()
-        self.file.discard()
+        super().discard()
 
     def _by_pair(self, segment: Segment, meshes: np.ndarray) -> list[tuple[str, np.ndarray]]:
         """Returns names of the prims of pairs of meshes with their rows, ascending, the pairs with the most rows first.

@@ -22,7 +22,7 @@ from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import Any, Protocol
+from typing import Any
 
 from .._arguments import given
 from ..usd.scene import Scene
@@ -37,40 +37,16 @@ _CHUNKS_EACH = 4  # fewest chunks for each worker, so that all workers end at ab
 _CONNECT_SECONDS = 10.0
 
 
-class Workers(Protocol):
-    """Processes to which functions can be submitted.
-
-    Attributes:
-        died: The error of a future of :meth:`submit` whose process has died.
-        attempts: Number of times that a function is submitted before its processes' deaths are an error.
-    """
-
-    died: type[Exception]
-    attempts: int
-
-    @property
-    def count(self) -> int:
-        """Current number of processes, at least 1."""
-        ...
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Returns a future of the function's result in one of the processes."""
-        ...
-
-    def result(self, future: Any) -> Any:
-        """Waits for a future of :meth:`submit` and returns its result, or raises the error of its function."""
-        ...
-
-    def close(self) -> None:
-        """Ends the processes' work at once, without waiting for it."""
-        ...
-
-
 class LocalWorkers:
     """Processes on this machine, which end when this one ends, even if it is killed.
 
     Each has its own pipe, and a thread in this process that waits at it. (The pool of Python's ``concurrent.futures``
     has one pipe for all results, and hangs if a process is killed while it writes to it.)
+
+    Attributes:
+        died: The error of a future of :meth:`submit` whose process has died.
+        attempts: Number of times that a function is submitted before its processes' deaths are an error.
+        count: Number of processes.
     """
 
     died: type[Exception] = ChildProcessError
@@ -143,7 +119,7 @@ class LocalWorkers:
 
 
 class Cluster:
-    """The workers of a running Dask cluster."""
+    """The workers of a running Dask cluster, with the attributes and methods of :class:`LocalWorkers`."""
 
     attempts = 1  # Dask itself repeats a call whose worker dies
 
@@ -200,6 +176,10 @@ class Cluster:
             yield
         except errors as error:
             raise ConnectionError(f"workers: {self._address}: lost the scheduler of the Dask cluster") from error
+
+
+Workers = LocalWorkers | Cluster
+"""Processes to which functions can be submitted."""
 
 
 def selection_without_initial_in_workers(scene: Scene, checks: Checks, workers: Workers) -> Selection:

@@ -7,7 +7,9 @@ typedef double Doubles __attribute__((ext_vector_type(8)));
 typedef decltype(Doubles() < Doubles()) Longs;
 constexpr long long top = 1ll << 52, limit = 1ll << largest_bits;
 for (int axis = 0; axis < 3; ++axis) {
-    const Doubles x = {a0[axis], b0[axis], c0[axis], d0[axis], a1[axis], b1[axis], c1[axis], d1[axis]};
+    Doubles x;
+    for (int point = 0; point < 8; ++point)
+        x[point] = query.data[point][axis];
     const Longs word = __builtin_bit_cast(Longs, x);
     const Longs field = (word >> 52) & 2047, mantissa = word & (top - 1);
     // not by a comparison of the whole word, which a compiler makes one of numbers, that takes subnormals for zero

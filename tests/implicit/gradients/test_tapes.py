@@ -33,7 +33,8 @@ def test_a_tape_changes_nothing_of_a_step(device):
         states = program.states
         if not on_tape:
             program.model.requires_grad = requires_grad
-            solver = bsc.SolverImplicit(program.model, max_iterations=60, friction=0.3)
+            radii = program.arrays["particle_radius"]
+            solver = bsc.SolverImplicit(program.model, max_iterations=60, friction=0.3, particle_radius=radii)
             assert (solver.gradients is None) != requires_grad
             states = program.begin(program.inputs)
             solver.reset(states[0])
@@ -44,6 +45,22 @@ def test_a_tape_changes_nothing_of_a_step(device):
     for of_tape, without, of_plain in zip(*ends, strict=True):
         np.testing.assert_array_equal(of_tape, without)
         np.testing.assert_allclose(of_plain, without, atol=5e-3)
+
+
+def test_distances_that_require_no_gradients_get_none(device):
+    """The others stay what they are."""
+    program = cloth_on_sheet(device)
+    program.run()  # contacts come in another order in the first run of a solver
+    radii, found = program.arrays["particle_radius"], []
+    for requires_grad in (True, False):
+        radii.requires_grad = requires_grad
+        program.run()
+        program.tape.backward(grads=program.seeds())
+        found.append(gradients_of(program.states[0]))
+        assert (radii.grad is not None) == requires_grad
+        assert not requires_grad or radii.grad.numpy().any()
+    for with_some, without in zip(*found, strict=True):
+        np.testing.assert_array_equal(with_some, without)
 
 
 def test_two_states_that_take_turns(device):

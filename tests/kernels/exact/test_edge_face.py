@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE
-from warp_bsc.kernels.exact.edge_face import BITS, TOUCHES, edge_meets_face_in
+from warp_bsc.kernels.exact.edge_face import BITS, TOUCHES, EdgeAndFace, edge_meets_face_in
 
 
 def kernel(limbs):
@@ -15,7 +15,10 @@ def kernel(limbs):
     @wp.kernel(enable_backward=False, module="unique")
     def decide(x: wp.array2d[wp.vec3d], status: wp.array[int]):
         i = wp.tid()
-        status[i] = edge_meets_face(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7])
+        points = EdgeAndFace()
+        for k in range(8):
+            points[k] = x[i, k]
+        status[i] = edge_meets_face(points)
 
     return decide
 

@@ -19,6 +19,7 @@ from warp_bsc.kernels.exact import algebraic
 from warp_bsc.kernels.exact.algebraic import remainder
 from warp_bsc.kernels.exact.polygon import BITS, coordinate, cross_component, make_polygon, spread, volume
 from warp_bsc.kernels.exact.wide_integers import integer, minor, subtract, times
+from warp_bsc.kernels.motion import query_of
 
 
 def assert_true(kind, points, limbs, *, least=1.0):
@@ -215,18 +216,12 @@ def phases_kernel(limbs):
         end: wp.array2d[eight],
     ):
         i = wp.tid()
-        a0 = points[i, 0]
-        b0 = points[i, 1]
-        c0 = points[i, 2]
-        d0 = points[i, 3]
-        a1 = points[i, 4]
-        b1 = points[i, 5]
-        c1 = points[i, 6]
-        d1 = points[i, 7]
-        exponents, width = spread(kind, a0, b0, c0, d0, a1, b1, c1, d1)
+        x = points[i]
+        query = query_of(x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7])
+        exponents, width = spread(kind, query)
         bits[i] = width
         polygon = wp.zeros(shape=(24,), dtype=one)
-        make_polygon(kind == 1, a0, b0, c0, d0, a1, b1, c1, d1, exponents, polygon)
+        make_polygon(kind == 1, query, exponents, polygon)
         for corner in range(4):
             for axis in range(3):
                 corners[i, 6 * corner + axis] = coordinate_of(polygon, corner, 0, axis)

@@ -9,6 +9,7 @@ from compilation import QUICK
 from warp_bsc import checker
 from warp_bsc.kernels import FREE, HIT, UNSURE
 from warp_bsc.kernels.exact.distance import BITS, TOO_WIDE, decide_distance_in
+from warp_bsc.kernels.motion import query_of
 
 DIGITS = 21
 
@@ -26,21 +27,8 @@ def kernel(limbs):
         status: wp.array[int],
     ):
         i = wp.tid()
-        status[i] = decide_distance(
-            kind,
-            x[i, 0],
-            x[i, 1],
-            x[i, 2],
-            x[i, 3],
-            x[i, 4],
-            x[i, 5],
-            x[i, 6],
-            x[i, 7],
-            distance[i],
-            toi[i],
-            wp.static(DIGITS),
-            timed,
-        )
+        query = query_of(x[i, 0], x[i, 1], x[i, 2], x[i, 3], x[i, 4], x[i, 5], x[i, 6], x[i, 7])
+        status[i] = decide_distance(kind, query, distance[i], toi[i], wp.static(DIGITS), timed)
 
     return decide
 

@@ -53,7 +53,8 @@ def classify_both_ways(kind, points, roundoff):
     queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
     alone, together = (wp.full(queries.count + int(BATCH), 7, dtype=int, device="cpu") for _ in range(2))
     one, many = kernels_of(kind, queries.dtype)
-    x0, x1, elements, pairs = queries.arrays
+    given = queries.given
+    x0, x1, elements, pairs = given.x0, given.x1, given.elements, given.pairs
     wp.launch(one, queries.count, inputs=[x0, x1, roundoff], outputs=[alone], device="cpu")
     inputs = [x0, x1, elements, pairs, roundoff]
     wp.launch(many, -(-queries.count // BATCH), inputs=inputs, outputs=[together], device="cpu")

@@ -85,7 +85,8 @@ def cull(kind, points, roundoff):
     queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
     alone, together = (wp.zeros(queries.count + BATCH, dtype=int, device="cpu") for _ in range(2))
     one, eight = kernels_of(kind, queries.dtype)
-    x0, x1, elements, pairs = queries.arrays
+    given = queries.given
+    x0, x1, elements, pairs = given.x0, given.x1, given.elements, given.pairs
     wp.launch(one, queries.count, inputs=[x0, x1, roundoff], outputs=[alone], device="cpu")
     inputs = [x0, x1, elements, pairs, roundoff]
     wp.launch(eight, -(-queries.count // BATCH), inputs=inputs, outputs=[together], device="cpu")

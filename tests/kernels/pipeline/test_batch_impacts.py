@@ -108,7 +108,8 @@ def find_both_ways(kind, points, roundoff, tolerance):
     one, many = kernels_of(kind, wp.vec3 if points.dtype == np.float32 else wp.vec3d)
     queries = QuerySet(Queries.of_points(PairKind[kind.upper()], points), "cpu")
     classified, *alone = wp.zeros(len(points), dtype=wp.int8, device="cpu"), *outputs_of(len(points))
-    inputs = [*queries.arrays[:2], roundoff, tolerance]
+    given = queries.given
+    inputs = [given.x0, given.x1, roundoff, tolerance]
     wp.launch(one, len(points), inputs=inputs, outputs=[classified, *alone], device="cpu")
     contacts = classified.numpy() != FREE
     alone = [array.numpy()[contacts] for array in alone]
@@ -119,7 +120,7 @@ def find_both_ways(kind, points, roundoff, tolerance):
     for timed in (True, False):
         status, *others = outputs_of(n)
         status.assign(classified.numpy()[contacts])
-        inputs = [*queries.arrays[:3], pairs, roundoff, timed, tolerance]
+        inputs = [given.x0, given.x1, given.elements, pairs, roundoff, timed, tolerance]
         wp.launch(many, -(-n // BATCH), inputs=inputs, outputs=[status, *others, left], device="cpu")
         results.append([array.numpy() for array in (status, *others)])
     return alone, *results, left.numpy() == 1, contacts

@@ -301,6 +301,62 @@ def test_bad_distances_are_refused(options, message, device):
         bsc.SolverCCD(newton.solvers.SolverXPBD(model), **options)
 
 
+def radii_of(solver):
+    """The radii of vertices and planes that a solver keeps."""
+    kept = solver.mesh.distances
+    return kept.radius.numpy().copy(), kept.of_planes.numpy().copy()
+
+
+def test_arrays_are_read_again_in_each_step(device):
+    """As numbers in a solver that is made anew; what is no distance counts as 0."""
+    builder = newton.ModelBuilder()
+    add_patch(builder, 3, 0.05, (0.0, 0.0, 0.05))
+    add_rope(builder, [(0.05 * i, 0.0, 0.2) for i in range(4)])
+    builder.add_ground_plane()
+    builder.add_shape_sphere(-1, radius=0.01)
+    builder.color()
+    model = builder.finalize(device=device)
+    least, radii = (wp.full(n, 1e-3, dtype=float, device=device) for n in (1, model.particle_count))
+    solver = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=least, particle_radius=radii)
+    states = model.state(), model.state()
+    values = np.float32(np.random.default_rng(1).uniform(1e-3, 2e-3, model.particle_count))
+    for minimum in (np.float32(0.004), np.float32(0.0)):
+        least.fill_(minimum)
+        radii.assign(values)
+        solver.step(*states, None, None, DT)
+        other = bsc.SolverCCD(newton.solvers.SolverXPBD(model), min_distance=float(minimum), particle_radius=values)
+        for found, expected in zip(radii_of(solver), radii_of(other), strict=True):
+            assert np.array_equal(found, expected)
+    least.fill_(np.nan)
+    radii.assign([-1.0, np.nan, *values[2:]])
+    solver.step(*states, None, None, DT)
+    expected = np.zeros(solver.mesh.vertex_count)
+    expected[2 : len(values)] = values[2:]
+    assert np.array_equal(radii_of(solver)[0], expected) and not radii_of(solver)[1].any()
+
+
+@pytest.mark.parametrize("options", [{"min_distance": "model"}, {}])
+def test_distances_of_a_model_with_gradients_are_read_again(options, device):
+    """By default those of springs and particles without faces alone."""
+    builder = newton.ModelBuilder()
+    add_patch(builder, 3, 0.05, (0.0, 0.0, 0.05))
+    add_rope(builder, [(0.05 * i, 0.0, 0.2) for i in range(4)])
+    builder.add_ground_plane()
+    builder.color()
+    model = builder.finalize(device=device, requires_grad=True)
+    solver = bsc.SolverImplicit(model, **options)
+    before = radii_of(solver)
+    model.particle_radius.assign(model.particle_radius.numpy() + np.float32(1e-3))
+    model.shape_margin.fill_(2e-3)
+    solver.step(model.state(), model.state(), None, None, DT)
+    after = bsc.SolverImplicit(model, **options)
+    for found, old, expected in zip(radii_of(solver), before, radii_of(after), strict=True):
+        assert np.array_equal(found, expected)
+        assert (found != old).any() == ("min_distance" in options or len(found) == solver.mesh.vertex_count)
+    is_face = np.isin(np.arange(solver.mesh.vertex_count), solver.mesh.faces)
+    assert radii_of(solver)[0][is_face].any() == ("min_distance" in options)
+
+
 def test_bodies_alone(device):
     """Boxes that fall onto each other and onto a table, in a model without particles, keep the distance."""
     distance = 0.01

@@ -12,7 +12,7 @@ from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
 from ...detection.run.settings import PairKind
 from ..record import name_place
 from ..tables import Column, Table, count, two
-from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds
+from .methods import MethodRun, Queries, QuerySet, measure_nanoseconds, time_in_turns
 
 METHODS = (*NARROW_PHASE_METHODS, "cubic")
 """The methods, see :mod:`.methods`."""
@@ -42,9 +42,6 @@ COLUMNS = (
 )
 """Columns of what :func:`benchmark_given_queries` returns."""
 
-_SMALLEST_LAUNCH = {False: 2**18, True: 2**22}
-"""Queries of a launch on a CPU and on a GPU: fewer are repeated."""
-
 
 def _nanoseconds(run: MethodRun) -> float:
     """Returns the time of a query in a launch of all queries [ns]."""
@@ -58,9 +55,7 @@ def _nanoseconds(run: MethodRun) -> float:
 def benchmark_given_queries(
     name: str, kind: PairKind, points: np.ndarray, *, device: wp.DeviceLike = None, repeat: int = 20
 ) -> dict[str, Any]:
-    """Measures all methods on queries, in turns; the fastest counts, as other work can only slow a turn down.
-
-    The first launch of each method, which loads its kernels, is not timed.
+    """Measures all methods on queries in turns, see :func:`.methods.time_in_turns`.
 
     Args:
         name: Name of the queries.
@@ -83,12 +78,7 @@ def benchmark_given_queries(
     queries = Queries.of_points(kind, points)
     exact = MethodRun("exact", QuerySet(queries, device))
     exact.launch()
-    repeated = QuerySet(queries, device, repeated=-(-_SMALLEST_LAUNCH[device.is_cuda] // len(queries)))
-    runs = {method: MethodRun(method, repeated) for method in METHODS}
-    for run in runs.values():
-        run.launch()
-    turns = [{method: _nanoseconds(run) for method, run in runs.items()} for _ in range(repeat)]
-    fastest = {method: min(turn[method] for turn in turns) for method in METHODS}
+    fastest = time_in_turns(METHODS, queries, device, repeat, _nanoseconds)
     hits = int(exact.find_hits().sum())
     return {"name": name, "kind": kind.display_name, "queries": len(queries), "hits": hits, "nanoseconds": fastest}
 

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import newton
 import numpy as np
@@ -13,26 +13,6 @@ from ...response.report.strain import edges_at_rest
 from ...response.state.mesh import ModelMesh, host_array
 from ..crossings import SoftPairs
 from ..scenes.simulation import largest_stretch
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """What exact detection finds in a trajectory. Pairs of two fixed shapes do not count.
-
-    Attributes:
-        crossings: Edges that pass through faces, at the end of each frame.
-        shape_crossings: Those of them in which one of the two belongs to a fixed shape.
-        collisions: Vertex-face and edge-edge pairs that meet on the straight way from each state to the next, for each
-            step.
-        inverted: Tetrahedra that are inverted, at the end of each frame.
-        stretch: Largest elongation of an edge beyond its length at rest, of all frame ends [%].
-    """
-
-    crossings: tuple[int, ...]
-    shape_crossings: tuple[int, ...]
-    collisions: tuple[int, ...]
-    inverted: tuple[int, ...]
-    stretch: float
 
 
 class Judge:
@@ -62,13 +42,20 @@ class Judge:
 
     def judge(
         self, states: list[np.ndarray], steps_per_frame: int, progress: Callable[[int], None] = lambda done: None
-    ) -> Judgement:
-        """Returns what detection finds in a trajectory.
+    ) -> dict[str, Any]:
+        """Returns what detection finds in a trajectory. Pairs of two fixed shapes do not count.
 
         Args:
             states: Positions of the particles at the start and after each step [m], each of shape [particle_count, 3].
             steps_per_frame: Steps of a frame; the last frame may have fewer.
             progress: Called with the number of steps that are judged.
+
+        Returns:
+            ``crossings``, the edges that pass through faces at the end of each frame, and ``shape_crossings``, those of
+            them in which one of the two belongs to a fixed shape; ``collisions``, the vertex-face and edge-edge pairs
+            that meet on the straight way from each state to the next, for each step; ``inverted``, the tetrahedra that
+            are inverted at the end of each frame; ``stretch``, the largest elongation of an edge beyond its length at
+            rest, of all frame ends [%].
 
         Raises:
             ValueError: If positions are not finite or have another shape.
@@ -83,13 +70,13 @@ class Judge:
         for step, pair in enumerate(itertools.pairwise(positions)):
             collisions.append(self._pairs.count_collisions(*pair))
             progress(step + 1)
-        return Judgement(
-            crossings=tuple(every for every, _ in crossings),
-            shape_crossings=tuple(with_shapes for _, with_shapes in crossings),
-            collisions=tuple(collisions),
-            inverted=tuple(inverted),
-            stretch=100.0 * max(largest_stretch(states[end], self._edges, self._lengths) for end in ends),
-        )
+        return {
+            "crossings": [every for every, _ in crossings],
+            "shape_crossings": [with_shapes for _, with_shapes in crossings],
+            "collisions": collisions,
+            "inverted": inverted,
+            "stretch": 100.0 * max(largest_stretch(states[end], self._edges, self._lengths) for end in ends),
+        }
 
     def _with_shapes(self, state: np.ndarray) -> wp.array:
         """Returns positions of all vertices on the device, of the shapes as well."""

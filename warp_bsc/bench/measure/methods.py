@@ -22,6 +22,7 @@ The phase that decides a query and its clock cycles come from a kernel of its ow
 """
 
 import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,7 @@ import warp as wp
 
 from ...detection.narrow.narrow_phase import NarrowPhase
 from ...detection.narrow.rules.contact import run_contacts
-from ...detection.queries.query_points import query_points
+from ...detection.queries.query_points import elements_of_rows, query_points
 from ...detection.run.launch import launch_over, launch_over_queue, retry_until_fits
 from ...detection.run.phase_timer import PhaseTimer
 from ...detection.run.settings import METHODS as NARROW_PHASE_METHODS
@@ -38,6 +39,7 @@ from ...kernels.bits import lowest_bit
 from ...kernels.classification import classify
 from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ...kernels.motion import edge_edge_motion, vertex_face_motion
+from ...kernels.pairs import ends_of, vertices_of_pair
 from ...kernels.pipeline.batch_culling import BATCH, cull_batch_of
 from ...kernels.pipeline.queues import take_slot
 from ...kernels.polynomials import coplanarity
@@ -57,6 +59,8 @@ _AXIS_BOXES, _BERNSTEIN_SIGNS, _SEPARATING_DIRECTION, _CLASSIFICATION, _SUBDIVIS
 )
 
 _WARP_SIZE = 32
+_SMALLEST_LAUNCH = {False: 2**18, True: 2**22}
+"""Queries of a launch on a CPU and on a GPU: fewer are repeated."""
 
 
 @wp.func_native("""
@@ -72,6 +76,22 @@ def _clock() -> wp.int64: ...
 
 
 @functools.cache
+def _pairs_of(dtype: type) -> type:
+    """Returns the struct that all methods read, for one type of position."""
+
+    @wp.struct
+    class MeshPairs:
+        """Pairs of a mesh's elements, and positions of its vertices at both ends of the step."""
+
+        x0: wp.array[dtype]
+        x1: wp.array[dtype]
+        elements: wp.array2d[int]
+        pairs: wp.array[wp.vec2i]
+
+    return MeshPairs
+
+
+@functools.cache
 def _kernels(kind: PairKind, dtype: type):
     """Returns the kernels for one kind of query and one type of position, each in a module of its own.
 
@@ -82,46 +102,22 @@ def _kernels(kind: PairKind, dtype: type):
     motion_of = vertex_face_motion if vertex_face else edge_edge_motion
     boxes_apart = vertex_face_boxes_apart if vertex_face else edge_edge_boxes_apart
     solve_cubic = cubic_solver_vertex_face if vertex_face else cubic_solver_edge_edge
+    kind_number, MeshPairs = int(kind), _pairs_of(dtype)
 
     @wp.func
-    def read(x: wp.array[dtype], elements: wp.array2d[int], pair: wp.vec2i):
-        first = pair[0]
-        second = pair[1]
-        if wp.static(vertex_face):
-            return x[first], x[elements[second, 0]], x[elements[second, 1]], x[elements[second, 2]]
-        return x[elements[first, 0]], x[elements[first, 1]], x[elements[second, 0]], x[elements[second, 1]]
+    def read(given: MeshPairs, i: int):
+        return ends_of(given.x0, given.x1, vertices_of_pair(kind_number, given.elements, given.pairs[i]))
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
-    def cubic(
-        first: int,
-        # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
-        # out
-        status: wp.array[wp.int8],
-    ):
+    def cubic(first: int, given: MeshPairs, status: wp.array[wp.int8]):
         i = first + wp.tid()
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(given, i)
         status[i] = wp.int8(solve_cubic(a0, b0, c0, d0, a1, b1, c1, d1))
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
-    def cull(
-        first: int,
-        # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
-        # out
-        survivors: wp.array[int],
-        survivor_count: wp.array[wp.int64],
-    ):
+    def cull(first: int, given: MeshPairs, survivors: wp.array[int], survivor_count: wp.array[wp.int64]):
         i = first + wp.tid()
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(given, i)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         y = coplanarity(motion)
         if certified_sign_cubic(y.k, y.bound) != 0:
@@ -135,19 +131,10 @@ def _kernels(kind: PairKind, dtype: type):
     cull_batch = cull_batch_of(dtype, vertex_face)
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
-    def cull_batches(
-        first: int,
-        # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
-        # out
-        survivors: wp.array[int],
-        survivor_count: wp.array[wp.int64],
-    ):
+    def cull_batches(first: int, given: MeshPairs, survivors: wp.array[int], survivor_count: wp.array[wp.int64]):
         i = BATCH * (first + wp.tid())
-        left = cull_batch(x0, x1, elements, pairs, i, wp.min(BATCH, pairs.shape[0] - i), wp.float64(0.0))
+        count = wp.min(BATCH, given.pairs.shape[0] - i)
+        left = cull_batch(given.x0, given.x1, given.elements, given.pairs, i, count, wp.float64(0.0))
         while left != wp.uint64(0):
             survivors[wp.int32(take_slot(survivor_count, 0))] = i + lowest_bit(left)
             left = left & (left - wp.uint64(1))
@@ -156,10 +143,7 @@ def _kernels(kind: PairKind, dtype: type):
     def classify_survivors(
         first: int,
         # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
+        given: MeshPairs,
         survivors: wp.array[int],
         survivor_count: wp.array[wp.int64],
         # out
@@ -169,8 +153,7 @@ def _kernels(kind: PairKind, dtype: type):
         if wp.int64(slot) >= survivor_count[0]:
             return
         i = survivors[slot]
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(given, i)
         motion = motion_of(a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
         status[i] = wp.int8(classify_reduced(motion, coplanarity(motion)))
 
@@ -178,10 +161,7 @@ def _kernels(kind: PairKind, dtype: type):
     def trace(
         first: int,
         # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        pairs: wp.array[wp.vec2i],
+        given: MeshPairs,
         lanes: int,
         solves_cubic: bool,
         reduced: bool,
@@ -192,8 +172,7 @@ def _kernels(kind: PairKind, dtype: type):
     ):
         i = (first + wp.tid()) // lanes
         start = _clock()
-        a0, b0, c0, d0 = read(x0, elements, pairs[i])
-        a1, b1, c1, d1 = read(x1, elements, pairs[i])
+        a0, b0, c0, d0, a1, b1, c1, d1 = read(given, i)
         decided = _AXIS_BOXES
         if solves_cubic:
             # any phase: only the time counts, and the status must be computed
@@ -242,10 +221,7 @@ class Queries:
         """Returns queries with four vertices of their own each, from rows as of :func:`warp_bsc.query_vertex_face`."""
         n = len(points)
         x0, x1 = (np.ascontiguousarray(x).reshape(-1, 3) for x in (points[:, :4], points[:, 4:]))
-        vertices, rows = np.arange(4 * n, dtype=np.int32).reshape(n, 4), np.arange(n, dtype=np.int32)
-        if kind == PairKind.VERTEX_FACE:
-            return cls(kind, x0, x1, np.ascontiguousarray(vertices[:, 1:]), np.stack([4 * rows, rows], axis=1))
-        return cls(kind, x0, x1, vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1))
+        return cls(kind, x0, x1, *elements_of_rows(kind, np.arange(4 * n, dtype=np.int32).reshape(n, 4)))
 
     def points(self, which: slice | np.ndarray | list[int] = slice(None)) -> np.ndarray:
         """Returns the points of some queries, rows as of :func:`warp_bsc.query_vertex_face`, shape [n, 8, 3]."""
@@ -263,8 +239,8 @@ class QuerySet:
         kind: Kind of pair.
         count: Number of queries.
         pairs: The queries' pairs on the host, without repetitions, int32, shape [n, 2].
-        arrays: The arrays that all methods read: positions at the start and at the end, Warp arrays of vec3 or vec3d;
-            elements, two-dimensional array of int; and pairs, array of vec2i.
+        given: What all methods read: positions at the start and at the end, Warp arrays of vec3 or vec3d; elements,
+            two-dimensional array of int; and pairs, array of vec2i.
     """
 
     def __init__(self, queries: Queries, device: wp.DeviceLike, *, repeated: int = 1):
@@ -274,11 +250,10 @@ class QuerySet:
         self.dtype = wp.vec3 if queries.x0.dtype == np.float32 else wp.vec3d
         self.pairs = queries.pairs
         self.count = repeated * len(queries)
-        self.arrays = [
-            *(wp.array(x, dtype=self.dtype, device=device) for x in (queries.x0, queries.x1)),
-            wp.array(queries.elements, dtype=int, device=device),
-            wp.array(np.tile(queries.pairs, (repeated, 1)), dtype=wp.vec2i, device=device),
-        ]
+        self.given = given = _pairs_of(self.dtype)()
+        given.x0, given.x1 = (wp.array(x, dtype=self.dtype, device=device) for x in (queries.x0, queries.x1))
+        given.elements = wp.array(queries.elements, dtype=int, device=device)
+        given.pairs = wp.array(np.tile(queries.pairs, (repeated, 1)), dtype=wp.vec2i, device=device)
 
 
 class MethodRun:
@@ -299,37 +274,36 @@ class MethodRun:
             self._survivors = wp.empty(n, dtype=int, device=device)
             self._survivor_count = wp.zeros(1, dtype=wp.int64, device=device)
             return
-        x0, _, elements, pairs = queries.arrays
-        first_elements = len(x0) if queries.kind == PairKind.VERTEX_FACE else len(elements)
+        given = queries.given
+        first_elements = len(given.x0) if queries.kind == PairKind.VERTEX_FACE else len(given.elements)
         self._counts = wp.zeros(len(Count), dtype=wp.int64, device=device)
         self._start_counts = wp.array(PairCounts(queued=n).values(), dtype=wp.int64, device=device)
-        self._narrow_phase = NarrowPhase(queries.kind, self._counts, n, (first_elements, len(elements)))
-        wp.copy(self._narrow_phase.queue, pairs)
+        self._narrow_phase = NarrowPhase(queries.kind, self._counts, n, (first_elements, len(given.elements)))
+        wp.copy(self._narrow_phase.queue, given.pairs)
         retry_until_fits(self.launch, self._narrow_phase, device)
 
     def launch(self) -> None:
         """Decides all queries; on a GPU without synchronizing with the device."""
         queries = self.queries
-        arrays, device = queries.arrays, queries.device
+        given, device = queries.given, queries.device
         if self.method in NARROW_PHASE_METHODS:
             wp.copy(self._counts, self._start_counts)
-            x0, x1, elements = arrays[:3]
-            phases = [(self._narrow_phase, elements)]
-            run_contacts(phases, x0, x1, method=self.method, timed=False, timer=PhaseTimer(None))
+            phases = [(self._narrow_phase, given.elements)]
+            run_contacts(phases, given.x0, given.x1, method=self.method, timed=False, timer=PhaseTimer(None))
             return
         cubic, cull, cull_batches, classify_survivors, _ = _kernels(queries.kind, queries.dtype)
         if self.method == "cubic":
-            launch_over(cubic, queries.count, inputs=arrays, outputs=[self._status], device=device)
+            launch_over(cubic, queries.count, inputs=[given], outputs=[self._status], device=device)
             return
         self._status.zero_()  # FREE, unless a query survives the culls
         self._survivor_count.zero_()
         outputs = [self._survivors, self._survivor_count]
         if device.is_cpu:
             batches = -(-queries.count // BATCH)
-            launch_over(cull_batches, batches, inputs=arrays, outputs=outputs, device=device, chunk=16)
+            launch_over(cull_batches, batches, inputs=[given], outputs=outputs, device=device, chunk=16)
         else:
-            launch_over(cull, queries.count, inputs=arrays, outputs=outputs, device=device)
-        inputs = [*arrays, self._survivors, self._survivor_count]
+            launch_over(cull, queries.count, inputs=[given], outputs=outputs, device=device)
+        inputs = [given, self._survivors, self._survivor_count]
         launch_over_queue(
             classify_survivors, self._survivors, self._survivor_count, 0, inputs=inputs, outputs=[self._status]
         )
@@ -366,6 +340,21 @@ def measure_nanoseconds(run: MethodRun, *, repeat: int) -> float:
     return 1e6 * median_milliseconds(run.launch, run.queries.device, repeat) / run.queries.count
 
 
+def time_in_turns(
+    methods: Sequence[str], queries: Queries, device: wp.Device, turns: int, measure: Callable[[MethodRun], float]
+) -> dict[str, float]:
+    """Returns what is measured of each method in turns, of which the fastest counts: other work can only slow one down.
+
+    The first launch of each method, which loads its kernels, is not measured. Few queries are repeated.
+    """
+    repeated = QuerySet(queries, device, repeated=-(-_SMALLEST_LAUNCH[device.is_cuda] // len(queries)))
+    runs = {method: MethodRun(method, repeated) for method in methods}
+    for run in runs.values():
+        run.launch()
+    measured = [{method: measure(run) for method, run in runs.items()} for _ in range(turns)]
+    return {method: min(turn[method] for turn in measured) for method in methods}
+
+
 def trace(queries: QuerySet, method: str) -> tuple[np.ndarray, np.ndarray]:
     """Finds the phase that decides each query, and the clock cycles that the query takes up to there.
 
@@ -385,7 +374,7 @@ def trace(queries: QuerySet, method: str) -> tuple[np.ndarray, np.ndarray]:
     cycles = wp.empty(n, dtype=wp.int64, device=device)
     lanes = _WARP_SIZE if device.is_cuda else 1
     roundoff = 0.0 if method in ("float", "reduced") else ROUNDOFF
-    inputs = [*queries.arrays, lanes, method == "cubic", method == "reduced", roundoff]
+    inputs = [queries.given, lanes, method == "cubic", method == "reduced", roundoff]
     *_, kernel = _kernels(queries.kind, queries.dtype)
     launch_over(kernel, lanes * n, inputs=inputs, outputs=[phase, cycles], device=device)
     return phase.numpy().copy(), cycles.numpy().copy()

@@ -175,11 +175,13 @@ def _measure_frames(
         stages: The stages behind or in place of its solvers.
         progress: Called with the number of frames done and the number of all.
     """
-    crossings = _Crossings(example)
-    model = example.model
+    from ..crossings import CrossingCounter  # noqa: PLC0415 (imports Newton)
+
+    state, model = _name_of_state(example), example.model
+    crossings = CrossingCounter(model)
     post_step = _Test(example, "test_post_step")
     seconds = []
-    at_start = crossings.count()
+    at_start = crossings.count(getattr(example, state))
     most, first_crossed, first_not_finite = 0, None, None
     for frame in range(frames):
         progress(frame, frames)
@@ -191,8 +193,8 @@ def _measure_frames(
         post_step.run()
         example.render()
         if first_not_finite is None and (frame % check_every == check_every - 1 or frame == frames - 1):
-            if crossings.are_finite():
-                count = crossings.count()
+            if crossings.is_finite(getattr(example, state)):
+                count = crossings.count(getattr(example, state))
                 most = max(most, count)
                 if count > at_start and first_crossed is None:
                     first_crossed = frame
@@ -248,38 +250,19 @@ class _Test:
             self.result = _describe_error(error)
 
 
-class _Crossings:
-    """Counts the crossings of an example's cloth and soft bodies in its present state.
+def _name_of_state(example: Any) -> str:
+    """Returns the name of the attribute that has an example's present state, which the example may replace by another.
 
     Raises:
         _NotApplicable: If the example has no cloth and no soft bodies, or its state is not where Newton's examples have
             theirs.
     """
-
-    def __init__(self, example: Any):
-        from ..crossings import CrossingCounter  # noqa: PLC0415 (imports Newton)
-
-        model = getattr(example, "model", None)
-        self._example = example
-        self._name = next((name for name in ("state_0", "state") if hasattr(example, name)), "")
-        if model is None or not self._name:
-            raise _NotApplicable("it has no attributes model and state_0")
-        if not model.tri_count + model.tet_count:
-            raise _NotApplicable("it has neither cloth nor soft bodies")
-        self._counter = CrossingCounter(model)
-
-    def count(self) -> int:
-        """Returns the number of crossings of an edge or a face of cloth or of a soft body."""
-        return self._counter.count(self._state)
-
-    def are_finite(self) -> bool:
-        """Returns whether the positions of all vertices of faces are finite."""
-        return self._counter.is_finite(self._state)
-
-    @property
-    def _state(self):
-        """The state, which the example may have replaced by another."""
-        return getattr(self._example, self._name)
+    model, name = getattr(example, "model", None), next((n for n in ("state_0", "state") if hasattr(example, n)), "")
+    if model is None or not name:
+        raise _NotApplicable("it has no attributes model and state_0")
+    if not model.tri_count + model.tet_count:
+        raise _NotApplicable("it has neither cloth nor soft bodies")
+    return name
 
 
 def _main() -> None:

@@ -26,12 +26,11 @@ from ..record import shorten_path
 from ..scenes.detector import BenchmarkScene, find_overlapping
 from ..timing import count_threads
 from .detector import benchmark_detector
-from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, trace
+from .methods import METHODS, PHASES, MethodRun, Queries, QuerySet, measure_nanoseconds, time_in_turns, trace
 from .worst_case import adversarial_queries, find_worst
 
 SEED = 0
 _TURNS = 8  # of timing all methods
-_CPU_QUERIES, _GPU_QUERIES = 2**18, 2**22  # smallest launches: fewer queries are repeated
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,10 @@ class Effort:
     adversaries: int
     repeat: int
 
-    @classmethod
-    def full(cls) -> "Effort":
-        """Returns the effort of the whole benchmark."""
-        return cls(intervals=8, queries=2**19, sample=20_000, ipc_queries=4000, adversaries=100_000, repeat=24)
 
-    @classmethod
-    def quick(cls) -> "Effort":
-        """Returns the effort of a first look."""
-        return cls(intervals=2, queries=2**15, sample=1000, ipc_queries=500, adversaries=5000, repeat=3)
+FULL = Effort(intervals=8, queries=2**19, sample=20_000, ipc_queries=4000, adversaries=100_000, repeat=24)
+QUICK = Effort(intervals=2, queries=2**15, sample=1000, ipc_queries=500, adversaries=5000, repeat=3)
+"""The effort of the whole benchmark, and of a first look."""
 
 
 @dataclass(frozen=True)
@@ -315,16 +309,12 @@ def _time_methods(queries: dict[PairKind, Queries], place: Place, effort: Effort
     nanoseconds = dict.fromkeys(METHODS, 0.0)
     with place.limited():
         for found in queries.values():
-            repeated = -(-(_GPU_QUERIES if place.device.is_cuda else _CPU_QUERIES) // len(found))
-            on_device = QuerySet(found, place.device, repeated=repeated)
-            runs = {method: MethodRun(method, on_device) for method in METHODS}
-            # in turns; the fastest counts, as other work on the machine can only slow a turn down
             repeat = -(-effort.repeat // _TURNS)
-            took = [
-                {method: measure_nanoseconds(run, repeat=repeat) for method, run in runs.items()} for _ in range(_TURNS)
-            ]
+            took = time_in_turns(
+                METHODS, found, place.device, _TURNS, lambda run, repeat=repeat: measure_nanoseconds(run, repeat=repeat)
+            )
             for method in METHODS:
-                nanoseconds[method] += min(turn[method] for turn in took) * len(found) / total
+                nanoseconds[method] += took[method] * len(found) / total
         worst = _find_slowest(queries.values(), place, effort) if place.cores in (1, None) else {}
     where = {"place": place.name, "device": str(place.device), "device_name": place.device.name, "cores": place.cores}
     return where | {"nanoseconds": nanoseconds, "worst": worst}

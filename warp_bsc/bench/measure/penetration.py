@@ -168,7 +168,7 @@ class PenetrationRun(Run):
         measured: Plain data for JSON. ``device``, that of Newton's solvers, "cpu" for MuJoCo, "cuda" for libuipc;
             ``version``, that of the distribution that the simulator comes with; numbers of ``particles``, of
             ``triangles`` of cloth and of the surfaces of soft bodies, of ``frames`` and ``steps``; ``crossings``,
-            ``shape_crossings`` and ``inverted`` of each frame end, and ``stretch``, as of :class:`.judge.Judgement`;
+            ``shape_crossings`` and ``inverted`` of each frame end, and ``stretch``, as of :meth:`.judge.Judge.judge`;
             ``collisions``, the pairs that meet on the straight way from each state to the next, all, and
             ``colliding_steps``, the steps in which there are such pairs; ``speed_kept``, the share of its speed that a
             freely flying body keeps before it meets anything, None where nothing flies for a step;
@@ -235,21 +235,17 @@ def _measure(scene: str, name: str, frames: int | None, progress: Callable[[int,
     device, trajectory = _simulate(built, name, seconds, lambda done, steps: progress(done, 2 * steps))
     states, timed = trajectory.states, trajectory.milliseconds[WARM_UP:] or trajectory.milliseconds
     steps = len(states) - 1
-    judgement = Judge(model).judge(states, simulator.rate // FRAME_RATE, lambda done: progress(steps + done, 2 * steps))
-    return {
+    judged = Judge(model).judge(states, simulator.rate // FRAME_RATE, lambda done: progress(steps + done, 2 * steps))
+    return judged | {
         "device": device,
         "version": version_of(simulator.package) or "of unknown version",  # built from source
         "particles": model.particle_count,
         "triangles": model.tri_count,
-        "frames": len(judgement.crossings),
+        "frames": len(judged["crossings"]),
         "steps": steps,
-        "crossings": judgement.crossings,
-        "shape_crossings": judgement.shape_crossings,
-        "collisions": sum(judgement.collisions),
-        "colliding_steps": sum(found > 0 for found in judgement.collisions),
-        "inverted": judgement.inverted,
+        "collisions": sum(judged["collisions"]),
+        "colliding_steps": sum(found > 0 for found in judged["collisions"]),
         "speed_kept": find_speed_kept(built, states, simulator.rate),
-        "stretch": judgement.stretch,
         "uncertified_steps": trajectory.uncertified_steps,
         "milliseconds": {"median": float(np.median(timed)), "mean": float(np.mean(timed))},
     }

@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from ...kernels.ccd import ccd_edge_edge, ccd_vertex_face, impact_edge_edge, imp
 from ...kernels.classification import classify
 from ...kernels.culling import centroid_direction, direction_separates, edge_edge_boxes_apart, vertex_face_boxes_apart
 from ...kernels.exact.first_contact import NONE, decide_in
-from ...kernels.motion import doubles, edge_edge_motion, vertex_face_motion
+from ...kernels.motion import edge_edge_motion, query_of, vertex_face_motion
 from ...kernels.pipeline.queues import take_slot
 from ...kernels.polynomials import coplanarity
 from ...kernels.signs import FREE, HIT, ROUNDOFF, UNSURE, certified_sign_cubic
@@ -64,53 +63,6 @@ _RATES = (
 
 _MAX_QUERIES = 2**26
 _COPIED_BYTES = 2**28  # more than a cache holds
-
-
-@dataclass(frozen=True)
-class QueryBenchmark:
-    """Results of the queries of one kind, and the times to find them.
-
-    Attributes:
-        kind: Kind of pair.
-        status: Status of each query, 0 FREE, 1 HIT, 2 UNSURE, int8, shape [query_count].
-        survivors: Number of queries that no cull decides.
-        milliseconds: Median time to decide all queries, by mode [ms].
-    """
-
-    kind: PairKind
-    status: np.ndarray
-    survivors: int
-    milliseconds: dict[str, float]
-
-    @property
-    def survivor_share(self) -> float:
-        """The share of the queries that no cull decides."""
-        return self.survivors / len(self.status)
-
-    @property
-    def free(self) -> int:
-        """Number of queries certified to be free."""
-        return int((self.status == FREE).sum())
-
-    @property
-    def hits(self) -> int:
-        """Number of queries certified to collide."""
-        return int((self.status == HIT).sum())
-
-    @property
-    def unsure(self) -> int:
-        """Number of queries that floating point could not certify."""
-        return int((self.status == UNSURE).sum())
-
-    @property
-    def queries_per_second(self) -> dict[str, float]:
-        """Queries answered per second, by mode [1/s]."""
-        return {mode: 1e3 * len(self.status) / took for mode, took in self.milliseconds.items()}
-
-    @property
-    def bytes_per_second(self) -> dict[str, float]:
-        """Bytes of queries read and of results written, by mode [1/s]."""
-        return {mode: MODES[mode] * rate for mode, rate in self.queries_per_second.items()}
 
 
 @functools.cache
@@ -220,9 +172,7 @@ def _kernels(kind: PairKind):
     ):
         i = first + wp.tid()
         a0, b0, c0, d0, a1, b1, c1, d1 = read(points, i)
-        a0d, b0d, c0d, d0d = doubles(a0, b0, c0, d0)
-        a1d, b1d, c1d, d1d = doubles(a1, b1, c1, d1)
-        time = decide(number, a0d, b0d, c0d, d0d, a1d, b1d, c1d, d1d, False, 0)
+        time = decide(number, query_of(a0, b0, c0, d0, a1, b1, c1, d1), False, 0)
         status[i] = wp.int8(wp.where(time < NONE, HIT, FREE))
 
     return find_status, find_impact, cull, classify_survivors, find_exact_status
@@ -236,7 +186,7 @@ def check_query_count(count: int) -> None:
 
 def benchmark_queries(
     kind: PairKind, *, count: int | None = None, device: wp.DeviceLike = None, repeat: int = 20
-) -> QueryBenchmark:
+) -> tuple[dict[str, Any], np.ndarray]:
     """Measures the time of random queries in each mode: replays of a CUDA graph, launches on the CPU.
 
     A first run of each mode is not timed.
@@ -246,6 +196,13 @@ def benchmark_queries(
         count: Number of queries; default: 2^24 on a GPU, 2^18 on the CPU.
         device: Warp device; default: Warp's default.
         repeat: Number of repetitions; their medians count.
+
+    Returns:
+        Plain data for JSON: ``kind``; ``queries``, the number of queries; ``survivors``, the number and
+        ``survivor_share``, the share of those that no cull decides; ``certified``, numbers of queries that are
+        certified to be ``free``, certified to collide, ``hit``, or that floating point could not certify, ``unsure``;
+        ``modes``, the median time to decide all queries by mode [ms]. And the status of each query, 0 FREE, 1 HIT, 2
+        UNSURE, int8, shape [count].
 
     Raises:
         TypeError: If ``repeat`` is no integer.
@@ -303,7 +260,18 @@ def benchmark_queries(
             raise RuntimeError(
                 f"{different} of {count} {kind.display_name} queries were decided differently by mode {mode}"
             )
-    return QueryBenchmark(kind, results["status"].copy(), int(counts.numpy()[0]), milliseconds)
+    answers, survivors_left = results["status"].copy(), int(counts.numpy()[0])
+    measured = {
+        "kind": kind.display_name,
+        "queries": count,
+        "survivors": survivors_left,
+        "survivor_share": survivors_left / count,
+        "certified": {
+            name: int((answers == answer).sum()) for name, answer in (("free", FREE), ("hit", HIT), ("unsure", UNSURE))
+        },
+        "modes": milliseconds,
+    }
+    return measured, answers
 
 
 def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
@@ -325,27 +293,23 @@ def benchmark_copy(*, device: wp.DeviceLike = None, repeat: int = 20) -> float:
     return 2e3 * _COPIED_BYTES / milliseconds
 
 
-def to_dict(benchmarks: list[QueryBenchmark], **settings: Any) -> dict[str, Any]:
+def to_dict(benchmarks: list[dict[str, Any]], **settings: Any) -> dict[str, Any]:
     """Returns results as plain data for JSON, with settings, of which one is the rate of :func:`benchmark_copy`."""
+
+    def rates(mode: str, milliseconds: float, queries: int) -> dict[str, float]:
+        """Returns what a mode does in a second, by its time for all queries."""
+        rate = 1e3 * queries / milliseconds
+        return {
+            "milliseconds": milliseconds,
+            "queries_per_second": rate,
+            "bytes_per_query": MODES[mode],
+            "bytes_per_second": MODES[mode] * rate,
+            "share_of_copy": MODES[mode] * rate / settings["copy_bytes_per_second"],
+        }
+
     return settings | {
         "kinds": [
-            {
-                "kind": found.kind.display_name,
-                "queries": len(found.status),
-                "survivors": found.survivors,
-                "survivor_share": found.survivor_share,
-                "certified": {"free": found.free, "hit": found.hits, "unsure": found.unsure},
-                "modes": {
-                    mode: {
-                        "milliseconds": milliseconds,
-                        "queries_per_second": found.queries_per_second[mode],
-                        "bytes_per_query": MODES[mode],
-                        "bytes_per_second": found.bytes_per_second[mode],
-                        "share_of_copy": found.bytes_per_second[mode] / settings["copy_bytes_per_second"],
-                    }
-                    for mode, milliseconds in found.milliseconds.items()
-                },
-            }
+            found | {"modes": {mode: rates(mode, took, found["queries"]) for mode, took in found["modes"].items()}}
             for found in benchmarks
         ]
     }

@@ -8,7 +8,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -116,78 +116,6 @@ _IMPLICIT: dict[str, dict[str, Any]] = {"implicit": {}, CONVERGED: {"max_iterati
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Differences between two runs of which one begins with all particles moved sideways.
-
-    Attributes:
-        distance: How far they are moved [m].
-        stretch_at_end: Difference of the stretches at the end [%].
-        stretch_at_most: Difference of the largest stretches [%].
-    """
-
-    distance: float
-    stretch_at_end: float
-    stretch_at_most: float
-
-
-@dataclass(frozen=True)
-class ResponseMeasurement:
-    """What a run gave.
-
-    Attributes:
-        device: The Warp device.
-        particles: Number of particles.
-        triangles: Number of triangles of cloth and of the surfaces of soft bodies.
-        rate: Steps a second.
-        steps: Number of steps.
-        stretch_at_end: Largest elongation of an edge of cloth, a tetrahedron or a spring beyond its length at rest,
-            mean over the last tenth of the steps [%].
-        stretch_at_most: The same, the largest of all steps [%].
-        rest_speed: Mean speed of movable particles over the last tenth of the steps [mm/s].
-        energy_gained: Largest rise of the kinetic, gravitational and elastic energy of a world above its least value
-            so far [J]; None where a program moves something, and behind other solvers than VBD, whose elastic energies
-            are others. Contacts have no energy here: what Newton's, which are springs, give back counts as a rise.
-        crossings: Crossings of cloth, soft bodies and springs at the end, also with rigid shapes.
-        collisions: Vertex-face and edge-edge pairs that meet on the straight way of a step, at least one of them not of
-            a rigid shape, in all steps together; None for the reference, which has too many.
-        uncertified_steps: Steps that were not certified; None without a stage.
-        milliseconds: Time of each step but the first :data:`WARM_UP` [ms], with Newton's contacts; two steps are timed
-            together.
-        early: Positions after :data:`EARLY_STEPS` steps [m], shape [particle_count, 3]; None if there are fewer steps.
-        spread: What a small offset of the start changes; None if it was not measured.
-    """
-
-    device: str
-    particles: int
-    triangles: int
-    rate: int
-    steps: int
-    stretch_at_end: float
-    stretch_at_most: float
-    rest_speed: float
-    energy_gained: float | None
-    crossings: int
-    collisions: int | None
-    uncertified_steps: int | None
-    milliseconds: list[float]
-    early: np.ndarray | None = field(default=None, repr=False)
-    spread: Spread | None = None
-
-    def distance_from(self, other: "ResponseMeasurement") -> float | None:
-        """Mean distance of the particles from those of a run with equal steps, after as many [mm]; None without it."""
-        if self.early is None or other.early is None or self.rate != other.rate:
-            return None
-        return 1e3 * float(np.linalg.norm(self.early - other.early, axis=1).mean())
-
-    def to_dict(self) -> dict[str, Any]:
-        """Returns the measurement as plain data for JSON."""
-        values, took = asdict(self), self.milliseconds
-        del values["early"]
-        times = {"median": float(np.median(took)), "mean": float(np.mean(took)), "worst": max(took)}
-        return values | {"milliseconds": times}
-
-
-@dataclass(frozen=True)
 class ResponseRun(Run):
     """A run of a scene in a configuration.
 
@@ -195,12 +123,39 @@ class ResponseRun(Run):
         scene: One of :data:`SCENES`.
         solver: One of :data:`SOLVERS`.
         configuration: One of :data:`CONFIGURATIONS`.
-        measured: A :class:`ResponseMeasurement`; None if there is none.
+        early: Positions after :data:`EARLY_STEPS` steps [m], shape [particle_count, 3]; None if there are fewer steps.
+        measured: Plain data for JSON. ``device``, that of Warp; numbers of ``particles``, and of ``triangles`` of cloth
+            and of the surfaces of soft bodies; ``rate``, steps a second; ``steps``, the number of steps;
+            ``stretch_at_end``, the largest elongation of an edge of cloth, a tetrahedron or a spring beyond its length
+            at rest, mean over the last tenth of the steps, and ``stretch_at_most``, the largest of all steps [%];
+            ``rest_speed``, the mean speed of movable particles over the last tenth of the steps [mm/s];
+            ``energy_gained``, the largest rise of the kinetic, gravitational and elastic energy of a world above its
+            least value so far [J], None where a program moves something, and behind other solvers than VBD, whose
+            elastic energies are others (contacts have no energy here: what Newton's, which are springs, give back
+            counts as a rise); ``crossings`` of cloth, soft bodies and springs at the end, also with rigid shapes;
+            ``collisions``, the vertex-face and edge-edge pairs that meet on the straight way of a step, at least one of
+            them not of a rigid shape, in all steps together, None for the reference, which has too many;
+            ``uncertified_steps``, None without a stage; ``milliseconds``, the median, mean and worst time of a step but
+            the first :data:`WARM_UP` [ms], with Newton's contacts, of which two are timed together; ``spread``, what a
+            small offset of the start changes, None if it was not measured: ``distance``, how far all particles are
+            moved sideways [m], and the differences of ``stretch_at_end`` and ``stretch_at_most`` [%].
     """
 
     scene: str
     solver: str
     configuration: str
+    early: np.ndarray | None = field(default=None, repr=False)
+
+    def distance_from(self, other: "ResponseRun | None") -> float | None:
+        """Mean distance of the particles from those of a run with equal steps, after as many [mm]; None without it."""
+        if (
+            other is None
+            or self.early is None
+            or other.early is None
+            or self.measured["rate"] != other.measured["rate"]
+        ):
+            return None
+        return 1e3 * float(np.linalg.norm(self.early - other.early, axis=1).mean())
 
 
 def measure_response(
@@ -226,8 +181,7 @@ def measure_response(
         rate: Steps a second of the other configurations; default: that of the scene, and of the semi-implicit solver
             :data:`SEMI_IMPLICIT_STEPS` times as many.
         reference_rate: Steps a second of the reference.
-        perturb: Distance [m]: the configuration ``stage`` runs a second time with all particles moved that far along x,
-            see :class:`Spread`.
+        perturb: Distance [m]: the configuration ``stage`` runs a second time with all particles moved that far along x.
         progress: Called with the number of steps done and the number of all.
 
     Returns:
@@ -259,7 +213,7 @@ def measure_response(
         return ResponseRun(scene, solver, configuration, problem="SolverImplicit takes the place of VBD")
     passes = 2 if perturb is not None and configuration == "stage" else 1
 
-    def run(number: int, offset: float) -> ResponseMeasurement:
+    def run(number: int, offset: float) -> tuple[dict[str, Any], np.ndarray | None]:
         def show(done: int, steps: int) -> None:
             if progress:
                 progress(number * steps + done, passes * steps)
@@ -270,17 +224,16 @@ def measure_response(
         with wp.ScopedDevice(device), warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             # what Style3D prints would be part of a JSON output; large strain is measured, and needs no warning
             warnings.simplefilter("ignore", UserWarning)
-            measured = run(0, 0.0)
+            measured, early = run(0, 0.0)
             if perturb is not None and passes == 2:
-                moved = run(1, perturb)
-                at_end, at_most = (
-                    abs(getattr(moved, name) - getattr(measured, name))
-                    for name in ("stretch_at_end", "stretch_at_most")
-                )
-                measured = replace(measured, spread=Spread(perturb, at_end, at_most))
+                moved, _ = run(1, perturb)
+                differences = {
+                    name: abs(moved[name] - measured[name]) for name in ("stretch_at_end", "stretch_at_most")
+                }
+                measured["spread"] = {"distance": perturb} | differences
     except (NotRunnable, NotFinite) as reason:
         return ResponseRun(scene, solver, configuration, problem=str(reason))
-    return ResponseRun(scene, solver, configuration, measured=measured)
+    return ResponseRun(scene, solver, configuration, early, measured=measured)
 
 
 def _measure(
@@ -292,8 +245,8 @@ def _measure(
     reference_rate: int,
     offset: float,
     progress: Callable[[int, int], None],
-) -> ResponseMeasurement:
-    """Runs a scene once, with all particles moved by an offset along x."""
+) -> tuple[dict[str, Any], np.ndarray | None]:
+    """Runs a scene once, with all particles moved by an offset along x; returns what it gave, and early positions."""
     from ..scenes.contact import build_scene  # noqa: PLC0415 (imports Newton)
     from ..scenes.simulation import Simulation, energy_gained  # noqa: PLC0415 (imports Newton)
 
@@ -319,36 +272,32 @@ def _measure(
     steps = simulation.run(built.seconds if seconds is None else seconds, progress)
     stage, samples, last = simulation.stage, simulation.samples, max(1, steps // 10)
     counts_energy = solver == "vbd" and not built.motion
-    return ResponseMeasurement(
-        device=str(built.model.device),
-        particles=built.model.particle_count,
-        triangles=built.model.tri_count,
-        rate=rate,
-        steps=steps,
-        stretch_at_end=100.0 * float(np.mean(samples.stretch[-last:])),
-        stretch_at_most=100.0 * max(samples.stretch[1:]),
-        rest_speed=1e3 * float(np.mean(samples.speed[-last:])),
-        energy_gained=energy_gained(np.array(samples.energy), samples.restarts) if counts_energy else None,
-        crossings=simulation.count_crossings(),
-        collisions=sum(simulation.collisions) if configuration != REFERENCE else None,
-        uncertified_steps=stage.report.totals.uncertified_steps if stage else None,
-        milliseconds=simulation.milliseconds[WARM_UP:],
-        early=samples.early,
-    )
+    took = simulation.milliseconds[WARM_UP:]
+    measured = {
+        "device": str(built.model.device),
+        "particles": built.model.particle_count,
+        "triangles": built.model.tri_count,
+        "rate": rate,
+        "steps": steps,
+        "stretch_at_end": 100.0 * float(np.mean(samples.stretch[-last:])),
+        "stretch_at_most": 100.0 * max(samples.stretch[1:]),
+        "rest_speed": 1e3 * float(np.mean(samples.speed[-last:])),
+        "energy_gained": energy_gained(np.array(samples.energy), samples.restarts) if counts_energy else None,
+        "crossings": simulation.count_crossings(),
+        "collisions": sum(simulation.collisions) if configuration != REFERENCE else None,
+        "uncertified_steps": stage.report.totals.uncertified_steps if stage else None,
+        "milliseconds": {"median": float(np.median(took)), "mean": float(np.mean(took)), "worst": max(took)},
+        "spread": None,
+    }
+    return measured, samples.early
 
 
 def to_dict(runs: list[ResponseRun]) -> dict[str, Any]:
     """Returns runs as plain data for JSON, with how far particles are from those of the converged run [mm]."""
-    converged = {run.scene: run.measured for run in runs if run.configuration == CONVERGED and run.measured}
-
-    def distance(run: ResponseRun) -> float | None:
-        other = converged.get(run.scene)
-        return run.measured.distance_from(other) if run.measured and other else None
-
-    rows = [
-        vars(run) | {"measured": run.measured and run.measured.to_dict(), "from_converged": distance(run)}
-        for run in runs
-    ]
+    converged = {run.scene: run for run in runs if run.configuration == CONVERGED}
+    rows = [vars(run) | {"from_converged": run.distance_from(converged.get(run.scene))} for run in runs]
+    for row in rows:
+        del row["early"]
     return {"steps_left_out": WARM_UP, "runs": rows}
 
 

@@ -8,7 +8,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..._arguments import as_numpy, check_finite, checked_coordinates, checked_distance, checked_number
-from ...kernels.arcs import arc_bounds, on_arc
+from ...kernels.arcs import Arcs, arc_bounds, on_arc_of
 from ...kernels.motion import double
 from ..run.launch import launch, made_once
 from ..run.settings import NO_FUSED_OPERATIONS, NO_GRADIENTS
@@ -34,32 +34,14 @@ _UP = 1.0 + 2.0**-40
 """Raises a few rounded operations above their exact result."""
 
 
-_Copy = tuple[wp.array, wp.array, wp.array]
-
-
 @made_once
 def _place_on_arcs(dtype: type) -> wp.Kernel:
     """Returns the kernel that computes positions at a time, for one type of position."""
 
     @wp.kernel(**NO_GRADIENTS)
-    def place_on_arcs(
-        # in
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        body: wp.array[int],
-        centre: wp.array[wp.vec3d],
-        turn: wp.array[wp.vec3d],
-        time: wp.float64,
-        # out
-        x: wp.array[wp.vec3d],
-    ):
+    def place_on_arcs(x0: wp.array[dtype], x1: wp.array[dtype], arcs: Arcs, time: wp.float64, x: wp.array[wp.vec3d]):
         i = wp.tid()
-        axis = wp.vec3d()
-        origin = wp.vec3d()
-        if body[i] >= 0:
-            axis = turn[body[i]]
-            origin = centre[body[i]]
-        x[i] = on_arc(x0[i], x1[i], origin, axis, time)
+        x[i] = on_arc_of(arcs, i, x0[i], x1[i], time)
 
     return place_on_arcs
 
@@ -136,7 +118,7 @@ class RigidMotion:
         self.body = bodies.astype(np.int32)
         for values in (self.body, self.centre, self.turn):  # copies, as detections keep them on the device
             values.flags.writeable = False
-        self._copies: dict[str, _Copy] = {}
+        self._copies: dict[str, Arcs] = {}
         self.tolerance = None if tolerance is None else checked_distance(tolerance, "tolerance", zero=False)
 
     @classmethod
@@ -276,17 +258,7 @@ def _measure_motion(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
     """Returns the kernels that measure a motion, and compare vertices with their bodies, for one type of position."""
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
-    def measure_motion(
-        # in
-        vertices: wp.array[int],
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        body: wp.array[int],
-        centre: wp.array[wp.vec3d],
-        turn: wp.array[wp.vec3d],
-        # out
-        extent: _Extent,
-    ):
+    def measure_motion(vertices: wp.array[int], x0: wp.array[dtype], x1: wp.array[dtype], arcs: Arcs, extent: _Extent):
         vertex = vertices[wp.tid()]
         start = double(x0[vertex])
         end = double(x1[vertex])
@@ -295,12 +267,12 @@ def _measure_motion(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
             return
         origin = wp.vec3d()
         axis = wp.vec3d()
-        b = body[vertex]
+        b = arcs.body[vertex]
         at_start = wp.max(wp.abs(start))
         at_end = wp.max(wp.abs(end))
         if b >= 0:
-            origin = centre[b]
-            axis = turn[b]
+            origin = arcs.centre[b]
+            axis = arcs.turn[b]
             if vertex < extent.reference[b]:
                 wp.atomic_min(extent.reference, b, vertex)
             _raise_to(extent.distance, b, wp.length(start - origin))
@@ -321,31 +293,24 @@ def _measure_motion(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.kernel(**NO_FUSED_OPERATIONS)
     def compare_with_body(
-        # in
-        vertices: wp.array[int],
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        body: wp.array[int],
-        centre: wp.array[wp.vec3d],
-        turn: wp.array[wp.vec3d],
-        # in and out
-        extent: _Extent,
+        vertices: wp.array[int], x0: wp.array[dtype], x1: wp.array[dtype], arcs: Arcs, extent: _Extent
     ):
         vertex = vertices[wp.tid()]
-        b = body[vertex]
+        b = arcs.body[vertex]
         if b >= 0 and extent.largest[4] == wp.float64(0.0):
-            of_reference = moved(extent.reference[b], x0, x1, centre[b], turn[b])
-            misfit = wp.length(moved(vertex, x0, x1, centre[b], turn[b]) - of_reference)
+            of_reference = moved(extent.reference[b], x0, x1, arcs.centre[b], arcs.turn[b])
+            misfit = wp.length(moved(vertex, x0, x1, arcs.centre[b], arcs.turn[b]) - of_reference)
             _raise_to(extent.misfit, b, misfit)
 
     return measure_motion, compare_with_body
 
 
-def _copy_of(motion: RigidMotion, device: wp.Device) -> _Copy:
-    """Returns body, centre and turn as Warp arrays of int, vec3d and vec3d, copied to a device once."""
+def _copy_of(motion: RigidMotion, device: wp.Device) -> Arcs:
+    """Returns arcs with body, centre and turn alone, copied to a device once."""
     if device.alias not in motion._copies:
-        centre, turn = (wp.array(v, dtype=wp.vec3d, device=device) for v in (motion.centre, motion.turn))
-        motion._copies[device.alias] = wp.array(motion.body, dtype=int, device=device), centre, turn
+        motion._copies[device.alias] = arcs = Arcs()
+        arcs.centre, arcs.turn = (wp.array(v, dtype=wp.vec3d, device=device) for v in (motion.centre, motion.turn))
+        arcs.body = wp.array(motion.body, dtype=int, device=device)
     return motion._copies[device.alias]
 
 
@@ -373,7 +338,7 @@ class ArcBounds:
                 those of the motion, or the tolerance is too small for their rounding.
         """
         self.motion = motion
-        self._vertices, self._arrays = vertices, _copy_of(motion, x0.device)
+        self._vertices, self._arcs = vertices, _copy_of(motion, x0.device)
         bodies, count = len(motion.centre), len(motion.body)
         self._extent = extent = _Extent()
         extent.bounds = wp.zeros(count, dtype=wp.vec3d, device=x0.device)
@@ -410,7 +375,7 @@ class ArcBounds:
         self._ends, extent = (x0, x1), self._extent
         extent.reference.fill_(len(self.motion.body))
         self._measured.zero_()
-        inputs = [self._vertices, x0, x1, *self._arrays]
+        inputs = [self._vertices, x0, x1, self._arcs]
         for kernel in _measure_motion(x0.dtype):
             launch(kernel, len(self._vertices), inputs=inputs, outputs=[extent], device=x0.device, record_tape=False)
 
@@ -442,6 +407,6 @@ class ArcBounds:
         """
         x0, x1 = self._ends
         x = wp.empty(len(x0), dtype=wp.vec3d, device=x0.device)
-        inputs = [x0, x1, *self._arrays, wp.float64(time)]
+        inputs = [x0, x1, self._arcs, wp.float64(time)]
         launch(_place_on_arcs(x0.dtype), len(x), inputs=inputs, outputs=[x], device=x0.device, record_tape=False)
         return x

@@ -13,7 +13,7 @@ from ..._arguments import check_finite, check_instance
 from ..._one_thread import one_at_a_time
 from ..._sorted_keys import distinct
 from ...kernels.crossing import edge_beside_face, edge_crosses_face
-from ...kernels.exact.edge_face import BITS, edge_meets_face_in
+from ...kernels.exact.edge_face import BITS, EdgeAndFace, edge_meets_face_in
 from ...kernels.motion import double
 from ...kernels.pipeline.queues import is_filled, take_slot
 from ...kernels.signs import FREE, HIT, UNSURE
@@ -94,17 +94,13 @@ def _decide_exactly(dtype: type, limbs: int) -> wp.Kernel:
             return
         edge = pairs[i][0]
         face = pairs[i][1]
-        decided = edge_meets_face(
-            double(x[edges[edge, 0]]),
-            double(x[edges[edge, 1]]),
-            double(x[faces[face, 0]]),
-            double(x[faces[face, 1]]),
-            double(x[faces[face, 2]]),
-            double(x[across[face, 0]]),
-            double(x[across[face, 1]]),
-            double(x[across[face, 2]]),
-        )
-        status[i] = wp.int8(decided)
+        points = EdgeAndFace()
+        for j in range(2):
+            points[j] = double(x[edges[edge, j]])
+        for k in range(3):
+            points[2 + k] = double(x[faces[face, k]])
+            points[5 + k] = double(x[across[face, k]])
+        status[i] = wp.int8(edge_meets_face(points))
 
     return decide_exactly
 

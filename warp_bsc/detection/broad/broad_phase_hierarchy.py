@@ -10,7 +10,7 @@ from ...kernels.pipeline.queues import take_slots, write
 from ..mesh import CollisionMesh
 from ..run.launch import THREADS_OF_MULTIPROCESSOR, launch
 from ..run.settings import capacity_for
-from .element_pairs import pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
+from .element_pairs import Pairs, pair_edges_with_faces_kernel, pair_elements_kernel, pair_points_kernel
 from .face_hierarchy import box_bundles, bundle_count, fit_kernel, make_hierarchy, traversal_kernel
 
 _WARPS_OF_MULTIPROCESSOR = 128
@@ -20,17 +20,9 @@ _TRAVERSAL_BLOCK = 128
 """Threads of a block of a traversal."""
 
 
-@wp.struct
-class _FacePairs:
-    """The queue of pairs of faces, by place, and its count."""
-
-    pairs: wp.array[wp.vec2i]
-    count: wp.array[wp.int64]
-
-
 @wp.func
-def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
-    slot = take_slots(queue.count, 0, count_set_bits(found))
+def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: Pairs):
+    slot = take_slots(queue.counts, 0, count_set_bits(found))
     while found != wp.uint32(0):
         write(wp.vec2i(place, first + lowest_set_bit(found)), queue.pairs, slot)
         found = found & (found - wp.uint32(1))
@@ -38,9 +30,10 @@ def _enqueue_faces(place: int, first: int, found: wp.uint32, queue: _FacePairs):
 
 
 class BroadPhaseHierarchy:
-    """The broad phase by a hierarchy over the faces, see :class:`warp_bsc.detection.broad.broad_phase.BroadPhase`.
+    """The broad phase by a hierarchy over the faces, see :data:`warp_bsc.detection.broad.broad_phase.BroadPhase`.
 
     Attributes:
+        lock: Held by each user of the broad phase from a run until its queues have been read.
         hierarchy: The hierarchy on the device; a run fits its boxes.
         face_pairs: The queue of the pairs of faces that a run finds, by place, array of vec2i.
     """
@@ -90,7 +83,7 @@ class BroadPhaseHierarchy:
 
     @property
     def buffers(self) -> list[wp.array]:
-        """The queue for pairs of faces."""
+        """All arrays that a run writes to and that may be replaced."""
         return [self.face_pairs]
 
     @property
@@ -104,24 +97,46 @@ class BroadPhaseHierarchy:
             self.face_pairs = wp.empty(capacity_for(count, "face pairs"), dtype=wp.vec2i, device=self._device)
 
     def count_filtered_by_world(self, counts: wp.array) -> None:
-        """Makes runs count the pairs that groups and masks leave out by world as well."""
+        """Makes runs add the pairs of elements that groups and masks leave out to counts by world, array of int64."""
         self.hierarchy.filtered_of_worlds = counts
 
     def pair_elements(
         self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
-        """Enqueues the candidates."""
+        """Enqueues the candidates.
+
+        Args:
+            x0: Positions at the start, array of vec3 or vec3d.
+            x1: Positions at the end, of the same type.
+            out: Counts by :class:`Count`, array of int64, and queue for (vertex, face), array of vec2i; then those for
+                (edge, edge), the smaller first.
+            changed: Nonzero for each vertex whose pairs are sought, array of int; None for all. More than 1, by body,
+                for those of rigid bodies, within which none are. What is not sought may be found as well.
+            keep_separated: Whether to enqueue the pairs that an axis separates, too.
+        """
         self.pair_faces(x0, x1, changed, keep_separated)
         self._launch_over_pairs(pair_elements_kernel, *out)
 
     def pair_points(
         self, x0: wp.array, x1: wp.array, *out: wp.array, changed: wp.array | None = None, keep_separated: bool = False
     ) -> None:
-        """Enqueues the candidates of points, from the pairs of cells of :meth:`pair_elements`."""
+        """Enqueues the candidates of points with the edges that no face has, and with points.
+
+        Call it after :meth:`pair_elements`, whose pairs of cells it reads, with the same arguments but queues for
+        (point, edge) and (point, point), the smaller first. A mesh without points has none.
+        """
         self._launch_over_pairs(pair_points_kernel, *out)
 
     def pair_edges_with_faces(self, x: wp.array, counts: wp.array, pairs: wp.array, *, is_end: bool = False) -> None:
-        """Enqueues the pairs (edge, face) of one configuration whose boxes overlap."""
+        """Enqueues the pairs (edge, face) of one configuration that share no vertex and whose boxes overlap.
+
+        Args:
+            x: Positions, array of vec3 or vec3d.
+            counts: By :class:`Count`, array of int64.
+            pairs: Queue for (edge, face), array of vec2i.
+            is_end: Whether the positions are those at the end of the motion in the last :meth:`pair_elements`, whose
+                boxes are reused on a CPU.
+        """
         self.pair_faces(x, x)
         self._launch_over_pairs(pair_edges_with_faces_kernel, counts, pairs)
 
@@ -152,11 +167,16 @@ class BroadPhaseHierarchy:
     def pair_faces(self, x0: wp.array, x1: wp.array, changed: wp.array | None = None, keep_separated=False) -> None:
         """Enqueues the pairs of faces that no axis separates, or all whose swept boxes overlap, each once."""
         self.fit(x0, x1, changed, keep_separated=keep_separated)
-        queue = _FacePairs()
-        queue.pairs, queue.count = self.face_pairs, self._count
-        self.traverse(traversal_kernel(_enqueue_faces, _FacePairs), queue)
+        self.traverse(traversal_kernel(_enqueue_faces, Pairs), _queue_of(self._count, self.face_pairs))
 
-    def _launch_over_pairs(self, make_kernel, *arguments):
+    def _launch_over_pairs(self, make_kernel, *out):
         threads = WIDTH if self._device.is_cpu else THREADS_OF_MULTIPROCESSOR * self._device.sm_count
-        inputs = [self.hierarchy, self.face_pairs, self._count, *arguments, threads]
+        queues = [_queue_of(counts, pairs) for counts, pairs in zip(out[::2], out[1::2], strict=True)]
+        inputs = [self.hierarchy, _queue_of(self._count, self.face_pairs), *queues, threads]
         launch(make_kernel(self.is_padded, self._swept), threads, inputs=inputs, device=self._device, record_tape=False)
+
+
+def _queue_of(counts, pairs):
+    queue = Pairs()
+    queue.counts, queue.pairs = counts, pairs
+    return queue

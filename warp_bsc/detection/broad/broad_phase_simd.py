@@ -12,11 +12,12 @@ from .wide_tree import WideTree, sort_trees
 
 
 class BroadPhaseSimd:
-    """The broad phase by wide BVHs, one for each kind of element, see :class:`.broad_phase.BroadPhase`.
+    """The broad phase by wide BVHs, one for each kind of element, see :data:`.broad_phase.BroadPhase`.
 
-    It pairs elements directly, and has no queue for pairs of faces. Points and the edges that no face has, whose pairs
-    count with a minimum distance only, have trees of their own. For a mesh with ``only_free``, only the trees of these
-    edges and of vertices that no face has are paired with the others.
+    Its methods are those of :class:`.BroadPhaseHierarchy`. It pairs elements directly, and has no queue for pairs of
+    faces. Points and the edges that no face has, whose pairs count with a minimum distance only, have trees of their
+    own. For a mesh with ``only_free``, only the trees of these edges and of vertices that no face has are paired with
+    the others.
     """
 
     buffers: tuple[wp.array, ...] = ()

@@ -38,6 +38,14 @@ _BITS_OF_PAIR = wp.constant(15)
 """Pairs of elements that two faces can represent: six of vertex and face, nine of edges."""
 
 
+@wp.struct
+class Pairs:
+    """A queue of pairs, and its counts: of pairs of faces by place one, of pairs of elements those by Count."""
+
+    pairs: wp.array[wp.vec2i]
+    counts: wp.array[wp.int64]
+
+
 @wp.func
 def _corners(faces: wp.array2d[int], face: int) -> wp.vec3i:
     return wp.vec3i(faces[face, 0], faces[face, 1], faces[face, 2])
@@ -238,14 +246,11 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
     @wp.func
     def pair_some(
         mesh: FaceHierarchy,
-        face_pairs: wp.array[wp.vec2i],
-        face_pair_count: wp.array[wp.int64],
+        face_pairs: Pairs,
         first: int,
         turns: int,
-        vertex_face_counts: wp.array[wp.int64],
-        vertex_face: wp.array[wp.vec2i],
-        edge_edge_counts: wp.array[wp.int64],
-        edge_edge: wp.array[wp.vec2i],
+        vertex_face: Pairs,
+        edge_edge: Pairs,
     ):
         """Enqueues the candidates of some pairs of faces: ``first``, and each that is a warp further."""
         found = wp.uint64(0)
@@ -253,9 +258,9 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
         filtered = wp.vec2i()
         for turn in range(turns):
             at = first + turn * _WIDTH
-            if is_filled(at, face_pairs, face_pair_count, 0):
-                face = face_pairs[at][0]
-                other = face_pairs[at][1]
+            if is_filled(at, face_pairs.pairs, face_pairs.counts, 0):
+                face = face_pairs.pairs[at][0]
+                other = face_pairs.pairs[at][1]
                 pairs = unseparated_pairs(mesh, face, other)
                 if mesh.pair_filter.group:
                     left_out = filtered_pairs(mesh, face, other, pairs)
@@ -267,57 +272,36 @@ def pair_elements_kernel(padded: bool, swept: bool) -> wp.Kernel:
                 queued[1] += count_set_bits(wp.uint32(pairs & ~_VERTEX_FACE_BITS))
                 found = found | (wp.uint64(pairs) << wp.uint64(_BITS_OF_PAIR * turn))
         if mesh.pair_filter.group:
-            raise_count(vertex_face_counts, _FILTERED, filtered[0])
-            raise_count(edge_edge_counts, _FILTERED, filtered[1])
-        vertex_face_slot = take_slots(vertex_face_counts, _QUEUED, queued[0])
-        edge_edge_slot = take_slots(edge_edge_counts, _QUEUED, queued[1])
+            raise_count(vertex_face.counts, _FILTERED, filtered[0])
+            raise_count(edge_edge.counts, _FILTERED, filtered[1])
+        vertex_face_slot = take_slots(vertex_face.counts, _QUEUED, queued[0])
+        edge_edge_slot = take_slots(edge_edge.counts, _QUEUED, queued[1])
         while found != wp.uint64(0):
             bit = lowest_bit(found)
             found = found & (found - wp.uint64(1))
             at = first + (bit / _BITS_OF_PAIR) * _WIDTH
             bit = bit % _BITS_OF_PAIR
-            face = face_pairs[at][0]
-            other = face_pairs[at][1]
+            face = face_pairs.pairs[at][0]
+            other = face_pairs.pairs[at][1]
             if bit < 3:
-                write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face, vertex_face_slot)
+                write(wp.vec2i(mesh.faces[face, bit], mesh.order[other]), vertex_face.pairs, vertex_face_slot)
                 vertex_face_slot += wp.int64(1)
             elif bit < 6:
-                write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face, vertex_face_slot)
+                write(wp.vec2i(mesh.faces[other, bit - 3], mesh.order[face]), vertex_face.pairs, vertex_face_slot)
                 vertex_face_slot += wp.int64(1)
             else:
                 edge = mesh.face_edges[face, (bit - 6) / 3]
                 other_edge = mesh.face_edges[other, (bit - 6) % 3]
-                write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge, edge_edge_slot)
+                write(wp.vec2i(wp.min(edge, other_edge), wp.max(edge, other_edge)), edge_edge.pairs, edge_edge_slot)
                 edge_edge_slot += wp.int64(1)
 
     @wp.kernel(**NO_GRADIENTS)
-    def pair_elements(
-        mesh: FaceHierarchy,
-        # in
-        face_pairs: wp.array[wp.vec2i],
-        face_pair_count: wp.array[wp.int64],
-        # counts, in and out, and queues
-        vertex_face_counts: wp.array[wp.int64],
-        vertex_face: wp.array[wp.vec2i],
-        edge_edge_counts: wp.array[wp.int64],
-        edge_edge: wp.array[wp.vec2i],
-        threads: int,
-    ):
+    def pair_elements(mesh: FaceHierarchy, face_pairs: Pairs, vertex_face: Pairs, edge_edge: Pairs, threads: int):
         i = wp.tid()
-        count = filled_entries(face_pairs, face_pair_count, 0)
+        count = filled_entries(face_pairs.pairs, face_pairs.counts, 0)
         turns = wp.clamp(count / _PAIRS_AT_ONCE, 1, _PAIRS_OF_THREAD)
         for first in range((i / _WIDTH) * turns * _WIDTH + i % _WIDTH, count, turns * threads):
-            pair_some(
-                mesh,
-                face_pairs,
-                face_pair_count,
-                first,
-                turns,
-                vertex_face_counts,
-                vertex_face,
-                edge_edge_counts,
-                edge_edge,
-            )
+            pair_some(mesh, face_pairs, first, turns, vertex_face, edge_edge)
 
     return pair_elements
 
@@ -328,29 +312,20 @@ def pair_edges_with_faces_kernel(padded: bool, swept: bool) -> wp.Kernel:
     unseparated_pairs = pair_functions(padded, swept).edge_face_pairs
 
     @wp.kernel(**NO_GRADIENTS)
-    def pair_edges_with_faces(
-        mesh: FaceHierarchy,
-        # in
-        face_pairs: wp.array[wp.vec2i],
-        face_pair_count: wp.array[wp.int64],
-        # in and out
-        counts: wp.array[wp.int64],
-        # out
-        pairs: wp.array[wp.vec2i],
-        threads: int,
-    ):
-        for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
-            left = unseparated_pairs(mesh, face_pairs[i][0], face_pairs[i][1])
+    def pair_edges_with_faces(mesh: FaceHierarchy, face_pairs: Pairs, edge_face: Pairs, threads: int):
+        for i in range(wp.tid(), filled_entries(face_pairs.pairs, face_pairs.counts, 0), threads):
+            left = unseparated_pairs(mesh, face_pairs.pairs[i][0], face_pairs.pairs[i][1])
             while left != 0:
                 bit = lowest_set_bit(wp.uint32(left))
                 left = left & (left - 1)
-                place = face_pairs[i][bit / 3]
-                other = face_pairs[i][1 - bit / 3]
+                place = face_pairs.pairs[i][bit / 3]
+                other = face_pairs.pairs[i][1 - bit / 3]
                 side = bit % 3
                 if is_filtered(mesh.pair_filter, _side(mesh.faces, place, side), _corners(mesh.faces, other)):
-                    take_slot(counts, _FILTERED)
+                    take_slot(edge_face.counts, _FILTERED)
                 else:
-                    append(wp.vec2i(mesh.face_edges[place, side], mesh.order[other]), pairs, counts, _QUEUED)
+                    pair = wp.vec2i(mesh.face_edges[place, side], mesh.order[other])
+                    append(pair, edge_face.pairs, edge_face.counts, _QUEUED)
 
     return pair_edges_with_faces
 
@@ -361,15 +336,7 @@ def pair_points_kernel(padded: bool, swept: bool) -> wp.Kernel:
     is_unseparated = pair_functions(padded, swept).point_pair
 
     @wp.func
-    def pair_point(
-        mesh: FaceHierarchy,
-        place: int,
-        other: int,
-        vertex_edge_counts: wp.array[wp.int64],
-        vertex_edge: wp.array[wp.vec2i],
-        vertex_vertex_counts: wp.array[wp.int64],
-        vertex_vertex: wp.array[wp.vec2i],
-    ):
+    def pair_point(mesh: FaceHierarchy, place: int, other: int, vertex_edge: Pairs, vertex_vertex: Pairs):
         """Enqueues a point with an edge that no face has or another point, if the cells at two places are that."""
         cell = mesh.order[other]
         if mesh.order[place] < mesh.point_start or cell < mesh.face_count or place == other:
@@ -381,34 +348,23 @@ def pair_points_kernel(padded: bool, swept: bool) -> wp.Kernel:
         is_point = cell >= mesh.point_start
         if is_filtered(mesh.pair_filter, wp.vec3i(p), _corners(mesh.faces, other)):
             if is_point:
-                take_slot(vertex_vertex_counts, _FILTERED)
+                take_slot(vertex_vertex.counts, _FILTERED)
             else:
-                take_slot(vertex_edge_counts, _FILTERED)
+                take_slot(vertex_edge.counts, _FILTERED)
             _count_filtered(mesh, place, 1)
         elif is_point:
-            append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex, vertex_vertex_counts, _QUEUED)
+            append(wp.vec2i(wp.min(p, q), wp.max(p, q)), vertex_vertex.pairs, vertex_vertex.counts, _QUEUED)
         else:
-            append(wp.vec2i(p, mesh.face_edges[other, 0]), vertex_edge, vertex_edge_counts, _QUEUED)
+            append(wp.vec2i(p, mesh.face_edges[other, 0]), vertex_edge.pairs, vertex_edge.counts, _QUEUED)
 
     @wp.kernel(**NO_GRADIENTS)
-    def pair_points(
-        mesh: FaceHierarchy,
-        # in
-        face_pairs: wp.array[wp.vec2i],
-        face_pair_count: wp.array[wp.int64],
-        # counts, in and out, and queues
-        vertex_edge_counts: wp.array[wp.int64],
-        vertex_edge: wp.array[wp.vec2i],
-        vertex_vertex_counts: wp.array[wp.int64],
-        vertex_vertex: wp.array[wp.vec2i],
-        threads: int,
-    ):
-        for i in range(wp.tid(), filled_entries(face_pairs, face_pair_count, 0), threads):
-            place = face_pairs[i][0]
-            other = face_pairs[i][1]
+    def pair_points(mesh: FaceHierarchy, face_pairs: Pairs, vertex_edge: Pairs, vertex_vertex: Pairs, threads: int):
+        for i in range(wp.tid(), filled_entries(face_pairs.pairs, face_pairs.counts, 0), threads):
+            place = face_pairs.pairs[i][0]
+            other = face_pairs.pairs[i][1]
             if mesh.order[place] < mesh.point_start:
-                place = face_pairs[i][1]
-                other = face_pairs[i][0]
-            pair_point(mesh, place, other, vertex_edge_counts, vertex_edge, vertex_vertex_counts, vertex_vertex)
+                place = face_pairs.pairs[i][1]
+                other = face_pairs.pairs[i][0]
+            pair_point(mesh, place, other, vertex_edge, vertex_vertex)
 
     return pair_points

@@ -52,6 +52,18 @@ def hilbert_transpose(cells: wp.vec3i) -> wp.vec3i:
     return wp.vec3i(cells[0] ^ turned, cells[1] ^ turned, cells[2] ^ turned)
 
 
+@wp.struct
+class _Tree:
+    """A tree, whose packets have eight elements each, and whose nodes have eight packets or nodes each."""
+
+    boxes: wp.array[wp.float32]
+    elements: wp.array[int]
+    corners: int  # of an element
+    nodes: wp.array[wp.float32]
+    node_marks: wp.array[int]
+    level_starts: wp.array[int]
+
+
 @made_once
 def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
     """Returns the kernels that encode elements and fit packets, for one type of position."""
@@ -92,21 +104,17 @@ def _kernels(dtype: type) -> tuple[wp.Kernel, wp.Kernel]:
         # in
         x0: wp.array[dtype],
         x1: wp.array[dtype],
-        corners: int,
         count: int,
         changed: wp.array[int],
         padding: wp.array[wp.float64],
         # in and out
-        elements: wp.array[int],
-        # out
-        boxes: wp.array[wp.float32],
-        nodes: wp.array[wp.float32],
-        node_marks: wp.array[int],
+        tree: _Tree,
     ):
         """Writes the boxes of each packet, and its entry in its node."""
         packet = first + wp.tid()
         lanes = wp.min(8, count - 8 * packet)
-        fit_packet(packet, lanes, x0, x1, corners, changed, padding, elements, boxes, nodes, node_marks)
+        elements, boxes = tree.elements, tree.boxes
+        fit_packet(packet, lanes, x0, x1, tree.corners, changed, padding, elements, boxes, tree.nodes, tree.node_marks)
 
     return encode, fit_packets
 
@@ -139,17 +147,8 @@ def _fill_packets(
 @wp.kernel(**NO_GRADIENTS)
 def _pair_packets(
     first: int,
-    # tree of the packets
-    boxes: wp.array[wp.float32],
-    elements: wp.array[int],
-    corners: int,
-    # tree that is traversed
-    other_boxes: wp.array[wp.float32],
-    other_elements: wp.array[int],
-    other_corners: int,
-    other_nodes: wp.array[wp.float32],
-    other_node_marks: wp.array[int],
-    level_starts: wp.array[int],
+    tree: _Tree,
+    traversed: _Tree,
     # options
     pair_filter: PairFilter,
     symmetric: int,
@@ -164,15 +163,15 @@ def _pair_packets(
     """Enqueues the pairs of a packet's elements with those of a tree, a packet a thread."""
     pair_packet(
         first + wp.tid(),
-        boxes,
-        elements,
-        corners,
-        other_boxes,
-        other_elements,
-        other_corners,
-        other_nodes,
-        other_node_marks,
-        level_starts,
+        tree.boxes,
+        tree.elements,
+        tree.corners,
+        traversed.boxes,
+        traversed.elements,
+        traversed.corners,
+        traversed.nodes,
+        traversed.node_marks,
+        traversed.level_starts,
         pair_filter.group,
         pair_filter.mask,
         symmetric,
@@ -257,7 +256,6 @@ class WideTree:
         self._corners = wp.array(corners, dtype=int, device=device)
         self._numbers = wp.array(numbers, dtype=int, device=device)
         self._worlds = wp.array(worlds, dtype=int, device=device)
-        self._level_starts = wp.array(starts, dtype=int, device=device)
         self._codes = wp.empty(2 * n, dtype=wp.int64, device=device)
         self._order = wp.empty(2 * n, dtype=int, device=device)
         # lanes without an element keep an empty box, which overlaps no other, and the world -1
@@ -266,6 +264,10 @@ class WideTree:
         self._elements = wp.full((packets, 48), -1, dtype=int, device=device)
         self._nodes = wp.array(np.tile(empty, (starts[-1], 3, 8)), dtype=wp.float32, device=device)
         self._node_marks = wp.full((starts[-1], 3, 8), -1, dtype=int, device=device)
+        self._tree = tree = _Tree()
+        tree.corners, tree.level_starts = corners.shape[1], wp.array(starts, dtype=int, device=device)
+        for name in ("boxes", "elements", "nodes", "node_marks"):
+            setattr(tree, name, getattr(self, f"_{name}").flatten())
         self._size = self._sorted_size = 0.0  # of all packets, when fitted and when sorted
         self.is_sorted = False
 
@@ -301,15 +303,12 @@ class WideTree:
         Args:
             x0: Positions at the start, Warp array of vec3 or vec3d.
             x1: Positions at the end, of the same type.
-            changed: As of :meth:`.BroadPhase.pair_elements`.
+            changed: As of :meth:`.BroadPhaseHierarchy.pair_elements`.
         """
         _, fit_packets = _kernels(x0.dtype)
-        inputs = [x0, x1, self._corners.shape[1], len(self._corners), changed, self._padding]
-        outputs = [self._elements, self._boxes, self._nodes, self._node_marks]
-        outputs = [array.flatten() for array in outputs]
-        device = self._corners.device
-        launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=outputs, device=device, chunk=2048)
-        nodes, starts = self._nodes.numpy(), self._level_starts.numpy().tolist()
+        inputs, device = [x0, x1, len(self._corners), changed, self._padding], self._corners.device
+        launch_over(fit_packets, len(self._boxes), inputs=inputs, outputs=[self._tree], device=device, chunk=2048)
+        nodes, starts = self._nodes.numpy(), self._tree.level_starts.numpy().tolist()
         with np.errstate(over="ignore"):
             sizes = nodes[: starts[1], 1::2] - nodes[: starts[1], 0::2]
         self._size = float(sizes.sum(where=np.isfinite(sizes), dtype=np.float64))
@@ -344,24 +343,8 @@ class WideTree:
         """
         if not len(other._boxes):
             return
-        inputs = [
-            self._boxes.flatten(),
-            self._elements.flatten(),
-            self._corners.shape[1],
-            other._boxes.flatten(),
-            other._elements.flatten(),
-            other._corners.shape[1],
-            other._nodes.flatten(),
-            other._node_marks.flatten(),
-            other._level_starts,
-            self._filter,
-            other is self,
-            ordered,
-            keep_separated,
-            at_end,
-            counts,
-            filtered_of_worlds,
-        ]
+        options = [self._filter, other is self, ordered, keep_separated, at_end]
+        inputs = [self._tree, other._tree, *options, counts, filtered_of_worlds]
         launch_over(_pair_packets, len(self._boxes), inputs=inputs, outputs=[pairs], device=pairs.device, chunk=64)
 
 

@@ -20,7 +20,7 @@ from ...kernels.exact.distance import BITS as DISTANCE_BITS
 from ...kernels.exact.distance import decide_distance_in
 from ...kernels.exact.first_contact import NONE, TOO_WIDE, decide_in
 from ...kernels.exact.polygon import BITS
-from ...kernels.motion import doubles, relative_motion
+from ...kernels.motion import query_at, query_motion
 from ...kernels.pairs import distance_of_corners, form_of, points_of_pair, vertices_of_pair
 from ...kernels.pipeline.queues import take_slot
 from ...kernels.signs import FREE, HIT, UNSURE
@@ -75,9 +75,8 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
         i = queue[slot]
         contacts = buffers.contacts
         v = vertices_of_pair(kind, buffers.elements, contacts.pairs[i])
-        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
-        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
-        time = decide(kind, a0, b0, c0, d0, a1, b1, c1, d1, timed, digits)
+        query = query_at(x0, x1, v)
+        time = decide(kind, query, timed, digits)
         if time == TOO_WIDE:
             left[wp.int32(take_slot(buffers.counts, too_wide))] = i
         elif time == NONE:
@@ -87,7 +86,7 @@ def _kernel(dtype: type, limbs: int) -> wp.Kernel:
             if timed:
                 # the time at which floating point has stopped is a lower bound too
                 time = wp.max(time, contacts.toi[i])
-                motion = relative_motion(kind, a0, b0, c0, d0, a1, b1, c1, d1, wp.float64(0.0))
+                motion = query_motion(kind, query, wp.float64(0.0))
                 at, direction = contact_at(motion, time)
                 contacts.within_tolerance[i] = True
                 contacts.toi[i] = time
@@ -124,10 +123,9 @@ def _distance_kernel(dtype: type, limbs: int) -> wp.Kernel:
         if known == FREE or (known == HIT and (contacts.within_tolerance[k] or not timed)):
             return
         v = points_of_pair(kind, buffers.elements, contacts.pairs[k])
-        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
-        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
+        query = query_at(x0, x1, v)
         distance = distance_of_corners(kind, v, radius)
-        status = decide(form_of(kind), a0, b0, c0, d0, a1, b1, c1, d1, distance, contacts.toi[k], digits, timed)
+        status = decide(form_of(kind), query, distance, contacts.toi[k], digits, timed)
         if status == FREE:
             _refute(k, buffers)
         elif status == HIT:

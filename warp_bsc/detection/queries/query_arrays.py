@@ -1,11 +1,11 @@
 """Results of elementary queries that stay on their device, and the buffers to find them without the host."""
 
+import numpy as np
 import warp as wp
 
 from ..._arguments import checked_flag, checked_integer
 from ...kernels.motion import all_finite
 from ...kernels.pipeline.queues import take_slot
-from ...kernels.polynomials import VERTEX_FACE
 from ...kernels.signs import FREE, UNSURE
 from ..narrow.narrow_phase import NarrowPhase
 from ..narrow.pair_kernels import PairBuffers
@@ -15,6 +15,7 @@ from ..run.launch import launch_over, launch_over_queue, made_once
 from ..run.phase_timer import PhaseTimer
 from ..run.settings import METHODS, NO_GRADIENTS, Count, Method, PairCounts, PairKind
 from ..run.start import checked_device
+from .query_points import elements_of_rows
 
 _MAX_QUERIES = 2**28 - 1
 """Their eight points each are numbered by int32."""
@@ -32,27 +33,6 @@ class _Rows:
     toi: wp.array[wp.float64]
     coordinates: wp.array[wp.vec3d]
     normal: wp.array[wp.vec3d]
-
-
-@wp.kernel(**NO_GRADIENTS)
-def _number_points(
-    first: int,
-    # in
-    kind: int,
-    # out
-    elements: wp.array2d[int],
-    pairs: wp.array[wp.vec2i],
-):
-    """Makes each query a pair of a mesh in which its points at the start are vertices 8 i to 8 i + 3."""
-    i = first + wp.tid()
-    if kind == VERTEX_FACE:
-        for corner in range(3):
-            elements[i, corner] = 8 * i + 1 + corner
-        pairs[i] = wp.vec2i(8 * i, i)
-    else:
-        for point in range(4):
-            elements[2 * i + point // 2, point % 2] = 8 * i + point
-        pairs[i] = wp.vec2i(2 * i, 2 * i + 1)
 
 
 @made_once
@@ -192,15 +172,13 @@ class DeviceQueryResult:
     def _buffers(self, kind: PairKind) -> tuple[NarrowPhase, wp.array]:
         """Returns the narrow phase of a kind, with the queries in its queue, and the vertices of its elements."""
         if kind not in self._narrow_phases:
-            n, device = self.count, self.device
-            vertex_face = kind == PairKind.VERTEX_FACE
-            elements = wp.empty((n, 3) if vertex_face else (2 * n, 2), dtype=int, device=device)
-            first_elements = 8 * n if vertex_face else 2 * n
-            narrow_phase = NarrowPhase(kind, self._counts, n, (max(first_elements, 1), max(len(elements), 1)))
+            # points at the start of query i are vertices 8 i to 8 i + 3
+            vertices = np.arange(0, 8 * self.count, 8, dtype=np.int32)[:, None] + np.arange(4, dtype=np.int32)
+            elements, pairs = elements_of_rows(kind, vertices)
+            narrow_phase = NarrowPhase(kind, self._counts, self.count, pairs[-1] + 1 if self.count else (1, 1))
             narrow_phase.fit_all()
-            outputs = [elements, narrow_phase.queue]
-            launch_over(_number_points, n, inputs=[int(kind)], outputs=outputs, device=device)
-            self._narrow_phases[kind] = narrow_phase, elements
+            narrow_phase.queue.assign(pairs)
+            self._narrow_phases[kind] = narrow_phase, wp.array(elements, dtype=int, device=self.device)
         return self._narrow_phases[kind]
 
     def _find(self, kind: PairKind, x: wp.array, method: Method, tolerance: float) -> None:

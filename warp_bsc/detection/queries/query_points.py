@@ -5,7 +5,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from ..._arguments import as_numpy, checked_choice, checked_shape
-from ..run.settings import DistanceKind
+from ..run.settings import DistanceKind, PairKind
 
 _CORNERS = {"vertex_face": (1, 3), "edge_edge": (2, 2), "vertex_edge": (1, 2), "vertex_vertex": (1, 1)}
 """Number of vertices of both elements, by kind of pair."""
@@ -82,17 +82,22 @@ def mesh_of_rows(kind: DistanceKind, points: np.ndarray, device: wp.Device) -> t
         points: The points of each pair at one time, float32 or float64, shape [n, kind.points, 3].
         device: The device of the positions and the elements.
     """
-    n, count = points.shape[:2]
     dtype = wp.vec3 if points.dtype == np.float32 else wp.vec3d
     x = wp.array(np.ascontiguousarray(points).reshape(-1, 3), dtype=dtype, device=device)
-    vertices, rows = np.arange(count * n, dtype=np.int32).reshape(n, count), np.arange(n, dtype=np.int32)
+    elements, pairs = elements_of_rows(kind, np.arange(len(x), dtype=np.int32).reshape(points.shape[:2]))
+    return x, wp.array(elements, dtype=int, device=device), pairs
+
+
+def elements_of_rows(kind: DistanceKind | PairKind, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the second elements of pairs that have vertices of their own, and the pairs, each from a row of vertices.
+
+    The elements of two edges are those of all first and second edges. All are int32, as the vertices, C-contiguous.
+    """
+    rows = np.arange(len(vertices), dtype=np.int32)
     if kind == DistanceKind.EDGE_EDGE:
-        elements, pairs = vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
-    elif kind == DistanceKind.VERTEX_VERTEX:
-        elements, pairs = vertices[:, 1:], vertices
-    else:
-        elements, pairs = vertices[:, 1:], np.stack([vertices[:, 0], rows], axis=1)
-    return x, wp.array(np.ascontiguousarray(elements), dtype=int, device=device), pairs
+        return vertices.reshape(-1, 2), np.stack([2 * rows, 2 * rows + 1], axis=1)
+    elements = np.ascontiguousarray(vertices[:, 1:])
+    return elements, vertices if kind == DistanceKind.VERTEX_VERTEX else np.stack([vertices[:, 0], rows], axis=1)
 
 
 def _check_detected(pairs: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:

@@ -6,8 +6,8 @@ import warp as wp
 
 from ...kernels.distance_gradients import with_distance_gradients
 from ...kernels.gradients import with_gradients
-from ...kernels.motion import doubles
-from ...kernels.pairs import distance_of_corners, form_of, points_of_pair, vertices_of_pair
+from ...kernels.motion import query_at
+from ...kernels.pairs import distance_of_corners, form_of, points_of_pair
 from ...kernels.signs import HIT, UNSURE
 from ...kernels.time_of_impact import Impact
 from ..mesh import CollisionMesh
@@ -17,57 +17,14 @@ from ..run.settings import DistanceKind
 
 
 @made_once
-def _kernel(dtype: type) -> wp.Kernel:
-    """Returns the kernel for one type of position, in a module of its own."""
+def _kernel(dtype: type, with_distance: bool) -> wp.Kernel:
+    """Returns the kernel for pairs with a minimum distance or without, for one type of position, in its own module.
+
+    Of a pair with a minimum distance coordinates and normal are neither read nor written.
+    """
 
     @wp.kernel(module="unique", module_options={"fuse_fp": False})
     def differentiate(
-        kind: int,
-        # mesh
-        x0: wp.array[dtype],
-        x1: wp.array[dtype],
-        elements: wp.array2d[int],
-        tolerance: wp.float64,
-        # in
-        contacts: ContactBuffer,
-        # out
-        toi: wp.array[wp.float64],
-        coordinates: wp.array[wp.vec3d],
-        normal: wp.array[wp.vec3d],
-        grazing: wp.array[wp.bool],
-    ):
-        i = wp.tid()
-        pair = contacts.pairs[i]
-        if pair[0] < 0:
-            toi[i] = wp.float64(2.0)
-            coordinates[i] = wp.vec3d()
-            normal[i] = wp.vec3d()
-            grazing[i] = False
-            return
-        v = vertices_of_pair(kind, elements, pair)
-        found = Impact()
-        found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
-        found.within_tolerance = wp.where(contacts.within_tolerance[i], 1, 0)
-        found.toi = contacts.toi[i]
-        found.coordinates = contacts.coordinates[i]
-        found.normal = contacts.normal[i]
-        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
-        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
-        contact = with_gradients(kind, a0, b0, c0, d0, a1, b1, c1, d1, found, tolerance)
-        toi[i] = contact.toi
-        coordinates[i] = contact.coordinates
-        normal[i] = contact.normal
-        grazing[i] = contact.grazing == 1
-
-    return differentiate
-
-
-@made_once
-def _distance_kernel(dtype: type) -> wp.Kernel:
-    """Returns the kernel for pairs with a minimum distance, for one type of position, in a module of its own."""
-
-    @wp.kernel(module="unique", module_options={"fuse_fp": False})
-    def differentiate_distances(
         kind: int,
         # mesh
         x0: wp.array[dtype],
@@ -80,26 +37,40 @@ def _distance_kernel(dtype: type) -> wp.Kernel:
         # out
         toi: wp.array[wp.float64],
         grazing: wp.array[wp.bool],
+        coordinates: wp.array[wp.vec3d],
+        normal: wp.array[wp.vec3d],
     ):
         i = wp.tid()
         pair = contacts.pairs[i]
         if pair[0] < 0:
             toi[i] = wp.float64(2.0)
             grazing[i] = False
+            if not wp.static(with_distance):
+                coordinates[i] = wp.vec3d()
+                normal[i] = wp.vec3d()
             return
         v = points_of_pair(kind, elements, pair)
         found = Impact()
         found.status = wp.where(contacts.within_tolerance[i], HIT, UNSURE)
         found.within_tolerance = wp.where(contacts.within_tolerance[i], 1, 0)
         found.toi = contacts.toi[i]
-        a0, b0, c0, d0 = doubles(x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]])
-        a1, b1, c1, d1 = doubles(x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]])
-        distance = distance_of_corners(kind, v, radius)
-        contact = with_distance_gradients(form_of(kind), a0, b0, c0, d0, a1, b1, c1, d1, distance, found, tolerance)
-        toi[i] = contact.toi
-        grazing[i] = contact.grazing == 1
+        query = query_at(x0, x1, v)
+        if wp.static(with_distance):
+            distance = distance_of_corners(kind, v, radius)
+            form = form_of(kind)
+            reached = with_distance_gradients(form, query, distance, found, tolerance)
+            toi[i] = reached.toi
+            grazing[i] = reached.grazing == 1
+        else:
+            found.coordinates = contacts.coordinates[i]
+            found.normal = contacts.normal[i]
+            contact = with_gradients(kind, query, found, tolerance)
+            toi[i] = contact.toi
+            grazing[i] = contact.grazing == 1
+            coordinates[i] = contact.coordinates
+            normal[i] = contact.normal
 
-    return differentiate_distances
+    return differentiate
 
 
 class DifferentiableContacts:
@@ -164,16 +135,12 @@ class DifferentiableContacts:
             elements = mesh.device_elements(kind)
             toi = wp.zeros_like(found.toi, requires_grad=True)
             grazing = wp.zeros(len(found.pairs), dtype=wp.bool, device=mesh.device)
-            inputs = [int(kind), x0, x1, elements]
+            coordinates, normal, outputs = found.coordinates, found.normal, [toi, grazing, None, None]
             if radius is None:
-                coordinates, normal = (wp.zeros_like(a, requires_grad=True) for a in (found.coordinates, found.normal))
-                kernel, inputs = _kernel(x0.dtype), [*inputs, tolerance, found]
-                outputs = [toi, coordinates, normal, grazing]
-            else:
-                coordinates, normal = found.coordinates, found.normal
-                kernel, inputs = _distance_kernel(x0.dtype), [*inputs, radius, tolerance, found]
-                outputs = [toi, grazing]
-            launch(kernel, len(found.pairs), inputs=inputs, outputs=outputs, device=mesh.device)
+                coordinates, normal = (wp.zeros_like(a, requires_grad=True) for a in (coordinates, normal))
+                outputs[2:] = coordinates, normal
+            kernel, inputs = _kernel(x0.dtype, radius is not None), [int(kind), x0, x1, elements, radius, tolerance]
+            launch(kernel, len(found.pairs), inputs=[*inputs, found], outputs=outputs, device=mesh.device)
             setattr(self, kind.label, found.pairs)
             results = {"toi": toi, "normal": normal, "grazing": grazing}
             if kind != DistanceKind.VERTEX_VERTEX:

@@ -192,6 +192,8 @@ class StepGradients:
             bodies = self._predict(dt, start, poses[1], is_solved)
         contacts = self._record_contacts(failed)
         of_motion = copied(motion, ["inverse_mass", "friction"])
+        if work.mesh.distance_arrays is not None:
+            of_motion.distances = copied(motion.distances, ["radius", "of_planes"])
         of_motion.materials = copied_materials(motion.materials)
         step = SolvedStep(
             dt,
@@ -270,6 +272,10 @@ class StepGradients:
         motion, of_motion = with_gradients(step.motion, ["inverse_mass", "friction"])
         table = self.work.motion.friction.materials.friction
         motion.materials, of_motion.materials = materials_with_gradients(step.motion.materials, table)
+        distances = self.work.mesh.distance_arrays
+        if distances is not None and distances.requires_grad:
+            names = "radius", "of_planes"
+            motion.distances, of_motion.distances = with_gradients(step.motion.distances, names)
         planes, of_planes = with_gradients(step.planes, ["start", "end", "friction"])
         contacts, of_contacts = with_gradients(step.contacts, ["fall"])
         bodies: Any = step.bodies
@@ -323,13 +329,11 @@ class StepGradients:
             inputs = [wp.float32(step.dt), model.gravity]
             self._adjoint(energies.find_falls, self.work.worlds, inputs, of_contacts.fall)
         self.work.motion.friction.backward(of_motion.friction, of_planes.friction)
+        if distances is not None and distances.requires_grad:
+            distances.backward(of_motion.distances.radius, of_motion.distances.of_planes)
         self._carried_to = before
-        for gradient in (
-            of.end_particle_q,
-            of.end_particle_qd,
-            of.end_body_q,
-            of.end_body_qd,
-        ):  # the step overwrote what they are of
+        # the step overwrote what they are of
+        for gradient in (of.end_particle_q, of.end_particle_qd, of.end_body_q, of.end_body_qd):
             if gradient is not None:
                 gradient.zero_()
 

@@ -13,7 +13,7 @@ from ...kernels.arcs import Arcs, impact_on_arcs, move_as_one, turns
 from ...kernels.ccd import impact_at_distance
 from ...kernels.classification import classify
 from ...kernels.min_distance import clears_at_once
-from ...kernels.motion import motion_and_distance, relative_motion
+from ...kernels.motion import motion_and_distance, query_of, relative_motion
 from ...kernels.pairs import ABOVE_SUM, distance_of_corners, ends_of
 from ...kernels.pipeline.hierarchy import lowest_set_bit
 from ...kernels.polynomials import VERTEX_EDGE, VERTEX_VERTEX, coplanarity
@@ -129,7 +129,8 @@ def _arc_function(keep_distances: bool) -> wp.Function:
             start, kept = distances_at_start(motion, corners, kind)
             result = impact_on_arcs_at_distance(kind, corners, motion.x0, arguments.step.vertices.x1, arcs, kept)
         else:
-            result = impact_on_arcs(kind, corners, a0, b0, c0, d0, a1, b1, c1, d1, arcs, ZERO)
+            query = query_of(a0, b0, c0, d0, a1, b1, c1, d1)
+            result = impact_on_arcs(kind, corners, query, arcs, ZERO)
             start = result.toi
         if result.status != FREE:
             _resolve(arguments, kind, pair, corners, owner, start, result.toi, kept)

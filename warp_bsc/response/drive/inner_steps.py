@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import newton
 import warp as wp
@@ -50,35 +50,21 @@ class StepCall:
         return self.number == self.count - 1
 
 
-class InnerSteps(Protocol):
-    """Divides a step into those that a stage resolves, and lets the inner solver take each."""
-
-    pushes_before: str | None
-    """What pushes contacts apart before the stage does, so that its impulses are not all; None for nothing."""
-
-    def parts(self, call: StepCall) -> Iterator[StepCall]:
-        """Yields the steps to take, one after the other; the stage resolves each before it asks for the next."""
-        ...
-
-    def take(self, call: StepCall) -> None:
-        """Steps the inner solver, which predicts the end of the step."""
-        ...
-
-
-class WholeSteps:
-    """Steps the inner solver once, with what it was called with."""
+class InnerSteps:
+    """Steps the inner solver once, with what it was called with; subclasses divide a step, or let it step otherwise."""
 
     pushes_before: str | None = None
+    """What pushes contacts apart before the stage does, so that its impulses are not all; None for nothing."""
 
     def __init__(self, stage: Any):
         """Steps the ``solver`` of a stage, whichever it is at the time."""
         self._stage = stage
 
     def parts(self, call: StepCall) -> Iterator[StepCall]:
-        """Yields the call itself."""
+        """Yields the steps to take, one after the other, here the call; the stage resolves each before the next."""
         yield call
 
     @phase("inner solver")
     def take(self, call: StepCall) -> None:
-        """Steps the inner solver."""
+        """Steps the inner solver, which predicts the end of the step."""
         self._stage.solver.step(call.state_in, call.state_out, call.control, call.contacts, call.dt, **call.options)

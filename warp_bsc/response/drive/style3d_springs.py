@@ -28,7 +28,7 @@ from ..state.vectors import ZERO, to_double, to_single
 from ..state.workspace import Workspace
 from ..step import add_proximities, find_contacts
 from ..tuning import INNER_STIFFNESS, SLOWEST_SLIP
-from .inner_steps import StepCall, WholeSteps
+from .inner_steps import InnerSteps, StepCall
 
 wp.set_module_options({"enable_backward": False})
 
@@ -298,7 +298,7 @@ class Style3DContacts:
         """Does nothing."""
 
 
-class SpringSteps(WholeSteps):
+class SpringSteps(InnerSteps):
     """Lets Style3D step with the constraints of the stage in place of its own contacts."""
 
     pushes_before: str | None = "SolverStyle3D pushes in its iterations"

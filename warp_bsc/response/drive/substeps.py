@@ -100,7 +100,7 @@ def _go_on(motion: Motion, way: _Way, i: int, number: int, start: StateArrays, e
                 end.body_q[k] = pose
 
 
-class Substeps:
+class Substeps(InnerSteps):
     """Divides steps into a number of smaller ones.
 
     Attributes:

@@ -12,7 +12,7 @@ from ...detection.narrow.rules.approach import MinDistances, make_min_distances
 from ...kernels.pairs import PairFilter
 from ..tuning import SEGMENTS
 from .collision_filter import CollisionFilter, bits_of_model
-from .kept_distances import KeptDistances
+from .kept_distances import DistanceArrays, KeptDistances
 from .shapes import PlacedShapes, place_shapes, shapes_of, take_shapes
 from .structs import Connectivity, Incidence
 from .tessellation import tessellate, tessellation_key
@@ -49,11 +49,7 @@ class Placement:
 
     particle_q: wp.array[wp.vec3]
     body_q: wp.array[wp.transform]
-    shape_vertex_position: wp.array[wp.vec3]
-    shape_vertex_body: wp.array[int]
-    plane_point: wp.array[wp.vec3]
-    plane_normal: wp.array[wp.vec3]
-    plane_body: wp.array[int]
+    shapes: PlacedShapes
 
 
 class ModelMesh(CollisionMesh):
@@ -85,6 +81,7 @@ class ModelMesh(CollisionMesh):
         placed_shapes: Both for kernels, ``state.shapes.PlacedShapes``.
         connectivity: The elements for kernels, :class:`.state.structs.Connectivity`.
         distances: Minimum distances of pairs, None if pairs only must not touch.
+        distance_arrays: What each step reads them from, None if they stay as they are.
         shape_filter: Groups and masks of the shapes on the device, for infinite planes; empty without a filter.
     """
 
@@ -192,9 +189,10 @@ class ModelMesh(CollisionMesh):
         self.inverse_masses = wp.zeros(vertex_count, dtype=float, device=self.device)
         self.refresh_inverse_masses()
         self.distances: MinDistances | None = None
+        self.distance_arrays: DistanceArrays | None = None
 
-    def min_distances(self, kept: KeptDistances, *, reach: float) -> MinDistances:
-        """Returns minimum distances of pairs, see :mod:`warp_bsc.detection.narrow.rules.approach`.
+    def keep_distances(self, kept: KeptDistances, *, reach: float) -> None:
+        """Makes pairs keep distances, see :mod:`warp_bsc.detection.narrow.rules.approach`.
 
         Args:
             kept: The distances that pairs keep.
@@ -204,9 +202,12 @@ class ModelMesh(CollisionMesh):
         half = 0.5 * kept.minimum
         every = half + np.concatenate([kept.radii, kept.margins[self.shape_vertices.shape]])
         rigid_id[count:] = self.shape_vertices.body + 1
-        return make_min_distances(
+        self.distances = make_min_distances(
             self, every, of_planes=half + kept.margins[self.planes.shape], reach=reach, rigid_id=rigid_id
         )
+        if any(array is not None for array in kept.arrays):
+            shapes = np.concatenate([self.shape_vertices.shape, self.planes.shape])
+            self.distance_arrays = DistanceArrays(kept, shapes, self.distances)
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         """Returns a Warp array of ints, or of vectors if the values are two-dimensional."""
@@ -240,10 +241,7 @@ class ModelMesh(CollisionMesh):
             length = 0 if array is None else len(array)
             if length != count:
                 raise ValueError(f"{name} must have length {count}, not {length}")
-        place.particle_q, place.body_q = particle_q, body_q
-        vertices, planes = self.device_shape_vertices, self.device_planes
-        place.shape_vertex_position, place.shape_vertex_body = vertices.position, vertices.body
-        place.plane_point, place.plane_normal, place.plane_body = planes.point, planes.normal, planes.body
+        place.particle_q, place.body_q, place.shapes = particle_q, body_q, self.placed_shapes
         return place
 
     def refresh_inverse_masses(self) -> None:
@@ -286,10 +284,10 @@ def vertex_position(place: Placement, vertex: int) -> wp.vec3:
     i = vertex - place.particle_q.shape[0]
     if i < 0:
         return place.particle_q[vertex]
-    body = place.shape_vertex_body[i]
+    body = place.shapes.body[i]
     if body < 0:
-        return place.shape_vertex_position[i]
-    return wp.transform_point(place.body_q[body], place.shape_vertex_position[i])
+        return place.shapes.position[i]
+    return wp.transform_point(place.body_q[body], place.shapes.position[i])
 
 
 @wp.kernel(enable_backward=False, module="unique")

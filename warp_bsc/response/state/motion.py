@@ -10,7 +10,6 @@ from .last_step import SAME_POSE, LastStep
 from .mesh import ModelMesh, Placement, members_of_worlds, vertex_position
 from .planes import MovingPlanes, transformed_plane
 from .poses import centre_of, velocity_on_body
-from .shapes import PlacedShapes
 from .structs import Bodies, Motion, add_zeros, body_of, can_move
 from .turns import BodyTurns
 from .vectors import to_double
@@ -38,10 +37,10 @@ def arrays_of(state: newton.State | newton.Model) -> StateArrays:
 
 
 @wp.func
-def _place_plane(place: Placement, i: int, planes: wp.array[wp.vec4d]):
-    """Writes a plane, if there is one of that number."""
-    if i < planes.shape[0]:
-        planes[i] = transformed_plane(place.plane_point[i], place.plane_normal[i], place.plane_body[i], place.body_q)
+def plane_in(place: Placement, i: int) -> wp.vec4d:
+    """Returns an infinite plane where its body is."""
+    shapes = place.shapes
+    return transformed_plane(shapes.plane_point[i], shapes.plane_normal[i], shapes.plane_body[i], place.body_q)
 
 
 @wp.func
@@ -81,7 +80,8 @@ def takes_part(mask: wp.array[wp.bool], world: int) -> bool:
 def _write_start(place: Placement, last: wp.array[wp.vec3], motion: Motion, planes: MovingPlanes):
     """Writes the positions of vertices and the planes at the start of a step, and which worlds were interrupted."""
     i = wp.tid()
-    _place_plane(place, i, planes.start)
+    if i < planes.start.shape[0]:
+        planes.start[i] = plane_in(place, i)
     if i >= motion.x0.shape[0]:
         return
     x = vertex_position(place, i)
@@ -159,10 +159,11 @@ def _write_end(
     the last step left it: it would otherwise pass undetected what is in its way, if a program moves it between steps.
     """
     i = wp.tid()
-    if last and i < planes.end.shape[0] and not can_move(motion, place.plane_body[i]):
-        if continues(motion, planes.world[i]) and wp.isfinite(last_planes[i]):
-            planes.start[i] = last_planes[i]
-    _place_plane(place, i, planes.end)
+    if i < planes.end.shape[0]:
+        if last and not can_move(motion, planes.body[i]):
+            if continues(motion, planes.world[i]) and wp.isfinite(last_planes[i]):
+                planes.start[i] = last_planes[i]
+        planes.end[i] = plane_in(place, i)
     if i >= motion.x1.shape[0]:
         return
     if last and motion.inverse_mass[i] == 0.0 and not moves_with_body(motion, i):
@@ -182,24 +183,15 @@ def _write_end(
 
 
 @wp.kernel(enable_backward=False)
-def _jump(
-    # in
-    placed: PlacedShapes,
-    poses: wp.array[wp.transform],
-    particle_count: int,
-    # out
-    x1: wp.array[wp.vec3],
-    planes: wp.array[wp.vec4d],
-):
-    """Writes vertices and planes of shapes that jumped to where the last step left their bodies."""
+def _jump(place: Placement, x1: wp.array[wp.vec3], planes: wp.array[wp.vec4d]):
+    """Writes vertices and planes of shapes that jumped to where a state has them."""
     i = wp.tid()
-    if i < planes.shape[0] and placed.jumped[placed.plane_shape[i]] == 1:
-        planes[i] = transformed_plane(placed.plane_point[i], placed.plane_normal[i], placed.plane_body[i], poses)
-    if i < placed.position.shape[0] and placed.jumped[placed.shape[i]] == 1:
-        x = placed.position[i]
-        if placed.body[i] >= 0:
-            x = wp.transform_point(poses[placed.body[i]], x)
-        x1[particle_count + i] = x
+    shapes = place.shapes
+    if i < planes.shape[0] and shapes.jumped[shapes.plane_shape[i]] == 1:
+        planes[i] = plane_in(place, i)
+    if i < shapes.position.shape[0] and shapes.jumped[shapes.shape[i]] == 1:
+        vertex = place.particle_q.shape[0] + i
+        x1[vertex] = vertex_position(place, vertex)
 
 
 class ModelMotion:
@@ -291,9 +283,9 @@ class ModelMotion:
         The last step is made to have ended there, so that nothing sweeps the way.
         """
         self.mesh.follow_shapes(not_followed)
-        inputs = [self.mesh.placed_shapes, self.last.poses, self.mesh.model.particle_count]
+        place = self.mesh.place(self.mesh.model.particle_q, self.last.poses)
         outputs = [self.last.positions, self.last.planes]
-        wp.launch(_jump, self._size, inputs=inputs, outputs=outputs, device=self.mesh.device)
+        wp.launch(_jump, self._size, inputs=[place], outputs=outputs, device=self.mesh.device)
         wp.copy(self.planes.end, self.last.planes)
 
     def set_start(self, start: StateArrays) -> None:

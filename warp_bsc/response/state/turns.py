@@ -12,7 +12,7 @@ import warp as wp
 from ...detection.narrow.rules.arc import allocate_arcs, bound_arc
 from ...kernels.arcs import Arcs
 from .mesh import ModelMesh
-from .poses import turn_between
+from .poses import point_of, turn_between
 from .structs import Motion, MovedBodies, Vertices, can_move
 from .vectors import HALF, to_double
 
@@ -35,14 +35,6 @@ class Turns:
 
 
 @wp.func
-def _centre(com: wp.vec3, pose: wp.transform) -> wp.vec3d:
-    """Returns the centre of mass of a body in a pose [m]."""
-    q = wp.transform_get_rotation(pose)
-    rotation = wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])))
-    return to_double(wp.transform_get_translation(pose)) + wp.quat_rotate(rotation, to_double(com))
-
-
-@wp.func
 def _are_same(a: wp.quat, b: wp.quat) -> bool:
     """Returns whether two rotations are equal bit for bit; computed, their difference may be more than 0."""
     return a[0] == b[0] and a[1] == b[1] and a[2] == b[2] and a[3] == b[3]
@@ -55,8 +47,8 @@ def _write_turn(turns: Turns, body: int, end: wp.transform, is_movable: bool):
     turn = wp.vec3d()
     if not _are_same(wp.transform_get_rotation(start), wp.transform_get_rotation(end)):
         turn = turn_between(start, end)
-    centre = _centre(turns.com[body], start)
-    path = _centre(turns.com[body], end) - centre
+    centre = point_of(start, turns.com[body])  # of mass
+    path = point_of(end, turns.com[body]) - centre
     if not (wp.isfinite(turn) and wp.isfinite(centre) and wp.isfinite(path)):
         turn = wp.vec3d()
         centre = wp.vec3d()

@@ -35,7 +35,7 @@ class SceneFiles:
         self.check_stage()
         self._find()
         for path, stamp in self._stamps.items():
-            if _stamp(path) != stamp:
+            if file_stamp(path) != stamp:
                 raise ValueError(f"{path}: the file has changed since it was opened")
 
     def check_stage(self) -> None:
@@ -58,11 +58,11 @@ class SceneFiles:
 
         for layer in self._stage.GetUsedLayers():
             path, _ = Ar.SplitPackageRelativePathOuter(layer.realPath)
-            if path not in self._stamps and (stamp := _stamp(path)):
+            if path not in self._stamps and (stamp := file_stamp(path)):
                 self._stamps[path] = stamp
 
 
-def _stamp(path):
+def file_stamp(path: str | os.PathLike) -> tuple[int, int, int] | None:
     """Returns a value that differs between versions of a file, None if the file does not exist."""
     try:
         status = os.stat(path)

@@ -206,6 +206,11 @@ class UsdMesh:
         self.states = dict(sorted((kept | {since: None} | last).items()))
 
     @property
+    def is_rigid(self) -> bool:
+        """Whether only its transform moves its points, and no point instancer places it."""
+        return not (self.deforms or self.is_skinned or self.may_jump or self.is_placed or self.instanced_prim)
+
+    @property
     def why_not_written(self) -> str | None:
         """Why a layer over the scene cannot give the mesh points of its own, in words; None if it can."""
         if self.instance:

@@ -19,12 +19,14 @@ class PositionReader:
                 indices of these among its points.
             dtype: Type of the positions.
         """
-        from .rigid_meshes import RigidMeshes, is_rigid  # noqa: PLC0415 (imports pxr)
-
         self._dtype = dtype
-        self._rigid_parts = [part for part in parts if is_rigid(part[0])]
-        self._rigid = RigidMeshes(self._rigid_parts, dtype)
-        parts = [part for part in parts if not is_rigid(part[0])]
+        self._rigid_parts = [part for part in parts if part[0].is_rigid]
+        self._rigid = None
+        if self._rigid_parts:
+            from .rigid_meshes import RigidMeshes  # noqa: PLC0415 (imports pxr)
+
+            self._rigid = RigidMeshes(self._rigid_parts, dtype)
+        parts = [part for part in parts if not part[0].is_rigid]
         instanced: dict[tuple, list] = {}
         self._single = []
         for part in parts:
@@ -51,7 +53,7 @@ class PositionReader:
                 positions[rows] = found
             else:
                 singles += members  # one of them is broken; reading it raises the error
-        if not self._rigid.read(positions, time, before):
+        if self._rigid and not self._rigid.read(positions, time, before):
             singles += self._rigid_parts
         for mesh, count, rows, points in singles:
             positions[rows] = mesh.read_positions(

@@ -6,14 +6,6 @@ from pxr import Usd, UsdGeom
 from .meshes import UsdMesh
 
 
-def is_rigid(mesh: UsdMesh) -> bool:
-    """Returns whether a mesh always has the same points in a space of its own, which a transform places in the world.
-
-    False as well for instances of point instancers, which are read together otherwise.
-    """
-    return not (mesh.deforms or mesh.is_skinned or mesh.may_jump or mesh.is_placed or mesh.instanced_prim)
-
-
 class RigidMeshes:
     """Reads positions of some points of rigid meshes. Transforms of prims above several meshes are computed once."""
 

@@ -2,8 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from pxr import Usd, UsdGeom
@@ -16,34 +15,35 @@ _CUBE_SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6,
 _SQUARE = [(-0.5, -0.5, 0.0), (0.5, -0.5, 0.0), (0.5, 0.5, 0.0), (-0.5, 0.5, 0.0)]
 
 
-class Polygons(Protocol):
-    """Polygons in the space of a prim, as attributes of that prim describe them."""
+class Polygons:
+    """Polygons in the space of a prim, as attributes of that prim describe them.
 
-    @property
-    def topology_attributes(self) -> Sequence[Usd.Attribute]:
-        """The attributes that define the polygons."""
-        ...
+    Attributes:
+        topology_attributes: The attributes that define the polygons.
+        point_attributes: The attributes that define the positions of their points.
+    """
 
-    @property
-    def point_attributes(self) -> Sequence[Usd.Attribute]:
-        """The attributes that define the positions of their points."""
-        ...
+    topology_attributes: tuple[Usd.Attribute, ...] = ()
+    point_attributes: tuple[Usd.Attribute, ...]
 
     @property
     def may_jump(self) -> bool:
-        """Whether points may jump at a time, see :func:`~warp_bsc.usd.read.samples.may_jump`."""
-        ...
+        """Whether points may jump at a time, see :func:`~warp_bsc.usd.read.samples.may_jump`: if value clips hold them.
+
+        USD interpolates other samples; a change of their number is an error.
+        """
+        return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
 
     def read_points(self, time: Usd.TimeCode) -> Any:
         """Returns the points, as USD stores them or float64, shape [point_count, 3]; None if there are none."""
-        ...
+        return self.point_attributes[0].Get(time)
 
     def read_topology(self, time: Usd.TimeCode) -> list[Any]:
         """Returns numbers of corners, the points at the corners and the holes, each None if there are none."""
-        ...
+        return [attribute.Get(time) for attribute in self.topology_attributes]
 
 
-class MeshPolygons:
+class MeshPolygons(Polygons):
     """The polygons of a mesh prim."""
 
     def __init__(self, prim: Usd.Prim):
@@ -56,27 +56,12 @@ class MeshPolygons:
         )
         self.point_attributes = (mesh.GetPointsAttr(),)
 
-    @property
-    def may_jump(self) -> bool:
-        """Whether value clips hold the points. USD interpolates other samples; a change of their number is an error."""
-        return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
 
-    def read_points(self, time: Usd.TimeCode) -> Any:
-        """Returns the points."""
-        return self.point_attributes[0].Get(time)
-
-    def read_topology(self, time: Usd.TimeCode) -> list[Any]:
-        """Returns numbers of corners, the points at the corners and the holes."""
-        return [attribute.Get(time) for attribute in self.topology_attributes]
-
-
-class ShapePolygons:
+class ShapePolygons(Polygons):
     """A cube, sphere, capsule, cylinder, cone or plane as polygons; the round ones are inscribed polyhedra.
 
     An inscribed circle of n segments has 1 - 2 pi^2 / (3 n^2) of the area, 99.4% for 32 segments.
     """
-
-    topology_attributes = ()
 
     def __init__(self, prim: Usd.Prim, segments: int = 32):
         """Finds the attributes of a prim.

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from .shapes import Polygons
 from .unreadable import UnreadableError
 
 
-class Strands:
+class Strands(Polygons):
     """The linear curves of a ``UsdGeom.BasisCurves`` prim, or the points of a ``UsdGeom.Points`` prim.
 
     Attributes:
@@ -34,11 +35,6 @@ class Strands:
         primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("widths")
         self._widths = primvar if primvar and primvar.HasAuthoredValue() else None
         self.width_attribute = self._widths.GetAttr() if self._widths else schema.GetWidthsAttr()
-
-    @property
-    def may_jump(self) -> bool:
-        """Whether value clips hold the points, as of :class:`~warp_bsc.usd.read.shapes.MeshPolygons`."""
-        return self.point_attributes[0].GetResolveInfo().GetSource() == Usd.ResolveInfoSourceValueClips
 
     def read_points(self, time: Usd.TimeCode) -> Any:
         """Returns the points.

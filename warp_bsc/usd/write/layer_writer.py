@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,7 @@ PrimKind = Literal["Mesh", "PointInstancer", "BasisCurves"]
 SHAPES = {"float3[]": ("f4", 3), "point3f[]": ("f4", 3), "float[]": ("f4", 1), "int[]": ("i4", 1), "int2[]": ("i4", 2)}
 """Type and number of the components of a row, by the type of an attribute."""
 
-_SAVED = 1 << 25  # bytes of samples that a binary layer holds in memory before it saves them
-_TEXT_ROWS = 4096  # rows of an array that are formatted at a time
+_SAVED = 1 << 25  # bytes of samples that a layer holds in memory before it saves them
 
 
 @dataclass(frozen=True)
@@ -91,17 +89,9 @@ class LayerContent:
     samples: Callable[[str, str], Iterable[tuple[float, np.ndarray]]]
 
 
-def write_binary_layer(content: LayerContent, path: Path) -> None:
-    """Writes a layer in USD's binary format, in which saved samples leave the memory.
-
-    Args:
-        content: The content.
-        path: A file that does not exist, with any name. After an error it does not exist.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
-    with new_layer(path, "usdc") as (layer, add):
+def write_layer(content: LayerContent, path: Path, file_format: str) -> None:
+    """Writes a layer, with arguments and errors as of :func:`new_layer`."""
+    with new_layer(path, file_format) as (layer, add):
         _define_prims(layer, content)
         _describe(layer, content)
         for prim, attribute, value_type in _attributes(content):
@@ -111,11 +101,11 @@ def write_binary_layer(content: LayerContent, path: Path) -> None:
 
 @contextlib.contextmanager
 def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str, float, Any, int], None]]]:
-    """Makes a layer, and saves it at the end of the block.
+    """Makes a layer in USD's binary format, in which saved samples leave the memory, and saves it after the block.
 
     Args:
         path: A file that does not exist, with any name. After an error it does not exist.
-        file_format: ``"usdc"``, USD's binary format, in which saved samples leave the memory, or ``"usda"``.
+        file_format: ``"usdc"``, or ``"usda"`` for a text that is made of the binary layer in the end.
 
     Yields:
         The layer, and a function that adds a sample to it, given the path of its attribute, its time code, its value
@@ -132,48 +122,24 @@ def new_layer(path: Path, file_format: str) -> Iterator[tuple[Any, Callable[[str
         nonlocal waiting
         layer.SetTimeSample(attribute, time, value)
         waiting += size
-        if waiting > _SAVED and file_format == "usdc":
+        if waiting > _SAVED:
             layer.Save()
             waiting = 0
 
+    text = path.with_suffix(".usda")
     try:
-        layer = Sdf.Layer.New(Sdf.FileFormat.FindById(file_format), str(path))
+        layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(path))
         yield layer, add
         layer.Save()
+        if file_format == "usda":
+            layer.Export(str(text))
+            text.replace(path)
     except BaseException as error:
         path.unlink(missing_ok=True)
+        text.unlink(missing_ok=True)
         if isinstance(error, Tf.ErrorException):
             raise _as_os_error(error) from error
         raise
-
-
-def write_text_layer(content: LayerContent, write: Callable[[str], None]) -> None:
-    """Writes a layer in USD's text format, sample by sample into the text of a layer without samples.
-
-    Args:
-        content: The content.
-        write: Writes a part of the text.
-    """
-    from pxr import Sdf  # noqa: PLC0415 (slow)
-
-    head, body = Sdf.Layer.CreateAnonymous(".usda"), Sdf.Layer.CreateAnonymous(".usda")
-    _describe(head, content)
-    _define_prims(body, content)
-    attributes = list(_attributes(content))
-    for number, (prim, attribute, value_type) in enumerate(attributes):  # a sample whose time is its number
-        body.SetTimeSample(f"{content.root}/{prim}.{attribute}", number, _to_vt(value_type, None))
-    write(head.ExportToString().rstrip("\n"))
-    # Text, number of the attribute, text, number, ...: names of prims contain no line breaks.
-    parts = re.split(r"\n *(\d+): \[\],\n", body.ExportToString().removeprefix("#usda 1.0"))
-    for part, number in zip(parts[::2], [*parts[1::2], None], strict=True):
-        write(part + "\n")
-        if number is not None:
-            prim, attribute, _ = attributes[int(number)]
-            for time, value in content.samples(prim, attribute):
-                write(f"{time!r}: [")
-                for start in range(0, len(value), _TEXT_ROWS):
-                    write(", " * bool(start) + _to_text(value[start : start + _TEXT_ROWS]))
-                write("],\n")
 
 
 def _describe(layer, content):
@@ -285,19 +251,12 @@ def _attributes(content) -> Iterator[tuple[str, str, str]]:
 
 
 def _to_vt(value_type, array):
-    """Returns an array as a value of USD, an empty array for None."""
+    """Returns an array as a value of USD."""
     from pxr import Vt  # noqa: PLC0415 (slow)
 
     types = {"float3[]": Vt.Vec3fArray, "point3f[]": Vt.Vec3fArray, "float[]": Vt.FloatArray}
     types |= {"int[]": Vt.IntArray, "int2[]": Vt.Vec2iArray}
-    return types[value_type]() if array is None else types[value_type].FromNumpy(array)
-
-
-def _to_text(rows) -> str:
-    """Returns rows of an array in the syntax of USD's text format."""
-    number = "{:.9g}" if rows.dtype.kind == "f" else "{}"
-    row = number if rows.ndim == 1 else "(" + ", ".join([number] * rows.shape[1]) + ")"
-    return ", ".join([row] * len(rows)).format(*rows.reshape(-1).tolist())
+    return types[value_type].FromNumpy(array)
 
 
 def _as_os_error(error) -> Exception:

@@ -14,8 +14,8 @@ import warp as wp
 from ....kernels.arcs import Arcs, distance_at, impact_on_arcs, move_as_one
 from ....kernels.ccd import impact_at_distance
 from ....kernels.min_distance import clears_at_once, closest_at
-from ....kernels.motion import doubles, motion_and_distance
-from ....kernels.pairs import ABOVE_SUM, distance_of_corners, firsts_of
+from ....kernels.motion import doubles, motion_and_distance, query_at
+from ....kernels.pairs import ABOVE_SUM, distance_of_corners, ends_of, firsts_of
 from ....kernels.signs import FREE, ROUNDOFF
 from ....kernels.time_of_impact import Impact
 from ...mesh import CollisionMesh
@@ -103,12 +103,10 @@ def impact_on_arcs_at_distance(
     It keeps its minimum distance ``kept`` at the end of the step, and :data:`SHARE_ON_ARCS` of it on the way. A pair
     that rests at its distance would otherwise have to be followed in ever shorter parts.
     """
-    a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-    a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
-    a, b, c, d = doubles(a1, b1, c1, d1)
-    found, error = distance_at(kind, a, b, c, d)
+    query = query_at(x0, x1, v)
+    found, error = distance_at(kind, query[4], query[5], query[6], query[7])
     least = wp.where(found - error >= kept, SHARE_ON_ARCS * kept, kept)
-    return impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, arcs, least)
+    return impact_on_arcs(kind, v, query, arcs, least)
 
 
 @wp.struct
@@ -146,8 +144,7 @@ def _rule(turning: bool) -> PairRule:
 
     @wp.func
     def clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]) -> bool:
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
         distances = options.distances
         distance = distance_of_corners(kind, v, distances.radius) + distances.reach
         reach = distances.reach
@@ -165,8 +162,7 @@ def _rule(turning: bool) -> PairRule:
 
     @wp.func
     def decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
-        a0, b0, c0, d0 = x0[v[0]], x0[v[1]], x0[v[2]], x0[v[3]]
-        a1, b1, c1, d1 = x1[v[0]], x1[v[1]], x1[v[2]], x1[v[3]]
+        a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
         distances = options.distances
         tolerance = options.tolerance
         a, b, c, d = doubles(a0, b0, c0, d0)

@@ -11,7 +11,7 @@ import warp as wp
 
 from ....kernels.arcs import Arcs, arc_bounds, impact_on_arcs, move_as_one, sagitta_of_part
 from ....kernels.min_distance import clears_at_once
-from ....kernels.motion import motion_and_distance
+from ....kernels.motion import motion_and_distance, query_at
 from ....kernels.pairs import distance_of_corners, ends_of, vertices_of_pair
 from ....kernels.pipeline.batch_culling import BATCH
 from ....kernels.pipeline.queues import filled_entries, take_slots
@@ -95,8 +95,7 @@ def _clears(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.
 
 @wp.func
 def _decide(options: Options, kind: int, v: wp.vec4i, x0: wp.array[Any], x1: wp.array[Any]):
-    a0, b0, c0, d0, a1, b1, c1, d1 = ends_of(x0, x1, v)
-    result = impact_on_arcs(kind, v, a0, b0, c0, d0, a1, b1, c1, d1, options.arcs, _ZERO)
+    result = impact_on_arcs(kind, v, query_at(x0, x1, v), options.arcs, _ZERO)
     return result, result.status != FREE
 
 

@@ -11,8 +11,8 @@ from ..detection.at_rest.body_parts import connect_cells
 from ..detection.at_rest.containment import ContainmentFinder
 from ..detection.at_rest.intersections import IntersectionFinder, Intersections
 from ..detection.mesh import CollisionMesh
-from .arguments import checked_mesh
-from .surface import weld_borders, welded
+from ..repairing.arguments import checked_mesh
+from ..repairing.surface import weld_borders, welded
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
