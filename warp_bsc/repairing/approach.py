@@ -8,11 +8,9 @@ from .motion import move_freely
 from .surface import Surface
 
 _ROUNDS = 24
-_MOMENTA = (0.9, 0.95, 0.0)
-"""Momenta of sweeps, of which the later ones are tried where nothing crosses, but strains are above the limit. Without
-one, sweeps reach less far, but also settle where surfaces are far from their shape."""
-_SWEEPS, _MORE_SWEEPS, _MOST_SWEEPS = 40, 160, 640
-"""Sweeps of a round in which strains are below the limit at its start, above it, and once such rounds do no more."""
+_MOMENTUM = 0.9
+_SWEEPS, _MORE_SWEEPS = 40, 160
+"""Sweeps of a round in which strains are below the limit at its start, and above it."""
 _RINGS = 10
 """Edges around vertices in contact within which springs move others."""
 _SETTLED = 2.0**-10
@@ -40,27 +38,16 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         springs: Springs of the vertices that may move.
         max_strain: Largest strain.
     """
-    found = []
-    for momentum in _MOMENTA:
-        found.append(_approach(surface, x, springs, max_strain, momentum))
-        crosses = not surface.are_fixed(surface.crossings(found[-1])).all()
-        if crosses or surface.is_late or not score_of(surface, found[-1], max_strain)[0]:
-            break
-    return min(found, key=lambda x: score_of(surface, x, max_strain))
-
-
-def _approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: float, momentum: float) -> np.ndarray:
-    """Returns positions as :func:`approach`, with one momentum of sweeps."""
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
-    held, stalled, known, more = np.zeros(len(x), dtype=bool), 0, Contacts.none(), _MORE_SWEEPS
+    held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         if held.any():
             around = springs.around(held, _RINGS)
-            sweeps = more if score[0] else _SWEEPS
+            sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
             slack = _SOUGHT * max_strain
-            goal = springs.relax(goal, sweeps, slack, momentum=momentum, contacts=known, around=around)
+            goal = springs.relax(goal, sweeps, slack, momentum=_MOMENTUM, contacts=known, around=around)
             goal = projected(surface.fixed, goal, known, device=surface.device)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
@@ -68,14 +55,12 @@ def _approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: flo
         start, (x, contacts) = x, move_freely(surface, x, goal)
         known = Contacts.joined([known, contacts]).latest()
         held[contacts.vertices] = True
-        before, score = score, score_of(surface, x, max_strain)
-        stalled = 0 if _is_better(before, score) or _is_better(best_score, score) else stalled + 1
+        score = score_of(surface, x, max_strain)
+        stalled = 0 if _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
         if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1) or surface.is_late:
-            if not score[0] or more == _MOST_SWEEPS or surface.is_late:
-                break
-            more, stalled = _MOST_SWEEPS, 0
+            break
     goes_home = surface.moves(best) < _SMALL * surface.edge
     while True:
         goal = surface.rounded(np.where(goes_home[:, None], surface.home, best))
