@@ -4,13 +4,16 @@ import numpy as np
 
 from .contacts import Contacts, projected
 from .elastic import Springs
-from .motion import move_freely
+from .motion import contacts_at, move_freely
 from .surface import Surface
 
-_ROUNDS = 24
-_MOMENTUM = 0.9
+_ROUNDS = 60
+_LEAP = 4.0
+"""Largest way of a round towards the input, in edges: from far, all springs relax after each."""
+_MOMENTUM, _MOMENTUM_FAR = 0.8, 0.9
 _SWEEPS, _MORE_SWEEPS = 40, 160
-"""Sweeps of a round in which strains are below the limit at its start, and above it."""
+"""Sweeps of a round in which strains are below the limit at its start, and above it; as many more after each round
+that comes no nearer."""
 _RINGS = 10
 """Edges around vertices in contact within which springs move others."""
 _SETTLED = 2.0**-10
@@ -43,20 +46,30 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
-        if held.any():
-            around = springs.around(held, _RINGS)
-            sweeps = _MORE_SWEEPS if score[0] else _SWEEPS
-            slack = _SOUGHT * max_strain
-            goal = springs.relax(goal, sweeps, slack, momentum=_MOMENTUM, contacts=known, around=around)
+        farthest = np.abs(goal - x).max(initial=0.0)
+        is_far = farthest > _LEAP * surface.edge
+        if is_far:
+            goal = x + _LEAP * surface.edge / farthest * (goal - x)
+        if is_far or held.any():
+            goal = springs.relax(
+                goal,
+                _MORE_SWEEPS * (1 + stalled) if score[0] else _SWEEPS,
+                _SOUGHT * max_strain,
+                momentum=_MOMENTUM_FAR if is_far else _MOMENTUM,
+                contacts=known,
+                around=None if is_far else springs.around(held, _RINGS),
+            )
             goal = projected(surface.fixed, goal, known, device=surface.device)
         goal = surface.rounded(goal)
         if _are_near(x, goal, surface.edge):
             break
         start, (x, contacts) = x, move_freely(surface, x, goal)
-        known = Contacts.joined([known, contacts]).latest()
         held[contacts.vertices] = True
+        # planes of earlier positions would keep pairs from places that are free
+        around = contacts_at(surface, x)
+        known = Contacts.joined([contacts, around.rows(held[around.vertices].any(axis=1))]).latest()
         score = score_of(surface, x, max_strain)
-        stalled = 0 if _is_better(best_score, score) else stalled + 1
+        stalled = 0 if is_far or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
         if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1) or surface.is_late:

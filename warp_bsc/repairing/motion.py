@@ -118,6 +118,13 @@ def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
 
 
+def contacts_at(surface: Surface, x: np.ndarray) -> Contacts:
+    """Returns the pairs that are so near at positions in units that a motion may bring them together, as contacts."""
+    positions = surface.detected(x)
+    found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions))
+    return _with_gaps(surface, found, near_pairs(surface, x))
+
+
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
     """Returns the contacts of a motion between positions in units; pairs at rest stay as they are.
 
@@ -128,13 +135,19 @@ def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.nd
         near: Keys of the pairs that do not keep the minimum distance at the start: they must only not touch.
     """
     x0, x1 = surface.detected(start), surface.detected(goal)
-    contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1), _GAP * surface.edge)
-    # short edges would be strained by the gap of longer ones
-    contacts = replace(contacts, gap=_GAP * surface.shortest[contacts.vertices].min(axis=1))
+    contacts = as_contacts(surface.mesh, surface.detector.detect(x0, x1))
     if surface.min_distance:
-        found = surface.distance_detector.detect(x0, x1)
-        too_near = as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
+        too_near = as_contacts(surface.mesh, surface.distance_detector.detect(x0, x1))
         too_near = too_near.rows(~np.isin(too_near.keys, near))
         contacts = Contacts.joined([contacts.rows(~np.isin(contacts.keys, too_near.keys)), too_near])
     moves = differ(start, goal)
-    return contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1)))
+    return _with_gaps(surface, contacts.rows(np.asarray(moves[contacts.vertices].any(axis=1))), near)
+
+
+def _with_gaps(surface: Surface, contacts: Contacts, near: np.ndarray) -> Contacts:
+    """Returns contacts with the distances that they are to have: the minimum distance, unless they are near ones."""
+    # short edges would be strained by the gap of longer ones
+    gap = _GAP * surface.shortest[contacts.vertices].min(axis=1)
+    if surface.min_distance:
+        gap = np.where(np.isin(contacts.keys, near), gap, _MORE_DISTANCE * surface.min_distance)
+    return replace(contacts, gap=gap)

@@ -13,8 +13,8 @@ from .contours import connected_components
 
 _WRECKED = 0.25
 """Median strain of edges that have moved above which a surface is no result."""
-
-
+_REACH = 0.25
+"""Distance of pairs that a motion may bring together, in edges."""
 _NO_TETRAHEDRA = np.zeros((0, 4), dtype=int)
 _DIRECTION = np.array([0.48, 0.6, 0.64])
 """A direction across which few vertices of a mesh lie."""
@@ -166,6 +166,11 @@ class Surface:
     def distance_detector(self) -> CollisionDetector:
         """A detector of pairs that come within the minimum distance."""
         return CollisionDetector(self.mesh, min_distance=self.min_distance)
+
+    @functools.cached_property
+    def reach_detector(self) -> CollisionDetector:
+        """A detector of pairs that a motion may bring together."""
+        return CollisionDetector(self.mesh, min_distance=max(_REACH * self.edge, 1.01 * self.min_distance))
 
     @property
     def is_late(self) -> bool:
