@@ -20,7 +20,7 @@ _SETTLED = 2.0**-10
 """Move, in edges, below which the approach ends."""
 _PROGRESS = 0.98
 """Share of the strain above the limit, or of the moves once there is none, to which a round must come down."""
-_PATIENCE = 4
+_PATIENCE = 8
 """Rounds that do not, after which the approach ends; one if strains are below the limit."""
 _SMALL = 0.03
 """Move, in edges, that in the end is taken back where that meets nothing."""
@@ -43,7 +43,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
-    held, stalled, known = np.zeros(len(x), dtype=bool), 0, Contacts.none()
+    held, stalled, contacts = np.zeros(len(x), dtype=bool), 0, Contacts.none()
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         farthest = np.abs(goal - x).max(initial=0.0)
@@ -51,6 +51,8 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         if is_far:
             goal = x + _LEAP * surface.edge / farthest * (goal - x)
         if is_far or held.any():
+            # planes of earlier positions would keep pairs from places that are free
+            known = Contacts.joined([contacts, contacts_at(surface, x, held)]).latest()
             goal = springs.relax(
                 goal,
                 _MORE_SWEEPS * (1 + stalled) if score[0] else _SWEEPS,
@@ -65,9 +67,6 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
             break
         start, (x, contacts) = x, move_freely(surface, x, goal)
         held[contacts.vertices] = True
-        # planes of earlier positions would keep pairs from places that are free
-        around = contacts_at(surface, x)
-        known = Contacts.joined([contacts, around.rows(held[around.vertices].any(axis=1))]).latest()
         score = score_of(surface, x, max_strain)
         stalled = 0 if is_far or _is_better(best_score, score) else stalled + 1
         if score < best_score:

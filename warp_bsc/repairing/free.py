@@ -17,6 +17,8 @@ _RINGS = 10
 """Edges around vertices that are pushed apart within which others may follow."""
 _OFFSET = 0.1
 """Distance by which layers that lie on each other leave each other, in edges."""
+_FAR = 4.0
+"""Move, in edges, above which another order of pieces is tried, which may be nearer."""
 _FLATTEST = 0.01
 """Length of the sum of normals around a vertex, as a share of that of their lengths, below which it has no normal."""
 _SWEEPS, _DOUBLINGS = 8, 10
@@ -84,7 +86,7 @@ def _found(
     if sheet is None and not surface.are_fixed(surface.crossings(x)).all():
         x = free_by_order(surface, x, max_strain, rank, chosen)
         x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
-    elif sheet is None and rank(x)[3]:
+    elif sheet is None and (rank(x)[3] or surface.moves(x).max() > _FAR * surface.edge):
         ordered = free_by_order(surface, surface.home, max_strain, rank, chosen)
         if rank(x) <= rank(ordered):
             chosen[:] = -1

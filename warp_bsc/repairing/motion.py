@@ -118,11 +118,11 @@ def _near_contacts(surface: Surface, x: np.ndarray) -> Contacts:
     return as_contacts(surface.mesh, found, surface.min_distance * _MORE_DISTANCE)
 
 
-def contacts_at(surface: Surface, x: np.ndarray) -> Contacts:
-    """Returns the pairs that are so near at positions in units that a motion may bring them together, as contacts."""
+def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
+    """Returns the pairs with held vertices that are near at positions in units, as contacts."""
     positions = surface.detected(x)
-    found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions))
-    return _with_gaps(surface, found, near_pairs(surface, x))
+    found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions, vertices=held))
+    return _with_gaps(surface, found.rows(held[found.vertices].any(axis=1)), near_pairs(surface, x))
 
 
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
