@@ -48,7 +48,7 @@ def border_border(n):
 
 
 def border_interior(n):
-    """Returns two sheets, each halfway into the other: the contour leads from the border of one to that of the other."""
+    """Returns two sheets, each halfway into the other: a contour from the border of one to the border of the other."""
 
     def place(u, v):
         return np.stack([0.75 + 0.0131 / n + u, 0.43 + 0.0177 / n + 0.3 * (v - 0.5), 0.9 * (v - 0.5)], -1)
@@ -111,7 +111,7 @@ def main():
             faces, x = make(size)
             mesh = bsc.CollisionMesh(faces, len(x), device="cpu")
             edge = np.median(np.linalg.norm(x[mesh.edges[:, 0]] - x[mesh.edges[:, 1]], axis=1))
-            bsc.repair(*KINDS[kind](20), device="cpu")  # loads kernels
+            bsc.repair(*make(20), device="cpu")  # loads kernels
             start = time.perf_counter()
             result = bsc.repair(faces, x, device="cpu")
             seconds = time.perf_counter() - start

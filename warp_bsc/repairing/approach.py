@@ -43,7 +43,7 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
     """
     best, score = x, score_of(surface, x, max_strain)
     best_score = score
-    held, stalled, contacts = np.zeros(len(x), dtype=bool), 0, Contacts.none()
+    held, stalled, contacts, nearest = np.zeros(len(x), dtype=bool), 0, Contacts.none(), np.inf
     for _ in range(_ROUNDS):
         goal = np.where(held[:, None], x, surface.home)
         farthest = np.abs(goal - x).max(initial=0.0)
@@ -68,7 +68,9 @@ def approach(surface: Surface, x: np.ndarray, springs: Springs, max_strain: floa
         start, (x, contacts) = x, move_freely(surface, x, goal)
         held[contacts.vertices] = True
         score = score_of(surface, x, max_strain)
-        stalled = 0 if is_far or _is_better(best_score, score) else stalled + 1
+        is_nearer = is_far and farthest < _PROGRESS * nearest
+        nearest = min(nearest, farthest)
+        stalled = 0 if is_nearer or _is_better(best_score, score) else stalled + 1
         if score < best_score:
             best, best_score = x, score
         if _are_near(start, x, surface.edge) or stalled >= (_PATIENCE if score[0] else 1) or surface.is_late:
