@@ -15,17 +15,25 @@ import time
 import numpy as np
 
 import warp_bsc as bsc
-from warp_bsc.bench.scenes.repair import _grid, _joined
 
 
 def one_mesh(*surfaces):
     """Returns the faces and positions of surfaces, each positions and faces."""
-    x, faces, _ = _joined(*surfaces)
-    return faces, x
+    firsts = np.cumsum([0] + [len(x) for x, _ in surfaces])
+    faces = np.concatenate([faces + first for (_, faces), first in zip(surfaces, firsts, strict=False)])
+    return faces, np.concatenate([x for x, _ in surfaces])
+
+
+def grid(n, m, place):
+    """Returns the positions and faces of a grid of n by m vertices at the places of (u, v) in [0, 1]."""
+    u, v = np.meshgrid(np.linspace(0.0, 1.0, n), np.linspace(0.0, 1.0, m), indexing="ij")
+    i = np.arange(n * m).reshape(n, m)
+    a, b, c, d = (corners.ravel() for corners in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    return place(u, v).reshape(-1, 3), np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def flat(n):
-    return _grid(n, n, lambda u, v: np.stack([u, v, 0.0 * u], -1))
+    return grid(n, n, lambda u, v: np.stack([u, v, 0.0 * u], -1))
 
 
 def closed(n):
@@ -35,7 +43,7 @@ def closed(n):
         sunk = 0.12 * np.exp(-((u - 0.5) ** 2 + (v - 0.5) ** 2) / 0.02)
         return np.stack([u + 0.0131 / n, v + 0.0177 / n, 0.05 - sunk], -1)
 
-    return one_mesh(flat(n), _grid(n, n, place))
+    return one_mesh(flat(n), grid(n, n, place))
 
 
 def border_border(n):
@@ -44,7 +52,7 @@ def border_border(n):
     def place(u, v):
         return np.stack([0.37 + 0.0131 / n + 0.25 * v, 0.51 + 0.0177 / n + 0.15 * (u - 0.85), 0.6 * (u - 0.85)], -1)
 
-    return one_mesh(flat(n), _grid(n, max(4, n // 4), place))
+    return one_mesh(flat(n), grid(n, max(4, n // 4), place))
 
 
 def border_interior(n):
@@ -53,7 +61,7 @@ def border_interior(n):
     def place(u, v):
         return np.stack([0.75 + 0.0131 / n + u, 0.43 + 0.0177 / n + 0.3 * (v - 0.5), 0.9 * (v - 0.5)], -1)
 
-    return one_mesh(flat(n), _grid(n, n, place))
+    return one_mesh(flat(n), grid(n, n, place))
 
 
 def curled(n, width, shift):
@@ -68,7 +76,7 @@ def curled(n, width, shift):
         along = turn / angle
         return np.stack([x, 0.5 * (v - 0.5) * (1.0 - along * (1.0 - width)) + shift * along, z], -1)
 
-    return one_mesh(_grid(n, n, place))
+    return one_mesh(grid(n, n, place))
 
 
 def border_loop(n):
@@ -78,7 +86,7 @@ def border_loop(n):
         u, w = 2.0 * u - 1.0, 0.8 * (2.0 * v - 1.0) - 0.1
         return np.stack([1.2 * u, w**3 - 0.6 * u * w, 0.8 * w * w], -1)
 
-    return one_mesh(_grid(n, n, place))
+    return one_mesh(grid(n, n, place))
 
 
 def loop_loop(n):
@@ -88,7 +96,7 @@ def loop_loop(n):
         u, w = 2.0 * u - 1.0, 1.3 * (2.0 * v - 1.0)
         return np.stack([1.2 * u, w**3 - 0.25 * (1.0 - (u / 0.7) ** 2) * w, 0.8 * w * w], -1)
 
-    return one_mesh(_grid(n, n, place))
+    return one_mesh(grid(n, n, place))
 
 
 KINDS = {

@@ -191,12 +191,6 @@ def free_by_smoothing(surface: Surface, start: np.ndarray, max_strain: float) ->
     return start
 
 
-def free_in_order(surface: Surface, sheet: np.ndarray, start: np.ndarray, max_strain: float) -> np.ndarray:
-    """Returns positions as :func:`free`, from where sheets are on their sides, see :func:`.sheets.separate_sheets`."""
-    x = separate_sheets(surface, sheet, start)
-    return free(surface, x, surface.crossings(x), max_strain, movable=~surface.fixed)
-
-
 def free_by_order(
     surface: Surface, x: np.ndarray, max_strain: float, rank: Callable[[np.ndarray], tuple], chosen: np.ndarray
 ) -> np.ndarray:
@@ -223,7 +217,8 @@ def free_by_order(
         found = []
         for inner, outer in (pairs[0], pairs[0][::-1]):
             sheet = np.where(piece == inner, 0, np.where(piece == outer, 1, -1))
-            y = free_in_order(surface, sheet, np.where(sheet[:, None] < 0, x, surface.home), max_strain)
+            y = separate_sheets(surface, sheet, np.where(sheet[:, None] < 0, x, surface.home))
+            y = free(surface, y, surface.crossings(y), max_strain, movable=~surface.fixed)
             found.append((rank(y), inner, outer, y))
         best, inner, outer, y = min(found, key=lambda each: (each[0][:2], each[0][-1]))
         if best[:2] < rank(x)[:2]:
