@@ -86,6 +86,7 @@ def _found(
     if sheet is None and not surface.are_fixed(surface.crossings(x)).all():
         x = free_by_order(surface, x, max_strain, rank, chosen)
         x = min(x, free_by_smoothing(surface, x, max_strain), key=rank)
+    # what is inside solids has left them, and is no sheet
     elif sheet is None and not before.inside.size and (rank(x)[3] or surface.moves(x).max() > _FAR * surface.edge):
         ordered = free_by_order(surface, surface.home, max_strain, rank, chosen)
         if rank(x) <= rank(ordered):

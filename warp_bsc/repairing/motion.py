@@ -122,7 +122,7 @@ def contacts_at(surface: Surface, x: np.ndarray, held: np.ndarray) -> Contacts:
     """Returns the pairs with held vertices that are near at positions in units, as contacts."""
     positions = surface.detected(x)
     found = as_contacts(surface.mesh, surface.reach_detector.detect(positions, positions, vertices=held))
-    return _with_gaps(surface, found.rows(held[found.vertices].any(axis=1)), near_pairs(surface, x))
+    return _with_gaps(surface, found.rows(np.asarray(held[found.vertices].any(axis=1))), near_pairs(surface, x))
 
 
 def _contacts(surface: Surface, start: np.ndarray, goal: np.ndarray, near: np.ndarray) -> Contacts:
